@@ -1,0 +1,60 @@
+"""Random numbers that depend on (seed, world, episode) alone.
+
+A world's starts must be the same whether it runs alone or among a thousand, and whatever the
+others do. A stateful generator cannot give that; a hash of a counter can.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+def _mix(z: np.ndarray) -> np.ndarray:
+    """The output function of SplitMix64 (Steele, Lea and Flood, 2014)."""
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+def world_keys(seed: int, num_worlds: int) -> np.ndarray:
+    """One 64-bit key for each world of a batch.
+
+    Args:
+        seed: any non-negative integer below 2**64.
+        num_worlds: number of worlds.
+
+    Returns:
+        Array [num_worlds] of uint64. World k has the same key in every batch with this seed.
+
+    Example:
+        >>> bool((world_keys(3, 2) == world_keys(3, 5)[:2]).all())
+        True
+    """
+    base = _mix(np.array([seed], dtype=np.uint64) + _GOLDEN)
+    return _mix(base + np.arange(1, num_worlds + 1, dtype=np.uint64) * _GOLDEN)
+
+
+def uniform(keys: np.ndarray, episodes: Tensor, count: int) -> Tensor:
+    """Uniform numbers in [0, 1) for given episodes of given worlds.
+
+    Args:
+        keys: [M] uint64, from :func:`world_keys`.
+        episodes: [M] int64, the number of the episode in its world.
+        count: how many numbers an episode needs, at most 256.
+
+    Returns:
+        Tensor [M, count] of float64.
+
+    Example:
+        >>> u = uniform(world_keys(0, 2), torch.tensor([0, 0]), 3)
+        >>> u.shape, bool(((u >= 0) & (u < 1)).all())
+        (torch.Size([2, 3]), True)
+    """
+    first = episodes.numpy().astype(np.uint64) * np.uint64(256)
+    counter = first[:, None] + np.arange(1, count + 1, dtype=np.uint64)
+    bits = _mix(keys[:, None] + counter * _GOLDEN)
+    return torch.from_numpy((bits >> np.uint64(11)).astype(np.float64) * 2.0**-53)

@@ -1,0 +1,305 @@
+"""The environment behind all eleven tasks: batched, TensorDict-native, with goals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_her_envs.effector import Effector
+from torchrl_her_envs.goals import BoxGoals, GoalDistribution, SectorGoals
+from torchrl_her_envs.hand import Hand
+from torchrl_her_envs.physics import BallPhysics
+from torchrl_her_envs.robot import Arm
+from torchrl_her_envs.seeding import uniform, world_keys
+from torchrl_her_envs.task import Task, WorldConfig
+
+
+@dataclass
+class WorldState:
+    """All that N worlds are, in metres, radians and seconds. Every tensor has N rows.
+
+    ``free`` says that the ball obeys physics (it does not while it is held, nor does the robot's
+    before it was first held); ``episode`` counts the resets of a world.
+    """
+
+    joints: Tensor
+    joint_velocity: Tensor
+    grip: Tensor
+    grip_velocity: Tensor
+    ball: Tensor
+    ball_velocity: Tensor
+    goal: Tensor
+    closed: Tensor
+    held: Tensor
+    free: Tensor
+    step: Tensor
+    episode: Tensor
+
+    @classmethod
+    def zeros(cls, num_worlds: int, num_joints: int) -> WorldState:
+        """N worlds before their first reset."""
+
+        def points(n: int) -> Tensor:
+            return torch.zeros(num_worlds, n, dtype=torch.float64)
+
+        def flags(dtype: torch.dtype) -> Tensor:
+            return torch.zeros(num_worlds, dtype=dtype)
+
+        return cls(
+            points(num_joints),
+            points(num_joints),
+            *(points(2) for _ in range(5)),
+            *(flags(torch.bool) for _ in range(3)),
+            *(flags(torch.int64) for _ in range(2)),
+        )
+
+
+class ThrowingEnv(EnvBase):
+    """N worlds in which a hand or an arm reaches for a ball or throws it into a black hole.
+
+    Keys: ``observation``, ``achieved_goal``, ``desired_goal`` (gymnasium's GoalEnv convention),
+    ``state`` (the observation with the desired goal behind it), ``action`` in [-1, 1] (speeds of
+    the joints, then the grip: above 0 it closes), ``reward`` (0 where the goal is achieved, -1
+    elsewhere), ``terminated`` (the goal is achieved), ``truncated`` (the last step), ``done``.
+
+    Positions are shown as ``2 * screen - 1``. Worlds are independent: world k with a given seed
+    does the same in every batch, and a partial reset leaves the others as they are.
+
+    Args:
+        task: what is to be done; see :data:`~torchrl_her_envs.TASKS`.
+        num_envs: N, the number of worlds.
+        seed: of all random starts and goals.
+        world: the constants.
+        num_links: of the arm.
+        dtype: of observations, goals, actions and rewards; the worlds themselves are in float64.
+
+    Raises:
+        ValueError: ``num_envs`` or ``num_links`` is below 1.
+
+    Example:
+        >>> from torchrl_her_envs import make_env
+        >>> env = make_env("hand_v1", num_envs=3, seed=0)
+        >>> env.rollout(10, break_when_any_done=False)["next", "reward"].shape
+        torch.Size([3, 10, 1])
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        num_envs: int = 1,
+        seed: int = 0,
+        world: WorldConfig | None = None,
+        num_links: int = 2,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        super().__init__(device="cpu", batch_size=(num_envs,))
+        self.task = task
+        self.world = world or WorldConfig()
+        self.dtype_shown = dtype
+        self.effector: Effector = (
+            Hand(self.world, wall=task.wall) if task.effector == "hand" else Arm(self.world, num_links=num_links)
+        )
+        self.threshold = self.world.shown(self.world.hole_radius if task.throws else self.world.ball_radius)
+        self._physics = BallPhysics(num_envs, self.world, wall=task.wall)
+        self._catch = self.world.ball_radius * self.world.size
+        self._ball_starts = self._make_ball_starts()
+        self._goals: GoalDistribution = self._make_goals()
+        self.worlds = WorldState.zeros(num_envs, self.effector.num_joints)
+        self._make_specs()
+        self.set_seed(seed)
+
+    # What the outside asks for
+
+    @property
+    def goal_distribution(self) -> GoalDistribution:
+        """Where desired goals come from, in the coordinates that the agent sees."""
+        return self._goals
+
+    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """The reward of having achieved one goal when another was desired.
+
+        Args:
+            achieved_goal: [..., 2].
+            desired_goal: [..., 2], broadcast against it.
+
+        Returns:
+            [..., 1]: 0 where they are nearer than the task's threshold, -1 elsewhere.
+        """
+        return self.compute_terminated(achieved_goal, desired_goal).to(achieved_goal.dtype) - 1.0
+
+    def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """Whether the goal is achieved, which ends an episode: [..., 1] of bool."""
+        gap = achieved_goal - desired_goal
+        return gap.square().sum(-1, keepdim=True) < self.threshold**2
+
+    def world_state_dict(self) -> dict[str, Tensor]:
+        """A copy of all that the worlds are; they resume exactly from it."""
+        return {field.name: getattr(self.worlds, field.name).clone() for field in fields(WorldState)}
+
+    def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Puts the worlds back to where :meth:`world_state_dict` was taken."""
+        self.worlds = WorldState(**{field.name: state[field.name].clone() for field in fields(WorldState)})
+
+    # TorchRL's hooks
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._keys = world_keys(seed or 0, self.batch_size[0])
+        self.worlds.episode.zero_()
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or bool(mask.all()):
+            which = torch.arange(self.batch_size[0])
+        else:
+            which = mask.view(-1).nonzero().squeeze(-1)
+        self._start_episodes(which)
+        shown = self._show()
+        off = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+        shown.update({"done": off, "terminated": off.clone(), "truncated": off.clone()})
+        return TensorDict(shown, batch_size=self.batch_size)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action")
+        if not bool(action.isfinite().all()):
+            bad = (~action.isfinite()).any(-1).nonzero().flatten().tolist()
+            raise ValueError(f"actions must be finite, got {action[bad[0]].tolist()} in world {bad[0]}")
+        self._advance(action.to(torch.float64).clamp(-1.0, 1.0))
+        shown = self._show()
+        terminated = self.compute_terminated(shown["achieved_goal"], shown["desired_goal"])
+        truncated = (self.worlds.step >= self.world.max_steps).unsqueeze(-1)
+        shown["reward"] = terminated.to(self.dtype_shown) - 1.0
+        shown.update({"terminated": terminated, "truncated": truncated, "done": terminated | truncated})
+        return TensorDict(shown, batch_size=self.batch_size)
+
+    # The worlds
+
+    def _advance(self, action: Tensor) -> None:
+        """One time step: open or close, move, let the balls fly, catch."""
+        w, dt = self.worlds, self.world.time_step
+        closed = action[:, -1] > 0
+        released = w.held & ~closed
+        # A released ball keeps the velocity that the hand had in the step before.
+        ball_velocity = torch.where(released.unsqueeze(-1), w.grip_velocity, w.ball_velocity)
+        held, free = w.held & closed, w.free | released
+
+        joints = self.effector.move(w.joints, action[:, :-1] * (self.effector.action_speed * dt))
+        grip = self.effector.grip(joints)
+        grip_velocity = (grip - w.grip) / dt
+        flown, flown_velocity = self._physics.step(w.ball, ball_velocity)
+        free_ = free.unsqueeze(-1)
+        ball = torch.where(free_, flown, w.ball)
+        ball_velocity = torch.where(free_, flown_velocity, ball_velocity)
+
+        near = (ball - grip).square().sum(-1) < self._catch**2
+        held = held | (closed & near)
+        held_ = held.unsqueeze(-1)
+        w.joint_velocity = (joints - w.joints) / dt
+        w.joints, w.grip, w.grip_velocity = joints, grip, grip_velocity
+        w.ball = torch.where(held_, grip, ball)
+        w.ball_velocity = torch.where(held_, grip_velocity, ball_velocity)
+        w.closed, w.held, w.free = closed, held, free & ~held
+        w.step = w.step + 1
+
+    def _start_episodes(self, which: Tensor) -> None:
+        """Draws the starts of new episodes in the given worlds [M]."""
+        w, n = self.worlds, self.effector.num_joints
+        u = uniform(self._keys[which.numpy()], w.episode[which], n + 5)
+        joints = self.effector.sample(u[:, :n])
+        grip = self.effector.grip(joints)
+        start = self.task.start
+        held = u[:, -1] < {"held": 1.0, "away": 0.0, "mixed": 0.5}[start]
+        away = self._ball_starts.from_uniform(u[:, n : n + 2])
+        ball = torch.where(held.unsqueeze(-1), grip, away)
+        goal = self._goals.from_uniform(u[:, n + 2 : n + 4]) if self.task.throws else self._scale(ball)
+        for name, value in {
+            "joints": joints,
+            "joint_velocity": 0.0,
+            "grip": grip,
+            "grip_velocity": 0.0,
+            "ball": ball,
+            "ball_velocity": 0.0,
+            "goal": goal,
+            "closed": held,
+            "held": held,
+            "free": ~held & (self.task.effector == "hand"),  # the robot's ball waits in the air
+            "step": 0,
+        }.items():
+            tensor = getattr(w, name).clone()
+            tensor[which] = value
+            setattr(w, name, tensor)
+        w.episode[which] += 1
+
+    def _scale(self, metres: Tensor) -> Tensor:
+        return metres * (2.0 / self.world.size) - 1.0
+
+    def _show(self) -> dict[str, Tensor]:
+        """What the agent sees of the worlds."""
+        w, config = self.worlds, self.world
+        grip, ball = self._scale(w.grip), self._scale(w.ball)
+        parts = [
+            self.effector.observe(
+                w.joints,
+                w.joint_velocity / self.effector.action_speed,
+                grip,
+                w.grip_velocity / config.hand_speed,
+                w.closed.unsqueeze(-1).to(torch.float64),
+            )
+        ]
+        if self.task.throws:
+            parts += [ball, w.ball_velocity / config.hand_speed]
+        state = torch.cat([*parts, w.goal], -1).to(self.dtype_shown)
+        achieved = (ball if self.task.throws else grip).to(self.dtype_shown)
+        return {
+            "state": state,
+            "observation": state[:, :-2].clone(),
+            "achieved_goal": achieved,
+            "desired_goal": state[:, -2:].clone(),
+        }
+
+    # Made once
+
+    def _make_ball_starts(self) -> GoalDistribution:
+        """Where a ball that is not held starts, in metres."""
+        config = self.world
+        if self.task.effector == "hand":
+            left, _, right, _ = (side * config.size for side in self.effector.reach)
+            floor = config.ball_radius * config.size
+            return BoxGoals((left, floor), (right, floor))
+        base = (config.arm_base[0] * config.size, config.arm_base[1] * config.size)
+        shortest, longest = (share * config.arm_length for share in config.arm_ball_radius)
+        return SectorGoals(base, angle=config.arm_ball_angle, radius=(shortest, longest))
+
+    def _make_goals(self) -> GoalDistribution:
+        """Where goals start, as the agent sees them."""
+        config = self.world
+        if self.task.throws:
+            box = config.hand_goals if self.task.effector == "hand" else config.arm_goals
+            left, bottom, right, top = (2.0 * side - 1.0 for side in box)
+            return BoxGoals((left, bottom), (right, top))
+        return self._ball_starts.scaled(2.0 / config.size, -1.0)
+
+    def _make_specs(self) -> None:
+        (n,) = self.batch_size
+        size = self.effector.observation_size + (4 if self.task.throws else 0)
+
+        def seen(width: int) -> Unbounded:
+            return Unbounded(shape=(n, width), dtype=self.dtype_shown)
+
+        def flag() -> Binary:
+            return Binary(n=1, shape=(n, 1), dtype=torch.bool)
+
+        self.observation_spec = Composite(
+            state=seen(size + 2), observation=seen(size), achieved_goal=seen(2), desired_goal=seen(2), shape=(n,)
+        )
+        width = self.effector.num_joints + 1
+        self.action_spec = Bounded(low=-1.0, high=1.0, shape=(n, width), dtype=self.dtype_shown)
+        self.reward_spec = Bounded(low=-1.0, high=0.0, shape=(n, 1), dtype=self.dtype_shown)
+        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
