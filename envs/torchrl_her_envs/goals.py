@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from itertools import product
 from typing import Protocol
 
 import torch
@@ -86,14 +88,19 @@ class SectorGoals(_Sampled):
         self.centre = torch.tensor(centre, dtype=torch.float64)
         self.angle = angle
         self.radius = radius
-        along, ends = torch.linspace(0, 1, 257, dtype=torch.float64), torch.tensor([0.0, 1.0], dtype=torch.float64)
-        edge = self.from_uniform(torch.cartesian_prod(along, ends))
+        # A sector touches its box at its corners, or straight left, right, above or below the centre.
+        straight = [90.0 * k for k in range(math.ceil(angle[0] / 90.0), math.floor(angle[1] / 90.0) + 1)]
+        touching = torch.tensor(list(product((*angle, *straight), radius)), dtype=torch.float64)
+        edge = self._point(touching[:, :1], touching[:, 1:])
         self.low, self.high = edge.amin(0), edge.amax(0)
 
     def from_uniform(self, u: Tensor) -> Tensor:
-        angle = torch.deg2rad(self.angle[0] + u[..., :1] * (self.angle[1] - self.angle[0]))
-        radius = self.radius[0] + u[..., 1:] * (self.radius[1] - self.radius[0])
-        return self.centre + radius * torch.cat((angle.cos(), angle.sin()), -1)
+        angle = self.angle[0] + u[..., :1] * (self.angle[1] - self.angle[0])
+        return self._point(angle, self.radius[0] + u[..., 1:] * (self.radius[1] - self.radius[0]))
+
+    def _point(self, angle: Tensor, radius: Tensor) -> Tensor:
+        turn = torch.deg2rad(angle)
+        return self.centre + radius * torch.cat((turn.cos(), turn.sin()), -1)
 
     def scaled(self, factor: float, shift: float) -> SectorGoals:
         x, y = (self.centre * factor + shift).tolist()

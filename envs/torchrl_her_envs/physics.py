@@ -52,6 +52,7 @@ class BallPhysics:
         self._state = np.zeros((num_worlds + 1, 4))
         self._balls = self._state[:num_worlds]
         self._buffer = pymunk.batch.Buffer()
+        self._parked = self._park(world)
 
     def step(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
         """Lets all balls move freely for one time step.
@@ -63,6 +64,7 @@ class BallPhysics:
         Returns:
             The new positions and velocities.
         """
+        self._forget()
         np.add(position.numpy(), self._offset, out=self._balls[:, :2])
         self._balls[:, 2:] = velocity.numpy()
         self._buffer.set_float_buf(self._state)
@@ -74,12 +76,30 @@ class BallPhysics:
         state = np.frombuffer(result.float_buf()).reshape(-1, 4)[: len(self._balls)]
         return torch.from_numpy(state[:, :2] - self._offset), torch.from_numpy(state[:, 2:].copy())
 
+    def _forget(self) -> None:
+        """Lets Chipmunk forget the step before, so that position and velocity are the whole state of a ball.
+
+        A body keeps its old contacts, and the push that still moves it out of a surface, for one substep
+        more. Nobody can read or write these, so the balls spend that substep where they touch nothing.
+        """
+        pymunk.batch.set_space_bodies(self._space, _FIELDS, self._parked)
+        self._space.step(self._substep)
+
+    def _park(self, world: WorldConfig) -> pymunk.batch.Buffer:
+        """All balls at rest, between the left side and the wall."""
+        parked = np.zeros_like(self._state)
+        middle = (world.wall_x - world.wall_thickness / 2) / 2
+        parked[:-1, :2] = self._offset + np.array([middle, 0.5]) * world.size
+        buffer = pymunk.batch.Buffer()
+        buffer.set_float_buf(parked)
+        return buffer
+
     def _build(self, num_worlds: int, world: WorldConfig, wall: bool) -> pymunk.Space:
         space = pymunk.Space()
         space.gravity = (0.0, -world.gravity)
         space.iterations = _ITERATIONS
         space.collision_slop = 1e-3  # metres; the default, 0.1, is meant for pixels
-        space.collision_persistence = 0  # no memory of old contacts: position and velocity are the whole state
+        space.collision_persistence = 1  # with 0, contacts are dropped before they act: nothing collides
         space.use_spatial_hash(_CELL, 10 * num_worlds)
         for offset in self._offset:
             space.add(*self._sides(space.static_body, offset, world, wall))

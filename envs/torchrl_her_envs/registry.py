@@ -30,6 +30,7 @@ def make_env(
     seed: int = 0,
     world: WorldConfig | None = None,
     num_links: int = 2,
+    threshold: float | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> ThrowingEnv:
     """Makes a batch of worlds of a task.
@@ -40,14 +41,23 @@ def make_env(
         seed: of all random starts and goals.
         world: the constants of the world, to change them.
         num_links: of the arm, for the robot's tasks.
+        threshold: how near to the goal is achieved, in shown coordinates; the task's if None.
         dtype: of what the agent sees and does.
 
     Raises:
-        ValueError: an unknown name, or a number below 1.
+        ValueError: an unknown name, a number below 1, or a threshold that is not positive.
 
     Example:
         >>> env = make_env("hand_v0", num_envs=2, seed=0)
         >>> env.reset()["observation"].shape
         torch.Size([2, 9])
     """
-    return ThrowingEnv(get_task(name), num_envs=num_envs, seed=seed, world=world, num_links=num_links, dtype=dtype)
+    return ThrowingEnv(
+        get_task(name),
+        num_envs=num_envs,
+        seed=seed,
+        world=world,
+        num_links=num_links,
+        threshold=threshold,
+        dtype=dtype,
+    )

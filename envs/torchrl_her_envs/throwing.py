@@ -76,10 +76,11 @@ class ThrowingEnv(EnvBase):
         seed: of all random starts and goals.
         world: the constants.
         num_links: of the arm.
+        threshold: how near to the goal is achieved, in shown coordinates; the task's if None.
         dtype: of observations, goals, actions and rewards; the worlds themselves are in float64.
 
     Raises:
-        ValueError: ``num_envs`` or ``num_links`` is below 1.
+        ValueError: ``num_envs`` or ``num_links`` is below 1, or ``threshold`` is not positive.
 
     Example:
         >>> from torchrl_her_envs import make_env
@@ -96,10 +97,13 @@ class ThrowingEnv(EnvBase):
         seed: int = 0,
         world: WorldConfig | None = None,
         num_links: int = 2,
+        threshold: float | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if threshold is not None and not threshold > 0:
+            raise ValueError(f"threshold must be positive, got {threshold}")
         super().__init__(device="cpu", batch_size=(num_envs,))
         self.task = task
         self.world = world or WorldConfig()
@@ -107,7 +111,8 @@ class ThrowingEnv(EnvBase):
         self.effector: Effector = (
             Hand(self.world, wall=task.wall) if task.effector == "hand" else Arm(self.world, num_links=num_links)
         )
-        self.threshold = self.world.shown(self.world.hole_radius if task.throws else self.world.ball_radius)
+        own = self.world.hole_radius if task.throws else self.world.ball_radius
+        self.threshold = self.world.shown(own) if threshold is None else threshold
         self._physics = BallPhysics(num_envs, self.world, wall=task.wall)
         self._catch = self.world.ball_radius * self.world.size
         self._ball_starts = self._make_ball_starts()

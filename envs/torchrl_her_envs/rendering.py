@@ -1,0 +1,141 @@
+"""Pictures of worlds, without a display."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchrl_her_envs import palette, sprites
+from torchrl_her_envs.canvas import MARGIN, Canvas, Point
+
+if TYPE_CHECKING:  # the environment imports this module
+    from torchrl_her_envs.throwing import ThrowingEnv
+
+_LINE = 0.004  # of the screen: thickness of the edges of regions
+_TEXT = 0.045  # of the screen: height of a caption
+
+
+def render(
+    env: ThrowingEnv,
+    worlds: int | Sequence[int] | None = None,
+    *,
+    size: int = 300,
+    trail: Sequence[Tensor] = (),
+    caption: str = "",
+) -> Tensor:
+    """Draws some of an environment's worlds as they are now, and changes nothing in them.
+
+    Red is the region that the hand or arm reaches, blue the one that goals come from. The ring of a
+    black hole ends where the goal does. Use :func:`~torchrl_her_envs.to_pixel` to find a point.
+
+    Args:
+        env: the environment.
+        worlds: indices of the worlds to draw; None for all.
+        size: side of each picture in pixels.
+        trail: earlier values of ``env.worlds.ball`` ([N, 2] each), oldest first, drawn as fading dots.
+        caption: a line of text at the top left.
+
+    Returns:
+        Pictures [len(worlds), size, size, 3] of uint8; without the first dimension for a single index.
+
+    Raises:
+        ValueError: a world that does not exist, or a size that is too small.
+
+    Example:
+        >>> from torchrl_her_envs import make_env
+        >>> env = make_env("hand_v1", num_envs=4)
+        >>> _ = env.reset()
+        >>> render(env, [0, 2], size=64).shape
+        torch.Size([2, 64, 64, 3])
+        >>> render(env, 3, size=64).shape
+        torch.Size([64, 64, 3])
+    """
+    chosen = choose_worlds(env, worlds)
+    stage = _draw_stage(env, size)
+    stage.text((0.02, 0.985), caption, height=_TEXT, fill=palette.INK)
+    pictures = []
+    for world in chosen:
+        canvas = stage.copy()
+        _draw_world(canvas, env, world, [_screen(env, balls[world]) for balls in trail])
+        pictures.append(canvas.finish())
+    return pictures[0] if isinstance(worlds, int) else torch.stack(pictures)
+
+
+def choose_worlds(env: ThrowingEnv, worlds: int | Sequence[int] | None) -> list[int]:
+    """The indices meant by what the user gave, checked.
+
+    Example:
+        >>> from torchrl_her_envs import make_env
+        >>> choose_worlds(make_env("hand_v1", num_envs=3), None)
+        [0, 1, 2]
+    """
+    count = env.batch_size[0]
+    if worlds is None:
+        return list(range(count))
+    chosen = [worlds] if isinstance(worlds, int) else list(worlds)
+    if not chosen or not all(0 <= world < count for world in chosen):
+        raise ValueError(f"worlds must be one or more indices from 0 to {count - 1}, got {worlds}")
+    return chosen
+
+
+def _draw_stage(env: ThrowingEnv, size: int) -> Canvas:
+    """What all worlds of an environment share: the screen, the regions and the wall."""
+    canvas = Canvas(size, background=palette.OUTSIDE)
+    canvas.box((0.0, 0.0), (1.0, 1.0), fill=palette.PAPER, edge=palette.FRAME, width=_LINE)
+    _draw_reach(canvas, env)
+    _draw_goals(canvas, env)
+    canvas.box((-MARGIN, -MARGIN), (1.0 + MARGIN, 0.0), fill=palette.FLOOR)
+    canvas.box((-MARGIN, -_LINE), (1.0 + MARGIN, 0.0), fill=palette.FLOOR_LINE)
+    if env.task.wall:
+        middle, half = env.world.wall_x, env.world.wall_thickness / 2
+        sprites.draw_wall(canvas, (middle - half, 0.0), (middle + half, env.world.wall_height))
+    return canvas
+
+
+def _draw_reach(canvas: Canvas, env: ThrowingEnv) -> None:
+    left, bottom, right, top = env.effector.reach
+    if env.task.effector == "arm":
+        centre, radius = ((left + right) / 2, (bottom + top) / 2), (right - left) / 2
+        canvas.disc(centre, radius, fill=palette.REACH, edge=palette.REACH_EDGE, width=_LINE)
+    else:
+        canvas.box((left, bottom), (right, top), fill=palette.REACH, edge=palette.REACH_EDGE, width=_LINE)
+
+
+def _draw_goals(canvas: Canvas, env: ThrowingEnv) -> None:
+    """The region of the goals, whatever its shape, unless it is a mere line."""
+    goals = env.goal_distribution
+    if (goals.high > goals.low).all():
+        along = torch.linspace(0, 1, 33, dtype=torch.float64)
+        on, off = torch.ones_like(along), torch.zeros_like(along)
+        sides = ((along, off), (on, along), (along.flip(0), on), (off, along.flip(0)))
+        edge = torch.cat([goals.from_uniform(torch.stack(side, -1)) for side in sides])
+        corners = _points((edge + 1) / 2)
+        canvas.polygon(corners, fill=palette.GOALS, edge=palette.GOALS_EDGE, width=_LINE)
+
+
+def _draw_world(canvas: Canvas, env: ThrowingEnv, world: int, trail: Sequence[Point]) -> None:
+    """What differs from world to world, from the back to the front."""
+    now, config = env.worlds, env.world
+    closed, joints = bool(now.closed[world]), env.effector.skeleton(now.joints[world]) / config.size
+    if env.task.throws:
+        sprites.draw_hole(canvas, _points((now.goal[world : world + 1] + 1) / 2)[0], config.hole_radius)
+    sprites.draw_trail(canvas, trail)
+    if env.task.effector == "arm":
+        sprites.draw_arm(canvas, _points(joints), closed=closed)
+    else:
+        sprites.draw_palm(canvas, _screen(env, now.grip[world]), closed=closed)
+    sprites.draw_ball(canvas, _screen(env, now.ball[world]), config.ball_radius)
+    if env.task.effector == "hand" and closed:
+        sprites.draw_fist(canvas, _screen(env, now.grip[world]))
+
+
+def _screen(env: ThrowingEnv, metres: Tensor) -> Point:
+    x, y = (metres / env.world.size).tolist()
+    return x, y
+
+
+def _points(screen: Tensor) -> list[Point]:
+    return [(x, y) for x, y in screen.tolist()]

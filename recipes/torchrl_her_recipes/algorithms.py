@@ -1,0 +1,49 @@
+"""The algorithms by name: what each does with the episodes that it collects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Algorithm:
+    """One way to use hindsight on top of DDPG.
+
+    Args:
+        name: the name that recipes take.
+        hindsight: whether virtual rows are written at all.
+        filter_achieved: whether virtual goals that were already achieved are left out.
+        summary: one line for people.
+    """
+
+    name: str
+    hindsight: bool = True
+    filter_achieved: bool = False
+    summary: str = ""
+
+
+ALGORITHMS: dict[str, Algorithm] = {
+    algorithm.name: algorithm
+    for algorithm in (
+        Algorithm(name="ddpg", hindsight=False, summary="DDPG without hindsight"),
+        Algorithm(name="her", summary="hindsight experience replay"),
+        Algorithm(
+            name="filtered_her", filter_achieved=True, summary="HER without goals that were already achieved"
+        ),
+    )
+}
+
+
+def get_algorithm(name: str) -> Algorithm:
+    """The algorithm of a name.
+
+    Raises:
+        ValueError: there is none; the message lists those that there are.
+
+    Example:
+        >>> get_algorithm("her").filter_achieved
+        False
+    """
+    if name not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm {name!r}; the algorithms are {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[name]

@@ -1,0 +1,166 @@
+"""The command line: ``torchrl-her train | play | list``."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from torchrl_her_envs import TASKS
+from torchrl_her_recipes.algorithms import ALGORITHMS
+from torchrl_her_recipes.play import play
+from torchrl_her_recipes.recipe import Recipe
+from torchrl_her_recipes.run import RunResult, resume
+from torchrl_her_recipes.versions import check_versions
+
+_BAD_INPUT = 2
+_INTERRUPTED = 130
+_USAGE = """usage: torchrl-her COMMAND ...
+
+commands:
+  train [NAME=VALUE ...]   train; for instance: torchrl-her train task=hand_v0 algo=filtered_her seed=0
+                           -m sweeps: torchrl-her train -m algo=her,filtered_her seed=0,1,2
+                           preset=demo takes the values of a preset; --cfg job shows all values
+  train --resume RUN       go on with a run from its checkpoint
+  play RUN                 a GIF of a run's policy, for several goals
+  list                     tasks, algorithms and presets
+"""
+_CONF = Path(__file__).parent / "conf"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns the exit code: 0, 2 for bad input, 130 for Ctrl-C."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    commands = {"train": _train, "play": _play, "list": _list}
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_USAGE, end="")
+        return 0 if arguments else _BAD_INPUT
+    if arguments[0] not in commands:
+        return _fail(f"unknown command {arguments[0]!r}; the commands are {', '.join(commands)}")
+    try:
+        check_versions()
+        return commands[arguments[0]](arguments[1:])
+    except KeyboardInterrupt:
+        return _fail("interrupted", _INTERRUPTED)
+    except (HydraException, OmegaConfBaseException, OSError, ValueError, ImportError) as error:
+        return _fail(_one_line(error))
+
+
+def _fail(message: str, code: int = _BAD_INPUT) -> int:
+    print(f"torchrl-her: {message}", file=sys.stderr)
+    return code
+
+
+def _one_line(error: BaseException) -> str:
+    """The message of an error, without the hints that other libraries put below it."""
+    if isinstance(error, OSError) and error.strerror is not None:
+        return f"cannot use {error.filename}: {error.strerror.lower()}"
+    cause = error.__cause__ if isinstance(error, HydraException) and error.__cause__ else error
+    lines = [line.strip() for line in (str(error) + "\n" + str(cause)).splitlines()]
+    kept = [line for line in lines if line and not line.startswith(("full_key", "object_type", "To append", "Set the env"))]
+    return "; ".join(dict.fromkeys(kept)) or type(error).__name__
+
+
+# train
+
+
+def _train(arguments: list[str]) -> int:
+    if "--resume" in arguments:
+        parser = argparse.ArgumentParser(prog="torchrl-her train --resume")
+        parser.add_argument("--resume", metavar="RUN", type=Path, required=True, help="folder of a run")
+        folder = parser.parse_args(arguments).resume
+        _say_start(folder)
+        return _say_end(resume(folder))
+    _store_recipe()
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to main() as they are
+    codes: list[int] = []
+
+    def job(config: DictConfig) -> None:
+        codes.append(_train_one(config))
+
+    before, sys.argv = sys.argv, ["torchrl-her train", *arguments]
+    try:
+        with warnings.catch_warnings():
+            hydra.main(version_base="1.3", config_path=str(_CONF), config_name="train")(job)()
+    finally:
+        sys.argv = before
+    return max(codes, default=0)
+
+
+def _train_one(config: DictConfig) -> int:
+    values = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(values, dict)
+    values.pop("folder")
+    recipe = Recipe.from_dict({str(key): value for key, value in values.items()})
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    _say_start(folder)
+    return _say_end(recipe.build().run(folder))
+
+
+def _store_recipe() -> None:
+    """Makes the recipe's fields and their types known to Hydra."""
+    node = OmegaConf.structured(Recipe)
+    OmegaConf.set_readonly(node, False)  # the dataclass is frozen; its configuration is not
+    ConfigStore.instance().store(name="recipe", node=node)
+
+
+def _say_start(folder: Path) -> None:
+    print(f"run: {folder}", flush=True)
+
+
+def _say_end(result: RunResult) -> int:
+    if result.interrupted:
+        print(f"interrupted: all there is was saved in {result.folder}")
+        print(f"go on with: torchrl-her train --resume {result.folder}")
+        return _INTERRUPTED
+    print(f"success {result.success:.0%} in the last evaluation")
+    print(f"run: {result.folder} (curves.png, policy.gif, metrics.csv, checkpoint.pt)")
+    return 0
+
+
+# play and list
+
+
+def _play(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="torchrl-her play", description="Make a GIF of a run's policy.")
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument("--out", type=Path, help="the .gif or .mp4 to write (default: RUN/play.gif)")
+    parser.add_argument("--goals", type=int, default=6, help="how many goals, side by side (default: 6)")
+    parser.add_argument("--seed", type=int, default=0, help="of the goals and starts (default: 0)")
+    parser.add_argument("--size", type=int, default=240, help="pixels of one world (default: 240)")
+    options = parser.parse_args(arguments)
+    out = options.out or options.run / "play.gif"
+    achieved = play(options.run, out, goals=options.goals, seed=options.seed, size=options.size)
+    print(f"{achieved} of {options.goals} goals achieved: {out}")
+    return 0
+
+
+def _list(arguments: list[str]) -> int:
+    argparse.ArgumentParser(prog="torchrl-her list", description="List what there is.").parse_args(arguments)
+    presets = sorted((_CONF / "preset").glob("*.yaml"))
+    sections = {
+        "tasks": {task.name: task.summary for task in TASKS.values()},
+        "algorithms": {algorithm.name: algorithm.summary for algorithm in ALGORITHMS.values()},
+        "presets": {path.stem: path.read_text().splitlines()[0].lstrip("# ") for path in presets},
+    }
+    for title, entries in sections.items():
+        print(f"{title}:")
+        for name, summary in entries.items():
+            print(f"  {name:<14} {summary}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,186 @@
+"""The parts of a run as named attributes, made from a recipe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torchrl.collectors import BaseCollector, Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, Sampler
+from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
+from torchrl.objectives.utils import TargetNetUpdater
+
+from torchrl_her import (
+    DecayingEpsilon,
+    EnvReward,
+    HERWriter,
+    LossLearner,
+    Trainer,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    make_target_updater,
+)
+from torchrl_her_envs import ThrowingEnv, make_env
+from torchrl_her_recipes.algorithms import get_algorithm
+from torchrl_her_recipes.recipe import Recipe
+
+if TYPE_CHECKING:
+    from torchrl_her_recipes.run import RunResult
+
+# Entries of a collected batch that no loss reads: not stored.
+_NOT_STORED = ("state", "achieved_goal", "collector")
+# Evaluation has seeds of its own, far from those of training.
+_EVAL_SEED = 1 << 32
+
+
+@dataclass
+class Parts:
+    """What a run consists of. Swap whatever you like, then call :meth:`run`.
+
+    A loss of your own needs its own optimiser and target updater; an environment of your own, its
+    own collector.
+
+    Attributes:
+        recipe: what the parts were made from.
+        env: batched training environments.
+        eval_env: batched environments for evaluation.
+        actor: the greedy policy.
+        critic: values of (observation, goal, action); used to measure its bias, None if there is none.
+        exploration: turns greedy into exploring actions.
+        policy: actor, then exploration.
+        collector: runs the policy in the environments.
+        buffer: with the writer that relabels and the sampler.
+        loss: any TorchRL loss module.
+        optimiser: over the loss module's parameters.
+        target: moves the target networks.
+        generator: of all random numbers in Python's hands (exploration, relabelling, sampling).
+    """
+
+    recipe: Recipe
+    env: EnvBase
+    eval_env: EnvBase
+    actor: TensorDictModule
+    critic: TensorDictModule | None
+    exploration: DecayingEpsilon
+    policy: TensorDictModuleBase
+    collector: BaseCollector
+    buffer: TensorDictReplayBuffer
+    loss: LossModule
+    optimiser: torch.optim.Optimizer
+    target: TargetNetUpdater | None
+    generator: torch.Generator
+
+    def trainer(self) -> Trainer:
+        """The training loop over these parts."""
+        recipe = self.recipe
+        return Trainer(
+            collector=self.collector,
+            buffer=self.buffer,
+            learner=LossLearner(self.loss, self.optimiser, self.target, max_grad_norm=recipe.max_grad_norm),
+            exploration=self.exploration,
+            epoch_frames=recipe.epoch_frames,
+            frames_per_update=recipe.frames_per_update,
+            batch_size=recipe.batch_size,
+            updates_per_draw=recipe.updates_per_draw,
+        )
+
+    def run(self, folder: str | Path | None = None, *, progress: bool = True) -> RunResult:
+        """Trains to the end and returns what came of it.
+
+        Args:
+            folder: where all that the run leaves behind goes; None leaves nothing.
+            progress: whether to show a progress bar.
+        """
+        from torchrl_her_recipes.run import run  # noqa: PLC0415  (runs need parts)
+
+        return run(self, folder, progress=progress)
+
+
+def build_parts(recipe: Recipe) -> Parts:
+    """Makes the parts that a recipe asks for."""
+    env = make_env(recipe.task, num_envs=recipe.num_envs, seed=recipe.seed, threshold=recipe.threshold)
+    eval_env = make_env(
+        recipe.task, num_envs=recipe.eval_episodes, seed=eval_seed(recipe, 0), threshold=recipe.threshold
+    )
+    generator = torch.Generator().manual_seed(recipe.seed)
+    actor, critic = make_networks(recipe, env)
+    low, high = env.action_spec.low[0], env.action_spec.high[0]
+    exploration = DecayingEpsilon(
+        low,
+        high,
+        start=recipe.epsilon_start,
+        decay=recipe.epsilon_decay,
+        end=recipe.epsilon_end,
+        generator=generator,
+    )
+    policy = TensorDictSequential(actor, exploration)
+    loss = make_ddpg_loss(actor, critic, gamma=recipe.gamma, action_penalty=recipe.action_penalty)
+    return Parts(
+        recipe=recipe,
+        env=env,
+        eval_env=eval_env,
+        actor=actor,
+        critic=critic,
+        exploration=exploration,
+        policy=policy,
+        collector=Collector(
+            env,
+            policy,
+            frames_per_batch=recipe.num_envs * recipe.steps_per_batch,
+            total_frames=-1,
+            auto_register_policy_transforms=False,
+        ),
+        buffer=make_buffer(recipe, env, generator),
+        loss=loss,
+        optimiser=torch.optim.Adam(loss.parameters(), lr=recipe.learning_rate, fused=True),
+        target=make_target_updater(loss, tau=recipe.tau, hard_interval=recipe.hard_update_interval),
+        generator=generator,
+    )
+
+
+def make_buffer(recipe: Recipe, env: ThrowingEnv, generator: torch.Generator) -> TensorDictReplayBuffer:
+    """The replay buffer with its hindsight writer and its sampler."""
+    algorithm = get_algorithm(recipe.algo)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(recipe.buffer_size),
+        writer=HERWriter(
+            EnvReward(env.compute_reward, env.compute_terminated),
+            k=recipe.k if algorithm.hindsight else 0,
+            strategy=recipe.strategy,  # type: ignore[arg-type]
+            filter_achieved=algorithm.filter_achieved,
+            exclude=_NOT_STORED,
+        ),
+        sampler=_make_sampler(recipe),
+        priority_key="td_error",
+    )
+    buffer.set_rng(generator)
+    return buffer
+
+
+def make_networks(recipe: Recipe, env: ThrowingEnv) -> tuple[TensorDictModule, TensorDictModule]:
+    """The actor and the critic, with weights that depend on the recipe's seed alone."""
+    widths = [env.observation_spec[key].shape[-1] for key in ("observation", "desired_goal")]
+    actions = env.action_spec.shape[-1]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(recipe.seed)
+        actor = make_actor(widths, actions, hidden=recipe.hidden)
+        critic = make_critic(widths, actions, hidden=recipe.hidden, normalise=recipe.batch_norm)
+    return actor, critic
+
+
+def eval_seed(recipe: Recipe, epoch: int) -> int:
+    """The seed of an evaluation: its own for each seed and epoch, and never one of training."""
+    return _EVAL_SEED + (recipe.seed << 20) + epoch
+
+
+def _make_sampler(recipe: Recipe) -> Sampler:
+    if recipe.sampler == "uniform":
+        return RandomSampler()
+    # TorchRL's losses give the square of the TD error, so half of alpha is Schaul's alpha.
+    return PrioritizedSampler(recipe.buffer_size, alpha=recipe.priority_alpha / 2, beta=recipe.priority_beta)

@@ -1,0 +1,50 @@
+"""Showing what a run has learnt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tensordict.nn import TensorDictModule
+
+from torchrl_her import evaluate, load_checkpoint, success
+from torchrl_her_envs import make_env, record_episodes, write_video
+from torchrl_her_recipes.parts import make_networks
+from torchrl_her_recipes.run_folder import RunFolder
+
+
+def load_actor(folder: str | Path) -> TensorDictModule:
+    """The greedy policy that a run ended with.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        ValueError: this is no folder of a run, or its policy is damaged.
+        OSError: the run has not saved a policy yet.
+    """
+    home = RunFolder(folder)
+    recipe = home.recipe()
+    actor, _ = make_networks(recipe, make_env(recipe.task))
+    actor.load_state_dict(load_checkpoint(home.policy)["actor"])
+    return actor
+
+
+def play(folder: str | Path, out: str | Path, *, goals: int = 6, seed: int = 0, size: int = 240) -> int:
+    """Writes a video of a run's policy, for several goals side by side.
+
+    Args:
+        folder: of the run.
+        out: a .gif or .mp4 file.
+        goals: how many.
+        seed: of the goals and starts.
+        size: pixels of one world.
+
+    Returns:
+        How many of the goals were achieved.
+    """
+    recipe = RunFolder(folder).recipe()
+    actor = load_actor(folder)
+    env = make_env(recipe.task, num_envs=goals, seed=seed, threshold=recipe.threshold)
+    write_video(record_episodes(env, actor, size=size), out)
+    env.set_seed(seed)
+    return int(success(evaluate(env, actor, max_steps=env.world.max_steps)).sum())

@@ -1,0 +1,138 @@
+"""A recipe: every choice of a training run, as one dataclass with real defaults."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+from torchrl_her.virtual_goals import check_strategy
+from torchrl_her_envs import get_task
+
+from torchrl_her_recipes.algorithms import get_algorithm
+
+if TYPE_CHECKING:
+    from torchrl_her_recipes.parts import Parts
+
+SAMPLERS = ("prioritised", "uniform")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """What a run is made of. Values are plain, so that they can come from Python, YAML or a shell.
+
+    Lengths are counted in environment steps ("frames"). A field that is ``None`` takes the value
+    of the task.
+
+    Raises:
+        ValueError: a value that cannot work; the message names it and what is allowed.
+
+    Example:
+        >>> recipe = Recipe(task="hand_v0", algo="her", seed=3)
+        >>> recipe.gamma, recipe.total_frames
+        (0.98, 96000)
+    """
+
+    task: str = "hand_v0"  # see `torchrl-her list`
+    algo: str = "filtered_her"  # likewise
+    seed: int = 0
+
+    epochs: int = 12
+    epoch_frames: int = 8_000
+    num_envs: int = 16
+    steps_per_batch: int = 10  # of each environment, before the updates that they pay for
+    frames_per_update: float = 2.0
+    updates_per_draw: int = 8  # gradient steps whose rows are drawn in one call
+
+    k: int = 4  # virtual rows for each real one
+    strategy: str = "future"
+    threshold: float | None = None  # how near is achieved, in shown coordinates
+
+    sampler: str = "prioritised"
+    priority_alpha: float = 0.6  # in Schaul's sense: of the absolute TD error
+    priority_beta: float = 0.4
+    buffer_size: int = 1_000_000  # real and virtual rows together
+    batch_size: int = 64
+
+    gamma: float = 0.98
+    learning_rate: float = 1e-3
+    max_grad_norm: float = 3.0
+    action_penalty: float = 0.0
+    hidden: int = 64
+    batch_norm: bool = False  # in the critic
+    tau: float = 0.01  # of the soft target update
+    hard_update_interval: int = 0  # gradient steps between hard target updates; 0: soft
+
+    epsilon_start: float = 1.0
+    epsilon_decay: float = 0.95  # an epoch
+    epsilon_end: float = 0.05
+
+    eval_episodes: int = 100
+    checkpoint_interval: int = 10  # epochs
+    threads: int = 1  # of torch: small networks are fastest with one
+
+    def __post_init__(self) -> None:
+        get_task(self.task)
+        get_algorithm(self.algo)
+        check_strategy(self.strategy)
+        if self.sampler not in SAMPLERS:
+            raise ValueError(f"unknown sampler {self.sampler!r}; the samplers are {', '.join(SAMPLERS)}")
+        for name, least in _AT_LEAST.items():
+            if not getattr(self, name) >= least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        for name in _POSITIVE:
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be above 0, got {value}")
+        for name in _SHARES:
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+        if self.batch_size * self.updates_per_draw > self.buffer_size:
+            raise ValueError(
+                f"batch_size={self.batch_size} times updates_per_draw={self.updates_per_draw} must fit "
+                f"buffer_size={self.buffer_size}"
+            )
+        if self.gamma >= 1.0:
+            raise ValueError(f"gamma must be below 1, got {self.gamma}")
+
+    @property
+    def total_frames(self) -> int:
+        """Environment steps of the whole run."""
+        return self.epochs * self.epoch_frames
+
+    def build(self) -> Parts:
+        """Makes the parts of the run, each of which may be swapped before ``.run()``."""
+        from torchrl_her_recipes.parts import build_parts  # noqa: PLC0415  (parts need recipes)
+
+        return build_parts(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, object]) -> Recipe:
+        """A recipe from plain values; a ValueError names the ones that no recipe has."""
+        known = {field.name for field in fields(cls)}
+        unknown = [name for name in values if name not in known]
+        if unknown:
+            raise ValueError(f"a recipe has no {', '.join(unknown)}; it has {', '.join(sorted(known))}")
+        return cls(**values)  # type: ignore[arg-type]
+
+
+_AT_LEAST = {
+    "seed": 0,
+    "epochs": 1,
+    "epoch_frames": 1,
+    "num_envs": 1,
+    "steps_per_batch": 1,
+    "updates_per_draw": 1,
+    "k": 0,
+    "priority_alpha": 0.0,
+    "priority_beta": 0.0,
+    "buffer_size": 1,
+    "batch_size": 1,
+    "hidden": 1,
+    "action_penalty": 0.0,
+    "hard_update_interval": 0,
+    "eval_episodes": 1,
+    "checkpoint_interval": 1,
+    "threads": 1,
+}
+_POSITIVE = ("frames_per_update", "threshold", "learning_rate", "max_grad_norm", "epsilon_decay", "gamma")
+_SHARES = ("tau", "gamma", "epsilon_start", "epsilon_end", "epsilon_decay")

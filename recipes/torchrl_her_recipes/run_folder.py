@@ -1,0 +1,94 @@
+"""The folder that a run leaves behind: configuration, metrics, events, checkpoint, pictures."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+import yaml
+from torch.utils.tensorboard import SummaryWriter
+
+from torchrl_her_recipes.recipe import Recipe
+
+_PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict", "gymnasium", "pymunk", "numpy")
+
+
+class RunFolder:
+    """Paths and tables of one run.
+
+    Args:
+        path: made if it is not there.
+
+    Raises:
+        OSError: it cannot be made or written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.path.mkdir(parents=True, exist_ok=True)
+        self.checkpoint = self.path / "checkpoint.pt"
+        self.policy = self.path / "policy.pt"
+        self.metrics = self.path / "metrics.csv"
+        self.curves = self.path / "curves.png"
+        self.goals = self.path / "virtual_goals.png"
+        self.video = self.path / "policy.gif"
+        self._events: SummaryWriter | None = None
+
+    def describe(self, recipe: Recipe) -> None:
+        """Writes the recipe, and the versions that run it."""
+        (self.path / "config.yaml").write_text(yaml.safe_dump(asdict(recipe), sort_keys=False))
+        about = {
+            "seed": recipe.seed,
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            "versions": {name: version(name) for name in _PACKAGES},
+        }
+        (self.path / "run.json").write_text(json.dumps(about, indent=2) + "\n")
+
+    def recipe(self) -> Recipe:
+        """The recipe of the run.
+
+        Raises:
+            ValueError: this is no folder of a run.
+        """
+        config = self.path / "config.yaml"
+        if not config.is_file():
+            raise ValueError(f"{self.path} is no folder of a run: it has no config.yaml")
+        return Recipe.from_dict(yaml.safe_load(config.read_text()))
+
+    def log(self, row: dict[str, float]) -> None:
+        """Adds a row to the table and to the events. All rows have the same columns."""
+        new = not self.metrics.exists()
+        with open(self.metrics, "a", newline="") as file:
+            writer = csv.DictWriter(file, row.keys())
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+        if self._events is None:
+            self._events = SummaryWriter(str(self.path / "tensorboard"), purge_step=int(row["frames"]))
+        for name, value in row.items():
+            self._events.add_scalar(name, value, int(row["frames"]))
+
+    def rows(self) -> list[dict[str, float]]:
+        """The table so far."""
+        if not self.metrics.exists():
+            return []
+        with open(self.metrics, newline="") as file:
+            return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+    def keep_rows(self, count: int) -> None:
+        """Forgets all rows but the first ``count``: those behind a checkpoint that a run goes on from."""
+        rows = self.rows()[:count]
+        self.metrics.unlink(missing_ok=True)
+        for row in rows:
+            self.log(row)
+
+    def close(self) -> None:
+        """Writes out what is still in memory."""
+        if self._events is not None:
+            self._events.close()
+            self._events = None

@@ -1,0 +1,75 @@
+"""Episodes whose goals tell where they come from."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+# The goal of state t of episode e of environment n is (1000 n + 100 e + t, 0): never equal to another.
+WANTED = -7.0
+
+
+def tag(env: int, episode: int, state: int) -> float:
+    """The achieved goal of a state."""
+    return 1000.0 * env + 100.0 * episode + state
+
+
+def make_batch(
+    lengths: list[list[int]],
+    *,
+    steps: int | None = None,
+    terminated: bool = False,
+    first: list[tuple[int, int]] | None = None,
+) -> TensorDict:
+    """A batch [N, T] as a collector gives it, with time last.
+
+    Args:
+        lengths: of the episodes of each environment.
+        steps: T; by default as many as the longest environment has. The last episode may be cut by it.
+        terminated: whether episodes end by termination; otherwise by truncation.
+        first: for each environment, the episode and state to begin with.
+    """
+    horizon = steps or max(sum(own) for own in lengths)
+    rows = []
+    for env, own in enumerate(lengths):
+        episode, state = first[env] if first else (0, 0)
+        for _ in range(horizon):
+            last = state + 1 >= own[episode]
+            rows.append((env, episode, state, last))
+            episode, state = (episode + 1, 0) if last else (episode, state + 1)
+            if episode >= len(own):
+                own = [*own, 10**6]
+    env, episode, state = (torch.tensor([row[i] for row in rows]) for i in range(3))
+    last = torch.tensor([row[3] for row in rows]).unsqueeze(-1)
+    batch = TensorDict(
+        {
+            "observation": _point(tag_of(env, episode, state)),
+            "achieved_goal": _point(tag_of(env, episode, state)),
+            "desired_goal": _point(torch.full((len(rows),), WANTED)),
+            "state": torch.full((len(rows), 3), WANTED),
+            "action": torch.zeros(len(rows), 1),
+            "collector": {"traj_ids": 50 * env + episode},
+            "next": {
+                "observation": _point(tag_of(env, episode, state + 1)),
+                "achieved_goal": _point(tag_of(env, episode, state + 1)),
+                "desired_goal": _point(torch.full((len(rows),), WANTED)),
+                "state": torch.full((len(rows), 3), WANTED),
+                "reward": torch.full((len(rows), 1), -1.0),
+                "terminated": last & terminated,
+                "truncated": last & (not terminated),
+                "done": last,
+            },
+        },
+        batch_size=[len(rows)],
+    )
+    return batch.reshape(len(lengths), horizon)
+
+
+def tag_of(env: Tensor, episode: Tensor, state: Tensor) -> Tensor:
+    """:func:`tag` of tensors."""
+    return (1000 * env + 100 * episode + state).float()
+
+
+def _point(x: Tensor) -> Tensor:
+    return torch.stack((x, torch.zeros_like(x)), -1)

@@ -1,0 +1,82 @@
+"""The factors that goals are drawn by, and the draw."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from torchrl_her import candidates, combine, draw
+
+
+@pytest.mark.parametrize(
+    ("strategy", "expected"),
+    [
+        ("future", [[1, 1, 1, 0], [0, 1, 1, 0], [0, 0, 1, 0], [0, 0, 0, 0]]),
+        ("final", [[0, 0, 1, 0], [0, 0, 1, 0], [0, 0, 1, 0], [0, 0, 0, 0]]),
+        ("episode", [[1, 1, 1, 0], [1, 1, 1, 0], [1, 1, 1, 0], [0, 0, 0, 0]]),
+    ],
+)
+def test_candidates_of_an_episode_of_three_padded_to_four(strategy: str, expected: list[list[int]]) -> None:
+    assert candidates(strategy, torch.tensor([3]), 4)[0].int().tolist() == expected
+
+
+def test_candidates_take_any_batch_shape() -> None:
+    lengths = torch.tensor([[1, 2], [3, 4]])
+    mask = candidates("future", lengths, 4)
+    assert mask.shape == (2, 2, 4, 4)
+    assert torch.equal(mask[1, 0], candidates("future", torch.tensor(3), 4))
+
+
+def test_an_unknown_strategy_is_named_with_those_that_there_are() -> None:
+    with pytest.raises(ValueError, match="'past'.*future, final, episode"):
+        candidates("past", torch.tensor([3]), 4)  # type: ignore[arg-type]
+
+
+def test_factors_multiply() -> None:
+    candidate = torch.tensor([[True, True], [False, True]])
+    keep = torch.tensor([[False, True], [True, True]])
+    assert combine(candidate, torch.tensor([2.0, 3.0]), keep).tolist() == [[0.0, 3.0], [0.0, 3.0]]
+    assert combine(candidate).tolist() == [[1.0, 1.0], [0.0, 1.0]]
+
+
+def test_goals_are_drawn_in_proportion() -> None:
+    likelihood = torch.tensor([[1.0, 0.0, 3.0]])
+    index, valid = draw(likelihood, 40_000, generator=torch.Generator().manual_seed(0))
+    share = torch.bincount(index[0], minlength=3) / 40_000
+    assert valid.tolist() == [True]
+    assert share[1] == 0
+    assert share[2].item() == pytest.approx(0.75, abs=0.01)  # 0.01 is more than four standard deviations
+
+
+def test_a_row_without_candidates_gets_none_and_no_nan() -> None:
+    index, valid = draw(torch.tensor([[0.0, 0.0], [0.0, 1.0]]), 3)
+    assert valid.tolist() == [False, True]
+    assert ((index >= 0) & (index < 2)).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    npst.arrays("float32", (4, 9), elements=st.sampled_from([0.0, 0.0, 1e-30, 1e-6, 0.1, 1.0, 3.0, 1e6])),
+    st.integers(0, 2**31),
+)
+def test_goals_of_weight_zero_are_never_drawn(weights: object, seed: int) -> None:
+    likelihood = torch.as_tensor(weights)
+    index, valid = draw(likelihood, 64, generator=torch.Generator().manual_seed(seed))
+    assert torch.equal(valid, likelihood.sum(-1) > 0)
+    assert (likelihood.gather(-1, index)[valid] > 0).all()
+
+
+def test_even_the_largest_random_number_draws_a_goal_that_may_be_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    largest = 1.0 - 2.0**-24
+    monkeypatch.setattr(torch, "rand", lambda *shape, **_: torch.full(shape, largest))
+    index, _ = draw(torch.tensor([[1.0, 1.0, 1.0, 0.0]]), 1)
+    assert index.item() == 2
+
+
+def test_the_same_generator_draws_the_same() -> None:
+    likelihood = torch.ones(3, 5)
+    draws = [draw(likelihood, 4, generator=torch.Generator().manual_seed(7))[0] for _ in range(2)]
+    assert torch.equal(*draws)

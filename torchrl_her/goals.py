@@ -1,0 +1,103 @@
+"""Goals as points: distance, whether one is achieved, and the sparse reward made of that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+
+class RewardFunction(Protocol):
+    """Maps goals [..., g] that were achieved and desired to (reward, terminated), each [..., 1].
+
+    The order of the arguments matters: gymnasium's ``compute_reward`` has the same.
+    """
+
+    def __call__(self, achieved_goal: Tensor, desired_goal: Tensor, /) -> tuple[Tensor, Tensor]: ...
+
+
+def distance(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    """Euclidean distance between goals.
+
+    Args:
+        achieved_goal: [..., g].
+        desired_goal: [..., g], broadcast against it.
+
+    Returns:
+        [...]
+
+    Example:
+        >>> distance(torch.tensor([0.0, 3.0]), torch.tensor([4.0, 0.0]))
+        tensor(5.)
+    """
+    return torch.linalg.vector_norm(achieved_goal - desired_goal, dim=-1)
+
+
+def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> Tensor:
+    """Whether goals are nearer to each other than a threshold.
+
+    Args:
+        achieved_goal: [..., g].
+        desired_goal: [..., g], broadcast against it.
+        threshold: in the unit of the goals.
+
+    Returns:
+        [...] of bool.
+    """
+    return (achieved_goal - desired_goal).square().sum(-1) < threshold**2
+
+
+class GoalReward:
+    """The sparse reward: 0 where the goal is achieved, which ends the episode, and -1 elsewhere.
+
+    Args:
+        threshold: how near counts as achieved, in the unit of the goals.
+
+    Raises:
+        ValueError: ``threshold`` is not positive.
+
+    Example:
+        >>> reward, terminated = GoalReward(0.1)(torch.zeros(2, 2), torch.tensor([[0.05, 0.0], [0.2, 0.0]]))
+        >>> reward.tolist(), terminated.tolist()
+        ([[0.0], [-1.0]], [[True], [False]])
+    """
+
+    def __init__(self, threshold: float) -> None:
+        if not threshold > 0:
+            raise ValueError(f"threshold must be positive, got {threshold}")
+        self.threshold = threshold
+
+    def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns (reward, terminated), each [..., 1], for goals [..., g]."""
+        terminated = achieved(achieved_goal, desired_goal, self.threshold).unsqueeze(-1)
+        return terminated.to(achieved_goal.dtype) - 1.0, terminated
+
+
+class EnvReward:
+    """An environment's own functions as a :class:`RewardFunction`.
+
+    Args:
+        compute_reward: (achieved, desired) goals [..., g] to rewards [..., 1].
+        compute_terminated: the same to whether the episode ends there.
+
+    Example:
+        >>> rule = EnvReward(lambda a, d: -(a - d).abs(), lambda a, d: a == d)
+        >>> rule(torch.tensor([1.0]), torch.tensor([3.0]))
+        (tensor([-2.]), tensor([False]))
+    """
+
+    def __init__(
+        self,
+        compute_reward: Callable[[Tensor, Tensor], Tensor],
+        compute_terminated: Callable[[Tensor, Tensor], Tensor],
+    ) -> None:
+        self.compute_reward = compute_reward
+        self.compute_terminated = compute_terminated
+
+    def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns (reward, terminated), each [..., 1], for goals [..., g]."""
+        return self.compute_reward(achieved_goal, desired_goal), self.compute_terminated(
+            achieved_goal, desired_goal
+        )

@@ -1,0 +1,161 @@
+"""DDPG from TorchRL's loss, with clamped targets; and the learner that applies any TorchRL loss."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.objectives import DDPGLoss, HardUpdate, LossModule, SoftUpdate
+from torchrl.objectives.utils import TargetNetUpdater
+from torchrl.objectives.value import TD0Estimator
+
+
+class ClampedTD0(TD0Estimator):
+    """One-step targets, kept within the values that are possible.
+
+    With rewards in [-1, 0] no value is below -1 / (1 - gamma) or above 0. Andrychowicz et al.,
+    Hindsight Experience Replay, 2017, appendix A.
+
+    Args:
+        low: least target.
+        high: greatest target.
+        **kwargs: of :class:`torchrl.objectives.value.TD0Estimator`.
+    """
+
+    def __init__(self, *, low: float, high: float, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.low, self.high = low, high
+
+    def value_estimate(self, tensordict: TensorDictBase, **kwargs: Any) -> Tensor:
+        return super().value_estimate(tensordict, **kwargs).clamp(self.low, self.high)
+
+
+class PenalisedDDPGLoss(DDPGLoss):
+    """TorchRL's DDPG loss with a price on large actions, which keeps tanh off its flat ends.
+
+    An actor that saturates early gets no gradient any more. The price is that of OpenAI's HER:
+    the mean square of the actions, times ``action_penalty``, is added to the actor's loss.
+
+    Args:
+        *args, **kwargs: of :class:`torchrl.objectives.DDPGLoss`.
+        action_penalty: at least 0.
+    """
+
+    def __init__(self, *args: Any, action_penalty: float, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.action_penalty = action_penalty
+
+    def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        actions: list[Tensor] = []
+        hook = self.actor_network.register_forward_hook(
+            lambda _module, _inputs, output: actions.append(output.get(self.actor_network.out_keys[0]))
+        )
+        loss, metadata = super().loss_actor(tensordict)
+        hook.remove()
+        return loss + self.action_penalty * actions[0].square().mean(), metadata
+
+
+def make_ddpg_loss(
+    actor: TensorDictModule,
+    critic: TensorDictModule,
+    *,
+    gamma: float = 0.98,
+    reward_range: tuple[float, float] = (-1.0, 0.0),
+    action_penalty: float = 0.0,
+) -> DDPGLoss:
+    """TorchRL's DDPG loss with target networks for both and clamped targets.
+
+    Args:
+        actor: from :func:`~torchrl_her.make_actor`.
+        critic: from :func:`~torchrl_her.make_critic`.
+        gamma: discount, in [0, 1).
+        reward_range: least and greatest reward; targets are clamped to what these allow.
+
+    Raises:
+        ValueError: a discount outside of [0, 1).
+
+    Example:
+        >>> from torchrl_her import make_actor, make_critic
+        >>> loss = make_ddpg_loss(make_actor((9, 2), 3), make_critic((9, 2), 3))
+        >>> type(loss).__name__
+        'DDPGLoss'
+    """
+    if not 0.0 <= gamma < 1.0:
+        raise ValueError(f"gamma must be in [0, 1), got {gamma}")
+    loss = PenalisedDDPGLoss(actor, critic, delay_actor=True, delay_value=True, action_penalty=action_penalty)
+    least, greatest = reward_range
+    estimator = ClampedTD0(
+        low=min(least, least / (1.0 - gamma)),  # paid once, if the episode ends there, or for ever
+        high=max(greatest, greatest / (1.0 - gamma)),
+        gamma=gamma,
+        value_network=loss.actor_critic,
+    )
+    estimator.set_keys(value="state_action_value")
+    loss.make_value_estimator(estimator)
+    return loss
+
+
+def make_target_updater(loss: LossModule, *, tau: float, hard_interval: int) -> TargetNetUpdater:
+    """A soft update with rate ``tau`` after each step, or with ``hard_interval > 0`` a copy every so many."""
+    if hard_interval > 0:
+        return HardUpdate(loss, value_network_update_interval=hard_interval)
+    return SoftUpdate(loss, tau=tau)
+
+
+class Learner(Protocol):
+    """What the training loop asks of an algorithm: one gradient step on a batch."""
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Learns from rows [B], writes their priorities into the batch, returns what it measured."""
+        ...
+
+
+class LossLearner:
+    """Gradient steps on any TorchRL loss module: backward, clipping, optimiser, target update.
+
+    Args:
+        loss: its ``loss_*`` outputs are summed; each of them must reach networks of its own.
+        optimiser: over the loss module's parameters.
+        target: moves the target networks; None for a loss without them.
+        max_grad_norm: the gradients of each network are clipped to this norm, apart.
+
+    Example:
+        >>> from torchrl_her import make_actor, make_critic
+        >>> loss = make_ddpg_loss(make_actor((9, 2), 3), make_critic((9, 2), 3))
+        >>> learner = LossLearner(loss, torch.optim.Adam(loss.parameters(), lr=1e-3), SoftUpdate(loss, tau=0.01))
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        optimiser: torch.optim.Optimizer,
+        target: TargetNetUpdater | None = None,
+        *,
+        max_grad_norm: float = 3.0,
+    ) -> None:
+        self.loss, self.optimiser, self.target = loss, optimiser, target
+        self.max_grad_norm = max_grad_norm
+        self._clipped = self._networks()
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        output = self.loss(batch)
+        losses = {key: value for key, value in output.items() if key.startswith("loss_")}
+        self.optimiser.zero_grad(set_to_none=True)
+        sum(losses.values(), torch.zeros(())).backward()
+        for parameters in self._clipped:
+            nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        self.optimiser.step()
+        if self.target is not None:
+            self.target.step()
+        return {key: value.detach() for key, value in losses.items()}
+
+    def _networks(self) -> list[Sequence[nn.Parameter]]:
+        """The parameters of each network: the loss module's children that have any."""
+        groups = {}
+        for name, parameter in self.loss.named_parameters():
+            groups.setdefault(name.split(".")[0], []).append(parameter)
+        return list(groups.values())

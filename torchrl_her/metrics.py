@@ -1,0 +1,67 @@
+"""What is measured of greedy episodes. Pure functions of a rollout [N, T], time last.
+
+Environments may have gone on with new episodes after the first one ended; only the first counts.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_her.goals import distance
+
+
+def first_episode(done: Tensor) -> Tensor:
+    """Which steps belong to the first episode.
+
+    Args:
+        done: [..., T] of bool.
+
+    Returns:
+        [..., T] of bool.
+
+    Example:
+        >>> first_episode(torch.tensor([False, True, False, True])).tolist()
+        [True, True, False, False]
+    """
+    return done.long().cumsum(-1) - done.long() == 0
+
+
+def success(rollout: TensorDictBase, *, achieved_reward: float = 0.0) -> Tensor:
+    """Whether the goal was achieved at some step: [N] of bool."""
+    reward = rollout.get(("next", "reward")).squeeze(-1)
+    inside = first_episode(rollout.get(("next", "done")).squeeze(-1))
+    return (inside & (reward >= achieved_reward)).any(-1)
+
+
+def final_distance(rollout: TensorDictBase) -> Tensor:
+    """Distance of the achieved goal to the desired goal at the last step: [N]."""
+    last = first_episode(rollout.get(("next", "done")).squeeze(-1)).sum(-1, keepdim=True) - 1
+    gap = distance(rollout.get(("next", "achieved_goal")), rollout.get(("next", "desired_goal")))
+    return gap.gather(-1, last).squeeze(-1)
+
+
+def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: float = -1.0) -> Tensor:
+    """The return of the first episode, from its first state, [N].
+
+    The tail of an episode that was truncated counts as ``tail_reward`` for ever, as a critic that
+    bootstraps there counts it.
+
+    Args:
+        rollout: [N, T].
+        gamma: discount.
+        tail_reward: reward of every step after a truncation.
+    """
+    reward = rollout.get(("next", "reward")).squeeze(-1)
+    inside = first_episode(rollout.get(("next", "done")).squeeze(-1))
+    discount = gamma ** torch.arange(reward.shape[-1], dtype=reward.dtype, device=reward.device)
+    total = (reward * inside * discount).sum(-1)
+    ended = (inside & rollout.get(("next", "terminated")).squeeze(-1)).any(-1)
+    tail = tail_reward * gamma ** inside.sum(-1).to(reward.dtype) / (1.0 - gamma)
+    return torch.where(ended, total, total + tail)
+
+
+def q_bias(initial_value: Tensor, returns: Tensor) -> Tensor:
+    """Estimated value of initial states minus the return really got, both [N]."""
+    return initial_value.reshape(returns.shape) - returns

@@ -1,0 +1,139 @@
+"""The loop: collect, write, update. No configuration, no files, no printing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.collectors import BaseCollector
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_her.exploration import DecayingEpsilon
+from torchrl_her.losses import Learner
+
+
+def check_finite(batch: TensorDictBase, keys: tuple[str, ...] = ("action", "observation")) -> None:
+    """Raises a ValueError that names the entry if a batch holds NaN or infinite numbers."""
+    for key in keys:
+        for name in (key, ("next", key)):
+            value = batch.get(name, None)
+            if value is not None and not bool(value.isfinite().all()):
+                raise ValueError(f"the collected {name!r} must be finite, got NaN or infinity in it")
+
+
+class Trainer:
+    """Trains in epochs of a fixed number of frames, each beginning with fresh episodes.
+
+    That epochs begin afresh is what lets a run go on exactly from a checkpoint between two of
+    them: nothing of a half-played episode needs to be kept.
+
+    Args:
+        collector: yields batches [N, T] of the exploring policy.
+        buffer: takes them, usually through a :class:`~torchrl_her.HERWriter`.
+        learner: learns from what is sampled.
+        exploration: decays after each epoch; None for none.
+
+    Keyword Args:
+        epoch_frames: environment steps an epoch, rounded up to whole batches.
+        frames_per_update: environment steps for each gradient step.
+        batch_size: rows of a gradient step.
+        updates_per_draw: gradient steps whose rows are drawn in one call. Their priorities are as
+            old as the call.
+
+    Attributes:
+        frames: environment steps so far.
+        updates: gradient steps so far.
+        epochs: epochs so far.
+    """
+
+    def __init__(
+        self,
+        *,
+        collector: BaseCollector,
+        buffer: TensorDictReplayBuffer,
+        learner: Learner,
+        exploration: DecayingEpsilon | None = None,
+        epoch_frames: int = 8_000,
+        frames_per_update: float = 20.0,
+        batch_size: int = 64,
+        updates_per_draw: int = 1,
+    ) -> None:
+        self.collector, self.buffer, self.learner, self.exploration = collector, buffer, learner, exploration
+        self.epoch_frames, self.frames_per_update = epoch_frames, frames_per_update
+        self.batch_size, self.updates_per_draw = batch_size, updates_per_draw
+        self.frames = self.updates = self.epochs = 0
+        self._credit = 0.0  # gradient steps that frames have paid for
+
+    def epoch(self, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, float]:
+        """Runs one epoch and returns the means of what the learner measured.
+
+        Args:
+            on_batch: called after each batch, for a progress bar.
+        """
+        self.collector.reset()
+        end = (self.epochs + 1) * self.epoch_frames  # also where an interrupted epoch is finished
+        measured: list[dict[str, Tensor]] = []
+        while self.frames < end:
+            batch = self.collector.next()
+            check_finite(batch)
+            self.buffer.extend(batch)
+            self.frames += batch.numel()
+            self._credit += batch.numel() / self.frames_per_update
+            measured += self._learn()
+            if on_batch is not None:
+                on_batch(self)
+        self.epochs += 1
+        if self.exploration is not None:
+            self.exploration.step()
+        keys = measured[0] if measured else {}
+        return {key: float(torch.stack([m[key] for m in measured]).mean()) for key in keys}
+
+    def _learn(self) -> list[dict[str, Tensor]]:
+        """All gradient steps that the collected frames have paid for."""
+        if len(self.buffer) < self.batch_size:
+            return []
+        measured = []
+        while self._credit >= 1.0:
+            steps = min(self.updates_per_draw, int(self._credit))
+            rows = self.buffer.sample(self.batch_size * steps)
+            parts = rows.split(self.batch_size)
+            measured += [self.learner.update(part) for part in parts]
+            self._set_priorities(rows, parts)
+            self._credit -= steps
+            self.updates += steps
+        return measured
+
+    def _set_priorities(self, rows: TensorDictBase, parts: tuple[TensorDictBase, ...]) -> None:
+        priorities = [part.get(self.buffer.priority_key, None) for part in parts]
+        if all(priority is not None for priority in priorities):
+            self.buffer.update_priority(rows.get("index"), torch.cat(priorities))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The counters; the parts have state of their own."""
+        return {"frames": self.frames, "updates": self.updates, "epochs": self.epochs, "credit": self._credit}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Puts the counters back."""
+        self.frames, self.updates, self.epochs = state["frames"], state["updates"], state["epochs"]
+        self._credit = state["credit"]
+
+
+@torch.no_grad()
+def evaluate(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], *, max_steps: int) -> TensorDictBase:
+    """Plays greedy episodes, one in each environment of a batch.
+
+    Args:
+        env: batched, [N]; an environment of its own, so that training is not disturbed.
+        policy: exploration inside of it is switched off.
+        max_steps: T.
+
+    Returns:
+        The rollout [N, T]; environments that end early go on, see :mod:`torchrl_her.metrics`.
+    """
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return env.rollout(max_steps, policy, break_when_any_done=False)
