@@ -15,11 +15,12 @@ from torchrl_her.losses import (
     Learner,
     LossLearner,
     PenalisedDDPGLoss,
+    clip_by_run,
     make_ddpg_loss,
     make_target_updater,
 )
 from torchrl_her.metrics import discounted_return, final_distance, first_episode, q_bias, success
-from torchrl_her.networks import ActorNet, CriticNet, make_actor, make_critic
+from torchrl_her.networks import ActorNet, CriticNet, make_actor, make_critic, stack_runs, take_run
 from torchrl_her.training import Trainer, evaluate
 from torchrl_her.virtual_goals import Strategy, candidates, combine, draw
 from torchrl_her.writer import GoalWeights, HERWriter, WriterCounts
@@ -45,6 +46,7 @@ __all__ = [
     "achieved",
     "buffer_state_dict",
     "candidates",
+    "clip_by_run",
     "combine",
     "discounted_return",
     "distance",
@@ -62,5 +64,7 @@ __all__ = [
     "make_target_updater",
     "q_bias",
     "save_checkpoint",
+    "stack_runs",
     "success",
+    "take_run",
 ]

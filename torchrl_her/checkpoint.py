@@ -71,7 +71,7 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     """
     n = len(buffer)
     state: dict[str, Any] = {
-        "rows": buffer[:].to_dict() if n else None,
+        "rows": buffer[:].clone().to_dict() if n else None,  # a view would bring the whole capacity along
         "size": n,
         "writer": buffer.writer.state_dict(),
         "sampler": None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -66,8 +67,12 @@ class DecayingEpsilon(TensorDictModuleBase):
         decay: what each step multiplies it by.
         end: where it stops.
         noise, uniform_share: see :func:`explore`.
-        generator: source of the random numbers.
+        generators: sources of the random numbers, one for each of R independent runs; actions
+            [..., a] are then R equal blocks of rows, run after run. None for torch's own.
         action: key.
+
+    Attributes:
+        epsilon: [R], the present share of exploring actions of each run.
 
     Raises:
         ValueError: not ``0 <= end <= start <= 1``, or a decay outside of (0, 1].
@@ -75,8 +80,8 @@ class DecayingEpsilon(TensorDictModuleBase):
     Example:
         >>> exploration = DecayingEpsilon(-torch.ones(3), torch.ones(3), start=1.0, decay=0.5)
         >>> exploration.step()
-        >>> float(exploration.epsilon)
-        0.5
+        >>> exploration.epsilon.tolist()
+        [0.5]
     """
 
     def __init__(
@@ -89,7 +94,7 @@ class DecayingEpsilon(TensorDictModuleBase):
         end: float = 0.05,
         noise: float = 0.05,
         uniform_share: float = 0.2,
-        generator: torch.Generator | None = None,
+        generators: Sequence[torch.Generator] | None = None,
         action: NestedKey = "action",
     ) -> None:
         if not 0.0 <= end <= start <= 1.0:
@@ -100,10 +105,10 @@ class DecayingEpsilon(TensorDictModuleBase):
         self.in_keys = self.out_keys = [action]
         self.start, self.decay, self.end = start, decay, end
         self.noise, self.uniform_share = noise, uniform_share
-        self.generator = generator
+        self.generators = [None] if generators is None else list(generators)
         self.register_buffer("low", low.clone())
         self.register_buffer("high", high.clone())
-        self.register_buffer("epsilon", torch.tensor(start, dtype=torch.float64))
+        self.register_buffer("epsilon", torch.full((len(self.generators),), start, dtype=torch.float64))
 
     def step(self) -> None:
         """Lets epsilon decay: call it at the end of an epoch."""
@@ -118,13 +123,22 @@ class DecayingEpsilon(TensorDictModuleBase):
         if exploration_type() not in (ExplorationType.RANDOM, None):
             return tensordict
         key = self.in_keys[0]
-        action = explore(
-            tensordict.get(key),
-            self.low,
-            self.high,
-            self.epsilon.to(self.low.dtype),
-            noise=self.noise,
-            uniform_share=self.uniform_share,
-            generator=self.generator,
-        )
-        return tensordict.set(key, action)
+        greedy = tensordict.get(key)
+        actions = [
+            explore(
+                own,
+                self.low,
+                self.high,
+                epsilon,
+                noise=self.noise,
+                uniform_share=self.uniform_share,
+                generator=generator,
+            )
+            for own, epsilon, generator in zip(
+                greedy.reshape(len(self.generators), -1, greedy.shape[-1]),
+                self.epsilon.to(greedy.dtype),
+                self.generators,
+                strict=True,
+            )
+        ]
+        return tensordict.set(key, torch.stack(actions).view_as(greedy))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -30,8 +30,9 @@ class ClampedTD0(TD0Estimator):
         super().__init__(**kwargs)
         self.low, self.high = low, high
 
-    def value_estimate(self, tensordict: TensorDictBase, **kwargs: Any) -> Tensor:
-        return super().value_estimate(tensordict, **kwargs).clamp(self.low, self.high)
+    def value_estimate(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Tensor:
+        """The targets, clamped."""
+        return super().value_estimate(tensordict, *args, **kwargs).clamp(self.low, self.high)
 
 
 class PenalisedDDPGLoss(DDPGLoss):
@@ -56,7 +57,8 @@ class PenalisedDDPGLoss(DDPGLoss):
         )
         loss, metadata = super().loss_actor(tensordict)
         hook.remove()
-        return loss + self.action_penalty * actions[0].square().mean(), metadata
+        price = self.action_penalty * actions[0].square().mean(-1)
+        return loss + (price if loss.ndim else price.mean()), metadata
 
 
 def make_ddpg_loss(
@@ -66,6 +68,7 @@ def make_ddpg_loss(
     gamma: float = 0.98,
     reward_range: tuple[float, float] = (-1.0, 0.0),
     action_penalty: float = 0.0,
+    reduction: Literal["mean", "none"] = "mean",
 ) -> DDPGLoss:
     """TorchRL's DDPG loss with target networks for both and clamped targets.
 
@@ -74,6 +77,8 @@ def make_ddpg_loss(
         critic: from :func:`~torchrl_her.make_critic`.
         gamma: discount, in [0, 1).
         reward_range: least and greatest reward; targets are clamped to what these allow.
+        action_penalty: see :class:`PenalisedDDPGLoss`.
+        reduction: ``"none"`` keeps the losses of rows [R, B] apart, for stacked networks.
 
     Raises:
         ValueError: a discount outside of [0, 1).
@@ -86,7 +91,9 @@ def make_ddpg_loss(
     """
     if not 0.0 <= gamma < 1.0:
         raise ValueError(f"gamma must be in [0, 1), got {gamma}")
-    loss = PenalisedDDPGLoss(actor, critic, delay_actor=True, delay_value=True, action_penalty=action_penalty)
+    loss = PenalisedDDPGLoss(
+        actor, critic, delay_actor=True, delay_value=True, action_penalty=action_penalty, reduction=reduction
+    )
     least, greatest = reward_range
     estimator = ClampedTD0(
         low=min(least, least / (1.0 - gamma)),  # paid once, if the episode ends there, or for ever
@@ -107,21 +114,26 @@ def make_target_updater(loss: LossModule, *, tau: float, hard_interval: int) -> 
 
 
 class Learner(Protocol):
-    """What the training loop asks of an algorithm: one gradient step on a batch."""
+    """What the training loop asks of an algorithm: one gradient step of each run."""
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Learns from rows [B], writes their priorities into the batch, returns what it measured."""
+        """Learns from rows [R, B], writes their priorities into them, returns what it measured: [R] each."""
         ...
 
 
 class LossLearner:
     """Gradient steps on any TorchRL loss module: backward, clipping, optimiser, target update.
 
+    Several independent runs are learnt at once if the networks are stacked and the loss keeps them
+    apart (``reduction="none"``): the sum over runs of each run's mean loss gives each run the
+    gradient that it would have alone.
+
     Args:
         loss: its ``loss_*`` outputs are summed; each of them must reach networks of its own.
-        optimiser: over the loss module's parameters.
+        optimiser: over the loss module's parameters; must treat each number by itself, as Adam does.
         target: moves the target networks; None for a loss without them.
-        max_grad_norm: the gradients of each network are clipped to this norm, apart.
+        max_grad_norm: the gradients of each network of each run are clipped to this norm, apart.
+        runs: R.
 
     Example:
         >>> from torchrl_her import make_actor, make_critic
@@ -136,26 +148,62 @@ class LossLearner:
         target: TargetNetUpdater | None = None,
         *,
         max_grad_norm: float = 3.0,
+        runs: int = 1,
     ) -> None:
         self.loss, self.optimiser, self.target = loss, optimiser, target
-        self.max_grad_norm = max_grad_norm
-        self._clipped = self._networks()
+        self.max_grad_norm, self.runs = max_grad_norm, runs
+        self._networks = self._find_networks()
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         output = self.loss(batch)
-        losses = {key: value for key, value in output.items() if key.startswith("loss_")}
+        losses = {
+            key: value.reshape(self.runs, -1).mean(1) for key, value in output.items() if key.startswith("loss_")
+        }
         self.optimiser.zero_grad(set_to_none=True)
-        sum(losses.values(), torch.zeros(())).backward()
-        for parameters in self._clipped:
-            nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        torch.stack(list(losses.values())).sum().backward()
+        for parameters in self._networks:
+            self._clip(parameters)
         self.optimiser.step()
         if self.target is not None:
             self.target.step()
         return {key: value.detach() for key, value in losses.items()}
 
-    def _networks(self) -> list[Sequence[nn.Parameter]]:
+    def _clip(self, parameters: list[nn.Parameter]) -> None:
+        if self.runs == 1:
+            nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        else:
+            clip_by_run(parameters, self.max_grad_norm)
+
+    def _find_networks(self) -> list[list[nn.Parameter]]:
         """The parameters of each network: the loss module's children that have any."""
-        groups = {}
+        groups: dict[str, list[nn.Parameter]] = {}
         for name, parameter in self.loss.named_parameters():
             groups.setdefault(name.split(".")[0], []).append(parameter)
         return list(groups.values())
+
+
+@torch.no_grad()
+def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float) -> Tensor:
+    """Clips the gradient of each run to a norm of its own.
+
+    Args:
+        parameters: of one stacked network; each has a leading dimension R.
+        max_norm: greatest norm of a run's gradient.
+
+    Returns:
+        [R], the norms before.
+
+    Example:
+        >>> weight = nn.Parameter(torch.zeros(2, 1, 1))
+        >>> weight.grad = torch.tensor([[[6.0]], [[2.0]]])
+        >>> clip_by_run([weight], 3.0).tolist(), weight.grad.flatten().tolist()
+        ([6.0, 2.0], [3.0, 2.0])
+    """
+    grads = [p.grad for p in parameters if p.grad is not None]
+    runs = len(grads[0])
+    norms = torch.cat([grad.view(runs, -1) for grad in grads], 1).norm(dim=1)
+    scale = (max_norm / (norms + 1e-6)).clamp(max=1.0)  # what clip_grad_norm_ does
+    scale = torch.where(norms <= max_norm, 1.0, scale)
+    for grad in grads:
+        grad.mul_(scale.view(runs, *[1] * (grad.ndim - 1)))
+    return norms

@@ -1,8 +1,14 @@
-"""Actor and critic of appendix B: three hidden layers, the action joined behind the critic's first."""
+"""Actor and critic of appendix B: three hidden layers, the action joined behind the critic's first.
+
+Networks hold the weights of one run, or of many independent runs side by side ("stacked"): every
+weight has a leading dimension R, and one batched product serves all runs. Inputs [..., width] are
+then R equal blocks of rows, run after run.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import NestedKey
@@ -12,16 +18,53 @@ from torch import Tensor, nn
 _LAST_LAYER = 3e-3  # small last layers keep early actions off the ends of tanh: Lillicrap et al., 2016
 
 
-def _layer(inputs: int, outputs: int, *, normalise: bool) -> nn.Sequential:
-    norm = [nn.BatchNorm1d(outputs)] if normalise else []
-    return nn.Sequential(nn.Linear(inputs, outputs), *norm, nn.ReLU())
+class StackedLinear(nn.Module):
+    """R linear layers side by side, each initialised as ``nn.Linear`` is.
+
+    Args:
+        inputs: width of the input.
+        outputs: width of the output.
+        runs: R.
+        bound: weights are uniform in [-bound, bound]; None for ``1 / sqrt(inputs)``.
+
+    Example:
+        >>> StackedLinear(4, 3, runs=2)(torch.zeros(2, 5, 4)).shape
+        torch.Size([2, 5, 3])
+    """
+
+    def __init__(self, inputs: int, outputs: int, *, runs: int = 1, bound: float | None = None) -> None:
+        super().__init__()
+        bound = 1.0 / math.sqrt(inputs) if bound is None else bound
+        self.weight = nn.Parameter(torch.empty(runs, inputs, outputs).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(runs, 1, outputs).uniform_(-bound, bound))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[R, rows, inputs] to [R, rows, outputs]."""
+        return torch.baddbmm(self.bias, x, self.weight)
 
 
-def _last_layer(inputs: int, outputs: int) -> nn.Linear:
-    layer = nn.Linear(inputs, outputs)
-    nn.init.uniform_(layer.weight, -_LAST_LAYER, _LAST_LAYER)
-    nn.init.uniform_(layer.bias, -_LAST_LAYER, _LAST_LAYER)
-    return layer
+class StackedBatchNorm(nn.Module):
+    """Batch normalisation with statistics of each run's own.
+
+    Args:
+        width: of the input.
+        runs: R.
+    """
+
+    def __init__(self, width: int, *, runs: int = 1) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm1d(runs * width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[R, rows, width] to the same."""
+        runs, rows, width = x.shape
+        flat = x.transpose(0, 1).reshape(rows, runs * width)
+        return self.norm(flat).view(rows, runs, width).transpose(0, 1)
+
+
+def _layer(inputs: int, outputs: int, *, runs: int, normalise: bool) -> nn.Sequential:
+    norm = [StackedBatchNorm(outputs, runs=runs)] if normalise else []
+    return nn.Sequential(StackedLinear(inputs, outputs, runs=runs), *norm, nn.ReLU())
 
 
 class ActorNet(nn.Module):
@@ -31,21 +74,26 @@ class ActorNet(nn.Module):
         inputs: width of all inputs together.
         actions: width of the action.
         hidden: width of each of the three hidden layers.
+        runs: R, how many independent actors.
 
     Example:
         >>> ActorNet(11, 3)(torch.zeros(2, 9), torch.zeros(2, 2)).shape
         torch.Size([2, 3])
     """
 
-    def __init__(self, inputs: int, actions: int, *, hidden: int = 64) -> None:
+    def __init__(self, inputs: int, actions: int, *, hidden: int = 64, runs: int = 1) -> None:
         super().__init__()
+        self.runs = runs
         widths = [inputs, hidden, hidden, hidden]
-        layers = [_layer(widths[i], widths[i + 1], normalise=False) for i in range(3)]
-        self.layers = nn.Sequential(*layers, _last_layer(hidden, actions), nn.Tanh())
+        layers = [_layer(widths[i], widths[i + 1], runs=runs, normalise=False) for i in range(3)]
+        self.layers = nn.Sequential(
+            *layers, StackedLinear(hidden, actions, runs=runs, bound=_LAST_LAYER), nn.Tanh()
+        )
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """[..., widths] of the inputs to [..., actions]."""
-        return self.layers(torch.cat(inputs, -1))
+        x = torch.cat(inputs, -1)
+        return self.layers(_by_run(x, self.runs)).view(*x.shape[:-1], -1)
 
 
 class CriticNet(nn.Module):
@@ -56,26 +104,59 @@ class CriticNet(nn.Module):
         actions: width of the action, the last input.
         hidden: width of each of the three hidden layers.
         normalise: batch normalisation of the input and of the hidden layers.
+        runs: R, how many independent critics.
 
     Example:
         >>> CriticNet(11, 3)(torch.zeros(2, 9), torch.zeros(2, 2), torch.zeros(2, 3)).shape
         torch.Size([2, 1])
     """
 
-    def __init__(self, inputs: int, actions: int, *, hidden: int = 64, normalise: bool = False) -> None:
+    def __init__(
+        self, inputs: int, actions: int, *, hidden: int = 64, normalise: bool = False, runs: int = 1
+    ) -> None:
         super().__init__()
-        norm = [nn.BatchNorm1d(inputs)] if normalise else []
-        self.first = nn.Sequential(*norm, _layer(inputs, hidden, normalise=normalise))
+        self.runs = runs
+        norm = [StackedBatchNorm(inputs, runs=runs)] if normalise else []
+        self.first = nn.Sequential(*norm, _layer(inputs, hidden, runs=runs, normalise=normalise))
         self.rest = nn.Sequential(
-            _layer(hidden + actions, hidden, normalise=normalise),
-            _layer(hidden, hidden, normalise=normalise),
-            _last_layer(hidden, 1),
+            _layer(hidden + actions, hidden, runs=runs, normalise=normalise),
+            _layer(hidden, hidden, runs=runs, normalise=normalise),
+            StackedLinear(hidden, 1, runs=runs, bound=_LAST_LAYER),
         )
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """[..., widths] of the inputs, the action last, to [..., 1]."""
         *seen, action = inputs
-        return self.rest(torch.cat((self.first(torch.cat(seen, -1)), action), -1))
+        hidden = self.first(_by_run(torch.cat(seen, -1), self.runs))
+        return self.rest(torch.cat((hidden, _by_run(action, self.runs)), -1)).view(*action.shape[:-1], 1)
+
+
+def _by_run(x: Tensor, runs: int) -> Tensor:
+    """[..., width] to [R, rows, width]."""
+    return x.reshape(runs, -1, x.shape[-1])
+
+
+def stack_runs(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """The state dict of a stacked network from those of single ones.
+
+    Args:
+        states: ``state_dict()`` of R networks of one make, each of a single run.
+
+    Returns:
+        What ``load_state_dict`` of the same network with ``runs=R`` takes.
+
+    Example:
+        >>> pair = ActorNet(3, 1, runs=2)
+        >>> pair.load_state_dict(stack_runs([ActorNet(3, 1).state_dict() for _ in range(2)]))
+        <All keys matched successfully>
+    """
+    first = states[0]
+    return {key: torch.cat([state[key] for state in states]) if first[key].ndim else first[key] for key in first}
+
+
+def take_run(state: Mapping[str, Tensor], run: int, runs: int) -> dict[str, Tensor]:
+    """The state dict of one run's network, from that of a stacked network of ``runs`` runs."""
+    return {key: value.chunk(runs)[run].clone() if value.ndim else value for key, value in state.items()}
 
 
 def make_actor(
@@ -83,6 +164,7 @@ def make_actor(
     actions: int,
     *,
     hidden: int = 64,
+    runs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     action: NestedKey = "action",
 ) -> TensorDictModule:
@@ -92,6 +174,7 @@ def make_actor(
         widths: of the inputs, one for each of ``in_keys``.
         actions: width of the action, which is within [-1, 1].
         hidden: width of the hidden layers.
+        runs: R, how many independent actors.
         in_keys: what it sees; the goal must be among them.
         action: where it writes.
 
@@ -101,7 +184,8 @@ def make_actor(
         >>> actor(TensorDict({"observation": torch.zeros(4, 9), "desired_goal": torch.zeros(4, 2)}, [4]))["action"].shape
         torch.Size([4, 3])
     """
-    return TensorDictModule(ActorNet(sum(widths), actions, hidden=hidden), in_keys=list(in_keys), out_keys=[action])
+    net = ActorNet(sum(widths), actions, hidden=hidden, runs=runs)
+    return TensorDictModule(net, in_keys=list(in_keys), out_keys=[action])
 
 
 def make_critic(
@@ -110,10 +194,11 @@ def make_critic(
     *,
     hidden: int = 64,
     normalise: bool = False,
+    runs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     action: NestedKey = "action",
     value: NestedKey = "state_action_value",
 ) -> TensorDictModule:
     """The critic as a TensorDict module; arguments as of :func:`make_actor` and :class:`CriticNet`."""
-    net = CriticNet(sum(widths), actions, hidden=hidden, normalise=normalise)
+    net = CriticNet(sum(widths), actions, hidden=hidden, normalise=normalise, runs=runs)
     return TensorDictModule(net, in_keys=[*in_keys, action], out_keys=[value])

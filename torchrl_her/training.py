@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -32,22 +32,25 @@ class Trainer:
     That epochs begin afresh is what lets a run go on exactly from a checkpoint between two of
     them: nothing of a half-played episode needs to be kept.
 
+    One loop serves a single run and many independent ones. The environments of R runs are R equal
+    blocks of one batch; each run has a replay buffer of its own.
+
     Args:
-        collector: yields batches [N, T] of the exploring policy.
-        buffer: takes them, usually through a :class:`~torchrl_her.HERWriter`.
+        collector: yields batches [R * E, T] of the exploring policy.
+        buffers: one for each of R runs, usually with a :class:`~torchrl_her.HERWriter`.
         learner: learns from what is sampled.
         exploration: decays after each epoch; None for none.
 
     Keyword Args:
-        epoch_frames: environment steps an epoch, rounded up to whole batches.
-        frames_per_update: environment steps for each gradient step.
-        batch_size: rows of a gradient step.
+        epoch_frames: environment steps of each run in an epoch, rounded up to whole batches.
+        frames_per_update: environment steps of each run for each of its gradient steps.
+        batch_size: rows of a gradient step of one run.
         updates_per_draw: gradient steps whose rows are drawn in one call. Their priorities are as
             old as the call.
 
     Attributes:
-        frames: environment steps so far.
-        updates: gradient steps so far.
+        frames: environment steps of each run so far.
+        updates: gradient steps of each run so far.
         epochs: epochs so far.
     """
 
@@ -55,7 +58,7 @@ class Trainer:
         self,
         *,
         collector: BaseCollector,
-        buffer: TensorDictReplayBuffer,
+        buffers: Sequence[TensorDictReplayBuffer],
         learner: Learner,
         exploration: DecayingEpsilon | None = None,
         epoch_frames: int = 8_000,
@@ -63,14 +66,14 @@ class Trainer:
         batch_size: int = 64,
         updates_per_draw: int = 1,
     ) -> None:
-        self.collector, self.buffer, self.learner, self.exploration = collector, buffer, learner, exploration
+        self.collector, self.buffers, self.learner, self.exploration = collector, buffers, learner, exploration
         self.epoch_frames, self.frames_per_update = epoch_frames, frames_per_update
         self.batch_size, self.updates_per_draw = batch_size, updates_per_draw
         self.frames = self.updates = self.epochs = 0
         self._credit = 0.0  # gradient steps that frames have paid for
 
-    def epoch(self, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, float]:
-        """Runs one epoch and returns the means of what the learner measured.
+    def epoch(self, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
+        """Runs one epoch and returns the means of what the learner measured, [R] each.
 
         Args:
             on_batch: called after each batch, for a progress bar.
@@ -81,9 +84,9 @@ class Trainer:
         while self.frames < end:
             batch = self.collector.next()
             check_finite(batch)
-            self.buffer.extend(batch)
-            self.frames += batch.numel()
-            self._credit += batch.numel() / self.frames_per_update
+            frames = self._write(batch)
+            self.frames += frames
+            self._credit += frames / self.frames_per_update
             measured += self._learn()
             if on_batch is not None:
                 on_batch(self)
@@ -91,27 +94,39 @@ class Trainer:
         if self.exploration is not None:
             self.exploration.step()
         keys = measured[0] if measured else {}
-        return {key: float(torch.stack([m[key] for m in measured]).mean()) for key in keys}
+        return {key: torch.stack([m[key] for m in measured]).mean(0) for key in keys}
+
+    def _write(self, batch: TensorDictBase) -> int:
+        """Gives each run its block of environments, and returns the frames of one run."""
+        blocks = batch.chunk(len(self.buffers))
+        for buffer, block in zip(self.buffers, blocks, strict=True):
+            buffer.extend(block)
+        return blocks[0].numel()
 
     def _learn(self) -> list[dict[str, Tensor]]:
         """All gradient steps that the collected frames have paid for."""
-        if len(self.buffer) < self.batch_size:
+        if any(len(buffer) < self.batch_size for buffer in self.buffers):
             return []
         measured = []
         while self._credit >= 1.0:
             steps = min(self.updates_per_draw, int(self._credit))
-            rows = self.buffer.sample(self.batch_size * steps)
-            parts = rows.split(self.batch_size)
+            drawn = [buffer.sample(self.batch_size * steps) for buffer in self.buffers]
+            parts = torch.stack(drawn).split(self.batch_size, 1)
             measured += [self.learner.update(part) for part in parts]
-            self._set_priorities(rows, parts)
+            self._set_priorities(drawn, parts)
             self._credit -= steps
             self.updates += steps
         return measured
 
-    def _set_priorities(self, rows: TensorDictBase, parts: tuple[TensorDictBase, ...]) -> None:
-        priorities = [part.get(self.buffer.priority_key, None) for part in parts]
-        if all(priority is not None for priority in priorities):
-            self.buffer.update_priority(rows.get("index"), torch.cat(priorities))
+    def _set_priorities(self, drawn: list[TensorDictBase], parts: tuple[TensorDictBase, ...]) -> None:
+        """Tells each run's sampler the new priorities of the rows that were learnt from."""
+        key = self.buffers[0].priority_key
+        priorities = [part.get(key, None) for part in parts]
+        if any(priority is None for priority in priorities):
+            return
+        for buffer, rows, own in zip(self.buffers, drawn, torch.cat(priorities, 1), strict=True):
+            rows.set(key, own)
+            buffer.update_tensordict_priority(rows)  # does nothing under a sampler without priorities
 
     def state_dict(self) -> dict[str, Any]:
         """The counters; the parts have state of their own."""

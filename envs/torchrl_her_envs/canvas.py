@@ -74,7 +74,13 @@ class Canvas:
         return max(1, round(length * self._scale))
 
     def disc(
-        self, centre: Point, radius: float, *, fill: Colour | None = None, edge: Colour | None = None, width: float = 0
+        self,
+        centre: Point,
+        radius: float,
+        *,
+        fill: Colour | None = None,
+        edge: Colour | None = None,
+        width: float = 0,
     ) -> None:
         """A disc, a ring, or both; ``radius`` is the outer one and the edge lies within it."""
         x, y = self._at(centre)
@@ -94,11 +100,20 @@ class Canvas:
         """An upright rectangle, with round corners if asked for."""
         (left, bottom), (right, top) = self._at(low), self._at(high)
         self._draw.rounded_rectangle(
-            (left, top, right, bottom), rounding * self._scale, fill=fill, outline=edge, width=self.pixels(width)
+            (left, top, right, bottom),
+            rounding * self._scale,
+            fill=fill,
+            outline=edge,
+            width=self.pixels(width),
         )
 
     def polygon(
-        self, corners: Iterable[Point], *, fill: Colour | None = None, edge: Colour | None = None, width: float = 0
+        self,
+        corners: Iterable[Point],
+        *,
+        fill: Colour | None = None,
+        edge: Colour | None = None,
+        width: float = 0,
     ) -> None:
         """A closed polygon."""
         points = [self._at(corner) for corner in corners]
@@ -117,9 +132,9 @@ class Canvas:
         self._image.paste(sprite, corner, sprite)
 
     def text(self, place: Point, words: str, *, height: float, fill: Colour) -> None:
-        """A line of text whose top left corner is given."""
+        """A line of text whose top right corner is given."""
         font = ImageFont.load_default(size=height * self._scale)
-        self._draw.text(self._at(place), words, fill=fill, font=font)
+        self._draw.text(self._at(place), words, fill=fill, font=font, anchor="ra")
 
     def _use(self, image: Image.Image) -> None:
         self._image = image

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -33,8 +31,9 @@ def two_link_angles(point: Tensor, base: Tensor, length: float) -> Tensor:
     Example:
         >>> from torchrl_her_envs.kinematics import chain
         >>> angles = two_link_angles(torch.tensor([0.6, 0.8]), torch.zeros(2), 2.0)
-        >>> chain(angles, torch.zeros(2), 2.0)[:, -1].round(decimals=4).tolist()
-        [[0.6, 0.8], [0.6, 0.8]]
+        >>> chain(angles, torch.zeros(2), 2.0)[:, -1]
+        tensor([[0.6000, 0.8000],
+                [0.6000, 0.8000]])
     """
     gap = point - base.to(point)
     # In a triangle of two equal links the elbow's angle halves on both sides of the line to the point.
@@ -44,7 +43,7 @@ def two_link_angles(point: Tensor, base: Tensor, length: float) -> Tensor:
     return torch.stack((heading - half, 2.0 * half), -1)
 
 
-def nearest_angles(joints: Tensor, point: Tensor, base: Tensor, length: float) -> Tensor:
+def nearest_turn(joints: Tensor, point: Tensor, base: Tensor, length: float) -> Tensor:
     """The turn [..., 2] of the joints to the solution that the slower joint reaches sooner.
 
     Args:
@@ -54,9 +53,9 @@ def nearest_angles(joints: Tensor, point: Tensor, base: Tensor, length: float) -
         length: total length of the two links.
 
     Example:
-        >>> up = torch.tensor([math.pi / 2, 0.0])
-        >>> nearest_angles(up, torch.tensor([2.0, 0.0]), torch.zeros(2), 2.0).tolist()  # a quarter, clockwise
-        [-1.5707963705062866, 0.0]
+        >>> up = torch.tensor([torch.pi / 2, 0.0])
+        >>> nearest_turn(up, torch.tensor([2.0, 0.0]), torch.zeros(2), 2.0)  # a quarter, clockwise
+        tensor([-1.5708,  0.0000])
     """
     turns = turn(joints.unsqueeze(-2), two_link_angles(point, base, length))
     best = turns.abs().amax(-1).argmin(-1)

@@ -18,6 +18,8 @@ from torchrl_her_envs.task import WorldConfig
 _FIELDS = pymunk.batch.BodyFields.POSITION | pymunk.batch.BodyFields.VELOCITY
 _BORDER = 0.5  # metres: half the thickness of the screen's sides, which lie outside of it
 _CELL = 4.0  # metres, of the spatial hash: measured best from 1 to 1024 worlds
+_SLOP = 1e-3  # metres that a ball may sink into a surface; Chipmunk's default, 0.1, is meant for pixels
+_SKIN = _SLOP / 2  # surfaces stand out by this, so that a ball put against one touches it whatever the rounding
 _ITERATIONS = 4  # of the solver: a ball touches at most a side and a corner at once
 
 
@@ -98,7 +100,7 @@ class BallPhysics:
         space = pymunk.Space()
         space.gravity = (0.0, -world.gravity)
         space.iterations = _ITERATIONS
-        space.collision_slop = 1e-3  # metres; the default, 0.1, is meant for pixels
+        space.collision_slop = _SLOP
         space.collision_persistence = 1  # with 0, contacts are dropped before they act: nothing collides
         space.use_spatial_hash(_CELL, 10 * num_worlds)
         for offset in self._offset:
@@ -116,13 +118,14 @@ class BallPhysics:
         low, high = offset - _BORDER, offset + world.size + _BORDER
         corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
         shapes: list[pymunk.Shape] = [
-            pymunk.Segment(body, corners[i], corners[(i + 1) % 4], _BORDER) for i in range(4)
+            pymunk.Segment(body, corners[i], corners[(i + 1) % 4], _BORDER + _SKIN) for i in range(4)
         ]
         if wall:
             left = offset[0] + (world.wall_x - world.wall_thickness / 2) * world.size
             right = left + world.wall_thickness * world.size
             top = offset[1] + world.wall_height * world.size
-            shapes.append(pymunk.Poly(body, [(left, offset[1]), (right, offset[1]), (right, top), (left, top)]))
+            outline = [(left, offset[1]), (right, offset[1]), (right, top), (left, top)]
+            shapes.append(pymunk.Poly(body, outline, radius=_SKIN))
         for shape in shapes:
             shape.elasticity = shape.friction = 1.0  # Chipmunk multiplies the two surfaces' values
         return shapes

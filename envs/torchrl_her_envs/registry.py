@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from torchrl_her_envs.task import TASKS, Task, WorldConfig
@@ -27,7 +29,7 @@ def make_env(
     name: str,
     *,
     num_envs: int = 1,
-    seed: int = 0,
+    seed: int | Sequence[int] = 0,
     world: WorldConfig | None = None,
     num_links: int = 2,
     threshold: float | None = None,
@@ -38,7 +40,7 @@ def make_env(
     Args:
         name: one of :data:`~torchrl_her_envs.TASKS`.
         num_envs: number of worlds.
-        seed: of all random starts and goals.
+        seed: of all random starts and goals; R seeds for R equal blocks of worlds, each as if alone.
         world: the constants of the world, to change them.
         num_links: of the arm, for the robot's tasks.
         threshold: how near to the goal is achieved, in shown coordinates; the task's if None.

@@ -36,7 +36,7 @@ def render(
         worlds: indices of the worlds to draw; None for all.
         size: side of each picture in pixels.
         trail: earlier values of ``env.worlds.ball`` ([N, 2] each), oldest first, drawn as fading dots.
-        caption: a line of text at the top left.
+        caption: a line of text at the top right, where no hand comes.
 
     Returns:
         Pictures [len(worlds), size, size, 3] of uint8; without the first dimension for a single index.
@@ -55,11 +55,11 @@ def render(
     """
     chosen = choose_worlds(env, worlds)
     stage = _draw_stage(env, size)
-    stage.text((0.02, 0.985), caption, height=_TEXT, fill=palette.INK)
+    stage.text((0.98, 0.985), caption, height=_TEXT, fill=palette.INK)
     pictures = []
     for world in chosen:
         canvas = stage.copy()
-        _draw_world(canvas, env, world, [_screen(env, balls[world]) for balls in trail])
+        _draw_world(canvas, env, world, trail)
         pictures.append(canvas.finish())
     return pictures[0] if isinstance(worlds, int) else torch.stack(pictures)
 
@@ -116,26 +116,27 @@ def _draw_goals(canvas: Canvas, env: ThrowingEnv) -> None:
         canvas.polygon(corners, fill=palette.GOALS, edge=palette.GOALS_EDGE, width=_LINE)
 
 
-def _draw_world(canvas: Canvas, env: ThrowingEnv, world: int, trail: Sequence[Point]) -> None:
+def _draw_world(canvas: Canvas, env: ThrowingEnv, world: int, trail: Sequence[Tensor]) -> None:
     """What differs from world to world, from the back to the front."""
-    now, config = env.worlds, env.world
-    closed, joints = bool(now.closed[world]), env.effector.skeleton(now.joints[world]) / config.size
+    now, size, closed = env.worlds, env.world.size, bool(env.worlds.closed[world])
+    grip = _point(now.grip[world] / size)
     if env.task.throws:
-        sprites.draw_hole(canvas, _points((now.goal[world : world + 1] + 1) / 2)[0], config.hole_radius)
-    sprites.draw_trail(canvas, trail)
+        # Both are shown coordinates, which span 2; the threshold is the black hole's radius unless changed.
+        sprites.draw_hole(canvas, _point((now.goal[world] + 1) / 2), env.threshold / 2)
+    sprites.draw_trail(canvas, [_point(balls[world] / size) for balls in trail])
     if env.task.effector == "arm":
-        sprites.draw_arm(canvas, _points(joints), closed=closed)
+        sprites.draw_arm(canvas, _points(env.effector.skeleton(now.joints[world]) / size), closed=closed)
     else:
-        sprites.draw_palm(canvas, _screen(env, now.grip[world]), closed=closed)
-    sprites.draw_ball(canvas, _screen(env, now.ball[world]), config.ball_radius)
+        sprites.draw_palm(canvas, grip, closed=closed)
+    sprites.draw_ball(canvas, _point(now.ball[world] / size), env.world.ball_radius)
     if env.task.effector == "hand" and closed:
-        sprites.draw_fist(canvas, _screen(env, now.grip[world]))
+        sprites.draw_fist(canvas, grip)
 
 
-def _screen(env: ThrowingEnv, metres: Tensor) -> Point:
-    x, y = (metres / env.world.size).tolist()
+def _point(screen: Tensor) -> Point:
+    x, y = screen.tolist()
     return x, y
 
 
 def _points(screen: Tensor) -> list[Point]:
-    return [(x, y) for x, y in screen.tolist()]
+    return [_point(row) for row in screen]

@@ -32,7 +32,7 @@ def draw_trail(canvas: Canvas, points: Sequence[Point]) -> None:
     """Where a ball was, oldest first: dots that fade with age."""
     for age, point in enumerate(reversed(points)):
         freshness = 1 - age / len(points)
-        canvas.disc(point, 0.003 + 0.006 * freshness, fill=(*palette.TRAIL[:3], round(30 + 130 * freshness)))
+        canvas.disc(point, 0.004 + 0.005 * freshness, fill=(*palette.TRAIL[:3], round(60 + 110 * freshness)))
 
 
 def draw_wall(canvas: Canvas, low: Point, high: Point) -> None:
@@ -82,16 +82,22 @@ def draw_arm(canvas: Canvas, joints: Sequence[Point], *, closed: bool) -> None:
         canvas.bar(start, stop, thickness=_LINK - 2 * _LINE, fill=palette.METAL)
     for joint in elbows:
         canvas.disc(joint, 0.75 * _LINK, fill=palette.METAL_LIGHT, edge=palette.METAL_EDGE, width=_LINE)
-    canvas.disc(
-        end, _GRIPPER, fill=palette.GRIPPER if closed else None, edge=palette.GRIPPER, width=1.5 * _LINE
-    )
+    draw_gripper(canvas, end, closed=closed)
+
+
+def draw_gripper(canvas: Canvas, centre: Point, *, closed: bool) -> None:
+    """The end of an arm, wide enough for the ball."""
+    fill = palette.GRIPPER if closed else None
+    canvas.disc(centre, _GRIPPER, fill=fill, edge=palette.GRIPPER, width=1.5 * _LINE)
 
 
 def _draw_base(canvas: Canvas, centre: Point) -> None:
     x, y = centre
     half = 1.5 * _LINK
     low, high = (x - half, y - half), (x + half, y + half)
-    canvas.box(low, high, fill=palette.METAL_LIGHT, edge=palette.METAL_EDGE, width=_LINE, rounding=0.4 * _LINK)
+    canvas.box(
+        low, high, fill=palette.METAL_LIGHT, edge=palette.METAL_EDGE, width=_LINE, rounding=0.4 * _LINK
+    )
     for bolt in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
         canvas.disc((x + bolt[0] * 0.68 * half, y + bolt[1] * 0.68 * half), _LINE, fill=palette.METAL_EDGE)
 

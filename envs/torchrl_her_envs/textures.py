@@ -30,9 +30,11 @@ def basketball(radius: int) -> Image.Image:
     """
     x, y, rim = _grid(radius)
     z = np.sqrt(np.clip(1 - rim**2, 0, 1))
-    u, v, w = np.einsum("ij,j...->i...", _rotation(), np.stack((x, y, z)))
+    u, v, _ = np.einsum("ij,j...->i...", _rotation(), np.stack((x, y, z)))
     # Two great circles and a curve that bends away from one of them, as on the real thing.
-    seams = np.minimum(np.minimum(np.abs(u), np.abs(v)), np.abs(np.sqrt(np.clip(u**2 - 0.55 * v**2, 0, 1)) - 0.55))
+    seams = np.minimum(
+        np.minimum(np.abs(u), np.abs(v)), np.abs(np.sqrt(np.clip(u**2 - 0.55 * v**2, 0, 1)) - 0.55)
+    )
     seam = _step(_SEAM_WIDTH - seams, radius) + _step(rim - 0.9, radius)
     light = 0.68 + 0.4 * np.clip(-0.45 * x + 0.55 * y + 0.7 * z, 0, 1)
     colour = _mix(np.clip(_rgb(palette.BALL) * light[..., None], 0, 255), palette.SEAM, np.clip(seam, 0, 1))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -14,6 +16,7 @@ from torchrl_her_envs.effector import Effector
 from torchrl_her_envs.goals import BoxGoals, GoalDistribution, SectorGoals
 from torchrl_her_envs.hand import Hand
 from torchrl_her_envs.physics import BallPhysics
+from torchrl_her_envs.rendering import render
 from torchrl_her_envs.robot import Arm
 from torchrl_her_envs.seeding import uniform, world_keys
 from torchrl_her_envs.task import Task, WorldConfig
@@ -73,7 +76,7 @@ class ThrowingEnv(EnvBase):
     Args:
         task: what is to be done; see :data:`~torchrl_her_envs.TASKS`.
         num_envs: N, the number of worlds.
-        seed: of all random starts and goals.
+        seed: of all random starts and goals; R seeds for R equal blocks of worlds, each as if alone.
         world: the constants.
         num_links: of the arm.
         threshold: how near to the goal is achieved, in shown coordinates; the task's if None.
@@ -94,7 +97,7 @@ class ThrowingEnv(EnvBase):
         task: Task,
         *,
         num_envs: int = 1,
-        seed: int = 0,
+        seed: int | Sequence[int] = 0,
         world: WorldConfig | None = None,
         num_links: int = 2,
         threshold: float | None = None,
@@ -119,7 +122,7 @@ class ThrowingEnv(EnvBase):
         self._goals: GoalDistribution = self._make_goals()
         self.worlds = WorldState.zeros(num_envs, self.effector.num_joints)
         self._make_specs()
-        self.set_seed(seed)
+        self.set_seeds([seed] if isinstance(seed, int) else seed)
 
     # What the outside asks for
 
@@ -145,6 +148,21 @@ class ThrowingEnv(EnvBase):
         gap = achieved_goal - desired_goal
         return gap.square().sum(-1, keepdim=True) < self.threshold**2
 
+    def render(self, worlds: int | Sequence[int] | None = 0, *, size: int = 300) -> Tensor:
+        """Draws worlds as they are now; see :func:`~torchrl_her_envs.render` for more options.
+
+        Args:
+            worlds: an index, several, or None for all.
+            size: side of each picture in pixels.
+
+        Returns:
+            [size, size, 3] of uint8, with a dimension for the worlds in front unless one index was given.
+
+        Raises:
+            ValueError: a world that does not exist, or a size that is too small.
+        """
+        return render(self, worlds, size=size)
+
     def world_state_dict(self) -> dict[str, Tensor]:
         """A copy of all that the worlds are; they resume exactly from it."""
         return {field.name: getattr(self.worlds, field.name).clone() for field in fields(WorldState)}
@@ -153,11 +171,25 @@ class ThrowingEnv(EnvBase):
         """Puts the worlds back to where :meth:`world_state_dict` was taken."""
         self.worlds = WorldState(**{field.name: state[field.name].clone() for field in fields(WorldState)})
 
+    def set_seeds(self, seeds: Sequence[int]) -> None:
+        """Seeds R equal blocks of worlds, each as if it were alone.
+
+        Args:
+            seeds: R of them.
+
+        Raises:
+            ValueError: the worlds cannot be shared out among R blocks.
+        """
+        (n,) = self.batch_size
+        if not seeds or n % len(seeds):
+            raise ValueError(f"{n} worlds cannot be shared out among {len(seeds)} seeds")
+        self._keys = np.concatenate([world_keys(seed, n // len(seeds)) for seed in seeds])
+        self.worlds.episode.zero_()
+
     # TorchRL's hooks
 
     def _set_seed(self, seed: int | None) -> None:
-        self._keys = world_keys(seed or 0, self.batch_size[0])
-        self.worlds.episode.zero_()
+        self.set_seeds([seed or 0])
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)

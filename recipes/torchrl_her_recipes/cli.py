@@ -6,15 +6,15 @@ import argparse
 import logging
 import os
 import sys
-import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_her_envs import TASKS
@@ -37,6 +37,8 @@ commands:
   list                     tasks, algorithms and presets
 """
 _CONF = Path(__file__).parent / "conf"
+_HINTS = ("full_key", "object_type", "reference_type", "To append", "Set the environment")  # Hydra's, for its users
+_BAD = (HydraException, OmegaConfBaseException, OSError, ValueError, ImportError)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return commands[arguments[0]](arguments[1:])
     except KeyboardInterrupt:
         return _fail("interrupted", _INTERRUPTED)
-    except (HydraException, OmegaConfBaseException, OSError, ValueError, ImportError) as error:
+    except _BAD as error:
         return _fail(_one_line(error))
 
 
@@ -67,10 +69,13 @@ def _one_line(error: BaseException) -> str:
     """The message of an error, without the hints that other libraries put below it."""
     if isinstance(error, OSError) and error.strerror is not None:
         return f"cannot use {error.filename}: {error.strerror.lower()}"
-    cause = error.__cause__ if isinstance(error, HydraException) and error.__cause__ else error
-    lines = [line.strip() for line in (str(error) + "\n" + str(cause)).splitlines()]
-    kept = [line for line in lines if line and not line.startswith(("full_key", "object_type", "To append", "Set the env"))]
-    return "; ".join(dict.fromkeys(kept)) or type(error).__name__
+    cause = str(error.__cause__ or "") if isinstance(error, HydraException) else ""
+    message = f"{error}\n{cause}".split("Config search path")[0].replace("In 'train': ", "")
+    lines = [line.strip() for line in message.splitlines()]
+    kept = [line.rstrip(".") for line in lines if line and not line.startswith(_HINTS)]
+    if "Could not override" in message:
+        kept.append(f"what may be set is {', '.join(field.name for field in fields(_Arguments))}")
+    return "; ".join(kept) or type(error).__name__
 
 
 # train
@@ -88,12 +93,14 @@ def _train(arguments: list[str]) -> int:
     codes: list[int] = []
 
     def job(config: DictConfig) -> None:
-        codes.append(_train_one(config))
+        try:
+            codes.append(_train_one(config))
+        except _BAD as error:  # reported here, so that the other jobs of a sweep go on
+            codes.append(_fail(_one_line(error)))
 
     before, sys.argv = sys.argv, ["torchrl-her train", *arguments]
     try:
-        with warnings.catch_warnings():
-            hydra.main(version_base="1.3", config_path=str(_CONF), config_name="train")(job)()
+        hydra.main(version_base="1.3", config_path=str(_CONF), config_name="train")(job)()
     finally:
         sys.argv = before
     return max(codes, default=0)
@@ -105,13 +112,21 @@ def _train_one(config: DictConfig) -> int:
     values.pop("folder")
     recipe = Recipe.from_dict({str(key): value for key, value in values.items()})
     folder = Path(HydraConfig.get().runtime.output_dir)
+    parts = recipe.build()
     _say_start(folder)
-    return _say_end(recipe.build().run(folder))
+    return _say_end(parts.run(folder))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Arguments(Recipe):
+    """What the command line of `train` takes: a recipe, and where to put the run."""
+
+    folder: str = MISSING
 
 
 def _store_recipe() -> None:
     """Makes the recipe's fields and their types known to Hydra."""
-    node = OmegaConf.structured(Recipe)
+    node = OmegaConf.structured(_Arguments)
     OmegaConf.set_readonly(node, False)  # the dataclass is frozen; its configuration is not
     ConfigStore.instance().store(name="recipe", node=node)
 
@@ -137,12 +152,13 @@ def _play(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="torchrl-her play", description="Make a GIF of a run's policy.")
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--out", type=Path, help="the .gif or .mp4 to write (default: RUN/play.gif)")
+    parser.add_argument("--run", type=int, default=0, dest="index", help="which, of several side by side")
     parser.add_argument("--goals", type=int, default=6, help="how many goals, side by side (default: 6)")
     parser.add_argument("--seed", type=int, default=0, help="of the goals and starts (default: 0)")
     parser.add_argument("--size", type=int, default=240, help="pixels of one world (default: 240)")
     options = parser.parse_args(arguments)
     out = options.out or options.run / "play.gif"
-    achieved = play(options.run, out, goals=options.goals, seed=options.seed, size=options.size)
+    achieved = play(options.run, out, run=options.index, goals=options.goals, seed=options.seed, size=options.size)
     print(f"{achieved} of {options.goals} goals achieved: {out}")
     return 0
 

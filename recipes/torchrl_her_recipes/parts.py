@@ -25,6 +25,7 @@ from torchrl_her import (
     make_critic,
     make_ddpg_loss,
     make_target_updater,
+    stack_runs,
 )
 from torchrl_her_envs import ThrowingEnv, make_env
 from torchrl_her_recipes.algorithms import get_algorithm
@@ -41,25 +42,26 @@ _EVAL_SEED = 1 << 32
 
 @dataclass
 class Parts:
-    """What a run consists of. Swap whatever you like, then call :meth:`run`.
+    """What a run, or R independent runs side by side, consist of. Swap what you like, then :meth:`run`.
 
     A loss of your own needs its own optimiser and target updater; an environment of your own, its
     own collector.
 
     Attributes:
         recipe: what the parts were made from.
-        env: batched training environments.
-        eval_env: batched environments for evaluation.
+        env: batched training environments: R equal blocks.
+        eval_env: batched environments for evaluation, likewise.
         actor: the greedy policy.
         critic: values of (observation, goal, action); used to measure its bias, None if there is none.
         exploration: turns greedy into exploring actions.
         policy: actor, then exploration.
         collector: runs the policy in the environments.
-        buffer: with the writer that relabels and the sampler.
+        buffers: one of each run, with the writer that relabels and the sampler; :attr:`buffer` is
+            that of a single run.
         loss: any TorchRL loss module.
         optimiser: over the loss module's parameters.
         target: moves the target networks.
-        generator: of all random numbers in Python's hands (exploration, relabelling, sampling).
+        generators: of each run's random numbers in Python's hands (exploration, relabelling, sampling).
     """
 
     recipe: Recipe
@@ -70,19 +72,36 @@ class Parts:
     exploration: DecayingEpsilon
     policy: TensorDictModuleBase
     collector: BaseCollector
-    buffer: TensorDictReplayBuffer
+    buffers: list[TensorDictReplayBuffer]
     loss: LossModule
     optimiser: torch.optim.Optimizer
     target: TargetNetUpdater | None
-    generator: torch.Generator
+    generators: list[torch.Generator]
+
+    @property
+    def buffer(self) -> TensorDictReplayBuffer:
+        """The buffer of a single run (of the first one if there are more)."""
+        return self.buffers[0]
+
+    @buffer.setter
+    def buffer(self, buffer: TensorDictReplayBuffer) -> None:
+        if len(self.buffers) > 1:
+            raise ValueError(f"there are {len(self.buffers)} runs: set `buffers`, one for each")
+        self.buffers = [buffer]
 
     def trainer(self) -> Trainer:
         """The training loop over these parts."""
         recipe = self.recipe
         return Trainer(
             collector=self.collector,
-            buffer=self.buffer,
-            learner=LossLearner(self.loss, self.optimiser, self.target, max_grad_norm=recipe.max_grad_norm),
+            buffers=self.buffers,
+            learner=LossLearner(
+                self.loss,
+                self.optimiser,
+                self.target,
+                max_grad_norm=recipe.max_grad_norm,
+                runs=recipe.num_runs,
+            ),
             exploration=self.exploration,
             epoch_frames=recipe.epoch_frames,
             frames_per_update=recipe.frames_per_update,
@@ -104,23 +123,29 @@ class Parts:
 
 def build_parts(recipe: Recipe) -> Parts:
     """Makes the parts that a recipe asks for."""
-    env = make_env(recipe.task, num_envs=recipe.num_envs, seed=recipe.seed, threshold=recipe.threshold)
-    eval_env = make_env(
-        recipe.task, num_envs=recipe.eval_episodes, seed=eval_seed(recipe, 0), threshold=recipe.threshold
+    env = make_env(
+        recipe.task, num_envs=recipe.num_runs * recipe.num_envs, seed=recipe.seeds, threshold=recipe.threshold
     )
-    generator = torch.Generator().manual_seed(recipe.seed)
+    eval_env = make_env(
+        recipe.task,
+        num_envs=recipe.num_runs * recipe.eval_episodes,
+        seed=eval_seeds(recipe, 0),
+        threshold=recipe.threshold,
+    )
+    generators = [torch.Generator().manual_seed(seed) for seed in recipe.seeds]
     actor, critic = make_networks(recipe, env)
-    low, high = env.action_spec.low[0], env.action_spec.high[0]
     exploration = DecayingEpsilon(
-        low,
-        high,
+        env.action_spec.low[0],
+        env.action_spec.high[0],
         start=recipe.epsilon_start,
         decay=recipe.epsilon_decay,
         end=recipe.epsilon_end,
-        generator=generator,
+        generators=generators,
     )
     policy = TensorDictSequential(actor, exploration)
-    loss = make_ddpg_loss(actor, critic, gamma=recipe.gamma, action_penalty=recipe.action_penalty)
+    loss = make_ddpg_loss(
+        actor, critic, gamma=recipe.gamma, action_penalty=recipe.action_penalty, reduction="none"
+    )
     return Parts(
         recipe=recipe,
         env=env,
@@ -129,18 +154,23 @@ def build_parts(recipe: Recipe) -> Parts:
         critic=critic,
         exploration=exploration,
         policy=policy,
-        collector=Collector(
-            env,
-            policy,
-            frames_per_batch=recipe.num_envs * recipe.steps_per_batch,
-            total_frames=-1,
-            auto_register_policy_transforms=False,
-        ),
-        buffer=make_buffer(recipe, env, generator),
+        collector=make_collector(recipe, env, policy),
+        buffers=[make_buffer(recipe, env, generator) for generator in generators],
         loss=loss,
         optimiser=torch.optim.Adam(loss.parameters(), lr=recipe.learning_rate, fused=True),
         target=make_target_updater(loss, tau=recipe.tau, hard_interval=recipe.hard_update_interval),
-        generator=generator,
+        generators=generators,
+    )
+
+
+def make_collector(recipe: Recipe, env: EnvBase, policy: TensorDictModuleBase) -> Collector:
+    """Runs a policy in the training environments, a few steps of each at a time."""
+    return Collector(
+        env,
+        policy,
+        frames_per_batch=env.batch_size.numel() * recipe.steps_per_batch,
+        total_frames=-1,
+        auto_register_policy_transforms=False,
     )
 
 
@@ -164,19 +194,28 @@ def make_buffer(recipe: Recipe, env: ThrowingEnv, generator: torch.Generator) ->
 
 
 def make_networks(recipe: Recipe, env: ThrowingEnv) -> tuple[TensorDictModule, TensorDictModule]:
-    """The actor and the critic, with weights that depend on the recipe's seed alone."""
+    """The actor and the critic; the weights of each run depend on its own seed alone."""
     widths = [env.observation_spec[key].shape[-1] for key in ("observation", "desired_goal")]
     actions = env.action_spec.shape[-1]
+
+    def make(runs: int) -> tuple[TensorDictModule, TensorDictModule]:
+        actor = make_actor(widths, actions, hidden=recipe.hidden, runs=runs)
+        return actor, make_critic(widths, actions, hidden=recipe.hidden, normalise=recipe.batch_norm, runs=runs)
+
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(recipe.seed)
-        actor = make_actor(widths, actions, hidden=recipe.hidden)
-        critic = make_critic(widths, actions, hidden=recipe.hidden, normalise=recipe.batch_norm)
+        alone = []
+        for seed in recipe.seeds:
+            torch.manual_seed(seed)
+            alone.append(make(1))
+        actor, critic = make(recipe.num_runs)
+    actor.load_state_dict(stack_runs([own.state_dict() for own, _ in alone]))
+    critic.load_state_dict(stack_runs([own.state_dict() for _, own in alone]))
     return actor, critic
 
 
-def eval_seed(recipe: Recipe, epoch: int) -> int:
-    """The seed of an evaluation: its own for each seed and epoch, and never one of training."""
-    return _EVAL_SEED + (recipe.seed << 20) + epoch
+def eval_seeds(recipe: Recipe, epoch: int) -> list[int]:
+    """The seeds of an evaluation: for each run and epoch its own, and never one of training."""
+    return [_EVAL_SEED + (seed << 20) + epoch for seed in recipe.seeds]
 
 
 def _make_sampler(recipe: Recipe) -> Sampler:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -25,23 +26,40 @@ _PANELS = (
 
 
 def plot_curves(rows: Sequence[dict[str, float]], path: Path, *, title: str = "") -> None:
-    """Draws the curves of one run.
+    """Draws the curves of a run; of several ones the median, and the 33rd to 67th percentile.
 
     Args:
-        rows: the table of metrics, one row an epoch.
+        rows: the table of metrics, one row an epoch and run.
         path: of the picture.
         title: above it.
     """
     figure = Figure(figsize=(10, 6), layout="constrained")
     figure.suptitle(title)
-    frames = [row["frames"] for row in rows]
     for axes, (name, label, limits) in zip(figure.subplots(2, 2).flat, _PANELS, strict=True):
-        axes.plot(frames, [row[name] for row in rows], color="#2b6cb0")
+        draw_curve(axes, rows, name)
         axes.set(xlabel="environment steps", ylabel=label)
         axes.grid(alpha=0.3)
         if limits is not None:
             axes.set_ylim(*limits)
     figure.savefig(path, dpi=110)
+
+
+def draw_curve(
+    axes: Axes, rows: Sequence[dict[str, float]], name: str, *, colour: str = "#2b6cb0", label: str | None = None
+) -> None:
+    """One metric over environment steps, on given axes: median, and 33rd to 67th percentile."""
+    frames, values = by_frames(rows, name)
+    low, middle, high = np.percentile(values, [33, 50, 67], axis=1)
+    axes.plot(frames, middle, color=colour, label=label)
+    axes.fill_between(frames, low, high, color=colour, alpha=0.25, linewidth=0)
+
+
+def by_frames(rows: Sequence[dict[str, float]], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """One metric as (frames [n], values [n, R])."""
+    groups: dict[float, list[float]] = {}
+    for row in rows:
+        groups.setdefault(row["frames"], []).append(row[name])
+    return np.array(list(groups)), np.array(list(groups.values()))
 
 
 def plot_goals(goals: Tensor, env: ThrowingEnv, path: Path, *, title: str = "", cells: int = 40) -> None:

@@ -29,18 +29,19 @@ class Recipe:
     Example:
         >>> recipe = Recipe(task="hand_v0", algo="her", seed=3)
         >>> recipe.gamma, recipe.total_frames
-        (0.98, 96000)
+        (0.98, 409600)
     """
 
     task: str = "hand_v0"  # see `torchrl-her list`
     algo: str = "filtered_her"  # likewise
     seed: int = 0
+    num_runs: int = 1  # independent runs side by side; run i has the seed ``seed + i``
 
-    epochs: int = 12
-    epoch_frames: int = 8_000
-    num_envs: int = 16
-    steps_per_batch: int = 10  # of each environment, before the updates that they pay for
-    frames_per_update: float = 2.0
+    epochs: int = 20
+    epoch_frames: int = 20_480  # of each run, as all that follows
+    num_envs: int = 64
+    steps_per_batch: int = 5  # of each environment, before the updates that they pay for
+    frames_per_update: float = 20.0
     updates_per_draw: int = 8  # gradient steps whose rows are drawn in one call
 
     k: int = 4  # virtual rows for each real one
@@ -51,19 +52,19 @@ class Recipe:
     priority_alpha: float = 0.6  # in Schaul's sense: of the absolute TD error
     priority_beta: float = 0.4
     buffer_size: int = 1_000_000  # real and virtual rows together
-    batch_size: int = 64
+    batch_size: int = 256
 
     gamma: float = 0.98
     learning_rate: float = 1e-3
     max_grad_norm: float = 3.0
-    action_penalty: float = 0.0
+    action_penalty: float = 0.3  # keeps actions off the ends of tanh
     hidden: int = 64
     batch_norm: bool = False  # in the critic
-    tau: float = 0.01  # of the soft target update
+    tau: float = 0.02  # of the soft target update
     hard_update_interval: int = 0  # gradient steps between hard target updates; 0: soft
 
     epsilon_start: float = 1.0
-    epsilon_decay: float = 0.95  # an epoch
+    epsilon_decay: float = 0.9  # an epoch
     epsilon_end: float = 0.05
 
     eval_episodes: int = 100
@@ -96,8 +97,13 @@ class Recipe:
 
     @property
     def total_frames(self) -> int:
-        """Environment steps of the whole run."""
+        """Environment steps of a whole run."""
         return self.epochs * self.epoch_frames
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seed of each run."""
+        return [self.seed + run for run in range(self.num_runs)]
 
     def build(self) -> Parts:
         """Makes the parts of the run, each of which may be swapped before ``.run()``."""
@@ -117,6 +123,7 @@ class Recipe:
 
 _AT_LEAST = {
     "seed": 0,
+    "num_runs": 1,
     "epochs": 1,
     "epoch_frames": 1,
     "num_envs": 1,

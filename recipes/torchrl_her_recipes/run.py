@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import logging
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -11,6 +11,9 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
 from tqdm import tqdm
 
 from torchrl_her import (
@@ -28,20 +31,20 @@ from torchrl_her import (
 )
 from torchrl_her_envs import ThrowingEnv, record_episodes, write_video
 from torchrl_her_recipes.interrupt import Interrupted, soft_interrupt
-from torchrl_her_recipes.parts import Parts, build_parts, eval_seed
+from torchrl_her_recipes.parts import Parts, build_parts, eval_seeds
 from torchrl_her_recipes.plots import plot_curves, plot_goals
 from torchrl_her_recipes.run_folder import RunFolder
 
-logger = logging.getLogger(__name__)
 _SATURATED = 0.99
+_FILMED = 6  # worlds in the GIF at the end of a run
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What came of a run.
+    """What came of a run, or of several side by side.
 
     Attributes:
-        rows: the table of metrics, one row an epoch.
+        rows: the table of metrics, one row an epoch and run.
         folder: where all of it is, or None.
         interrupted: whether somebody stopped it.
     """
@@ -52,14 +55,21 @@ class RunResult:
 
     @property
     def success(self) -> float:
-        """Success rate of the last evaluation; 0 if there was none."""
-        return self.rows[-1]["success"] if self.rows else 0.0
+        """Success rate in the last evaluation, the median of the runs; 0 if there was none."""
+        return statistics.median(last_success(self.rows)) if self.rows else 0.0
+
+
+def last_success(rows: list[dict[str, float]]) -> list[float]:
+    """Success of each run in the last evaluation."""
+    return [row["success"] for row in rows if row["epoch"] == rows[-1]["epoch"]]
 
 
 def run(parts: Parts, folder: str | Path | None = None, *, progress: bool = True) -> RunResult:
     """Trains the given parts to the end of their recipe; see :meth:`Parts.run`."""
     home = None if folder is None else RunFolder(folder)
     if home is not None:
+        if home.config.exists():
+            raise ValueError(f"{home.path} holds a run already; go on with it by --resume, or choose another folder")
         home.describe(parts.recipe)
     return _run(parts, parts.trainer(), home, progress=progress)
 
@@ -75,7 +85,7 @@ def resume(folder: str | Path, *, progress: bool = True) -> RunResult:
     parts = build_parts(home.recipe())
     trainer = parts.trainer()
     load_run_state(parts, trainer, load_checkpoint(home.checkpoint))
-    home.keep_rows(trainer.epochs)
+    home.keep_rows(trainer.epochs * parts.recipe.num_runs)
     return _run(parts, trainer, home, progress=progress)
 
 
@@ -87,8 +97,8 @@ def run_state(parts: Parts, trainer: Trainer) -> dict[str, Any]:
         "loss": dict(parts.loss.state_dict()),
         "optimiser": parts.optimiser.state_dict(),
         "exploration": dict(parts.exploration.state_dict()),
-        "buffer": buffer_state_dict(parts.buffer),
-        "generator": parts.generator.get_state(),
+        "buffers": [buffer_state_dict(buffer) for buffer in parts.buffers],
+        "generators": [generator.get_state() for generator in parts.generators],
         "worlds": parts.env.world_state_dict() if isinstance(parts.env, ThrowingEnv) else None,
         "trajectories": parts.collector.state_dict().get("traj_pool"),
     }
@@ -99,8 +109,10 @@ def load_run_state(parts: Parts, trainer: Trainer, state: dict[str, Any]) -> Non
     parts.loss.load_state_dict(state["loss"])
     parts.optimiser.load_state_dict(state["optimiser"])
     parts.exploration.load_state_dict(state["exploration"])
-    load_buffer_state_dict(parts.buffer, state["buffer"])
-    parts.generator.set_state(state["generator"])
+    for buffer, own in zip(parts.buffers, state["buffers"], strict=True):
+        load_buffer_state_dict(buffer, own)
+    for generator, own in zip(parts.generators, state["generators"], strict=True):
+        generator.set_state(own)
     if state["worlds"] is not None and isinstance(parts.env, ThrowingEnv):
         parts.env.load_world_state_dict(state["worlds"])
     parts.collector.load_state_dict({**parts.collector.state_dict(), "traj_pool": state["trajectories"]})
@@ -112,14 +124,15 @@ def _run(parts: Parts, trainer: Trainer, home: RunFolder | None, *, progress: bo
     rows = home.rows() if home is not None else []
     threads = torch.get_num_threads()
     torch.set_num_threads(recipe.threads)
-    bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit=" frames", disable=not progress)
+    bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
     interrupted = False
     try:
         with soft_interrupt() as check:
             while trainer.epochs < recipe.epochs:
-                rows.append(_epoch(parts, trainer, bar, check, rows[-1]["seconds"] if rows else 0.0))
+                new = _epoch(parts, trainer, bar, check, rows[-1]["seconds"] if rows else 0.0)
+                rows += new
                 if home is not None:
-                    home.log(rows[-1])
+                    home.log(new)
                     if trainer.epochs % recipe.checkpoint_interval == 0:
                         save_checkpoint(run_state(parts, trainer), home.checkpoint)
     except Interrupted:
@@ -134,74 +147,90 @@ def _run(parts: Parts, trainer: Trainer, home: RunFolder | None, *, progress: bo
 
 def _epoch(
     parts: Parts, trainer: Trainer, bar: tqdm, check: Callable[[], None], seconds: float
-) -> dict[str, float]:
-    """One epoch and its evaluation, as a row of the table."""
+) -> list[dict[str, float]]:
+    """One epoch and its evaluation, as rows of the table: one for each run."""
 
     def on_batch(trainer: Trainer) -> None:
+        bar.set_description_str(f"{trainer.updates} updates", refresh=False)
         bar.update(trainer.frames - bar.n)
         check()
 
     began = time.perf_counter()
     measured = trainer.epoch(on_batch)
-    row = _evaluate(parts, trainer)
-    row["seconds"] = seconds + time.perf_counter() - began
-    bar.set_postfix(updates=trainer.updates, success=f"{row['success']:.2f}")
-    return {**row, **measured}
-
-
-def _evaluate(parts: Parts, trainer: Trainer) -> dict[str, float]:
-    recipe = parts.recipe
-    parts.eval_env.set_seed(eval_seed(recipe, trainer.epochs))
-    rollout = evaluate(parts.eval_env, parts.policy, max_steps=_max_steps(parts))
-    row: dict[str, float] = {
-        "epoch": trainer.epochs,
-        "frames": trainer.frames,
-        "updates": trainer.updates,
-        "success": float(success(rollout).float().mean()),
-        "distance": float(final_distance(rollout).mean()),
-        "saturation": float((rollout["action"].abs() > _SATURATED).float().mean()),
-        "epsilon": float(parts.exploration.epsilon),
-        **_values(parts, rollout),
-    }
-    if isinstance(parts.buffer.writer, HERWriter):
-        row.update({f"rows_{name}": value for name, value in asdict(parts.buffer.writer.counts).items()})
-    return row
+    measured |= _evaluate(parts, trainer.epochs)
+    seconds += time.perf_counter() - began
+    rows = []
+    for run, seed in enumerate(parts.recipe.seeds):
+        counters = {"run": run, "seed": seed, "epoch": trainer.epochs, "frames": trainer.frames}
+        times = {"updates": trainer.updates, "seconds": seconds}
+        values = {name: float(value[run]) for name, value in measured.items()}
+        rows.append({**counters, **times, **values, **_counts(parts.buffers[run])})
+    bar.set_postfix(success=f"{statistics.median(last_success(rows)):.2f}")
+    return rows
 
 
 @torch.no_grad()
-def _values(parts: Parts, rollout: TensorDictBase) -> dict[str, float]:
-    returns = discounted_return(rollout, parts.recipe.gamma)
-    values = {"return": float(returns.mean())}
+def _evaluate(parts: Parts, epoch: int) -> dict[str, Tensor]:
+    """What greedy episodes of each run show, [R] each."""
+    recipe = parts.recipe
+    parts.eval_env.set_seeds(eval_seeds(recipe, epoch))
+    rollout = evaluate(parts.eval_env, parts.policy, max_steps=parts.eval_env.world.max_steps)
+    returns = discounted_return(rollout, recipe.gamma)
+    measured = {
+        "success": success(rollout).float(),
+        "distance": final_distance(rollout),
+        "return": returns,
+        "saturation": (rollout["action"].abs() > _SATURATED).float().mean((1, 2)),
+    }
     if parts.critic is not None:
-        start = rollout[:, 0].select("observation", "desired_goal")
-        parts.critic.eval()
-        value = parts.critic(parts.actor(start)).get(parts.critic.out_keys[0])
-        parts.critic.train()
-        values |= {"q": float(value.mean()), "q_bias": float(q_bias(value, returns).mean())}
-    return values
+        value = _initial_value(parts.actor, parts.critic, rollout[:, 0])
+        measured |= {"q": value, "q_bias": q_bias(value, returns)}
+    means = {name: value.view(recipe.num_runs, -1).mean(1) for name, value in measured.items()}
+    return means | {"epsilon": parts.exploration.epsilon}
 
 
-def _max_steps(parts: Parts) -> int:
-    return parts.eval_env.world.max_steps
+def _initial_value(actor: TensorDictModule, critic: TensorDictModule, start: TensorDictBase) -> Tensor:
+    """The critic's value [N] of first states [N]."""
+    critic.eval()
+    value = critic(actor(start.select("observation", "desired_goal"))).get(critic.out_keys[0])
+    critic.train()
+    return value.squeeze(-1)
+
+
+def _counts(buffer: TensorDictReplayBuffer) -> dict[str, float]:
+    if not isinstance(buffer.writer, HERWriter):
+        return {}
+    return {f"rows_{name}": value for name, value in asdict(buffer.writer.counts).items()}
 
 
 def _finish(parts: Parts, trainer: Trainer, rows: list[dict[str, float]], home: RunFolder) -> None:
     """Leaves behind what people want to look at."""
+    recipe = parts.recipe
     save_checkpoint(run_state(parts, trainer), home.checkpoint)
     save_checkpoint({"actor": dict(parts.actor.state_dict())}, home.policy)
     home.close()
-    title = f"{parts.recipe.task}, {parts.recipe.algo}, seed {parts.recipe.seed}"
+    title = f"{recipe.task}, {recipe.algo}, " + (
+        f"seed {recipe.seed}" if recipe.num_runs == 1 else f"{recipe.num_runs} runs"
+    )
     if rows:
         plot_curves(rows, home.curves, title=title)
-    goals = virtual_goals(parts)
+    goals = torch.cat([virtual_goals(buffer) for buffer in parts.buffers])
     if len(goals):
         plot_goals(goals, parts.env, home.goals, title=f"virtual goals: {title}")
-    write_video(record_episodes(parts.eval_env, parts.policy, worlds=range(min(6, parts.recipe.eval_episodes))), home.video)
+    first = recipe.eval_episodes * (_median_run(rows) if rows else 0)
+    worlds = range(first, first + min(_FILMED, recipe.eval_episodes))
+    write_video(record_episodes(parts.eval_env, parts.policy, worlds=worlds), home.video)
 
 
-def virtual_goals(parts: Parts) -> torch.Tensor:
-    """The goals [n, 2] of all virtual rows in the buffer."""
-    if not len(parts.buffer):
+def _median_run(rows: list[dict[str, float]]) -> int:
+    """The run in the middle of the last evaluation."""
+    values = last_success(rows)
+    return sorted(range(len(values)), key=values.__getitem__)[len(values) // 2]
+
+
+def virtual_goals(buffer: TensorDictReplayBuffer) -> Tensor:
+    """The goals [n, 2] of all virtual rows in a buffer."""
+    if not len(buffer):
         return torch.empty(0, 2)
-    rows = parts.buffer[:]
+    rows = buffer[:]
     return rows["desired_goal"][rows["virtual"].squeeze(-1)]

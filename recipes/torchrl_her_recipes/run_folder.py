@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import platform
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -30,6 +31,7 @@ class RunFolder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.path.mkdir(parents=True, exist_ok=True)
+        self.config = self.path / "config.yaml"
         self.checkpoint = self.path / "checkpoint.pt"
         self.policy = self.path / "policy.pt"
         self.metrics = self.path / "metrics.csv"
@@ -40,7 +42,7 @@ class RunFolder:
 
     def describe(self, recipe: Recipe) -> None:
         """Writes the recipe, and the versions that run it."""
-        (self.path / "config.yaml").write_text(yaml.safe_dump(asdict(recipe), sort_keys=False))
+        self.config.write_text(yaml.safe_dump(asdict(recipe), sort_keys=False))
         about = {
             "seed": recipe.seed,
             "python": platform.python_version(),
@@ -55,23 +57,23 @@ class RunFolder:
         Raises:
             ValueError: this is no folder of a run.
         """
-        config = self.path / "config.yaml"
-        if not config.is_file():
+        if not self.config.is_file():
             raise ValueError(f"{self.path} is no folder of a run: it has no config.yaml")
-        return Recipe.from_dict(yaml.safe_load(config.read_text()))
+        return Recipe.from_dict(yaml.safe_load(self.config.read_text()))
 
-    def log(self, row: dict[str, float]) -> None:
-        """Adds a row to the table and to the events. All rows have the same columns."""
+    def log(self, rows: Sequence[dict[str, float]]) -> None:
+        """Adds rows to the table and to the events. All rows have the same columns."""
         new = not self.metrics.exists()
         with open(self.metrics, "a", newline="") as file:
-            writer = csv.DictWriter(file, row.keys())
+            writer = csv.DictWriter(file, rows[0].keys())
             if new:
                 writer.writeheader()
-            writer.writerow(row)
+            writer.writerows(rows)
         if self._events is None:
-            self._events = SummaryWriter(str(self.path / "tensorboard"), purge_step=int(row["frames"]))
-        for name, value in row.items():
-            self._events.add_scalar(name, value, int(row["frames"]))
+            self._events = SummaryWriter(str(self.path / "tensorboard"), purge_step=int(rows[0]["frames"]))
+        for row in rows:
+            for name, value in row.items():
+                self._events.add_scalar(f"{name}/run_{row['run']:.0f}", value, int(row["frames"]))
 
     def rows(self) -> list[dict[str, float]]:
         """The table so far."""
@@ -84,8 +86,8 @@ class RunFolder:
         """Forgets all rows but the first ``count``: those behind a checkpoint that a run goes on from."""
         rows = self.rows()[:count]
         self.metrics.unlink(missing_ok=True)
-        for row in rows:
-            self.log(row)
+        if rows:
+            self.log(rows)
 
     def close(self) -> None:
         """Writes out what is still in memory."""

@@ -179,6 +179,7 @@ def test_a_closed_hand_over_the_ball_catches_it(
     put(env, joints=[1.0, 3.0], ball=[1.0 + offset[0], 3.0 + offset[1]])
     act(env, [0.0, 0.0, grip])
     assert env.worlds.held.item() is caught
+    assert env.worlds.free.item() is not caught
     assert env.worlds.closed.item() is (grip > 0)
     where, speed = ([1.0, 3.0], [0.0, 0.0]) if caught else ([1.0 + offset[0], 2.994 + offset[1]], [0.0, -0.4])
     close(env.worlds.ball, where)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 from torchrl_her_envs import TASKS, make_env
@@ -70,8 +70,9 @@ def test_a_collector_gets_whole_episodes() -> None:
 
 def test_transforms_go_around_it() -> None:
     torch.manual_seed(0)
-    env = TransformedEnv(make_env("robot_v1", num_envs=3), Compose(StepCounter(), RewardSum()))
+    env = TransformedEnv(make_env("robot_v1", num_envs=3), StepCounter())
     check_env_specs(env, seed=0)
+    env = env.append_transform(RewardSum())
     steps = env.rollout(60, break_when_any_done=False)
     after = steps["next"]
     assert torch.equal(after["step_count"] == 50, after["truncated"])

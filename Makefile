@@ -1,0 +1,34 @@
+# Each target makes the environment that it needs, from nothing but Python 3.11 or newer.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint bench clean
+
+demo: $(VENV)/.ready  ## train hand_v0 in a few minutes; ends with a curve and a GIF
+	$(BIN)/torchrl-her train preset=demo
+
+test: $(VENV)/.ready-test  ## all tests and doctests
+	$(BIN)/python -m pytest $(TESTS)
+
+lint: $(VENV)/.ready-test  ## style, formatting, types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(VENV)/.ready  ## speed of environments and writer, beside their peers
+	$(BIN)/python benchmarks/env_speed.py
+	$(BIN)/python benchmarks/writer_speed.py
+
+clean:
+	rm -rf $(VENV)
+
+$(VENV)/.ready: EXTRAS :=
+$(VENV)/.ready-test: EXTRAS := [test,lint,video]
+$(VENV)/.ready $(VENV)/.ready-test: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; set PYTHON=") if sys.version_info < (3, 11) else None'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet uv  # installs torch in seconds; pip is the way out where it cannot
+	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uv pip install --quiet --editable '.$(EXTRAS)' \
+		|| $(BIN)/python -m pip install --quiet --editable '.$(EXTRAS)'
+	touch $@

@@ -1,0 +1,155 @@
+"""Time to write with hindsight, beside TorchRL's plain writer for the same number of rows.
+
+    python benchmarks/writer_speed.py --out writer_speed.md
+
+A batch of 800 episodes of 50 steps is written in one call. With k = 4 virtual rows for each real one
+that makes 200,000 rows; the plain writer is given the very same 200,000 rows, ready-made.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+import torchrl
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.writers import RoundRobinWriter, Writer
+
+from torchrl_her import EnvReward, HERWriter
+from torchrl_her_envs import ThrowingEnv, make_env
+
+EPISODES, STEPS, K = 800, 50, 4
+ROWS = EPISODES * STEPS * (K + 1)
+CAPACITY = 1_000_000
+NOT_STORED = ("state", "achieved_goal", "collector")  # as in the recipes
+
+PLAIN, HER, FILTERED = "RoundRobinWriter (TorchRL)", "HERWriter", "HERWriter, filtered"
+
+
+def collect(env: ThrowingEnv) -> TensorDictBase:
+    """A collector's batch [N, T] of whole episodes, all of whose balls move.
+
+    Under random actions hardly any ball does, and the filter would drop nearly all virtual rows:
+    achieved goals are therefore replaced by random walks, whose steps are half of the threshold.
+    """
+    batch = Collector(env, frames_per_batch=EPISODES * STEPS, total_frames=-1).next()
+    walk = (torch.randn(EPISODES, STEPS + 1, 2) * (env.threshold / 2)).cumsum(1)
+    batch["achieved_goal"], batch["next", "achieved_goal"] = walk[:, :-1], walk[:, 1:]
+    last = torch.arange(STEPS) == STEPS - 1
+    ends = last.view(1, STEPS, 1).expand(EPISODES, STEPS, 1)
+    batch["next"].update({"done": ends, "truncated": ends, "terminated": torch.zeros_like(ends)})
+    batch["collector", "traj_ids"] = torch.arange(EPISODES).unsqueeze(-1).expand(EPISODES, STEPS)
+    return batch.contiguous()
+
+
+def make_buffer(writer: Writer) -> TensorDictReplayBuffer:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(CAPACITY), writer=writer, batch_size=64)
+    buffer.set_rng(torch.Generator().manual_seed(0))
+    return buffer
+
+
+def make_her(env: ThrowingEnv, *, filter_achieved: bool) -> HERWriter:
+    reward = EnvReward(env.compute_reward, env.compute_terminated)
+    return HERWriter(reward, k=K, filter_achieved=filter_achieved, exclude=NOT_STORED)
+
+
+def make_cases() -> dict[str, tuple[TensorDictReplayBuffer, TensorDictBase]]:
+    """Each writer in a buffer of its own, and the batch that it is given."""
+    env = make_env("hand_v1", num_envs=EPISODES, seed=0)
+    batch = collect(env)
+    her = make_buffer(make_her(env, filter_achieved=False))
+    her.extend(batch.copy())
+    ready_made = her[:ROWS].clone()
+    return {
+        PLAIN: (make_buffer(RoundRobinWriter()), ready_made),
+        HER: (her, batch),
+        FILTERED: (make_buffer(make_her(env, filter_achieved=True)), batch),
+    }
+
+
+def write(buffer: TensorDictReplayBuffer, batch: TensorDictBase) -> Callable[[], object]:
+    # A shallow copy: the buffer adds its index to what it is given.
+    return lambda: buffer.extend(batch.copy())
+
+
+def rows_of_one_write(buffer: TensorDictReplayBuffer, batch: TensorDictBase) -> int:
+    before = buffer.writer._write_count
+    buffer.extend(batch.copy())
+    return buffer.writer._write_count - before
+
+
+def warm(buffer: TensorDictReplayBuffer, batch: TensorDictBase) -> None:
+    """Fills the buffer, so that no timed write touches memory for the first time."""
+    while len(buffer) < CAPACITY:
+        buffer.extend(batch.copy())
+
+
+def interleaved(actions: dict[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
+    """Seconds of each action, taken in turns so that a busy machine slows all of them alike."""
+    seconds: dict[str, list[float]] = {name: [] for name in actions}
+    for _ in range(repeats):
+        for name, action in actions.items():
+            start = time.perf_counter()
+            action()
+            seconds[name].append(time.perf_counter() - start)
+    return seconds
+
+
+def machine() -> str:
+    cpu = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
+        cpu = names[0] if names else cpu
+    return (
+        f"{cpu}, 1 thread; Python {platform.python_version()}, torch {torch.__version__}, "
+        f"torchrl {torchrl.__version__}"
+    )
+
+
+def report(rows: dict[str, int], seconds: dict[str, list[float]]) -> str:
+    middle = {name: statistics.median(values) for name, values in seconds.items()}
+    lines = [
+        f"**Ratio HERWriter / plain: {middle[HER] / middle[PLAIN]:.2f}** (at most 2.00 is wanted); "
+        f"filtered / not filtered: {middle[FILTERED] / middle[HER]:.2f} (at most 1.50).",
+        "",
+        f"One batch of {EPISODES} episodes of {STEPS} steps, k = {K}; medians of "
+        f"{len(seconds[HER])} writes taken in turns. {machine()}.",
+        "",
+        "| writer | rows written | ms, median | ms, least | ms, most | million rows/s |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for name, values in seconds.items():
+        lines.append(
+            f"| {name} | {rows[name]:,} | {middle[name] * 1e3:.1f} | {min(values) * 1e3:.1f} | "
+            f"{max(values) * 1e3:.1f} | {rows[name] / middle[name] / 1e6:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--repeats", type=int, default=15, help="timed writes of each writer")
+    parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    cases = make_cases()
+    rows = {name: rows_of_one_write(*case) for name, case in cases.items()}
+    for case in cases.values():
+        warm(*case)
+    table = report(rows, interleaved({name: write(*case) for name, case in cases.items()}, options.repeats))
+    print(table)
+    if options.out is not None:
+        options.out.write_text(table + "\n")
+
+
+if __name__ == "__main__":
+    main()

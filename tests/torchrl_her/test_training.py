@@ -1,0 +1,169 @@
+"""The loop, and that it learns: a task of one dimension that is solved in seconds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.data import Binary, Bounded, Composite, LazyTensorStorage, TensorDictReplayBuffer, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_her import (
+    DecayingEpsilon,
+    GoalReward,
+    HERWriter,
+    LossLearner,
+    Trainer,
+    evaluate,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    make_target_updater,
+    success,
+)
+
+N, STEPS = 8, 10
+
+
+class LineEnv(EnvBase):
+    """A point on a line from -1 to 1 that moves by a tenth of the action; the goal is to be somewhere."""
+
+    def __init__(self, seed: int = 0) -> None:
+        super().__init__(device="cpu", batch_size=(N,))
+        self.reward = GoalReward(0.1)
+
+        def line() -> Unbounded:
+            return Unbounded(shape=(N, 1))
+
+        def flag() -> Binary:
+            return Binary(n=1, shape=(N, 1), dtype=torch.bool)
+
+        self.observation_spec = Composite(observation=line(), achieved_goal=line(), desired_goal=line(), shape=(N,))
+        self.action_spec = Bounded(-1.0, 1.0, shape=(N, 1))
+        self.reward_spec = Unbounded(shape=(N, 1))
+        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(N,))
+        self.x, self.goal, self.t = torch.zeros(N, 1), torch.zeros(N, 1), torch.zeros(N, 1)
+        self.set_seed(seed)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.rng = torch.Generator().manual_seed(seed or 0)
+
+    def _shown(self) -> dict[str, Tensor]:
+        return {"observation": self.x.clone(), "achieved_goal": self.x.clone(), "desired_goal": self.goal.clone()}
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = torch.ones(N, 1, dtype=torch.bool) if tensordict is None else tensordict.get("_reset", None)
+        mask = torch.ones(N, 1, dtype=torch.bool) if mask is None else mask.view(N, 1)
+        start = torch.rand(2, N, 1, generator=self.rng) * 2 - 1
+        self.x, self.goal = torch.where(mask, start[0], self.x), torch.where(mask, start[1], self.goal)
+        self.t = self.t.masked_fill(mask, 0)
+        return TensorDict(self._shown(), batch_size=[N])
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.x = (self.x + 0.25 * tensordict["action"]).clamp(-1, 1)
+        self.t = self.t + 1
+        reward, terminated = self.reward(self.x, self.goal)
+        truncated = self.t >= STEPS
+        flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        return TensorDict({**self._shown(), "reward": reward, **flags}, batch_size=[N])
+
+
+def make_trainer(seed: int = 0, **options: Any) -> tuple[Trainer, TensorDictSequential]:
+    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
+    actor, critic = make_actor((1, 1), 1, hidden=32), make_critic((1, 1), 1, hidden=32)
+    exploration = DecayingEpsilon(-torch.ones(1), torch.ones(1), decay=0.8, generator=generator)
+    policy = TensorDictSequential(actor, exploration)
+    loss = make_ddpg_loss(actor, critic, gamma=0.9)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(20_000), writer=HERWriter(GoalReward(0.1), filter_achieved=True)
+    )
+    buffer.set_rng(generator)
+    trainer = Trainer(
+        collector=Collector(
+            LineEnv(seed),
+            policy,
+            frames_per_batch=N * STEPS,
+            total_frames=-1,
+            auto_register_policy_transforms=False,
+        ),
+        buffer=buffer,
+        learner=LossLearner(
+            loss,
+            torch.optim.Adam(loss.parameters(), lr=1e-3),
+            make_target_updater(loss, tau=0.05, hard_interval=0),
+        ),
+        exploration=exploration,
+        **{"epoch_frames": 800, "frames_per_update": 2.0, "updates_per_draw": 8, **options},
+    )
+    return trainer, policy
+
+
+
+
+def test_it_learns_a_task_of_one_dimension() -> None:
+    trainer, policy = make_trainer()
+    before = success(evaluate(LineEnv(1), policy, max_steps=STEPS)).float().mean()
+    for _ in range(10):
+        trainer.epoch()
+    after = torch.stack([success(evaluate(LineEnv(seed), policy, max_steps=STEPS)).float().mean() for seed in range(10)])
+    assert before < 0.7
+    assert after.mean() > 0.95
+
+
+def test_frames_updates_and_epsilon_by_hand() -> None:
+    trainer, _ = make_trainer(epoch_frames=160, frames_per_update=10.0)
+    measured = trainer.epoch()
+    assert (trainer.frames, trainer.updates, trainer.epochs) == (160, 16, 1)
+    assert set(measured) == {"loss_actor", "loss_value"}
+    assert trainer.exploration is not None
+    assert float(trainer.exploration.epsilon) == pytest.approx(0.8)
+
+
+def test_frames_that_do_not_divide_are_not_lost() -> None:
+    trainer, _ = make_trainer(epoch_frames=200, frames_per_update=30.0)
+    for _ in range(4):
+        trainer.epoch()
+    assert trainer.frames == 800
+    assert trainer.updates == 800 // 30
+
+
+def test_progress_is_told_after_each_batch() -> None:
+    trainer, _ = make_trainer(epoch_frames=240)
+    seen: list[int] = []
+    trainer.epoch(lambda own: seen.append(own.frames))
+    assert seen == [80, 160, 240]
+
+
+def test_seeds_make_training_repeat_bit_for_bit() -> None:
+    weights = []
+    for seed in (0, 0, 1):
+        trainer, policy = make_trainer(seed)
+        trainer.epoch()
+        weights.append(torch.cat([p.detach().flatten() for p in policy.parameters()]))
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+
+
+@pytest.mark.parametrize("key", ["action", "observation"])
+def test_nan_is_noticed_and_named(key: str) -> None:
+    trainer, _ = make_trainer()
+    batch = trainer.collector.next()
+    batch[key][0, 0] = float("nan")
+    trainer.collector.next = lambda: batch  # type: ignore[method-assign]
+    with pytest.raises(ValueError, match=f"{key}.*must be finite"):
+        trainer.epoch()
+
+
+def test_evaluation_is_greedy_and_leaves_training_alone() -> None:
+    trainer, policy = make_trainer()
+    state = trainer.exploration.generator.get_state()  # type: ignore[union-attr]
+    rollout = evaluate(LineEnv(1), policy, max_steps=STEPS)
+    assert rollout.shape == (N, STEPS)
+    assert torch.equal(policy[0](rollout.select("observation", "desired_goal"))["action"], rollout["action"])
+    assert torch.equal(trainer.exploration.generator.get_state(), state)  # type: ignore[union-attr]
