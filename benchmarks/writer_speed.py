@@ -103,15 +103,12 @@ def interleaved(actions: dict[str, Callable[[], object]], repeats: int) -> dict[
 
 
 def machine() -> str:
-    cpu = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
-        cpu = names[0] if names else cpu
-    return (
-        f"{cpu}, 1 thread; Python {platform.python_version()}, torch {torch.__version__}, "
-        f"torchrl {torchrl.__version__}"
-    )
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    cpu = names[0] if names else platform.processor() or platform.machine()
+    versions = f"Python {platform.python_version()}, torch {torch.__version__}, torchrl {torchrl.__version__}"
+    return f"{cpu}, 1 thread; {versions}"
 
 
 def report(rows: dict[str, int], seconds: dict[str, list[float]]) -> str:

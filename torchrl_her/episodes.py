@@ -53,7 +53,9 @@ def find_episodes(lanes: Tensor, done: Tensor, trajectory: Tensor | None = None)
         >>> episodes.rows.tolist(), left.tolist()
         ([[0, 2]], [1, 3, 4])
     """
-    order = lanes.argsort(stable=True)
+    order = torch.arange(len(lanes), device=lanes.device)
+    if bool((lanes[1:] < lanes[:-1]).any()):  # a batch [N, T] comes in order, and sorting takes long
+        order = lanes.argsort(stable=True)
     lane, end = lanes[order], done[order].clone()
     same_lane = lane[1:] == lane[:-1]
     if trajectory is not None:

@@ -14,6 +14,9 @@ from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import TD0Estimator
 
 
+_WEIGHT = "priority_weight"  # of importance sampling, as TorchRL's samplers and losses call it
+
+
 class ClampedTD0(TD0Estimator):
     """One-step targets, kept within the values that are possible.
 
@@ -155,6 +158,12 @@ class LossLearner:
         self._networks = self._find_networks()
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """One gradient step of each run; see :class:`Learner`."""
+        weight = batch.get(_WEIGHT, None)
+        if weight is not None:
+            # TorchRL divides by the sum of the weights if it averages, but not if it keeps rows apart.
+            by_run = weight.reshape(self.runs, -1)
+            batch.set(_WEIGHT, (by_run / by_run.mean(1, keepdim=True)).view_as(weight))
         output = self.loss(batch)
         losses = {
             key: value.reshape(self.runs, -1).mean(1) for key, value in output.items() if key.startswith("loss_")

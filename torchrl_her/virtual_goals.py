@@ -19,7 +19,8 @@ Strategy = Literal["future", "final", "episode"]
 def check_strategy(strategy: str) -> None:
     """Raises a ValueError that lists the strategies if there is no such one."""
     if strategy not in get_args(Strategy):
-        raise ValueError(f"unknown goal strategy {strategy!r}; the strategies are {', '.join(get_args(Strategy))}")
+        known = ", ".join(get_args(Strategy))
+        raise ValueError(f"unknown goal strategy {strategy!r}; the strategies are {known}")
 
 
 def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
@@ -47,12 +48,11 @@ def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
     check_strategy(strategy)
     time = torch.arange(horizon, device=lengths.device)
     inside = time < lengths.unsqueeze(-1)
-    real = inside.unsqueeze(-1) & inside.unsqueeze(-2)
     if strategy == "future":
-        return real & (time >= time.unsqueeze(-1))
+        return inside.unsqueeze(-2) & (time >= time.unsqueeze(-1))  # where t' is inside, so is t <= t'
     if strategy == "final":
-        return real & (time == lengths.unsqueeze(-1) - 1).unsqueeze(-2)
-    return real
+        return inside.unsqueeze(-1) & (time == lengths.unsqueeze(-1) - 1).unsqueeze(-2)
+    return inside.unsqueeze(-1) & inside.unsqueeze(-2)
 
 
 def combine(candidate: Tensor, weight: Tensor | None = None, keep: Tensor | None = None) -> Tensor:

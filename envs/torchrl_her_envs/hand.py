@@ -17,7 +17,8 @@ class Hand:
 
     Example:
         >>> hand = Hand(WorldConfig(), wall=False)
-        >>> hand.move(torch.tensor([1.0, 1.0]), torch.tensor([9.0, 0.5])).tolist()  # stays in its half
+        >>> at, change = torch.tensor([[1.0, 1.0], [9.0, 0.5]], dtype=torch.float64)
+        >>> hand.move(at, change).tolist()  # stays in its half
         [2.82, 1.5]
     """
 

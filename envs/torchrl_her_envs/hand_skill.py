@@ -11,7 +11,7 @@ from torchrl_her_envs.effector import Effector
 from torchrl_her_envs.hand import Hand
 from torchrl_her_envs.task import WorldConfig
 
-_PLACES = (6, 10)  # columns and rows of places to throw from: about half a metre apart
+_PLACES = (11, 10)  # columns and rows of places to throw from; columns count for goals close behind the wall
 
 
 class HandSkill:

@@ -20,9 +20,9 @@ def chain(angles: Tensor, base: Tensor, length: float) -> Tensor:
 
     Example:
         >>> import math
-        >>> angles = torch.tensor([math.pi / 2, -math.pi / 2])  # up, then right
+        >>> angles = torch.tensor([0.0, math.pi / 2])  # right, then up
         >>> chain(angles, torch.zeros(2), 2.0).round(decimals=4).tolist()
-        [[0.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
+        [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]
     """
     heading = angles.cumsum(-1)
     links = torch.stack((heading.cos(), heading.sin()), -1) * (length / angles.shape[-1])

@@ -145,8 +145,10 @@ class ThrowingEnv(EnvBase):
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """Whether the goal is achieved, which ends an episode: [..., 1] of bool."""
-        gap = achieved_goal - desired_goal
-        return gap.square().sum(-1, keepdim=True) < self.threshold**2
+        # One coordinate after the other: torch takes several times as long to sum over two numbers.
+        (x, y), (desired_x, desired_y) = achieved_goal.unbind(-1), desired_goal.unbind(-1)
+        near = (x - desired_x).square() + (y - desired_y).square() < self.threshold**2
+        return near.unsqueeze(-1)
 
     def render(self, worlds: int | Sequence[int] | None = 0, *, size: int = 300) -> Tensor:
         """Draws worlds as they are now; see :func:`~torchrl_her_envs.render` for more options.

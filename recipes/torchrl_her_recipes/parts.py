@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -123,15 +124,8 @@ class Parts:
 
 def build_parts(recipe: Recipe) -> Parts:
     """Makes the parts that a recipe asks for."""
-    env = make_env(
-        recipe.task, num_envs=recipe.num_runs * recipe.num_envs, seed=recipe.seeds, threshold=recipe.threshold
-    )
-    eval_env = make_env(
-        recipe.task,
-        num_envs=recipe.num_runs * recipe.eval_episodes,
-        seed=eval_seeds(recipe, 0),
-        threshold=recipe.threshold,
-    )
+    env = make_envs(recipe, recipe.num_envs, recipe.seeds)
+    eval_env = make_envs(recipe, recipe.eval_episodes, eval_seeds(recipe, 0))
     generators = [torch.Generator().manual_seed(seed) for seed in recipe.seeds]
     actor, critic = make_networks(recipe, env)
     exploration = DecayingEpsilon(
@@ -160,6 +154,17 @@ def build_parts(recipe: Recipe) -> Parts:
         optimiser=torch.optim.Adam(loss.parameters(), lr=recipe.learning_rate, fused=True),
         target=make_target_updater(loss, tau=recipe.tau, hard_interval=recipe.hard_update_interval),
         generators=generators,
+    )
+
+
+def make_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int]) -> ThrowingEnv:
+    """Worlds of the recipe's task: ``num_envs`` for each seed."""
+    return make_env(
+        recipe.task,
+        num_envs=num_envs * len(seeds),
+        seed=seeds,
+        threshold=recipe.threshold,
+        dtype=getattr(torch, recipe.dtype),
     )
 
 
@@ -196,11 +201,12 @@ def make_buffer(recipe: Recipe, env: ThrowingEnv, generator: torch.Generator) ->
 def make_networks(recipe: Recipe, env: ThrowingEnv) -> tuple[TensorDictModule, TensorDictModule]:
     """The actor and the critic; the weights of each run depend on its own seed alone."""
     widths = [env.observation_spec[key].shape[-1] for key in ("observation", "desired_goal")]
-    actions = env.action_spec.shape[-1]
+    actions, dtype = env.action_spec.shape[-1], getattr(torch, recipe.dtype)
 
     def make(runs: int) -> tuple[TensorDictModule, TensorDictModule]:
         actor = make_actor(widths, actions, hidden=recipe.hidden, runs=runs)
-        return actor, make_critic(widths, actions, hidden=recipe.hidden, normalise=recipe.batch_norm, runs=runs)
+        critic = make_critic(widths, actions, hidden=recipe.hidden, normalise=recipe.batch_norm, runs=runs)
+        return actor.to(dtype), critic.to(dtype)
 
     with torch.random.fork_rng(devices=[]):
         alone = []
@@ -222,4 +228,9 @@ def _make_sampler(recipe: Recipe) -> Sampler:
     if recipe.sampler == "uniform":
         return RandomSampler()
     # TorchRL's losses give the square of the TD error, so half of alpha is Schaul's alpha.
-    return PrioritizedSampler(recipe.buffer_size, alpha=recipe.priority_alpha / 2, beta=recipe.priority_beta)
+    return PrioritizedSampler(
+        recipe.buffer_size,
+        alpha=recipe.priority_alpha / 2,
+        beta=recipe.priority_beta,
+        dtype=getattr(torch, recipe.dtype),
+    )

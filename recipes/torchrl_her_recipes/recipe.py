@@ -13,7 +13,7 @@ from torchrl_her_recipes.algorithms import get_algorithm
 if TYPE_CHECKING:
     from torchrl_her_recipes.parts import Parts
 
-SAMPLERS = ("prioritised", "uniform")
+_WORDS = {"sampler": ("prioritised", "uniform"), "dtype": ("float32", "float64")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,13 +70,15 @@ class Recipe:
     eval_episodes: int = 100
     checkpoint_interval: int = 10  # epochs
     threads: int = 1  # of torch: small networks are fastest with one
+    dtype: str = "float32"  # of observations and networks
 
     def __post_init__(self) -> None:
         get_task(self.task)
         get_algorithm(self.algo)
         check_strategy(self.strategy)
-        if self.sampler not in SAMPLERS:
-            raise ValueError(f"unknown sampler {self.sampler!r}; the samplers are {', '.join(SAMPLERS)}")
+        for name, words in _WORDS.items():
+            if getattr(self, name) not in words:
+                raise ValueError(f"{name} must be one of {', '.join(words)}, got {getattr(self, name)!r}")
         for name, least in _AT_LEAST.items():
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
@@ -91,6 +93,10 @@ class Recipe:
             raise ValueError(
                 f"batch_size={self.batch_size} times updates_per_draw={self.updates_per_draw} must fit "
                 f"buffer_size={self.buffer_size}"
+            )
+        if self.epsilon_end > self.epsilon_start:
+            raise ValueError(
+                f"epsilon_end={self.epsilon_end} must not be above epsilon_start={self.epsilon_start}"
             )
         if self.gamma >= 1.0:
             raise ValueError(f"gamma must be below 1, got {self.gamma}")

@@ -109,7 +109,7 @@ def test_closes_at_the_ball(height: float, action: list[float]) -> None:
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_lets_a_ball_fly_that_will_hit(closed: bool) -> None:
-    # In 10 steps, 40 substeps of 0.01 s, it flies 2 m and falls by 5 * 0.01^2 * 40 * 39 = 0.78 m, to 0.1 m above.
+    # In 10 steps, 40 substeps of 0.01 s, it flies 2 m and falls by 5 * 0.01^2 * 40 * 39 = 0.78 m.
     point = [2.0, 3.78]
     state = hand_state(grip=point, ball=point, velocity=[5.0, 0.0], closed=closed, goal=[4.0, 2.9])
     action = make_controller(make_env("hand_v1"))(state)["action"]

@@ -1,0 +1,172 @@
+"""A run leaves behind what it promises, and goes on from its checkpoint as if it had never stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+import yaml
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from torchrl_her import load_checkpoint
+from torchrl_her_recipes import Parts, Recipe, load_actor, play, resume
+
+from .small import small
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    small(seed=3).build().run(folder, progress=False)
+    return folder
+
+
+def test_configuration_versions_and_seed(finished: Path) -> None:
+    assert Recipe.from_dict(yaml.safe_load((finished / "config.yaml").read_text())) == small(seed=3)
+    about = json.loads((finished / "run.json").read_text())
+    assert about["seed"] == 3
+    assert about["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
+
+
+def test_pandas_reads_the_metrics_at_once(finished: Path) -> None:
+    table = pd.read_csv(finished / "metrics.csv")
+    assert table["frames"].tolist() == [1_600, 3_200]
+    assert table["updates"].tolist() == [80, 160]
+    assert table["epsilon"].tolist() == pytest.approx([0.9, 0.81])
+    assert {"success", "distance", "return", "q", "q_bias", "loss_actor", "loss_value"} <= set(table.columns)
+    assert (table["rows_virtual"] == 4 * table["rows_real"]).any() or (table["rows_virtual"] > 0).all()
+
+
+def test_tensorboard_reads_the_events(finished: Path) -> None:
+    events = EventAccumulator(str(finished / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("success/run_0")] == [1_600, 3_200]
+
+
+def test_pictures_open(finished: Path) -> None:
+    for name in ("curves.png", "virtual_goals.png", "policy.gif"):
+        with Image.open(finished / name) as picture:
+            assert min(picture.size) > 100, name
+            assert picture.convert("L").getextrema()[0] < picture.convert("L").getextrema()[1], name
+
+
+def test_play_shows_the_policy_that_the_run_ended_with(finished: Path, tmp_path: Path) -> None:
+    achieved = play(finished, tmp_path / "play.gif", goals=2, size=64)
+    assert 0 <= achieved <= 2
+    with Image.open(tmp_path / "play.gif") as film:
+        assert film.n_frames > 10
+    state = load_checkpoint(finished / "policy.pt")["actor"]
+    for name, value in load_actor(finished).state_dict().items():
+        assert torch.equal(value, state[name])
+
+
+def test_a_folder_that_holds_a_run_is_not_written_over(finished: Path) -> None:
+    with pytest.raises(ValueError, match="holds a run already"):
+        small().build().run(finished, progress=False)
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="is no folder of a run"):
+        resume(tmp_path)
+    with pytest.raises(ValueError, match="there is no run 4 in"):
+        folder = tmp_path / "run"
+        small(epochs=1).build().run(folder, progress=False)
+        load_actor(folder, run=4)
+
+
+# Going on
+
+
+def everything(parts: Parts) -> dict[str, Any]:
+    """Weights, targets and optimiser, as one flat dict."""
+    state = dict(parts.loss.state_dict())
+    for index, own in parts.optimiser.state_dict()["state"].items():
+        state |= {f"optimiser {index} {name}": value for name, value in own.items()}
+    return {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
+
+
+def interrupted_after(parts: Parts, folder: Path, batches: int, signal_number: int = signal.SIGINT) -> None:
+    """Runs, and presses Ctrl-C after a number of batches."""
+    collect, count = parts.collector.next, iter(range(10**6))
+
+    def next_batch() -> Any:
+        if next(count) == batches:
+            os.kill(os.getpid(), signal_number)
+        return collect()
+
+    parts.collector.next = next_batch  # type: ignore[method-assign]
+    assert parts.run(folder, progress=False).interrupted
+
+
+@pytest.mark.parametrize("options", [{"task": "hand_wall_v2"}, {"task": "robot_v2", "num_runs": 2}, {"sampler": "uniform"}])
+def test_a_run_resumed_between_epochs_ends_bit_for_bit_as_one_that_was_not_stopped(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    recipe = small(epochs=4, checkpoint_interval=2, **options)
+    whole = recipe.build()
+    whole.run(tmp_path / "whole", progress=False)
+
+    part = replace(recipe, epochs=2).build()
+    part.run(tmp_path / "part", progress=False)
+    (tmp_path / "part" / "config.yaml").write_text((tmp_path / "whole" / "config.yaml").read_text())
+    result = resume(tmp_path / "part", progress=False)
+
+    first = load_checkpoint(tmp_path / "whole" / "checkpoint.pt")
+    second = load_checkpoint(tmp_path / "part" / "checkpoint.pt")
+    assert_same(first, second, skip=("trajectories",))
+    assert len(result.rows) == 4 * recipe.num_runs
+    columns = ["frames", "updates", "success", "distance", "q", "loss_value", "rows_virtual"]
+    tables = [pd.read_csv(tmp_path / name / "metrics.csv")[columns] for name in ("whole", "part")]
+    pd.testing.assert_frame_equal(*tables)
+
+
+def assert_same(first: Any, second: Any, *, skip: tuple[str, ...] = (), path: str = "") -> None:
+    """Nested plain data and tensors, bit for bit."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys(), path
+        for key in first.keys() - set(skip):
+            assert_same(first[key], second[key], path=f"{path}/{key}")
+    elif isinstance(first, list | tuple):
+        for index, pair in enumerate(zip(first, second, strict=True)):
+            assert_same(*pair, path=f"{path}/{index}")
+    elif isinstance(first, torch.Tensor):
+        assert torch.equal(first, second), path
+    else:
+        assert first == second, path
+
+
+def test_ctrl_c_saves_what_there_is_and_the_run_can_go_on(tmp_path: Path) -> None:
+    recipe = small(epochs=3)
+    interrupted_after(recipe.build(), tmp_path / "run", 50)  # in the middle of the second epoch
+    saved = load_checkpoint(tmp_path / "run" / "checkpoint.pt")
+    assert saved["trainer"]["frames"] == 51 * 40
+    assert (tmp_path / "run" / "curves.png").exists()
+    result = resume(tmp_path / "run", progress=False)
+    assert [row["frames"] for row in result.rows] == [1_600, 3_200, 4_800]
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
+    small(epochs=1).build().run(tmp_path / "run", progress=False)
+    path = tmp_path / "run" / "checkpoint.pt"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match="checksum"):
+        resume(tmp_path / "run", progress=False)
+
+
+def test_the_same_seed_gives_the_same_run() -> None:
+    runs = [small(epochs=1, seed=seed).build() for seed in (1, 1, 2)]
+    for parts in runs:
+        parts.run(progress=False)
+    first, second, other = (everything(parts) for parts in runs)
+    assert_same(first, second)
+    assert not all(torch.equal(first[name], other[name]) for name in first)
