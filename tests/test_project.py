@@ -51,7 +51,9 @@ def test_only_one_file_knows_pymunk() -> None:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_what_a_package_exports_is_there_and_sorted(package: str) -> None:
     module = __import__(package)
-    assert module.__all__ == sorted(module.__all__, key=lambda name: (not name.isupper(), name[0].islower(), name))
+    assert module.__all__ == sorted(
+        module.__all__, key=lambda name: (not name.isupper(), name[0].islower(), name)
+    )
     for name in module.__all__:
         assert getattr(module, name) is not None
 
@@ -70,7 +72,8 @@ def test_the_wheel_installs_three_packages_and_no_module_called_envs_or_recipes(
     assert "torchrl_her_recipes/conf/train.yaml" in names
     check = (
         "import importlib.util, torchrl_her, torchrl_her_envs, torchrl_her_recipes\n"
-        f"assert all(m.__file__.startswith({str(tmp_path)!r}) for m in (torchrl_her, torchrl_her_envs, torchrl_her_recipes))\n"
+        "packages = torchrl_her, torchrl_her_envs, torchrl_her_recipes\n"
+        f"assert all(package.__file__.startswith({str(tmp_path)!r}) for package in packages)\n"
         "assert importlib.util.find_spec('envs') is None\n"
         "assert importlib.util.find_spec('recipes') is None\n"
     )

@@ -9,6 +9,7 @@ from torchrl_her.checkpoint import (
 )
 from torchrl_her.episodes import Episodes, find_episodes
 from torchrl_her.exploration import DecayingEpsilon, explore
+from torchrl_her.fused import FusedDDPGLearner, can_fuse
 from torchrl_her.goals import EnvReward, GoalReward, RewardFunction, achieved, distance
 from torchrl_her.losses import (
     ClampedTD0,
@@ -33,6 +34,7 @@ __all__ = [
     "DecayingEpsilon",
     "EnvReward",
     "Episodes",
+    "FusedDDPGLearner",
     "GoalReward",
     "GoalWeights",
     "HERWriter",
@@ -45,6 +47,7 @@ __all__ = [
     "WriterCounts",
     "achieved",
     "buffer_state_dict",
+    "can_fuse",
     "candidates",
     "clip_by_run",
     "combine",

@@ -82,7 +82,9 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
         state["sampler"] = {
             "sum": torch.as_tensor(sampler["_sum_tree"][filled]) if n else None,
             "min": torch.as_tensor(sampler["_min_tree"][filled]) if n else None,
-            "max_priority": [None if value is None else torch.as_tensor(value) for value in sampler["_max_priority"]],
+            "max_priority": [
+                None if value is None else torch.as_tensor(value) for value in sampler["_max_priority"]
+            ],
         }
     return state
 

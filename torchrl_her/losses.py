@@ -13,7 +13,6 @@ from torchrl.objectives import DDPGLoss, HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import TD0Estimator
 
-
 _WEIGHT = "priority_weight"  # of importance sampling, as TorchRL's samplers and losses call it
 
 
@@ -141,7 +140,7 @@ class LossLearner:
     Example:
         >>> from torchrl_her import make_actor, make_critic
         >>> loss = make_ddpg_loss(make_actor((9, 2), 3), make_critic((9, 2), 3))
-        >>> learner = LossLearner(loss, torch.optim.Adam(loss.parameters(), lr=1e-3), SoftUpdate(loss, tau=0.01))
+        >>> learner = LossLearner(loss, torch.optim.Adam(loss.parameters()), SoftUpdate(loss, tau=0.01))
     """
 
     def __init__(
@@ -166,7 +165,9 @@ class LossLearner:
             batch.set(_WEIGHT, (by_run / by_run.mean(1, keepdim=True)).view_as(weight))
         output = self.loss(batch)
         losses = {
-            key: value.reshape(self.runs, -1).mean(1) for key, value in output.items() if key.startswith("loss_")
+            key: value.reshape(self.runs, -1).mean(1)
+            for key, value in output.items()
+            if key.startswith("loss_")
         }
         self.optimiser.zero_grad(set_to_none=True)
         torch.stack(list(losses.values())).sum().backward()

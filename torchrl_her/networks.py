@@ -151,7 +151,9 @@ def stack_runs(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
         <All keys matched successfully>
     """
     first = states[0]
-    return {key: torch.cat([state[key] for state in states]) if first[key].ndim else first[key] for key in first}
+    return {
+        key: torch.cat([state[key] for state in states]) if first[key].ndim else first[key] for key in first
+    }
 
 
 def take_run(state: Mapping[str, Tensor], run: int, runs: int) -> dict[str, Tensor]:
@@ -181,7 +183,8 @@ def make_actor(
     Example:
         >>> from tensordict import TensorDict
         >>> actor = make_actor((9, 2), 3)
-        >>> actor(TensorDict({"observation": torch.zeros(4, 9), "desired_goal": torch.zeros(4, 2)}, [4]))["action"].shape
+        >>> seen = {"observation": torch.zeros(4, 9), "desired_goal": torch.zeros(4, 2)}
+        >>> actor(TensorDict(seen, [4]))["action"].shape
         torch.Size([4, 3])
     """
     net = ActorNet(sum(widths), actions, hidden=hidden, runs=runs)

@@ -66,7 +66,12 @@ class Trainer:
         batch_size: int = 64,
         updates_per_draw: int = 1,
     ) -> None:
-        self.collector, self.buffers, self.learner, self.exploration = collector, buffers, learner, exploration
+        self.collector, self.buffers, self.learner, self.exploration = (
+            collector,
+            buffers,
+            learner,
+            exploration,
+        )
         self.epoch_frames, self.frames_per_update = epoch_frames, frames_per_update
         self.batch_size, self.updates_per_draw = batch_size, updates_per_draw
         self.frames = self.updates = self.epochs = 0
@@ -139,7 +144,9 @@ class Trainer:
 
 
 @torch.no_grad()
-def evaluate(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], *, max_steps: int) -> TensorDictBase:
+def evaluate(
+    env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], *, max_steps: int
+) -> TensorDictBase:
     """Plays greedy episodes, one in each environment of a batch.
 
     Args:

@@ -31,7 +31,9 @@ class Effector(Protocol):
         """Position [..., 2] of what grips."""
         ...
 
-    def observe(self, joints: Tensor, speed: Tensor, grip: Tensor, grip_speed: Tensor, closed: Tensor) -> Tensor:
+    def observe(
+        self, joints: Tensor, speed: Tensor, grip: Tensor, grip_speed: Tensor, closed: Tensor
+    ) -> Tensor:
         """The entries [..., observation_size] that the agent sees of it, from scaled quantities."""
         ...
 

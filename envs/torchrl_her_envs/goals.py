@@ -104,4 +104,6 @@ class SectorGoals(_Sampled):
 
     def scaled(self, factor: float, shift: float) -> SectorGoals:
         x, y = (self.centre * factor + shift).tolist()
-        return SectorGoals((x, y), angle=self.angle, radius=(self.radius[0] * factor, self.radius[1] * factor))
+        return SectorGoals(
+            (x, y), angle=self.angle, radius=(self.radius[0] * factor, self.radius[1] * factor)
+        )

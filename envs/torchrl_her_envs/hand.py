@@ -42,7 +42,9 @@ class Hand:
     def grip(self, joints: Tensor) -> Tensor:
         return joints
 
-    def observe(self, joints: Tensor, speed: Tensor, grip: Tensor, grip_speed: Tensor, closed: Tensor) -> Tensor:
+    def observe(
+        self, joints: Tensor, speed: Tensor, grip: Tensor, grip_speed: Tensor, closed: Tensor
+    ) -> Tensor:
         return torch.cat((grip, grip_speed, closed), -1)
 
     def skeleton(self, joints: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ _FIELDS = pymunk.batch.BodyFields.POSITION | pymunk.batch.BodyFields.VELOCITY
 _BORDER = 0.5  # metres: half the thickness of the screen's sides, which lie outside of it
 _CELL = 4.0  # metres, of the spatial hash: measured best from 1 to 1024 worlds
 _SLOP = 1e-3  # metres that a ball may sink into a surface; Chipmunk's default, 0.1, is meant for pixels
-_SKIN = _SLOP / 2  # surfaces stand out by this, so that a ball put against one touches it whatever the rounding
+_SKIN = _SLOP / 2  # surfaces stand out by this: a ball put against one touches it, whatever the rounding
 _ITERATIONS = 4  # of the solver: a ball touches at most a side and a corner at once
 
 
@@ -46,7 +46,9 @@ class BallPhysics:
         self._substep = world.time_step / world.substeps
         self._substeps = world.substeps
         pitch = world.size + 4 * _BORDER
-        columns = math.ceil(math.sqrt(num_worlds))  # a square of worlds keeps the offsets, and their rounding, small
+        columns = math.ceil(
+            math.sqrt(num_worlds)
+        )  # a square of worlds keeps the offsets, and their rounding, small
         index = np.arange(num_worlds)
         self._offset = np.stack((index % columns, index // columns), -1) * pitch
         self._space = self._build(num_worlds, world, wall)

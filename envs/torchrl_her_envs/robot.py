@@ -49,7 +49,9 @@ class Arm:
     def grip(self, joints: Tensor) -> Tensor:
         return self.skeleton(joints)[..., -1, :]
 
-    def observe(self, joints: Tensor, speed: Tensor, grip: Tensor, grip_speed: Tensor, closed: Tensor) -> Tensor:
+    def observe(
+        self, joints: Tensor, speed: Tensor, grip: Tensor, grip_speed: Tensor, closed: Tensor
+    ) -> Tensor:
         return torch.cat((joints.cos(), joints.sin(), grip, speed, grip_speed, closed), -1)
 
     def skeleton(self, joints: Tensor) -> Tensor:

@@ -84,16 +84,38 @@ class Task:
 TASKS: dict[str, Task] = {
     task.name: task
     for task in (
-        Task(name="hand_reach", effector="hand", throws=False, summary="bring the hand to a ball on the floor"),
+        Task(
+            name="hand_reach", effector="hand", throws=False, summary="bring the hand to a ball on the floor"
+        ),
         Task(name="hand_v0", effector="hand", start="held", summary="throw a held ball into the black hole"),
         Task(name="hand_v1", effector="hand", summary="pick the ball up from the floor and throw it"),
         Task(name="hand_v2", effector="hand", start="mixed", summary="as v0 or v1, at even odds"),
         Task(
-            name="hand_wall_v0", effector="hand", start="held", wall=True, summary="throw a held ball over a wall"
+            name="hand_wall_v0",
+            effector="hand",
+            start="held",
+            wall=True,
+            summary="throw a held ball over a wall",
         ),
-        Task(name="hand_wall_v1", effector="hand", wall=True, summary="pick the ball up and throw it over a wall"),
-        Task(name="hand_wall_v2", effector="hand", start="mixed", wall=True, summary="as v0 or v1, at even odds"),
-        Task(name="robot_reach", effector="arm", throws=False, summary="bring the arm's end to a ball in the air"),
+        Task(
+            name="hand_wall_v1",
+            effector="hand",
+            wall=True,
+            summary="pick the ball up and throw it over a wall",
+        ),
+        Task(
+            name="hand_wall_v2",
+            effector="hand",
+            start="mixed",
+            wall=True,
+            summary="as v0 or v1, at even odds",
+        ),
+        Task(
+            name="robot_reach",
+            effector="arm",
+            throws=False,
+            summary="bring the arm's end to a ball in the air",
+        ),
         Task(name="robot_v0", effector="arm", start="held", summary="throw a held ball into the black hole"),
         Task(name="robot_v1", effector="arm", summary="catch the ball in the air and throw it"),
         Task(name="robot_v2", effector="arm", start="mixed", summary="as v0 or v1, at even odds"),

@@ -112,7 +112,9 @@ class ThrowingEnv(EnvBase):
         self.world = world or WorldConfig()
         self.dtype_shown = dtype
         self.effector: Effector = (
-            Hand(self.world, wall=task.wall) if task.effector == "hand" else Arm(self.world, num_links=num_links)
+            Hand(self.world, wall=task.wall)
+            if task.effector == "hand"
+            else Arm(self.world, num_links=num_links)
         )
         own = self.world.hole_radius if task.throws else self.world.ball_radius
         self.threshold = self.world.shown(own) if threshold is None else threshold
@@ -336,7 +338,11 @@ class ThrowingEnv(EnvBase):
             return Binary(n=1, shape=(n, 1), dtype=torch.bool)
 
         self.observation_spec = Composite(
-            state=seen(size + 2), observation=seen(size), achieved_goal=seen(2), desired_goal=seen(2), shape=(n,)
+            state=seen(size + 2),
+            observation=seen(size),
+            achieved_goal=seen(2),
+            desired_goal=seen(2),
+            shape=(n,),
         )
         width = self.effector.num_joints + 1
         self.action_spec = Bounded(low=-1.0, high=1.0, shape=(n, width), dtype=self.dtype_shown)

@@ -37,7 +37,13 @@ commands:
   list                     tasks, algorithms and presets
 """
 _CONF = Path(__file__).parent / "conf"
-_HINTS = ("full_key", "object_type", "reference_type", "To append", "Set the environment")  # Hydra's, for its users
+_HINTS = (
+    "full_key",
+    "object_type",
+    "reference_type",
+    "To append",
+    "Set the environment",
+)  # Hydra's, for its users
 _BAD = (HydraException, OmegaConfBaseException, OSError, ValueError, ImportError)
 
 
@@ -158,7 +164,9 @@ def _play(arguments: list[str]) -> int:
     parser.add_argument("--size", type=int, default=240, help="pixels of one world (default: 240)")
     options = parser.parse_args(arguments)
     out = options.out or options.run / "play.gif"
-    achieved = play(options.run, out, run=options.index, goals=options.goals, seed=options.seed, size=options.size)
+    achieved = play(
+        options.run, out, run=options.index, goals=options.goals, seed=options.seed, size=options.size
+    )
     print(f"{achieved} of {options.goals} goals achieved: {out}")
     return 0
 

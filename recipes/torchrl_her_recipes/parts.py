@@ -19,9 +19,12 @@ from torchrl.objectives.utils import TargetNetUpdater
 from torchrl_her import (
     DecayingEpsilon,
     EnvReward,
+    FusedDDPGLearner,
     HERWriter,
+    Learner,
     LossLearner,
     Trainer,
+    can_fuse,
     make_actor,
     make_critic,
     make_ddpg_loss,
@@ -90,19 +93,22 @@ class Parts:
             raise ValueError(f"there are {len(self.buffers)} runs: set `buffers`, one for each")
         self.buffers = [buffer]
 
+    def learner(self) -> Learner:
+        """Gradient steps on the loss: fused where that is possible, through the loss module elsewhere."""
+        norm = self.recipe.max_grad_norm
+        if can_fuse(self.loss, self.target):
+            return FusedDDPGLearner(self.loss, self.optimiser, self.target, max_grad_norm=norm)
+        return LossLearner(
+            self.loss, self.optimiser, self.target, max_grad_norm=norm, runs=self.recipe.num_runs
+        )
+
     def trainer(self) -> Trainer:
         """The training loop over these parts."""
         recipe = self.recipe
         return Trainer(
             collector=self.collector,
             buffers=self.buffers,
-            learner=LossLearner(
-                self.loss,
-                self.optimiser,
-                self.target,
-                max_grad_norm=recipe.max_grad_norm,
-                runs=recipe.num_runs,
-            ),
+            learner=self.learner(),
             exploration=self.exploration,
             epoch_frames=recipe.epoch_frames,
             frames_per_update=recipe.frames_per_update,

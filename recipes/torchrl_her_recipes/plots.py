@@ -45,7 +45,12 @@ def plot_curves(rows: Sequence[dict[str, float]], path: Path, *, title: str = ""
 
 
 def draw_curve(
-    axes: Axes, rows: Sequence[dict[str, float]], name: str, *, colour: str = "#2b6cb0", label: str | None = None
+    axes: Axes,
+    rows: Sequence[dict[str, float]],
+    name: str,
+    *,
+    colour: str = "#2b6cb0",
+    label: str | None = None,
 ) -> None:
     """One metric over environment steps, on given axes: median, and 33rd to 67th percentile."""
     frames, values = by_frames(rows, name)
@@ -85,10 +90,10 @@ def draw_goals(axes: Axes, goals: Tensor, env: ThrowingEnv, *, cells: int = 40, 
     counts, _ = torch.histogramdd(goals.double().cpu(), bins=[cells, cells], range=[-1.0, 1.0, -1.0, 1.0])
     share = (counts / counts.sum().clamp_min(1.0)).T
     axes.imshow(share, origin="lower", extent=(-1, 1, -1, 1), cmap="magma", vmin=0.0, vmax=limit)
-    low, high = env.goal_distribution.low.tolist(), env.goal_distribution.high.tolist()
+    (x, y), (x_end, y_end) = env.goal_distribution.low.tolist(), env.goal_distribution.high.tolist()
     left, bottom, right, top = (2.0 * side - 1.0 for side in env.effector.reach)
     for corner, size, colour in (
-        (low, (high[0] - low[0], high[1] - low[1]), "#63b3ed"),
+        ((x, y), (x_end - x, y_end - y), "#63b3ed"),
         ((left, bottom), (right - left, top - bottom), "#fc8181"),
     ):
         axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=1.5))

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from torchrl_her.virtual_goals import check_strategy
 from torchrl_her_envs import get_task
-
 from torchrl_her_recipes.algorithms import get_algorithm
 
 if TYPE_CHECKING:

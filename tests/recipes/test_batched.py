@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -34,9 +33,14 @@ def priorities(parts: Parts, run: int) -> Tensor:
 
 
 @pytest.fixture(scope="module", params=["her", "filtered_her"])
-def runs(request: pytest.FixtureRequest) -> Iterator[tuple[Parts, list[Parts]]]:
-    options: dict[str, Any] = {"algo": request.param, "dtype": "float64", "frames_per_update": 16.0, "seed": 5}
-    yield (
+def runs(request: pytest.FixtureRequest) -> tuple[Parts, list[Parts]]:
+    options: dict[str, Any] = {
+        "algo": request.param,
+        "dtype": "float64",
+        "frames_per_update": 16.0,
+        "seed": 5,
+    }
+    return (
         train(small(num_runs=RUNS, **options)),
         [train(small(**{**options, "seed": 5 + run})) for run in range(RUNS)],
     )

@@ -63,7 +63,9 @@ def test_every_goal_strategy_runs(strategy: str) -> None:
     assert small(strategy=strategy, epochs=1).build().run(progress=False).rows
 
 
-@pytest.mark.parametrize("options", [{"batch_norm": True}, {"hard_update_interval": 50}, {"dtype": "float64"}, {"k": 0}])
+@pytest.mark.parametrize(
+    "options", [{"batch_norm": True}, {"hard_update_interval": 50}, {"dtype": "float64"}, {"k": 0}]
+)
 def test_other_options_run(options: dict[str, Any]) -> None:
     rows = small(epochs=1, **options).build().run(progress=False).rows
     assert torch.tensor([value for row in rows for value in row.values()]).isfinite().all()

@@ -76,9 +76,9 @@ def test_a_folder_that_holds_a_run_is_not_written_over(finished: Path) -> None:
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is no folder of a run"):
         resume(tmp_path)
+    folder = tmp_path / "run"
+    small(epochs=1).build().run(folder, progress=False)
     with pytest.raises(ValueError, match="there is no run 4 in"):
-        folder = tmp_path / "run"
-        small(epochs=1).build().run(folder, progress=False)
         load_actor(folder, run=4)
 
 
@@ -106,7 +106,9 @@ def interrupted_after(parts: Parts, folder: Path, batches: int, signal_number: i
     assert parts.run(folder, progress=False).interrupted
 
 
-@pytest.mark.parametrize("options", [{"task": "hand_wall_v2"}, {"task": "robot_v2", "num_runs": 2}, {"sampler": "uniform"}])
+@pytest.mark.parametrize(
+    "options", [{"task": "hand_wall_v2"}, {"task": "robot_v2", "num_runs": 2}, {"sampler": "uniform"}]
+)
 def test_a_run_resumed_between_epochs_ends_bit_for_bit_as_one_that_was_not_stopped(
     options: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -43,7 +43,9 @@ class LineEnv(EnvBase):
         def flag() -> Binary:
             return Binary(n=1, shape=(N, 1), dtype=torch.bool)
 
-        self.observation_spec = Composite(observation=line(), achieved_goal=line(), desired_goal=line(), shape=(N,))
+        self.observation_spec = Composite(
+            observation=line(), achieved_goal=line(), desired_goal=line(), shape=(N,)
+        )
         self.action_spec = Bounded(-1.0, 1.0, shape=(N, 1))
         self.reward_spec = Unbounded(shape=(N, 1))
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(N,))
@@ -54,7 +56,11 @@ class LineEnv(EnvBase):
         self.rng = torch.Generator().manual_seed(seed or 0)
 
     def _shown(self) -> dict[str, Tensor]:
-        return {"observation": self.x.clone(), "achieved_goal": self.x.clone(), "desired_goal": self.goal.clone()}
+        return {
+            "observation": self.x.clone(),
+            "achieved_goal": self.x.clone(),
+            "desired_goal": self.goal.clone(),
+        }
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = torch.ones(N, 1, dtype=torch.bool) if tensordict is None else tensordict.get("_reset", None)
@@ -104,14 +110,14 @@ def make_trainer(seed: int = 0, **options: Any) -> tuple[Trainer, TensorDictSequ
     return trainer, policy
 
 
-
-
 def test_it_learns_a_task_of_one_dimension() -> None:
     trainer, policy = make_trainer()
     before = success(evaluate(LineEnv(1), policy, max_steps=STEPS)).float().mean()
     for _ in range(10):
         trainer.epoch()
-    after = torch.stack([success(evaluate(LineEnv(seed), policy, max_steps=STEPS)).float().mean() for seed in range(10)])
+    after = torch.stack(
+        [success(evaluate(LineEnv(seed), policy, max_steps=STEPS)).float().mean() for seed in range(10)]
+    )
     assert before < 0.7
     assert after.mean() > 0.95
 

@@ -69,7 +69,9 @@ def test_goals_of_weight_zero_are_never_drawn(weights: object, seed: int) -> Non
     assert (likelihood.gather(-1, index)[valid] > 0).all()
 
 
-def test_even_the_largest_random_number_draws_a_goal_that_may_be_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_even_the_largest_random_number_draws_a_goal_that_may_be_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     largest = 1.0 - 2.0**-24
     monkeypatch.setattr(torch, "rand", lambda *shape, **_: torch.full(shape, largest))
     index, _ = draw(torch.tensor([[1.0, 1.0, 1.0, 0.0]]), 1)

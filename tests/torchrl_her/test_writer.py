@@ -24,12 +24,12 @@ from .her_data import WANTED, make_batch, tag
 REWARD = GoalReward(0.5)  # tags differ by at least 1
 
 
-def make_buffer(capacity: int = 10_000, *, per: bool = False, seed: int = 0, **options: Any) -> TensorDictReplayBuffer:
+def make_buffer(
+    capacity: int = 10_000, *, per: bool = False, seed: int = 0, **options: Any
+) -> TensorDictReplayBuffer:
     sampler = PrioritizedSampler(capacity, alpha=0.6, beta=0.4) if per else RandomSampler()
     writer = HERWriter(options.pop("reward", REWARD), **options)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity), writer=writer, sampler=sampler
-    )
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), writer=writer, sampler=sampler)
     buffer.set_rng(torch.Generator().manual_seed(seed))
     return buffer
 
@@ -58,7 +58,11 @@ def test_goals_are_achieved_by_next_states_of_the_same_episode(strategy: str) ->
     for observation, goal in zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True):
         origin, t = divmod(observation, 100)
         length = lengths[int(origin * 100)]
-        allowed = {"future": range(int(t) + 1, length + 1), "final": [length], "episode": range(1, length + 1)}
+        allowed = {
+            "future": range(int(t) + 1, length + 1),
+            "final": [length],
+            "episode": range(1, length + 1),
+        }
         assert goal - origin * 100 in allowed[strategy]
 
 
@@ -94,7 +98,9 @@ def test_reward_terminated_and_done_are_recomputed_and_truncated_stays() -> None
 
 
 def test_a_real_termination_is_undone_when_the_virtual_goal_is_not_reached_there() -> None:
-    reward = EnvReward(lambda a, d: -torch.ones_like(a[..., :1]), lambda a, d: torch.zeros_like(a[..., :1]).bool())
+    reward = EnvReward(
+        lambda a, d: -torch.ones_like(a[..., :1]), lambda a, d: torch.zeros_like(a[..., :1]).bool()
+    )
     buffer = make_buffer(reward=reward, k=1)
     buffer.extend(make_batch([[3]], terminated=True))
     real, virtual = split(buffer)
@@ -155,7 +161,9 @@ def test_the_reward_is_asked_in_the_order_achieved_desired() -> None:
     def compute_reward(achieved: Tensor, desired: Tensor) -> Tensor:
         return (achieved[..., :1] >= desired[..., :1]).float() - 1.0
 
-    buffer = make_buffer(reward=EnvReward(compute_reward, lambda a, d: compute_reward(a, d) == 0), strategy="episode")
+    buffer = make_buffer(
+        reward=EnvReward(compute_reward, lambda a, d: compute_reward(a, d) == 0), strategy="episode"
+    )
     buffer.extend(make_batch([[6]]))
     _, virtual = split(buffer)
     expected = (virtual["next", "achieved_goal"][:, :1] >= virtual["desired_goal"][:, :1]).float() - 1.0
@@ -177,7 +185,11 @@ def test_filter_leaves_out_goals_already_achieved_before_the_action() -> None:
     assert len(real) == 5
     pairs = set(zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True))
     # Not (0, 0) and (1, 0): the goal 0 is where the ball already is. Step 2 achieves 1 by itself: kept.
-    assert pairs == {(t, g) for t, goals in ((0, (1, 2, 3)), (1, (1, 2, 3)), (2, (1, 2, 3)), (3, (2, 3)), (4, (3,))) for g in goals}
+    assert pairs == {
+        (t, g)
+        for t, goals in ((0, (1, 2, 3)), (1, (1, 2, 3)), (2, (1, 2, 3)), (3, (2, 3)), (4, (3,)))
+        for g in goals
+    }
 
 
 def test_an_episode_in_which_nothing_moved_writes_real_rows_only() -> None:
@@ -284,7 +296,9 @@ def test_an_environment_reset_from_outside_leaks_nothing() -> None:
     st.sampled_from([13, 40, 10_000]),
     st.booleans(),
 )
-def test_no_goal_ever_leaks(lengths: list[list[int]], size: int, strategy: str, capacity: int, per: bool) -> None:
+def test_no_goal_ever_leaks(
+    lengths: list[list[int]], size: int, strategy: str, capacity: int, per: bool
+) -> None:
     """Batches of any size, buffers that wrap: every virtual goal is of its own episode."""
     buffer = make_buffer(capacity, strategy=strategy, k=3, per=per)
     whole = make_batch(lengths)
@@ -458,7 +472,9 @@ def test_counts_by_hand() -> None:
 
 def test_keys_of_ones_own() -> None:
     batch = make_batch([[4]])
-    renamed = batch.rename_key_("desired_goal", ("goals", "wanted")).rename_key_("achieved_goal", ("goals", "got"))
+    renamed = batch.rename_key_("desired_goal", ("goals", "wanted")).rename_key_(
+        "achieved_goal", ("goals", "got")
+    )
     after = renamed["next"]
     after.rename_key_("desired_goal", ("goals", "wanted")).rename_key_("achieved_goal", ("goals", "got"))
     after.rename_key_("reward", "cost")
@@ -481,6 +497,8 @@ def test_bad_options_are_named() -> None:
 
 
 def test_a_storage_of_two_dimensions_is_refused() -> None:
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100, ndim=2), writer=HERWriter(REWARD), batch_size=4)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100, ndim=2), writer=HERWriter(REWARD), batch_size=4
+    )
     with pytest.raises(ValueError, match="storage of 1 dimension, got one of 2"):
         buffer.extend(make_batch([[3]]))
