@@ -82,7 +82,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     torch.set_num_threads(1)  # small tensors are slower with more
-    rows, fine = [HEADER], True
+    rows: list[tuple[str, ...]] = [HEADER]
+    fine = True
     for name in options.tasks or TASKS:
         row, within = check(name, episodes=options.episodes, seed=options.seed)
         rows.append(row)

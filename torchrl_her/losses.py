@@ -88,8 +88,8 @@ def make_ddpg_loss(
     Example:
         >>> from torchrl_her import make_actor, make_critic
         >>> loss = make_ddpg_loss(make_actor((9, 2), 3), make_critic((9, 2), 3))
-        >>> type(loss).__name__
-        'DDPGLoss'
+        >>> loss.value_estimator.low, loss.value_estimator.high
+        (-50.00000000000004, 0.0)
     """
     if not 0.0 <= gamma < 1.0:
         raise ValueError(f"gamma must be in [0, 1), got {gamma}")
@@ -111,7 +111,8 @@ def make_ddpg_loss(
 def make_target_updater(loss: LossModule, *, tau: float, hard_interval: int) -> TargetNetUpdater:
     """A soft update with rate ``tau`` after each step, or with ``hard_interval > 0`` a copy every so many."""
     if hard_interval > 0:
-        return HardUpdate(loss, value_network_update_interval=hard_interval)
+        # TorchRL counts that many steps without a copy before each step with one
+        return HardUpdate(loss, value_network_update_interval=hard_interval - 1)
     return SoftUpdate(loss, tau=tau)
 
 
@@ -206,8 +207,10 @@ def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float) -> Tensor:
     Example:
         >>> weight = nn.Parameter(torch.zeros(2, 1, 1))
         >>> weight.grad = torch.tensor([[[6.0]], [[2.0]]])
-        >>> clip_by_run([weight], 3.0).tolist(), weight.grad.flatten().tolist()
-        ([6.0, 2.0], [3.0, 2.0])
+        >>> clip_by_run([weight], 3.0).tolist()
+        [6.0, 2.0]
+        >>> weight.grad.flatten()
+        tensor([3.0000, 2.0000])
     """
     grads = [p.grad for p in parameters if p.grad is not None]
     runs = len(grads[0])

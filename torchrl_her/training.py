@@ -44,6 +44,9 @@ class Trainer:
     Keyword Args:
         epoch_frames: environment steps of each run in an epoch, rounded up to whole batches.
         frames_per_update: environment steps of each run for each of its gradient steps.
+        warmup_frames: environment steps of each run before its first gradient step; the steps that
+            they pay for follow then. As many as it takes to end an episode in each environment keep
+            runs apart from the first step on.
         batch_size: rows of a gradient step of one run.
         updates_per_draw: gradient steps whose rows are drawn in one call. Their priorities are as
             old as the call.
@@ -63,6 +66,7 @@ class Trainer:
         exploration: DecayingEpsilon | None = None,
         epoch_frames: int = 8_000,
         frames_per_update: float = 20.0,
+        warmup_frames: int = 0,
         batch_size: int = 64,
         updates_per_draw: int = 1,
     ) -> None:
@@ -73,6 +77,7 @@ class Trainer:
             exploration,
         )
         self.epoch_frames, self.frames_per_update = epoch_frames, frames_per_update
+        self.warmup_frames = warmup_frames
         self.batch_size, self.updates_per_draw = batch_size, updates_per_draw
         self.frames = self.updates = self.epochs = 0
         self._credit = 0.0  # gradient steps that frames have paid for
@@ -110,7 +115,8 @@ class Trainer:
 
     def _learn(self) -> list[dict[str, Tensor]]:
         """All gradient steps that the collected frames have paid for."""
-        if any(len(buffer) < self.batch_size for buffer in self.buffers):
+        # How full another run's buffer is must not matter; where one is empty there is nothing to draw.
+        if self.frames < self.warmup_frames or not all(len(buffer) for buffer in self.buffers):
             return []
         measured = []
         while self._credit >= 1.0:
@@ -130,7 +136,7 @@ class Trainer:
         if any(priority is None for priority in priorities):
             return
         for buffer, rows, own in zip(self.buffers, drawn, torch.cat(priorities, 1), strict=True):
-            rows.set(key, own)
+            rows.set(key, own.float())  # what TorchRL's priority trees hold, also for networks in float64
             buffer.update_tensordict_priority(rows)  # does nothing under a sampler without priorities
 
     def state_dict(self) -> dict[str, Any]:

@@ -77,6 +77,40 @@ def combine(candidate: Tensor, weight: Tensor | None = None, keep: Tensor | None
     return candidate * weight.unsqueeze(-2)
 
 
+def draw_alike(
+    strategy: Strategy, lengths: Tensor, horizon: int, k: int, *, generator: torch.Generator | None = None
+) -> Tensor:
+    """Draws k goals, with replacement, for each transition, all its candidates being equally likely.
+
+    The same as :func:`draw` from the table of :func:`candidates`, without making the table, whose
+    size grows with the square of the horizon.
+
+    Args:
+        strategy: as of :func:`candidates`.
+        lengths: [...] int64, lengths of the episodes.
+        horizon: T, the length to which they are padded.
+        k: number of draws.
+        generator: source of the random numbers.
+
+    Returns:
+        [..., T, k] of int64, the transition that achieved the goal; means nothing where t is padding.
+
+    Raises:
+        ValueError: an unknown strategy.
+
+    Example:
+        >>> draw_alike("final", torch.tensor(3), 3, 2).tolist()
+        [[2, 2], [2, 2], [2, 2]]
+    """
+    check_strategy(strategy)
+    time = torch.arange(horizon, device=lengths.device)
+    last = lengths.unsqueeze(-1) - 1
+    first = {"future": time, "final": last, "episode": torch.zeros_like(time)}[strategy]
+    span = (last - first + 1).unsqueeze(-1)
+    u = torch.rand(*lengths.shape, horizon, k, device=lengths.device, generator=generator)
+    return first.unsqueeze(-1) + (u * span).long()
+
+
 def draw(likelihood: Tensor, k: int, *, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
     """Draws k goals, with replacement, for each transition.
 

@@ -15,10 +15,10 @@ from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
 from torchrl_her.episodes import Episodes, find_episodes
 from torchrl_her.goals import EnvReward, RewardFunction
-from torchrl_her.virtual_goals import Strategy, candidates, check_strategy, combine, draw
+from torchrl_her.virtual_goals import Strategy, candidates, check_strategy, combine, draw, draw_alike
 
-# Goal likelihoods are a table [episodes, T, T]; longer batches are written piece by piece. Smaller pieces
-# pay more for the calls than the processor's cache gains them, larger ones touch fresh memory each time.
+# Likelihoods of goals may need a table [episodes, T, T]; longer batches are written piece by piece. Smaller
+# pieces pay more for the calls than the processor's cache saves, larger ones touch fresh memory each time.
 _TABLE_ENTRIES = 1 << 20
 _STATE_FILE = "her_writer.pt"
 
@@ -314,22 +314,47 @@ class HERWriter(RoundRobinWriter):
         """Which rows [V] are written once more, and the rows [V] whose achieved goals they take."""
         if self.k == 0:
             return episodes.lengths.new_empty(0), episodes.lengths.new_empty(0)
-        goals = rows.get(self._next_achieved_key)[episodes.rows]
-        likelihood = combine(
-            candidates(self.strategy, episodes.lengths, episodes.rows.shape[1]),
-            None if self.weights is None else self.weights(goals),
-            self._keep(rows, episodes, goals) if self.filter_achieved else None,
-        )
-        index, valid = draw(likelihood, self.k, generator=self._rng)  # padding has no candidates: not valid
+        lengths, valid = episodes.lengths, episodes.inside
+        index = draw_alike(self.strategy, lengths, valid.shape[1], self.k, generator=self._rng)
+        again = self._to_draw_again(rows, episodes, index)
+        if again is not None:
+            index[again], valid[again] = self._draw_from_table(rows, episodes, again)
         source = episodes.rows[valid].unsqueeze(-1).expand(-1, self.k).flatten()
         goal_source = episodes.rows.gather(1, index.flatten(1)).view_as(index)[valid].flatten()
         return source, goal_source
 
-    def _keep(self, rows: TensorDictBase, episodes: Episodes, goals: Tensor) -> Tensor:
-        """The filter, [E, T, T]: False where s_t already has the goal that t' achieved."""
-        before = rows.get(self._achieved_key)[episodes.rows]
-        reward = self._reward_alone(before.unsqueeze(2), goals.unsqueeze(1))
-        return reward.squeeze(-1) < self.achieved_reward
+    def _to_draw_again(self, rows: TensorDictBase, episodes: Episodes, index: Tensor) -> Tensor | None:
+        """Which transitions [E, T] may not keep the goals that were drawn as if all were alike.
+
+        All k goals of a transition are accepted or rejected together: rejection sampling, which
+        spares most transitions the row of likelihoods of all their candidates. None for no row.
+        """
+        if self.weights is not None:
+            return episodes.inside
+        if not self.filter_achieved:
+            return None
+        goals = rows.get(self._next_achieved_key)[episodes.rows.gather(1, index.flatten(1)).view_as(index)]
+        before = rows.get(self._achieved_key)[episodes.rows].unsqueeze(2)
+        return episodes.inside & ~self._keep(before, goals).all(-1)
+
+    def _draw_from_table(
+        self, rows: TensorDictBase, episodes: Episodes, which: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Goals [R, k] for the R transitions of a mask [E, T], and for which there are any, [R]."""
+        episode = which.nonzero()[:, 0]
+        goals = rows.get(self._next_achieved_key)[episodes.rows]
+        weight = None if self.weights is None else self.weights(goals)[episode]
+        keep = None
+        if self.filter_achieved:
+            before = rows.get(self._achieved_key)[episodes.rows[which]]
+            keep = self._keep(before.unsqueeze(1), goals[episode]).unsqueeze(1)
+        candidate = candidates(self.strategy, episodes.lengths, which.shape[1])[which].unsqueeze(1)
+        likelihood = combine(candidate, weight, keep).squeeze(1)
+        return draw(likelihood, self.k, generator=self._rng)
+
+    def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
+        """The filter, [...]: False where a goal [..., g] was already achieved before the action."""
+        return self._reward_alone(before, goals).squeeze(-1) < self.achieved_reward
 
     def _relabel(self, rows: TensorDictBase, source: Tensor, goal_source: Tensor) -> dict[NestedKey, Tensor]:
         """The entries of virtual rows that differ from those of the rows they are made of."""

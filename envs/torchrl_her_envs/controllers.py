@@ -18,7 +18,7 @@ from torchrl_her_envs.hand_skill import HandSkill
 from torchrl_her_envs.recording import base_env
 from torchrl_her_envs.task import Task, WorldConfig
 
-_CHUNK = 128  # throws planned at once: a plan compares thousands, which should stay in the processor's cache
+_CHUNK = 16  # throws planned at once: each compares thousands, and all should fit into the processor's cache
 _PLANNED = 0.8  # share of the threshold by which a planned throw may miss the goal ...
 _LET_GO = 0.9  # ... and one that is let go: a little more, so that rounding never spoils a plan
 

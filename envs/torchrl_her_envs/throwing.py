@@ -118,13 +118,16 @@ class ThrowingEnv(EnvBase):
         )
         own = self.world.hole_radius if task.throws else self.world.ball_radius
         self.threshold = self.world.shown(own) if threshold is None else threshold
-        self._physics = BallPhysics(num_envs, self.world, wall=task.wall)
         self._catch = self.world.ball_radius * self.world.size
         self._ball_starts = self._make_ball_starts()
         self._goals: GoalDistribution = self._make_goals()
         self.worlds = WorldState.zeros(num_envs, self.effector.num_joints)
         self._make_specs()
-        self.set_seeds([seed] if isinstance(seed, int) else seed)
+        seeds = [seed] if isinstance(seed, int) else seed
+        self.set_seeds(seeds)
+        # A space for each block: the last bits of a ball's path depend on where its world lies in its space.
+        size = num_envs // len(seeds)
+        self._physics = [BallPhysics(size, self.world, wall=task.wall) for _ in seeds]
 
     # What the outside asks for
 
@@ -234,7 +237,7 @@ class ThrowingEnv(EnvBase):
         joints = self.effector.move(w.joints, action[:, :-1] * (self.effector.action_speed * dt))
         grip = self.effector.grip(joints)
         grip_velocity = (grip - w.grip) / dt
-        flown, flown_velocity = self._physics.step(w.ball, ball_velocity)
+        flown, flown_velocity = self._fly(w.ball, ball_velocity)
         free_ = free.unsqueeze(-1)
         ball = torch.where(free_, flown, w.ball)
         ball_velocity = torch.where(free_, flown_velocity, ball_velocity)
@@ -248,6 +251,15 @@ class ThrowingEnv(EnvBase):
         w.ball_velocity = torch.where(held_, grip_velocity, ball_velocity)
         w.closed, w.held, w.free = closed, held, free & ~held
         w.step = w.step + 1
+
+    def _fly(self, ball: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+        """One time step of all balls, as if they were free."""
+        if len(self._physics) == 1:
+            return self._physics[0].step(ball, velocity)
+        blocks = zip(ball.chunk(len(self._physics)), velocity.chunk(len(self._physics)), strict=True)
+        flown = [physics.step(*block) for physics, block in zip(self._physics, blocks, strict=True)]
+        balls, velocities = zip(*flown, strict=True)
+        return torch.cat(balls), torch.cat(velocities)
 
     def _start_episodes(self, which: Tensor) -> None:
         """Draws the starts of new episodes in the given worlds [M]."""

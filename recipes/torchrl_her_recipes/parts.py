@@ -112,6 +112,7 @@ class Parts:
             exploration=self.exploration,
             epoch_frames=recipe.epoch_frames,
             frames_per_update=recipe.frames_per_update,
+            warmup_frames=recipe.warmup_frames,
             batch_size=recipe.batch_size,
             updates_per_draw=recipe.updates_per_draw,
         )
@@ -235,8 +236,5 @@ def _make_sampler(recipe: Recipe) -> Sampler:
         return RandomSampler()
     # TorchRL's losses give the square of the TD error, so half of alpha is Schaul's alpha.
     return PrioritizedSampler(
-        recipe.buffer_size,
-        alpha=recipe.priority_alpha / 2,
-        beta=recipe.priority_beta,
-        dtype=getattr(torch, recipe.dtype),
+        recipe.buffer_size, alpha=recipe.priority_alpha / 2, beta=recipe.priority_beta
     )

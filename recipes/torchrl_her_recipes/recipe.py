@@ -41,6 +41,7 @@ class Recipe:
     num_envs: int = 64
     steps_per_batch: int = 5  # of each environment, before the updates that they pay for
     frames_per_update: float = 20.0
+    warmup_frames: int = 3_200  # before the first update: an episode of each environment
     updates_per_draw: int = 8  # gradient steps whose rows are drawn in one call
 
     k: int = 4  # virtual rows for each real one
@@ -134,6 +135,7 @@ _AT_LEAST = {
     "num_envs": 1,
     "steps_per_batch": 1,
     "updates_per_draw": 1,
+    "warmup_frames": 0,
     "k": 0,
     "priority_alpha": 0.0,
     "priority_beta": 0.0,

@@ -10,6 +10,7 @@ SMALL: dict[str, Any] = {
     "epochs": 2,
     "epoch_frames": 1_600,
     "num_envs": 8,
+    "warmup_frames": 400,
     "batch_size": 32,
     "buffer_size": 20_000,
     "eval_episodes": 4,

@@ -83,7 +83,7 @@ def make_trainer(seed: int = 0, **options: Any) -> tuple[Trainer, TensorDictSequ
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     actor, critic = make_actor((1, 1), 1, hidden=32), make_critic((1, 1), 1, hidden=32)
-    exploration = DecayingEpsilon(-torch.ones(1), torch.ones(1), decay=0.8, generator=generator)
+    exploration = DecayingEpsilon(-torch.ones(1), torch.ones(1), decay=0.8, generators=[generator])
     policy = TensorDictSequential(actor, exploration)
     loss = make_ddpg_loss(actor, critic, gamma=0.9)
     buffer = TensorDictReplayBuffer(
@@ -98,7 +98,7 @@ def make_trainer(seed: int = 0, **options: Any) -> tuple[Trainer, TensorDictSequ
             total_frames=-1,
             auto_register_policy_transforms=False,
         ),
-        buffer=buffer,
+        buffers=[buffer],
         learner=LossLearner(
             loss,
             torch.optim.Adam(loss.parameters(), lr=1e-3),
@@ -168,8 +168,8 @@ def test_nan_is_noticed_and_named(key: str) -> None:
 
 def test_evaluation_is_greedy_and_leaves_training_alone() -> None:
     trainer, policy = make_trainer()
-    state = trainer.exploration.generator.get_state()  # type: ignore[union-attr]
+    state = trainer.exploration.generators[0].get_state()  
     rollout = evaluate(LineEnv(1), policy, max_steps=STEPS)
     assert rollout.shape == (N, STEPS)
     assert torch.equal(policy[0](rollout.select("observation", "desired_goal"))["action"], rollout["action"])
-    assert torch.equal(trainer.exploration.generator.get_state(), state)  # type: ignore[union-attr]
+    assert torch.equal(trainer.exploration.generators[0].get_state(), state)  
