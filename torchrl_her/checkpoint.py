@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
         path: a file that :func:`save_checkpoint` wrote.
 
     Raises:
-        CheckpointError: it is not whole, or not a checkpoint.
+        CheckpointError: it is not whole, not a checkpoint, or holds more than tensors and plain data.
         OSError: it cannot be read.
     """
     data = Path(path).read_bytes()
@@ -60,7 +61,10 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
         raise CheckpointError(f"{path} is not a checkpoint of torchrl-her")
     if hashlib.sha256(body).digest() != digest:
         raise CheckpointError(f"{path} is damaged: its checksum does not match")
-    return torch.load(io.BytesIO(body), weights_only=True)
+    try:
+        return torch.load(io.BytesIO(body), weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise CheckpointError(f"{path} holds more than tensors and plain data") from error
 
 
 def buffer_state_dict(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
