@@ -62,13 +62,16 @@ def as_markdown(rows: Sequence[Sequence[str]]) -> str:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description="Success of a scripted controller and of a random policy in first episodes of each task.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument(
         "tasks", nargs="*", metavar="TASK", help="tasks to check; all eleven if none is named"
     )
-    parser.add_argument("--episodes", type=int, default=1000, help="episodes of each task and policy")
-    parser.add_argument("--seed", type=int, default=0, help="of the starts, the goals and the random actions")
+    parser.add_argument(
+        "--episodes", type=int, default=1000, help="episodes of each task and policy (%(default)s)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of starts, goals and random actions (%(default)s)"
+    )
     parser.add_argument("--out", type=Path, help="write the table to this markdown file, too")
     options = parser.parse_args(arguments)
     unknown = set(options.tasks) - set(TASKS)

@@ -90,19 +90,25 @@ class Trainer:
         """
         self.collector.reset()
         end = (self.epochs + 1) * self.epoch_frames  # also where an interrupted epoch is finished
+        measured = self.run(end - self.frames, on_batch)
+        self.epochs += 1
+        if self.exploration is not None:
+            self.exploration.step()
+        return measured
+
+    def run(self, frames: int, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
+        """Collects and learns for a number of frames of each run, rounded up to whole batches."""
+        end = self.frames + frames
         measured: list[dict[str, Tensor]] = []
         while self.frames < end:
             batch = self.collector.next()
             check_finite(batch)
-            frames = self._write(batch)
-            self.frames += frames
-            self._credit += frames / self.frames_per_update
+            collected = self._write(batch)
+            self.frames += collected
+            self._credit += collected / self.frames_per_update
             measured += self._learn()
             if on_batch is not None:
                 on_batch(self)
-        self.epochs += 1
-        if self.exploration is not None:
-            self.exploration.step()
         keys = measured[0] if measured else {}
         return {key: torch.stack([m[key] for m in measured]).mean(0) for key in keys}
 

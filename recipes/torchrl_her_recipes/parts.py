@@ -235,6 +235,4 @@ def _make_sampler(recipe: Recipe) -> Sampler:
     if recipe.sampler == "uniform":
         return RandomSampler()
     # TorchRL's losses give the square of the TD error, so half of alpha is Schaul's alpha.
-    return PrioritizedSampler(
-        recipe.buffer_size, alpha=recipe.priority_alpha / 2, beta=recipe.priority_beta
-    )
+    return PrioritizedSampler(recipe.buffer_size, alpha=recipe.priority_alpha / 2, beta=recipe.priority_beta)

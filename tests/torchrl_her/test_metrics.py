@@ -54,10 +54,8 @@ def test_another_reward_may_mean_success() -> None:
 
 def test_final_distance_is_that_of_the_first_episodes_last_step() -> None:
     data = rollout("--U-", "----", "T---")
-    data["next", "achieved_goal"] = torch.tensor([3.0, 6.0, 9.0, 12.0]).view(1, 4, 1) * torch.tensor(
-        [1.0, 0.0]
-    )
-    data["next", "achieved_goal"] = data["next", "achieved_goal"].expand(3, 4, 2)
+    path = torch.tensor([[3.0, 0.0], [6.0, 0.0], [9.0, 0.0], [12.0, 0.0]])
+    data["next", "achieved_goal"] = path.expand(3, 4, 2)
     data["next", "desired_goal"] = torch.tensor([0.0, 4.0]).expand(3, 4, 2)
     expected = [97**0.5, 160**0.5, 5.0]  # (9, -4), (12, -4), (3, -4)
     assert final_distance(data).tolist() == pytest.approx(expected)

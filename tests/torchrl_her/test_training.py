@@ -168,9 +168,9 @@ def test_nan_is_noticed_and_named(key: str) -> None:
 
 def test_evaluation_is_greedy_and_leaves_training_alone() -> None:
     trainer, policy = make_trainer()
-    state = trainer.exploration.generators[0].get_state()  
+    state = trainer.exploration.generators[0].get_state()
     rollout = evaluate(LineEnv(1), policy, max_steps=STEPS)
     assert rollout.shape == (N, STEPS)
     greedy = policy[0](rollout.select("observation", "desired_goal"))["action"]
     torch.testing.assert_close(greedy, rollout["action"])
-    assert torch.equal(trainer.exploration.generators[0].get_state(), state)  
+    assert torch.equal(trainer.exploration.generators[0].get_state(), state)
