@@ -171,12 +171,14 @@ class ThrowingEnv(EnvBase):
         return render(self, worlds, size=size)
 
     def world_state_dict(self) -> dict[str, Tensor]:
-        """A copy of all that the worlds are; they resume exactly from it."""
-        return {field.name: getattr(self.worlds, field.name).clone() for field in fields(WorldState)}
+        """A copy of all that the worlds are, row by row; they resume exactly from it."""
+        state = {field.name: getattr(self.worlds, field.name).clone() for field in fields(WorldState)}
+        return state | {"key": torch.from_numpy(self._keys.view(np.int64).copy())}
 
     def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
         """Puts the worlds back to where :meth:`world_state_dict` was taken."""
         self.worlds = WorldState(**{field.name: state[field.name].clone() for field in fields(WorldState)})
+        self._keys = state["key"].numpy().copy().view(np.uint64)
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
         """Seeds R equal blocks of worlds, each as if it were alone.
@@ -358,5 +360,5 @@ class ThrowingEnv(EnvBase):
         )
         width = self.effector.num_joints + 1
         self.action_spec = Bounded(low=-1.0, high=1.0, shape=(n, width), dtype=self.dtype_shown)
-        self.reward_spec = Bounded(low=-1.0, high=0.0, shape=(n, 1), dtype=self.dtype_shown)
+        self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype_shown)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))

@@ -177,7 +177,7 @@ def _list(arguments: list[str]) -> int:
     sections = {
         "tasks": {task.name: task.summary for task in TASKS.values()},
         "algorithms": {algorithm.name: algorithm.summary for algorithm in ALGORITHMS.values()},
-        "presets": {path.stem: path.read_text().splitlines()[0].lstrip("# ") for path in presets},
+        "presets": {path.stem: path.read_text().splitlines()[1].lstrip("# ") for path in presets},
     }
     for title, entries in sections.items():
         print(f"{title}:")

@@ -68,10 +68,6 @@ def run(parts: Parts, folder: str | Path | None = None, *, progress: bool = True
     """Trains the given parts to the end of their recipe; see :meth:`Parts.run`."""
     home = None if folder is None else RunFolder(folder)
     if home is not None:
-        if home.config.exists():
-            raise ValueError(
-                f"{home.path} holds a run already; go on with it by --resume, or choose another folder"
-            )
         home.describe(parts.recipe)
     return _run(parts, parts.trainer(), home, progress=progress)
 

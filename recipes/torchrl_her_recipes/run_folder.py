@@ -22,15 +22,11 @@ class RunFolder:
     """Paths and tables of one run.
 
     Args:
-        path: made if it is not there.
-
-    Raises:
-        OSError: it cannot be made or written.
+        path: of the folder; :meth:`describe` makes it.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.path.mkdir(parents=True, exist_ok=True)
         self.config = self.path / "config.yaml"
         self.checkpoint = self.path / "checkpoint.pt"
         self.policy = self.path / "policy.pt"
@@ -41,7 +37,17 @@ class RunFolder:
         self._events: SummaryWriter | None = None
 
     def describe(self, recipe: Recipe) -> None:
-        """Writes the recipe, and the versions that run it."""
+        """Makes the folder, and writes the recipe and the versions that run it.
+
+        Raises:
+            ValueError: there is a run in it already.
+            OSError: it cannot be made or written.
+        """
+        if self.config.exists():
+            raise ValueError(
+                f"{self.path} holds a run already; go on with it by --resume, or choose another folder"
+            )
+        self.path.mkdir(parents=True, exist_ok=True)
         self.config.write_text(yaml.safe_dump(asdict(recipe), sort_keys=False))
         about = {
             "seed": recipe.seed,

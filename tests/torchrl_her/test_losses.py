@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import pytest
@@ -192,7 +193,7 @@ def test_the_price_may_be_kept_apart_for_each_row() -> None:
 
 def test_the_price_reaches_the_actor_only() -> None:
     nets, data = networks(), batch()
-    losses = [penalised_loss(*nets, penalty) for penalty in (0.0, 5.0)]
+    losses = [penalised_loss(*deepcopy(nets), penalty) for penalty in (0.0, 5.0)]
     for loss in losses:
         loss(data)["loss_actor"].backward()
     free, priced = ({name: p.grad for name, p in loss.named_parameters()} for loss in losses)
