@@ -2,7 +2,8 @@
 
     python docs/make_results.py runs/results
 
-expects the folders hand_v0_her, robot_v0_her, hand_v2_her and hand_v2_filtered_her in there.
+expects the folders hand_v0_her, robot_v0_her, hand_v2_her and hand_v2_filtered_her in there, and for the
+choices that the agent leaves open batch_norm and hard_copy.
 """
 
 from __future__ import annotations
@@ -26,6 +27,11 @@ RUNS = {
     "robot_v0, her": ("robot_v0_her", "#38a169"),
     "hand_v2, her": ("hand_v2_her", "#dd6b20"),
     "hand_v2, filtered_her": ("hand_v2_filtered_her", "#805ad5"),
+}
+CHOICES = {
+    "as it is": ("hand_v0_her", "#2b6cb0"),
+    "batch normalisation": ("batch_norm", "#dd6b20"),
+    "hard copies": ("hard_copy", "#38a169"),
 }
 FLOOR = -0.9  # shown coordinate below which a ball lies on the floor, or nearly
 
@@ -53,19 +59,34 @@ def draw_success(folder: Path) -> None:
     """Curves of all runs, and the table."""
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    print("| task and algorithm | frames | median | each run |\n| --- | --- | --- | --- |")
+    print("| task and algorithm | frames | median | over the whole run | each run |")
+    print("| --- | --- | --- | --- | --- |")
     for label, (name, colour) in RUNS.items():
         rows = read(folder / name)
         draw_curve(right if "v2" in name else left, rows, "success", colour=colour, label=label)
         each = last(rows)
         listed = ", ".join(f"{value:.0%}" for value in sorted(each))
-        print(f"| {label} | {rows[-1]['frames']:,.0f} | {statistics.median(each):.0%} | {listed} |")
+        whole = statistics.median(last(rows, epochs=10**6))
+        frames = f"{rows[-1]['frames']:,.0f}"
+        print(f"| {label} | {frames} | {statistics.median(each):.0%} | {whole:.0%} | {listed} |")
     for axes in (left, right):
         axes.set(xlabel="environment steps of each run", ylim=(-0.02, 1.02))
         axes.grid(alpha=0.3)
         axes.legend(loc="upper left")
     left.set_ylabel("success rate (median, 33rd to 67th percentile)")
     figure.savefig(IMAGES / "success.png", dpi=100)
+
+
+def draw_choices(folder: Path) -> None:
+    """Batch normalisation and hard target updates, beside the defaults."""
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    for label, (name, colour) in CHOICES.items():
+        draw_curve(axes, read(folder / name), "success", colour=colour, label=label)
+    axes.set(xlabel="environment steps of each run", ylabel="success rate, hand_v0, her", ylim=(-0.02, 1.02))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="upper left")
+    figure.savefig(IMAGES / "choices.png", dpi=100)
 
 
 def draw_goal_maps(folder: Path) -> None:
@@ -88,6 +109,7 @@ def main() -> None:
     folder = parser.parse_args().runs
     draw_success(folder)
     draw_goal_maps(folder)
+    draw_choices(folder)
 
 
 if __name__ == "__main__":

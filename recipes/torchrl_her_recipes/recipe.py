@@ -28,7 +28,7 @@ class Recipe:
     Example:
         >>> recipe = Recipe(task="hand_v0", algo="her", seed=3)
         >>> recipe.gamma, recipe.total_frames
-        (0.98, 409600)
+        (0.98, 614400)
     """
 
     task: str = "hand_v0"  # see `torchrl-her list`
@@ -36,7 +36,7 @@ class Recipe:
     seed: int = 0
     num_runs: int = 1  # independent runs side by side; run i has the seed ``seed + i``
 
-    epochs: int = 20
+    epochs: int = 30
     epoch_frames: int = 20_480  # of each run, as all that follows
     num_envs: int = 64
     steps_per_batch: int = 5  # of each environment, before the updates that they pay for

@@ -112,9 +112,7 @@ def test_a_folder_that_may_not_be_written(capsys: pytest.CaptureFixture[str]) ->
 
 def test_versions_that_do_not_fit_are_named_with_the_remedy() -> None:
     installed = {"torch": "2.13.0+cpu", "tensordict": "0.14.3", "torchrl": "0.14.1"}
-    with pytest.raises(
-        ImportError, match=r"^torch 2.13.0 does not fit .* install .*torch==2.14.1"
-    ):
+    with pytest.raises(ImportError, match=r"^torch 2.13.0 does not fit .* install .*torch==2.14.1"):
         check_versions(installed.__getitem__)
     check_versions({**installed, "torch": "2.14.1+cu130"}.__getitem__)
 
