@@ -23,7 +23,7 @@ from torchrl_her.losses import (
 from torchrl_her.metrics import discounted_return, final_distance, first_episode, q_bias, success
 from torchrl_her.networks import ActorNet, CriticNet, make_actor, make_critic, stack_runs, take_run
 from torchrl_her.training import Trainer, evaluate
-from torchrl_her.virtual_goals import Strategy, candidates, combine, draw, draw_alike
+from torchrl_her.virtual_goals import Strategy, candidates, combine, draw, draw_alike, window
 from torchrl_her.writer import GoalWeights, HERWriter, WriterCounts
 
 __all__ = [
@@ -71,4 +71,5 @@ __all__ = [
     "stack_runs",
     "success",
     "take_run",
+    "window",
 ]

@@ -114,7 +114,7 @@ class FusedDDPGLearner:
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         for group in self._groups:
-            clip_by_run(group, self.max_grad_norm)
+            clip_by_run(group, self.max_grad_norm, runs=self.runs)
         self.optimiser.step()
         torch._foreach_lerp_(self._targets, [p.data for p in self._parameters], self.tau)
 

@@ -183,7 +183,7 @@ class LossLearner:
         if self.runs == 1:
             nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         else:
-            clip_by_run(parameters, self.max_grad_norm)
+            clip_by_run(parameters, self.max_grad_norm, runs=self.runs)
 
     def _find_networks(self) -> list[list[nn.Parameter]]:
         """The parameters of each network: the loss module's children that have any."""
@@ -194,12 +194,13 @@ class LossLearner:
 
 
 @torch.no_grad()
-def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float) -> Tensor:
+def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float, *, runs: int) -> Tensor:
     """Clips the gradient of each run to a norm of its own.
 
     Args:
-        parameters: of one stacked network; each has a leading dimension R.
+        parameters: of one stacked network; each is R equal blocks, run after run.
         max_norm: greatest norm of a run's gradient.
+        runs: R.
 
     Returns:
         [R], the norms before.
@@ -207,16 +208,14 @@ def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float) -> Tensor:
     Example:
         >>> weight = nn.Parameter(torch.zeros(2, 1, 1))
         >>> weight.grad = torch.tensor([[[6.0]], [[2.0]]])
-        >>> clip_by_run([weight], 3.0).tolist()
+        >>> clip_by_run([weight], 3.0, runs=2).tolist()
         [6.0, 2.0]
-        >>> weight.grad.flatten()
-        tensor([3.0000, 2.0000])
+        >>> weight.grad.flatten().round(decimals=4).tolist()
+        [3.0, 2.0]
     """
-    grads = [p.grad for p in parameters if p.grad is not None]
-    runs = len(grads[0])
-    norms = torch.cat([grad.view(runs, -1) for grad in grads], 1).norm(dim=1)
-    scale = (max_norm / (norms + 1e-6)).clamp(max=1.0)  # what clip_grad_norm_ does
-    scale = torch.where(norms <= max_norm, 1.0, scale)
-    for grad in grads:
-        grad.mul_(scale.view(runs, *[1] * (grad.ndim - 1)))
+    blocks = [parameter.grad.view(runs, -1) for parameter in parameters if parameter.grad is not None]
+    norms = torch.cat(blocks, 1).norm(dim=1)
+    scale = (max_norm / (norms + 1e-6)).clamp(max=1.0)  # as torch's clip_grad_norm_
+    for block in blocks:
+        block.mul_(scale.unsqueeze(1))
     return norms

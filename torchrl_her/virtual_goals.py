@@ -3,7 +3,7 @@
 For transition t of an episode of length T, the goal achieved by transition t' is drawn with
 probability proportional to ``candidate(t, t') * weight(g_t') * keep(t, t')``. Plain HER, filtered
 HER, directed HER and their combinations differ in the factors alone. All functions work on
-episodes padded to a common horizon and take any leading batch shape.
+episodes padded to a common horizon T and take any leading batch shape.
 """
 
 from __future__ import annotations
@@ -23,12 +23,37 @@ def check_strategy(strategy: str) -> None:
         raise ValueError(f"unknown goal strategy {strategy!r}; the strategies are {known}")
 
 
-def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
-    """Which achieved goals a transition may take as its virtual goal.
+def window(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the candidates of transitions begin, and where they end.
 
     Transition t' achieves the goal of the state that it leads to, so ``future`` (t' >= t) never
     looks at the past, and ``final`` is the goal of the episode's last state. Andrychowicz et al.,
     Hindsight Experience Replay, 2017, section 4.5.
+
+    Args:
+        strategy: ``"future"``, ``"final"`` or ``"episode"`` (any of the same episode).
+        time: [...] int64, the transitions t.
+        lengths: [...] int64, lengths of their episodes; broadcast against it.
+
+    Returns:
+        ``(first, end)``, [...] each: the candidates are ``first <= t' < end``.
+
+    Raises:
+        ValueError: an unknown strategy.
+
+    Example:
+        >>> first, end = window("future", torch.tensor([0, 1]), torch.tensor(2))
+        >>> first.tolist(), end.tolist()
+        ([0, 1], [2, 2])
+    """
+    check_strategy(strategy)
+    time, end = torch.broadcast_tensors(time, lengths)
+    first = {"future": time, "final": end - 1, "episode": torch.zeros_like(time)}[strategy]
+    return first, end
+
+
+def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
+    """Which achieved goals a transition may take as its virtual goal: see :func:`window`.
 
     Args:
         strategy: ``"future"``, ``"final"`` or ``"episode"`` (any of the same episode).
@@ -45,26 +70,27 @@ def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
         >>> candidates("future", torch.tensor(2), 3).int().tolist()
         [[1, 1, 0], [0, 1, 0], [0, 0, 0]]
     """
-    check_strategy(strategy)
     time = torch.arange(horizon, device=lengths.device)
     inside = time < lengths.unsqueeze(-1)
-    if strategy == "future":
-        return inside.unsqueeze(-2) & (time >= time.unsqueeze(-1))  # where t' is inside, so is t <= t'
-    if strategy == "final":
-        return inside.unsqueeze(-1) & (time == lengths.unsqueeze(-1) - 1).unsqueeze(-2)
-    return inside.unsqueeze(-1) & inside.unsqueeze(-2)
+    return between(*window(strategy, time, lengths.unsqueeze(-1)), horizon) & inside.unsqueeze(-1)
+
+
+def between(first: Tensor, end: Tensor, horizon: int) -> Tensor:
+    """The candidates of :func:`window` as a mask [..., T], T being the horizon."""
+    time = torch.arange(horizon, device=first.device)
+    return (time >= first.unsqueeze(-1)) & (time < end.unsqueeze(-1))
 
 
 def combine(candidate: Tensor, weight: Tensor | None = None, keep: Tensor | None = None) -> Tensor:
     """The product of the factors: how likely each goal is to be drawn, not normalised.
 
     Args:
-        candidate: [..., T, T] of bool, from :func:`candidates`.
+        candidate: [..., T] of bool, from :func:`candidates` or :func:`between`.
         weight: [..., T], how useful each achieved goal is, at least 0; None for all alike.
-        keep: [..., T, T] of bool, the filter; None to keep all.
+        keep: [..., T] of bool, the filter; None to keep all. All are broadcast against each other.
 
     Returns:
-        [..., T, T] of float.
+        [..., T] of float.
 
     Example:
         >>> combine(torch.tensor([[True, True], [False, True]]), torch.tensor([1.0, 3.0])).tolist()
@@ -74,55 +100,44 @@ def combine(candidate: Tensor, weight: Tensor | None = None, keep: Tensor | None
         candidate = candidate & keep
     if weight is None:
         return candidate.float()
-    return candidate * weight.unsqueeze(-2)
+    return candidate * weight
 
 
-def draw_alike(
-    strategy: Strategy, lengths: Tensor, horizon: int, k: int, *, generator: torch.Generator | None = None
-) -> Tensor:
+def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: torch.Generator | None = None) -> Tensor:
     """Draws k goals, with replacement, for each transition, all its candidates being equally likely.
 
-    The same as :func:`draw` from the table of :func:`candidates`, without making the table, whose
-    size grows with the square of the horizon.
+    The same as :func:`draw` from a table of candidates, without the table: its size is that of
+    the transitions times the horizon.
 
     Args:
-        strategy: as of :func:`candidates`.
-        lengths: [...] int64, lengths of the episodes.
-        horizon: T, the length to which they are padded.
+        first: [...] int64, the first candidate.
+        end: [...] int64, behind the last one; above ``first``.
         k: number of draws.
         generator: source of the random numbers.
 
     Returns:
-        [..., T, k] of int64, the transition that achieved the goal; means nothing where t is padding.
-
-    Raises:
-        ValueError: an unknown strategy.
+        [..., k] of int64, the transition that achieved the goal.
 
     Example:
-        >>> draw_alike("final", torch.tensor(3), 3, 2).tolist()
-        [[2, 2], [2, 2], [2, 2]]
+        >>> draw_alike(torch.tensor([5, 7]), torch.tensor([6, 8]), 3).tolist()
+        [[5, 5, 5], [7, 7, 7]]
     """
-    check_strategy(strategy)
-    time = torch.arange(horizon, device=lengths.device)
-    last = lengths.unsqueeze(-1) - 1
-    first = {"future": time, "final": last, "episode": torch.zeros_like(time)}[strategy]
-    span = (last - first + 1).unsqueeze(-1)
-    u = torch.rand(*lengths.shape, horizon, k, device=lengths.device, generator=generator)
-    return first.unsqueeze(-1) + (u * span).long()
+    u = torch.rand(*first.shape, k, device=first.device, generator=generator)
+    return first.unsqueeze(-1) + (u * (end - first).unsqueeze(-1)).long()
 
 
 def draw(likelihood: Tensor, k: int, *, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
     """Draws k goals, with replacement, for each transition.
 
     Args:
-        likelihood: [..., T, T], at least 0, from :func:`combine`.
+        likelihood: [..., T], at least 0, from :func:`combine`.
         k: number of draws.
         generator: source of the random numbers.
 
     Returns:
-        ``(index, valid)``: [..., T, k] of int64, the transition that achieved the goal, and
-        [..., T] of bool, False where all candidates of a transition have likelihood 0 (its
-        indices then mean nothing).
+        ``(index, valid)``: [..., k] of int64, the transition that achieved the goal, and [...] of
+        bool, False where all candidates of a transition have likelihood 0 (its indices then mean
+        nothing).
 
     Example:
         >>> index, valid = draw(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]), 2)

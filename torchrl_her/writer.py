@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -15,11 +15,12 @@ from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
 from torchrl_her.episodes import Episodes, find_episodes
 from torchrl_her.goals import EnvReward, RewardFunction
-from torchrl_her.virtual_goals import Strategy, candidates, check_strategy, combine, draw, draw_alike
+from torchrl_her.virtual_goals import Strategy, between, check_strategy, combine, draw, draw_alike, window
 
-# Likelihoods of goals may need a table [episodes, T, T]; longer batches are written piece by piece. Smaller
-# pieces pay more for the calls than the processor's cache saves, larger ones touch fresh memory each time.
-_TABLE_ENTRIES = 1 << 20
+# Work is done piece by piece: pieces that are too large touch fresh memory in every call, pieces that are too
+# small pay more for the calls. These are rows written at once, and likelihoods of goals [rows, T] at once.
+_ROWS = 1 << 16
+_LIKELIHOODS = 1 << 17
 _STATE_FILE = "her_writer.pt"
 
 
@@ -260,14 +261,13 @@ class HERWriter(RoundRobinWriter):
         return rows, lanes, rows.get(self._trajectory_key).reshape(-1)
 
     def _episodes_at_once(self, episodes: Episodes) -> int:
-        horizon = max(episodes.rows.shape[1], 1)
-        fitting = self._storage.max_size // (horizon * (self.k + 1))
-        return max(1, min(_TABLE_ENTRIES // horizon**2, fitting))
+        rows_of_each = max(1, episodes.rows.shape[1]) * (self.k + 1)
+        return max(1, min(_ROWS, self._storage.max_size) // rows_of_each)
 
     def _write(self, rows: TensorDictBase, episodes: Episodes, place: Tensor, written: int) -> int:
         """Stores the real and virtual rows of some episodes and notes the places of the real ones."""
         real = episodes.rows[episodes.inside]
-        source, goal_source = self._draw(rows, episodes)
+        source, goal_source = self._draw(rows, episodes, real)
         virtual = len(source)
         out = self._build(rows, real, source, self._relabel(rows, source, goal_source) if virtual else {})
         place[real] = torch.arange(written + virtual, written + len(out), device=place.device)
@@ -310,47 +310,57 @@ class HERWriter(RoundRobinWriter):
                 self._bump_generation(index, part)
                 self._mark_update_entities(index)
 
-    def _draw(self, rows: TensorDictBase, episodes: Episodes) -> tuple[Tensor, Tensor]:
+    def _draw(self, rows: TensorDictBase, episodes: Episodes, real: Tensor) -> tuple[Tensor, Tensor]:
         """Which rows [V] are written once more, and the rows [V] whose achieved goals they take."""
         if self.k == 0:
-            return episodes.lengths.new_empty(0), episodes.lengths.new_empty(0)
-        lengths, valid = episodes.lengths, episodes.inside
-        index = draw_alike(self.strategy, lengths, valid.shape[1], self.k, generator=self._rng)
-        again = self._to_draw_again(rows, episodes, index)
-        if again is not None:
-            index[again], valid[again] = self._draw_from_table(rows, episodes, again)
-        source = episodes.rows[valid].unsqueeze(-1).expand(-1, self.k).flatten()
-        goal_source = episodes.rows.gather(1, index.flatten(1)).view_as(index)[valid].flatten()
-        return source, goal_source
+            return real[:0], real[:0]
+        episode, time = episodes.inside.nonzero(as_tuple=True)  # of each real row
+        index = draw_alike(
+            *window(self.strategy, time, episodes.lengths[episode]), self.k, generator=self._rng
+        )
+        valid = torch.ones_like(real, dtype=torch.bool)
+        begin = (episode * episodes.rows.shape[1]).unsqueeze(-1)  # of the episode in the flat table of rows
+        again = self._rejected(rows, episodes, real, begin + index)
+        if len(again) > 0:
+            drawn = [
+                draw(likelihood, self.k, generator=self._rng)
+                for likelihood in self._likelihoods(rows, episodes, real, again)
+            ]
+            index[again], valid[again] = (torch.cat(part) for part in zip(*drawn, strict=True))
+        source = real[valid].unsqueeze(-1).expand(-1, self.k).flatten()
+        return source, episodes.rows.take(begin + index)[valid].flatten()
 
-    def _to_draw_again(self, rows: TensorDictBase, episodes: Episodes, index: Tensor) -> Tensor | None:
-        """Which transitions [E, T] may not keep the goals that were drawn as if all were alike.
+    def _rejected(self, rows: TensorDictBase, episodes: Episodes, real: Tensor, drawn: Tensor) -> Tensor:
+        """Which real rows, by position, may not keep the goals [n, k] drawn as if all were alike.
 
-        All k goals of a transition are accepted or rejected together: rejection sampling, which
-        spares most transitions the row of likelihoods of all their candidates. None for no row.
+        All goals of a row are accepted or rejected together. This rejection sampling spares most
+        rows the likelihoods of all their candidates.
         """
         if self.weights is not None:
-            return episodes.inside
+            return torch.arange(len(real), device=real.device)
         if not self.filter_achieved:
-            return None
-        goals = rows.get(self._next_achieved_key)[episodes.rows.gather(1, index.flatten(1)).view_as(index)]
-        before = rows.get(self._achieved_key)[episodes.rows].unsqueeze(2)
-        return episodes.inside & ~self._keep(before, goals).all(-1)
+            return real[:0]
+        before = rows.get(self._achieved_key)[real].unsqueeze(1)
+        goals = rows.get(self._next_achieved_key)[episodes.rows.take(drawn)]
+        return (~self._keep(before, goals).all(-1)).nonzero().squeeze(-1)
 
-    def _draw_from_table(
-        self, rows: TensorDictBase, episodes: Episodes, which: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Goals [R, k] for the R transitions of a mask [E, T], and for which there are any, [R]."""
-        episode = which.nonzero()[:, 0]
+    def _likelihoods(
+        self, rows: TensorDictBase, episodes: Episodes, real: Tensor, which: Tensor
+    ) -> Iterator[Tensor]:
+        """The likelihoods [n, T] of all goals of their episodes for some real rows, piece by piece."""
+        episode, time = (entry[which] for entry in episodes.inside.nonzero(as_tuple=True))
+        first, end = window(self.strategy, time, episodes.lengths[episode])
+        before = rows.get(self._achieved_key)[real[which]].unsqueeze(1)
         goals = rows.get(self._next_achieved_key)[episodes.rows]
-        weight = None if self.weights is None else self.weights(goals)[episode]
-        keep = None
-        if self.filter_achieved:
-            before = rows.get(self._achieved_key)[episodes.rows[which]]
-            keep = self._keep(before.unsqueeze(1), goals[episode]).unsqueeze(1)
-        candidate = candidates(self.strategy, episodes.lengths, which.shape[1])[which].unsqueeze(1)
-        likelihood = combine(candidate, weight, keep).squeeze(1)
-        return draw(likelihood, self.k, generator=self._rng)
+        weight = None if self.weights is None else self.weights(goals)
+        horizon = goals.shape[1]
+        for part in torch.arange(len(which), device=real.device).split(max(1, _LIKELIHOODS // horizon)):
+            own = episode[part]
+            yield combine(
+                between(first[part], end[part], horizon),
+                None if weight is None else weight[own],
+                self._keep(before[part], goals[own]) if self.filter_achieved else None,
+            )
 
     def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
         """The filter, [...]: False where a goal [..., g] was already achieved before the action."""

@@ -64,7 +64,14 @@ def test_every_goal_strategy_runs(strategy: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"batch_norm": True}, {"hard_update_interval": 50}, {"dtype": "float64"}, {"k": 0}]
+    "options",
+    [
+        {"batch_norm": True},
+        {"batch_norm": True, "num_runs": 2},
+        {"hard_update_interval": 50},
+        {"dtype": "float64"},
+        {"k": 0},
+    ],
 )
 def test_other_options_run(options: dict[str, Any]) -> None:
     rows = small(epochs=1, **options).build().run(progress=False).rows

@@ -257,7 +257,7 @@ def test_clipping_by_run_is_clipping_each_run() -> None:
     stacked = [nn.Parameter(torch.zeros_like(gradient)) for gradient in gradients]
     for parameter, gradient in zip(stacked, gradients, strict=True):
         parameter.grad = gradient.clone()
-    norms = clip_by_run(stacked, 3.0)
+    norms = clip_by_run(stacked, 3.0, runs=2)
     for run in range(2):
         single = [nn.Parameter(torch.zeros_like(gradient[run])) for gradient in gradients]
         for parameter, gradient in zip(single, gradients, strict=True):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from torchrl_her import candidates, combine, draw
+from torchrl_her import candidates, combine, draw, draw_alike, window
 
 
 @pytest.mark.parametrize(
@@ -82,3 +82,34 @@ def test_the_same_generator_draws_the_same() -> None:
     likelihood = torch.ones(3, 5)
     draws = [draw(likelihood, 4, generator=torch.Generator().manual_seed(7))[0] for _ in range(2)]
     assert torch.equal(*draws)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "first", "end"),
+    [("future", [0, 1, 2], [3, 3, 3]), ("final", [2, 2, 2], [3, 3, 3]), ("episode", [0, 0, 0], [3, 3, 3])],
+)
+def test_windows_of_an_episode_of_three(strategy: str, first: list[int], end: list[int]) -> None:
+    window_ = window(strategy, torch.arange(3), torch.tensor(3))  # type: ignore[arg-type]
+    assert [edge.tolist() for edge in window_] == [first, end]
+
+
+@pytest.mark.parametrize("strategy", ["future", "final", "episode"])
+def test_drawing_all_alike_is_drawing_from_the_candidates(strategy: str) -> None:
+    lengths, n = torch.tensor([1, 4]), 20_000
+    table = candidates(strategy, lengths, 4).float()  # type: ignore[arg-type]
+    for episode, time in ((0, 0), (1, 0), (1, 1), (1, 3)):
+        edges = window(strategy, torch.tensor(time), lengths[episode])  # type: ignore[arg-type]
+        index = draw_alike(*edges, n, generator=torch.Generator().manual_seed(0))
+        share = torch.bincount(index, minlength=4) / n
+        expected = table[episode, time] / table[episode, time].sum()
+        assert share.tolist() == pytest.approx(expected.tolist(), abs=0.02)  # six standard deviations
+        assert torch.equal(share > 0, expected > 0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**24), st.integers(1, 2**24))
+def test_even_the_largest_random_number_stays_in_the_window(first: int, size: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch, "rand", lambda *shape, **_: torch.full(shape, 1.0 - 2.0**-24))
+        index = draw_alike(torch.tensor(first), torch.tensor(first + size), 1)
+    assert first <= index.item() < first + size

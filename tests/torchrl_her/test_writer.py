@@ -218,6 +218,33 @@ def test_the_filter_asks_the_reward_even_where_nothing_ever_terminates() -> None
 # Episodes, environments, batches
 
 
+class PreferFar(GoalWeights):
+    """A goal is as useful as it is far away."""
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        return goals[..., 0]
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_goals_that_pass_the_filter_are_drawn_in_proportion(weighted: bool) -> None:
+    batch = make_batch([[4]] * 2_000)
+    path = torch.tensor([0.0, 0.0, 1.0, 3.0, 0.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    batch["observation"][..., 0] = torch.arange(4.0)
+    buffer = make_buffer(80_000, k=2, filter_achieved=True, weights=PreferFar() if weighted else None)
+    buffer.extend(batch)
+    virtual = buffer[:][buffer[:]["virtual"].squeeze(-1)]
+    time, goal = virtual["observation"][:, 0], virtual["desired_goal"][:, 0]
+    for t, kept in enumerate([[1.0, 3.0], [1.0, 3.0], [3.0, 0.0], [0.0]]):  # the goal 0 is achieved at first
+        drawn = goal[time == t]
+        total = sum(kept) if weighted else len(kept)
+        assert len(drawn) == (4_000 if total else 0)
+        for value in (0.0, 1.0, 3.0):
+            expected = (value if weighted else 1.0) / total if value in kept and total else 0.0
+            share = (drawn == value).sum().item() / 4_000
+            assert share == pytest.approx(expected, abs=0.05)  # six standard deviations
+
+
 def test_episodes_of_length_one_and_success_at_the_first_step() -> None:
     buffer = make_buffer(k=2)
     buffer.extend(make_batch([[1, 1, 1]], terminated=True))
