@@ -125,9 +125,9 @@ def machine() -> str:
 def report(rows: dict[str, int], seconds: dict[str, list[float]]) -> str:
     middle = {name: statistics.median(values) for name, values in seconds.items()}
     lines = [
-        f"**HERWriter takes {middle[HER] / middle[PLAIN]:.2f} times as long as the plain writer** (at most 2).",
+        f"**HERWriter takes {middle[HER] / middle[PLAIN]:.2f} times as long as the plain writer** (limit: 2).",
         f"Filtered, it takes {middle[FILTERED] / middle[HER]:.2f} times as long as not filtered, and "
-        f"{middle[RESTING] / middle[HER]:.2f} times where no ball moves (at most 1.5).",
+        f"{middle[RESTING] / middle[HER]:.2f} times where no ball moves (limit: 1.5).",
         "",
         f"One batch of {EPISODES} episodes of {STEPS} steps, k = {K}, rows as of `hand_v1`; medians of "
         f"{len(seconds[HER])} writes taken in turns. {machine()}.",
