@@ -125,7 +125,7 @@ def machine() -> str:
 def report(rows: dict[str, int], seconds: dict[str, list[float]]) -> str:
     middle = {name: statistics.median(values) for name, values in seconds.items()}
     lines = [
-        f"**HERWriter takes {middle[HER] / middle[PLAIN]:.2f} times as long as the plain writer** (limit: 2).",
+        f"**HERWriter takes {middle[HER] / middle[PLAIN]:.2f} times the plain writer's time** (limit: 2).",
         f"Filtered, it takes {middle[FILTERED] / middle[HER]:.2f} times as long as not filtered, and "
         f"{middle[RESTING] / middle[HER]:.2f} times where no ball moves (limit: 1.5).",
         "",

@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule
 from torchrl_her import evaluate, load_checkpoint, success, take_run
 from torchrl_her_envs import record_episodes, write_video
 from torchrl_her_recipes.parts import make_envs, make_networks
+from torchrl_her_recipes.run import FPS
 from torchrl_her_recipes.run_folder import RunFolder
 
 
@@ -52,6 +53,6 @@ def play(
     recipe = RunFolder(folder).recipe()
     actor = load_actor(folder, run=run)
     env = make_envs(recipe, goals, [seed])
-    write_video(record_episodes(env, actor, size=size), out)
+    write_video(record_episodes(env, actor, size=size), out, fps=FPS)
     env.set_seed(seed)
     return int(success(evaluate(env, actor, max_steps=env.world.max_steps)).sum())

@@ -36,6 +36,7 @@ from torchrl_her_recipes.plots import plot_curves, plot_goals
 from torchrl_her_recipes.run_folder import RunFolder
 
 _SATURATED = 0.99
+FPS = 12  # of films: half the true speed, as a throw takes half a second
 _FILMED = 6  # worlds in the GIF at the end of a run
 
 
@@ -217,7 +218,7 @@ def _finish(parts: Parts, trainer: Trainer, rows: list[dict[str, float]], home: 
         plot_goals(goals, parts.env, home.goals, title=f"virtual goals: {title}")
     first = recipe.eval_episodes * (_median_run(rows) if rows else 0)
     worlds = range(first, first + min(_FILMED, recipe.eval_episodes))
-    write_video(record_episodes(parts.eval_env, parts.policy, worlds=worlds), home.video)
+    write_video(record_episodes(parts.eval_env, parts.policy, worlds=worlds), home.video, fps=FPS)
 
 
 def _median_run(rows: list[dict[str, float]]) -> int:
