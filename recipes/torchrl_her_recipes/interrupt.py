@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+
+_TOGETHER = 1.0  # seconds
 
 
 class Interrupted(Exception):
@@ -15,16 +19,18 @@ class Interrupted(Exception):
 
 @contextmanager
 def soft_interrupt() -> Iterator[Callable[[], None]]:
-    """Defers the first Ctrl-C to the next call of what this yields; a second one strikes at once.
+    """Defers the first Ctrl-C to the next call of what this yields; a later one strikes at once.
+
+    Signals that come together, as from a process group and its parent, count as one.
 
     Example:
         >>> with soft_interrupt() as check:
         ...     check()  # raises Interrupted if somebody pressed Ctrl-C
     """
-    pressed = threading.Event()
+    pressed: list[float] = []  # when
 
     def check() -> None:
-        if pressed.is_set():
+        if pressed:
             raise Interrupted
 
     if threading.current_thread() is not threading.main_thread():
@@ -32,9 +38,9 @@ def soft_interrupt() -> Iterator[Callable[[], None]]:
         return
 
     def handle(_number: int, _frame: FrameType | None) -> None:
-        if pressed.is_set():
+        pressed.append(time.monotonic())
+        if pressed[-1] - pressed[0] > _TOGETHER:
             raise KeyboardInterrupt
-        pressed.set()
 
     before = signal.signal(signal.SIGINT, handle)
     try:

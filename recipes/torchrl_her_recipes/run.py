@@ -125,8 +125,8 @@ def _run(parts: Parts, trainer: Trainer, home: RunFolder | None, *, progress: bo
     torch.set_num_threads(recipe.threads)
     bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
     interrupted = False
-    try:
-        with soft_interrupt() as check:
+    with soft_interrupt() as check:  # also while things are saved at the end
+        try:
             while trainer.epochs < recipe.epochs:
                 new = _epoch(parts, trainer, bar, check, rows[-1]["seconds"] if rows else 0.0)
                 rows += new
@@ -134,13 +134,13 @@ def _run(parts: Parts, trainer: Trainer, home: RunFolder | None, *, progress: bo
                     home.log(new)
                     if trainer.epochs % recipe.checkpoint_interval == 0:
                         save_checkpoint(run_state(parts, trainer), home.checkpoint)
-    except Interrupted:
-        interrupted = True
-    finally:
-        bar.close()
-        torch.set_num_threads(threads)
-    if home is not None:
-        _finish(parts, trainer, rows, home)
+        except Interrupted:
+            interrupted = True
+        finally:
+            bar.close()
+            torch.set_num_threads(threads)
+        if home is not None:
+            _finish(parts, trainer, rows, home)
     return RunResult(rows=rows, folder=None if home is None else home.path, interrupted=interrupted)
 
 

@@ -1,0 +1,58 @@
+"""Ctrl-C: the first lets the work at hand finish, a later one strikes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import pytest
+
+from torchrl_her_recipes import interrupt
+from torchrl_her_recipes.interrupt import Interrupted, soft_interrupt
+
+
+def press() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_the_first_one_waits_for_a_good_moment() -> None:
+    with soft_interrupt() as check:
+        check()
+        press()
+        with pytest.raises(Interrupted):
+            check()
+
+
+def test_signals_that_come_together_count_as_one() -> None:
+    with soft_interrupt() as check:
+        press()
+        press()
+        with pytest.raises(Interrupted):
+            check()
+
+
+def test_a_later_one_strikes_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interrupt, "_TOGETHER", -1.0)
+    with pytest.raises(KeyboardInterrupt), soft_interrupt():
+        press()
+
+
+def test_the_handler_from_before_comes_back() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with soft_interrupt():
+        assert signal.getsignal(signal.SIGINT) is not before
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_other_threads_leave_signals_alone() -> None:
+    def work() -> None:
+        with soft_interrupt() as check:
+            check()
+            checked.append(True)
+
+    checked: list[bool] = []
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert checked == [True]
