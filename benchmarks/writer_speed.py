@@ -124,10 +124,13 @@ def machine() -> str:
 
 def report(rows: dict[str, int], seconds: dict[str, list[float]]) -> str:
     middle = {name: statistics.median(values) for name, values in seconds.items()}
+    ratio, filtered, resting = (
+        f"{middle[one] / middle[other]:.2f} times"
+        for one, other in ((HER, PLAIN), (FILTERED, HER), (RESTING, HER))
+    )
     lines = [
-        f"**HERWriter takes {middle[HER] / middle[PLAIN]:.2f} times the plain writer's time** (limit: 2).",
-        f"Filtered, it takes {middle[FILTERED] / middle[HER]:.2f} times as long as not filtered, and "
-        f"{middle[RESTING] / middle[HER]:.2f} times where no ball moves (limit: 1.5).",
+        f"**HERWriter takes {ratio} as long as the plain writer** (at most 2). With the filter it takes "
+        f"{filtered} as long as without (at most 1.5), and {resting} where no ball moves.",
         "",
         f"One batch of {EPISODES} episodes of {STEPS} steps, k = {K}, rows as of `hand_v1`; medians of "
         f"{len(seconds[HER])} writes taken in turns. {machine()}.",

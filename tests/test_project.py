@@ -97,5 +97,7 @@ def test_the_repository_names_no_package_index_and_no_path_of_a_machine() -> Non
         pytest.skip("not a git checkout")
     for name in listed.stdout.split():
         path = ROOT / name
-        if path.suffix in {".py", ".md", ".toml", ".yaml", ".txt"} and path != Path(__file__):
-            assert not re.search(r"index-url|find-links|files\.pythonhosted|/root/", path.read_text()), name
+        if path.suffix not in {".png", ".gif"} and path != Path(__file__):
+            assert not re.search(
+                r"index-url|find-links|pythonhosted|/root/|/home/|/tmp/|/work/", path.read_text()
+            ), name

@@ -19,7 +19,7 @@ from torchrl_her.virtual_goals import Strategy, between, check_strategy, combine
 
 # Work is done piece by piece: pieces that are too large touch fresh memory in every call, pieces that are too
 # small pay more for the calls. These are rows written at once, and likelihoods of goals [rows, T] at once.
-_ROWS = 1 << 16
+_ROWS = 1 << 17
 _LIKELIHOODS = 1 << 17
 _STATE_FILE = "her_writer.pt"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from numbers import Integral
 
 import numpy as np
 import torch
@@ -123,7 +124,7 @@ class ThrowingEnv(EnvBase):
         self._goals: GoalDistribution = self._make_goals()
         self.worlds = WorldState.zeros(num_envs, self.effector.num_joints)
         self._make_specs()
-        seeds = [seed] if isinstance(seed, int) else seed
+        seeds = [int(seed)] if isinstance(seed, Integral) else list(seed)
         self.set_seeds(seeds)
         # A space for each block: the last bits of a ball's path depend on where its world lies in its space.
         size = num_envs // len(seeds)
@@ -187,11 +188,14 @@ class ThrowingEnv(EnvBase):
             seeds: R of them.
 
         Raises:
-            ValueError: the worlds cannot be shared out among R blocks.
+            ValueError: the worlds cannot be shared out among R blocks, or a seed is out of range.
         """
         (n,) = self.batch_size
         if not seeds or n % len(seeds):
             raise ValueError(f"{n} worlds cannot be shared out among {len(seeds)} seeds")
+        for seed in seeds:
+            if not 0 <= seed < 1 << 64:
+                raise ValueError(f"a seed must be at least 0 and below 2**64, got {seed}")
         self._keys = np.concatenate([world_keys(seed, n // len(seeds)) for seed in seeds])
         self.worlds.episode.zero_()
 

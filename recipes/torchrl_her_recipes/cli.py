@@ -14,6 +14,7 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -61,7 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_versions()
         return commands[arguments[0]](arguments[1:])
     except KeyboardInterrupt:
-        return _fail("interrupted", _INTERRUPTED)
+        print("torchrl-her: interrupted", file=sys.stderr)
+        return _INTERRUPTED
     except _BAD as error:
         return _fail(_one_line(error))
 
@@ -88,7 +90,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def _train(arguments: list[str]) -> int:
-    if "--resume" in arguments:
+    if any(argument.split("=")[0] == "--resume" for argument in arguments):
         parser = argparse.ArgumentParser(prog="torchrl-her train --resume")
         parser.add_argument("--resume", metavar="RUN", type=Path, required=True, help="folder of a run")
         folder = parser.parse_args(arguments).resume
@@ -103,6 +105,8 @@ def _train(arguments: list[str]) -> int:
             codes.append(_train_one(config))
         except _BAD as error:  # reported here, so that the other jobs of a sweep go on
             codes.append(_fail(_one_line(error)))
+        if codes[-1] == _INTERRUPTED:
+            raise KeyboardInterrupt  # which ends a sweep, too
 
     before, sys.argv = sys.argv, ["torchrl-her train", *arguments]
     try:
@@ -115,9 +119,10 @@ def _train(arguments: list[str]) -> int:
 def _train_one(config: DictConfig) -> int:
     values = OmegaConf.to_container(config, resolve=True)
     assert isinstance(values, dict)
-    values.pop("folder")
+    folder = Path(str(values.pop("folder")))
     recipe = Recipe.from_dict({str(key): value for key, value in values.items()})
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        folder = Path(HydraConfig.get().runtime.output_dir)
     parts = recipe.build()
     _say_start(folder)
     return _say_end(parts.run(folder))

@@ -114,7 +114,7 @@ class Parts:
             frames_per_update=recipe.frames_per_update,
             warmup_frames=recipe.warmup_frames,
             batch_size=recipe.batch_size,
-            updates_per_draw=recipe.updates_per_draw,
+            updates_per_draw=min(recipe.updates_per_draw, recipe.buffer_size // recipe.batch_size),
         )
 
     def run(self, folder: str | Path | None = None, *, progress: bool = True) -> RunResult:

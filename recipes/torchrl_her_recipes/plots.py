@@ -36,7 +36,8 @@ def plot_curves(rows: Sequence[dict[str, float]], path: Path, *, title: str = ""
     figure = Figure(figsize=(10, 6), layout="constrained")
     figure.suptitle(title)
     for axes, (name, label, limits) in zip(figure.subplots(2, 2).flat, _PANELS, strict=True):
-        draw_curve(axes, rows, name)
+        if all(name in row for row in rows):
+            draw_curve(axes, rows, name)
         axes.set(xlabel="environment steps", ylabel=label)
         axes.grid(alpha=0.3)
         if limits is not None:

@@ -12,6 +12,7 @@ from torchrl_her_recipes.algorithms import get_algorithm
 if TYPE_CHECKING:
     from torchrl_her_recipes.parts import Parts
 
+_SEEDS = 1 << 31  # so that those of evaluations, which are made of it, have room
 _WORDS = {"sampler": ("prioritised", "uniform"), "dtype": ("float32", "float64")}
 
 
@@ -89,11 +90,15 @@ class Recipe:
         for name in _SHARES:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
-        if self.batch_size * self.updates_per_draw > self.buffer_size:
+        if self.batch_size > self.buffer_size:
+            raise ValueError(f"batch_size={self.batch_size} must fit buffer_size={self.buffer_size}")
+        if self.epoch_frames < self.num_envs * self.steps_per_batch:
             raise ValueError(
-                f"batch_size={self.batch_size} times updates_per_draw={self.updates_per_draw} must fit "
-                f"buffer_size={self.buffer_size}"
+                f"epoch_frames={self.epoch_frames} must be at least num_envs times steps_per_batch, "
+                f"{self.num_envs * self.steps_per_batch}"
             )
+        if self.seed + self.num_runs > _SEEDS:
+            raise ValueError(f"seed must be below {_SEEDS - self.num_runs + 1}, got {self.seed}")
         if self.epsilon_end > self.epsilon_start:
             raise ValueError(
                 f"epsilon_end={self.epsilon_end} must not be above epsilon_start={self.epsilon_start}"

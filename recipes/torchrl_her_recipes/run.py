@@ -70,28 +70,37 @@ def run(parts: Parts, folder: str | Path | None = None, *, progress: bool = True
     home = None if folder is None else RunFolder(folder)
     if home is not None:
         home.describe(parts.recipe)
-    return _run(parts, parts.trainer(), home, progress=progress)
+    return _run(parts, parts.trainer(), home, [], progress=progress)
 
 
-def resume(folder: str | Path, *, progress: bool = True) -> RunResult:
-    """Goes on with a run from its checkpoint, as if it had never stopped.
+def resume(folder: str | Path, *, parts: Parts | None = None, progress: bool = True) -> RunResult:
+    """Goes on with a run from its checkpoint.
+
+    From a checkpoint between two epochs, as if it had never stopped: bit for bit. After Ctrl-C in the
+    middle of an epoch the rest of it is made up with fresh episodes.
+
+    Args:
+        folder: of the run.
+        parts: freshly built ones, if the run's were not those of its recipe.
+        progress: whether to show a progress bar.
 
     Raises:
-        ValueError: there is no run in the folder, or its checkpoint is damaged.
+        ValueError: there is no run in the folder, its checkpoint is damaged, or the parts are others.
         OSError: there is no checkpoint yet.
     """
     home = RunFolder(folder)
-    parts = build_parts(home.recipe())
+    parts = parts or build_parts(home.recipe())
     trainer = parts.trainer()
     load_run_state(parts, trainer, load_checkpoint(home.checkpoint))
-    home.keep_rows(trainer.epochs * parts.recipe.num_runs)
-    return _run(parts, trainer, home, progress=progress)
+    rows = home.rows()[: trainer.epochs * parts.recipe.num_runs]  # not those behind the checkpoint
+    return _run(parts, trainer, home, rows, progress=progress)
 
 
 def run_state(parts: Parts, trainer: Trainer) -> dict[str, Any]:
     """All that a run is, as tensors and plain data."""
     return {
         "recipe": asdict(parts.recipe),
+        "made_of": _made_of(parts),
         "trainer": trainer.state_dict(),
         "loss": dict(parts.loss.state_dict()),
         "optimiser": parts.optimiser.state_dict(),
@@ -104,7 +113,16 @@ def run_state(parts: Parts, trainer: Trainer) -> dict[str, Any]:
 
 
 def load_run_state(parts: Parts, trainer: Trainer, state: dict[str, Any]) -> None:
-    """Puts freshly built parts where :func:`run_state` was taken."""
+    """Puts freshly built parts where :func:`run_state` was taken.
+
+    Raises:
+        ValueError: the parts are of other types or have other settings than those of the run.
+    """
+    for name, value in _made_of(parts).items():
+        if value != state["made_of"][name]:
+            raise ValueError(
+                f"the run's {name} was {state['made_of'][name]}, not {value}: give resume() parts made as its were"
+            )
     parts.loss.load_state_dict(state["loss"])
     parts.optimiser.load_state_dict(state["optimiser"])
     parts.exploration.load_state_dict(state["exploration"])
@@ -118,9 +136,24 @@ def load_run_state(parts: Parts, trainer: Trainer, state: dict[str, Any]) -> Non
     trainer.load_state_dict(state["trainer"])
 
 
-def _run(parts: Parts, trainer: Trainer, home: RunFolder | None, *, progress: bool) -> RunResult:
+def _made_of(parts: Parts) -> dict[str, str]:
+    """What must be the same for a run to go on."""
+    writer = parts.buffer.writer
+    hindsight = [writer.k, writer.strategy, writer.filter_achieved] if isinstance(writer, HERWriter) else []
+    names = {
+        name: type(getattr(parts, name)).__name__
+        for name in ("actor", "critic", "loss", "optimiser", "target")
+    }
+    return names | {
+        "writer": " ".join(map(str, [type(writer).__name__, *hindsight])),
+        "sampler": type(parts.buffer.sampler).__name__,
+    }
+
+
+def _run(
+    parts: Parts, trainer: Trainer, home: RunFolder | None, rows: list[dict[str, float]], *, progress: bool
+) -> RunResult:
     recipe = parts.recipe
-    rows = home.rows() if home is not None else []
     threads = torch.get_num_threads()
     torch.set_num_threads(recipe.threads)
     bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
@@ -131,7 +164,7 @@ def _run(parts: Parts, trainer: Trainer, home: RunFolder | None, *, progress: bo
                 new = _epoch(parts, trainer, bar, check, rows[-1]["seconds"] if rows else 0.0)
                 rows += new
                 if home is not None:
-                    home.log(new)
+                    home.log(rows, len(new))
                     if trainer.epochs % recipe.checkpoint_interval == 0:
                         save_checkpoint(run_state(parts, trainer), home.checkpoint)
         except Interrupted:
@@ -229,7 +262,7 @@ def _median_run(rows: list[dict[str, float]]) -> int:
 
 def virtual_goals(buffer: TensorDictReplayBuffer) -> Tensor:
     """The goals [n, 2] of all virtual rows in a buffer."""
-    if not len(buffer):
+    if not len(buffer) or "virtual" not in buffer[:].keys():
         return torch.empty(0, 2)
     rows = buffer[:]
     return rows["desired_goal"][rows["virtual"].squeeze(-1)]

@@ -61,41 +61,48 @@ class RunFolder:
         """The recipe of the run.
 
         Raises:
-            ValueError: this is no folder of a run.
+            ValueError: this is no folder of a run, or its configuration cannot be read.
         """
         if not self.config.is_file():
             raise ValueError(f"{self.path} is no folder of a run: it has no config.yaml")
-        return Recipe.from_dict(yaml.safe_load(self.config.read_text()))
+        try:
+            return Recipe.from_dict(yaml.safe_load(self.config.read_text()))
+        except (yaml.YAMLError, TypeError) as error:
+            raise ValueError(f"{self.config} cannot be read: {' '.join(str(error).split())}") from error
 
-    def log(self, rows: Sequence[dict[str, float]]) -> None:
-        """Adds rows to the table and to the events. All rows have the same columns."""
-        new = not self.metrics.exists()
-        with open(self.metrics, "a", newline="") as file:
-            writer = csv.DictWriter(file, rows[0].keys())
-            if new:
-                writer.writeheader()
+    def log(self, rows: Sequence[dict[str, float]], new: int) -> None:
+        """Writes the table, and the last rows of it to the events.
+
+        Args:
+            rows: the whole table: columns may join it on the way (losses, at the first update).
+            new: how many rows at its end are new.
+        """
+        columns = list(dict.fromkeys(name for row in rows for name in row))
+        part = self.metrics.with_suffix(".part")
+        with open(part, "w", newline="") as file:
+            writer = csv.DictWriter(file, columns, restval="nan")
+            writer.writeheader()
             writer.writerows(rows)
+        part.replace(self.metrics)
         if self._events is None:
-            self._events = SummaryWriter(str(self.path / "tensorboard"), purge_step=int(rows[0]["frames"]))
-        for row in rows:
+            self._events = SummaryWriter(str(self.path / "tensorboard"), purge_step=int(rows[-new]["frames"]))
+        for row in rows[-new:]:
             for name, value in row.items():
-                self._events.add_scalar(f"{name}/run_{row['run']:.0f}", value, int(row["frames"]))
+                self._events.add_scalar(f"{name}/run_{row['run']}", value, int(row["frames"]))
 
     def rows(self) -> list[dict[str, float]]:
         """The table so far."""
         if not self.metrics.exists():
             return []
         with open(self.metrics, newline="") as file:
-            return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
-
-    def keep_rows(self, count: int) -> None:
-        """Forgets all rows but the first ``count``: those behind a checkpoint that a run goes on from."""
-        if self.metrics.exists():
-            lines = self.metrics.read_text().splitlines(keepends=True)
-            self.metrics.write_text("".join(lines[: count + 1]))  # and the names of the columns
+            return [{name: _number(text) for name, text in row.items()} for row in csv.DictReader(file)]
 
     def close(self) -> None:
         """Writes out what is still in memory."""
         if self._events is not None:
             self._events.close()
             self._events = None
+
+
+def _number(text: str) -> float:
+    return int(text) if text.isdigit() else float(text)

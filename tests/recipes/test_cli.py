@@ -81,6 +81,7 @@ def test_every_preset_runs(preset: Path) -> None:
         (["train", "threshold=-1"], "threshold must be above 0, got -1.0"),
         (["train", "folder=/proc/nothing/here"], "cannot use /proc/nothing"),
         (["train", "--resume", "nowhere"], "nowhere is no folder of a run"),
+        (["train", "--resume=nowhere"], "nowhere is no folder of a run"),
         (["play", "nowhere"], "nowhere is no folder of a run"),
         (["fly"], "unknown command 'fly'; the commands are train, play, list"),
     ],
@@ -95,6 +96,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert captured.err.count("\n") == 1
     assert "Traceback" not in captured.err
     assert not Path("nowhere").exists()
+    assert not Path("runs").exists()
 
 
 def test_no_command_shows_how_to_use_it(capsys: pytest.CaptureFixture[str]) -> None:

@@ -88,6 +88,12 @@ def test_it_works_on_the_loss_s_own_weights() -> None:
 def test_what_it_does_not_know_it_refuses() -> None:
     loss = make_loss(1, normalise=True)
     assert not can_fuse(loss, SoftUpdate(loss, tau=0.1))
+    other_keys, other_order, other_distance = make_loss(1), make_loss(1), make_loss(1)
+    other_keys.set_keys(reward="cost")
+    other_order.value_network.in_keys = ["desired_goal", "observation", "action"]
+    other_distance.loss_function = "smooth_l1"
+    for unknown in (other_keys, other_order, other_distance):
+        assert not can_fuse(unknown, SoftUpdate(unknown, tau=0.1))
     plain = make_loss(1)
     assert not can_fuse(plain, HardUpdate(plain, value_network_update_interval=5))
     assert can_fuse(plain, SoftUpdate(plain, tau=0.1))
