@@ -46,6 +46,9 @@ class StackedLinear(nn.Module):
 class StackedBatchNorm(nn.Module):
     """Batch normalisation with statistics of each run's own.
 
+    Under TorchRL's DDPG loss the online critic's running statistics move twice an update and the
+    target critic's by themselves, since both are evaluated in training mode.
+
     Args:
         width: of the input.
         runs: R.

@@ -51,6 +51,9 @@ class Trainer:
         updates_per_draw: gradient steps whose rows are drawn in one call. Their priorities are as
             old as the call.
 
+    Raises:
+        ValueError: when running, if what was collected is not finite or has no trajectory ids.
+
     Attributes:
         frames: environment steps of each run so far.
         updates: gradient steps of each run so far.
@@ -64,11 +67,11 @@ class Trainer:
         buffers: Sequence[TensorDictReplayBuffer],
         learner: Learner,
         exploration: DecayingEpsilon | None = None,
-        epoch_frames: int = 8_000,
+        epoch_frames: int = 20_480,
         frames_per_update: float = 20.0,
         warmup_frames: int = 0,
-        batch_size: int = 64,
-        updates_per_draw: int = 1,
+        batch_size: int = 256,
+        updates_per_draw: int = 8,
     ) -> None:
         self.collector, self.buffers, self.learner, self.exploration = (
             collector,
@@ -103,6 +106,8 @@ class Trainer:
         while self.frames < end:
             batch = self.collector.next()
             check_finite(batch)
+            if ("collector", "traj_ids") not in batch.keys(True):
+                raise ValueError("the collector must mark trajectories: episodes are cut where epochs begin")
             collected = self._write(batch)
             self.frames += collected
             self._credit += collected / self.frames_per_update

@@ -124,7 +124,7 @@ class ThrowingEnv(EnvBase):
         self._goals: GoalDistribution = self._make_goals()
         self.worlds = WorldState.zeros(num_envs, self.effector.num_joints)
         self._make_specs()
-        seeds = [int(seed)] if isinstance(seed, Integral) else list(seed)
+        seeds = [int(seed)] if isinstance(seed, int | Integral) else list(seed)
         self.set_seeds(seeds)
         # A space for each block: the last bits of a ball's path depend on where its world lies in its space.
         size = num_envs // len(seeds)

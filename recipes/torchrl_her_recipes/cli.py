@@ -20,10 +20,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_her_envs import TASKS
 from torchrl_her_recipes.algorithms import ALGORITHMS
-from torchrl_her_recipes.play import play
+from torchrl_her_recipes.playing import play
 from torchrl_her_recipes.recipe import Recipe
-from torchrl_her_recipes.run import RunResult, resume
-from torchrl_her_recipes.versions import check_versions
+from torchrl_her_recipes.running import RunResult, resume
 
 _BAD_INPUT = 2
 _INTERRUPTED = 130
@@ -59,7 +58,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments[0] not in commands:
         return _fail(f"unknown command {arguments[0]!r}; the commands are {', '.join(commands)}")
     try:
-        check_versions()
         return commands[arguments[0]](arguments[1:])
     except KeyboardInterrupt:
         print("torchrl-her: interrupted", file=sys.stderr)
@@ -189,7 +187,3 @@ def _list(arguments: list[str]) -> int:
         for name, summary in entries.items():
             print(f"  {name:<14} {summary}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -36,7 +36,7 @@ from torchrl_her_recipes.algorithms import get_algorithm
 from torchrl_her_recipes.recipe import Recipe
 
 if TYPE_CHECKING:
-    from torchrl_her_recipes.run import RunResult
+    from torchrl_her_recipes.running import RunResult
 
 # Entries of a collected batch that no loss reads: not stored.
 _NOT_STORED = ("state", "achieved_goal", "collector")
@@ -124,7 +124,7 @@ class Parts:
             folder: where all that the run leaves behind goes; None leaves nothing.
             progress: whether to show a progress bar.
         """
-        from torchrl_her_recipes.run import run  # noqa: PLC0415  (runs need parts)
+        from torchrl_her_recipes.running import run  # noqa: PLC0415  (runs need parts)
 
         return run(self, folder, progress=progress)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -119,12 +121,18 @@ def test_versions_that_do_not_fit_are_named_with_the_remedy() -> None:
     check_versions({**installed, "torch": "2.14.1+cu130"}.__getitem__)
 
 
-def test_versions_are_checked_before_anything_runs(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refuse() -> None:
-        raise ImportError("torch 1.0 does not fit")
-
-    monkeypatch.setattr(cli, "check_versions", refuse)
-    assert cli.main(["list"]) == 2
-    assert capsys.readouterr().err == "torchrl-her: torch 1.0 does not fit\n"
+def test_versions_are_checked_before_anything_is_imported(tmp_path: Path) -> None:
+    """A torchrl that cannot even be imported beside this torch is still named in one line."""
+    for name, version in (("torch", "2.13.0"), ("tensordict", "0.14.3"), ("torchrl", "0.14.1")):
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('not to be imported')")
+        about = tmp_path / f"{name}-{version}.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-m", "torchrl_her_recipes", "list"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith(
+        "torchrl-her: torch 2.13.0 does not fit this version of torchrl-her; install "
+    )
+    assert done.stderr.count("\n") == 1

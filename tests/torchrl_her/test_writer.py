@@ -492,6 +492,16 @@ def test_counts_by_hand() -> None:
     counts = buffer.writer.counts
     assert (counts.real, counts.virtual, counts.real_positive) == (3, 6, 1)
     assert (counts.virtual_positive, counts.useful_virtual_positive) == (2, 2)
+    assert buffer.write_count == 9
+
+
+def test_a_goal_that_was_achieved_before_is_no_useful_positive() -> None:
+    batch, path = make_batch([[2]]), torch.tensor([5.0, 0.0, 0.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    buffer = make_buffer(strategy="final", k=1)
+    buffer.extend(batch)
+    counts = buffer.writer.counts
+    assert (counts.virtual_positive, counts.useful_virtual_positive) == (2, 1)
 
 
 # Options

@@ -120,9 +120,8 @@ def load_run_state(parts: Parts, trainer: Trainer, state: dict[str, Any]) -> Non
     """
     for name, value in _made_of(parts).items():
         if value != state["made_of"][name]:
-            raise ValueError(
-                f"the run's {name} was {state['made_of'][name]}, not {value}: give resume() parts made as its were"
-            )
+            was = state["made_of"][name]
+            raise ValueError(f"the run's {name} was {was}, not {value}: give resume() parts made as its were")
     parts.loss.load_state_dict(state["loss"])
     parts.optimiser.load_state_dict(state["optimiser"])
     parts.exploration.load_state_dict(state["exploration"])
@@ -262,7 +261,7 @@ def _median_run(rows: list[dict[str, float]]) -> int:
 
 def virtual_goals(buffer: TensorDictReplayBuffer) -> Tensor:
     """The goals [n, 2] of all virtual rows in a buffer."""
-    if not len(buffer) or "virtual" not in buffer[:].keys():
+    rows = buffer[:] if len(buffer) else {}
+    if "virtual" not in rows:
         return torch.empty(0, 2)
-    rows = buffer[:]
     return rows["desired_goal"][rows["virtual"].squeeze(-1)]

@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictModule
 from torchrl_her import evaluate, load_checkpoint, success, take_run
 from torchrl_her_envs import record_episodes, write_video
 from torchrl_her_recipes.parts import make_envs, make_networks
-from torchrl_her_recipes.run import FPS
 from torchrl_her_recipes.run_folder import RunFolder
+from torchrl_her_recipes.running import FPS
 
 
 def load_actor(folder: str | Path, *, run: int = 0) -> TensorDictModule:
