@@ -16,16 +16,19 @@ lint: $(VENV)/.ready-test  ## style, formatting, types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(VENV)/.ready  ## speed of environments and writer, beside their peers
+bench: $(VENV)/.ready-bench  ## speed, beside peers; and that every task can be solved
 	$(BIN)/python benchmarks/env_speed.py
 	$(BIN)/python benchmarks/writer_speed.py
+	$(BIN)/python benchmarks/update_speed.py
+	$(BIN)/python benchmarks/task_check.py
 
 clean:
 	rm -rf $(VENV)
 
 $(VENV)/.ready: EXTRAS :=
 $(VENV)/.ready-test: EXTRAS := [test,lint,video]
-$(VENV)/.ready $(VENV)/.ready-test: pyproject.toml
+$(VENV)/.ready-bench: EXTRAS := [bench]
+$(VENV)/.ready $(VENV)/.ready-test $(VENV)/.ready-bench: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; set PYTHON=") if sys.version_info < (3, 11) else None'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet uv  # installs torch in seconds; pip is the way out where it cannot
