@@ -29,14 +29,35 @@ def first_episode(done: Tensor) -> Tensor:
 
 
 def success(rollout: TensorDictBase, *, achieved_reward: float = 0.0) -> Tensor:
-    """Whether the goal was achieved at some step: [N] of bool."""
+    """Whether the goal was achieved at some step.
+
+    Args:
+        rollout: [N, T].
+        achieved_reward: the reward of an achieved goal.
+
+    Returns:
+        [N] of bool.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> reward, done = torch.tensor([[[-1.0], [0.0]]]), torch.tensor([[[False], [True]]])
+        >>> success(TensorDict({"next": {"reward": reward, "done": done}}, [1, 2])).tolist()
+        [True]
+    """
     reward = rollout.get(("next", "reward")).squeeze(-1)
     inside = first_episode(rollout.get(("next", "done")).squeeze(-1))
     return (inside & (reward >= achieved_reward)).any(-1)
 
 
 def final_distance(rollout: TensorDictBase) -> Tensor:
-    """Distance of the achieved goal to the desired goal at the last step: [N]."""
+    """Distance of the achieved goal to the desired goal at the last step.
+
+    Args:
+        rollout: [N, T].
+
+    Returns:
+        [N], in the unit of the goals.
+    """
     last = first_episode(rollout.get(("next", "done")).squeeze(-1)).sum(-1, keepdim=True) - 1
     gap = distance(rollout.get(("next", "achieved_goal")), rollout.get(("next", "desired_goal")))
     return gap.gather(-1, last).squeeze(-1)
@@ -52,7 +73,22 @@ def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: flo
         rollout: [N, T].
         gamma: discount.
         tail_reward: reward of every step after a truncation.
+
+    Returns:
+        [N]
+
+    Raises:
+        ValueError: a discount outside of [0, 1).
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> reward, done = -torch.ones(1, 2, 1), torch.tensor([[[False], [True]]])
+        >>> after = {"reward": reward, "done": done, "terminated": torch.zeros_like(done)}
+        >>> discounted_return(TensorDict({"next": after}, [1, 2]), 0.5).tolist()  # truncated: -1 for ever
+        [-2.0]
     """
+    if not 0.0 <= gamma < 1.0:
+        raise ValueError(f"gamma must be in [0, 1), got {gamma}")
     reward = rollout.get(("next", "reward")).squeeze(-1)
     inside = first_episode(rollout.get(("next", "done")).squeeze(-1))
     discount = gamma ** torch.arange(reward.shape[-1], dtype=reward.dtype, device=reward.device)
