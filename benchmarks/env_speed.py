@@ -12,7 +12,6 @@ of both are compared.
 from __future__ import annotations
 
 import argparse
-import platform
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -21,10 +20,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import pymunk
 import torch
-import torchrl
 from gymnasium.vector import SyncVectorEnv, VectorEnv
+from machine import describe
 from peer_env import PeerEnv
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, GymWrapper, SerialEnv
@@ -32,6 +30,7 @@ from torchrl.envs import EnvBase, GymWrapper, SerialEnv
 from torchrl_her_envs import TASKS, ThrowingEnv, get_task, make_env
 
 OURS, MADE, BARE, SERIAL = "this", "gymnasium.make_vec", "bare SyncVectorEnv", "SerialEnv"
+PACKAGES = ("torch", "torchrl", "pymunk", "gymnasium")
 PEER_ID = "torchrl_her_benchmarks/Peer-v0"
 HAND_TASKS = [name for name, task in TASKS.items() if task.effector == "hand" and task.throws]
 WORLDS = (1, 16, 64, 256, 1024)
@@ -178,26 +177,12 @@ def measure(task: str, worlds: int, *, repeats: int, seconds: float) -> dict[str
 # Report
 
 
-def machine() -> str:
-    cpu = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line
-        ]
-        cpu = names[0] if names else cpu
-    return (
-        f"{cpu}, 1 thread; Python {platform.python_version()}, torch {torch.__version__}, "
-        f"torchrl {torchrl.__version__}, pymunk {pymunk.version}, gymnasium {gymnasium.__version__}"
-    )
-
-
 def report(task: str, rows: dict[int, dict[str, float]], difference: float, repeats: int) -> str:
     lines = [
         f"Environment steps a second of `{task}` with random actions and automatic resets; medians of "
         f"{repeats} runs taken in turns. Same starts and actions gave paths at most {difference:.0e} apart.",
         "",
-        f"{machine()}.",
+        f"{describe(*PACKAGES)}.",
         "",
         "| worlds | " + " | ".join(f"over {name}" for name in PEERS) + " | this, steps/s |",
         "| ---: |" + " ---: |" * (len(PEERS) + 1),

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import argparse
 import logging
-import platform
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
-import torchrl
+from machine import describe
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -113,15 +112,6 @@ def interleaved(actions: dict[str, Callable[[], object]], repeats: int) -> dict[
     return seconds
 
 
-def machine() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    cpu = names[0] if names else platform.processor() or platform.machine()
-    versions = f"Python {platform.python_version()}, torch {torch.__version__}, torchrl {torchrl.__version__}"
-    return f"{cpu}, 1 thread; {versions}"
-
-
 def report(rows: dict[str, int], seconds: dict[str, list[float]]) -> str:
     middle = {name: statistics.median(values) for name, values in seconds.items()}
     ratio, filtered, resting = (
@@ -133,7 +123,7 @@ def report(rows: dict[str, int], seconds: dict[str, list[float]]) -> str:
         f"{filtered} as long as without (at most 1.5), and {resting} where no ball moves.",
         "",
         f"One batch of {EPISODES} episodes of {STEPS} steps, k = {K}, rows as of `hand_v1`; medians of "
-        f"{len(seconds[HER])} writes taken in turns. {machine()}.",
+        f"{len(seconds[HER])} writes taken in turns. {describe('torch', 'torchrl')}.",
         "",
         "| writer | rows written | ms, median | ms, least | ms, most | million rows/s |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
