@@ -16,11 +16,8 @@ lint: $(VENV)/.ready-test  ## style, formatting, types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(VENV)/.ready-bench  ## speed, beside peers; and that every task can be solved
-	$(BIN)/python benchmarks/env_speed.py
-	$(BIN)/python benchmarks/writer_speed.py
-	$(BIN)/python benchmarks/update_speed.py
-	$(BIN)/python benchmarks/task_check.py
+bench: $(VENV)/.ready-bench  ## all benchmarks, beside peers, in one report: bench.md
+	$(BIN)/python benchmarks/run.py
 
 clean:
 	rm -rf $(VENV)

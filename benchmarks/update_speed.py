@@ -9,7 +9,7 @@ Stable-Baselines3 (the extra `bench`) has no prioritised replay and relabels whi
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +50,7 @@ def ours(runs: int, *, frames_per_update: float = 20.0, fused: bool = True, per_
         warmup_frames=FILL,
         buffer_size=200_000,
         eval_episodes=1,
+        compile="always",
     )
     parts = recipe.build()
     trainer = parts.trainer()
@@ -146,7 +147,7 @@ def loop_table(repeats: int) -> str:
     return table(header, rows)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -154,8 +155,9 @@ def main() -> None:
         "--repeats", type=int, default=7, help="measurements of each, taken in turns (default: 7)"
     )
     parser.add_argument("--out", type=Path, help="write the tables to this file, too")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    torch.set_flush_denormal(True)  # as in runs
     machine = describe("torch", "torchrl", "stable-baselines3")
     text = "\n\n".join((machine, update_table(options.repeats), loop_table(options.repeats)))
     print(text)

@@ -7,10 +7,15 @@ from torchrl_her.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from torchrl_her.compiling import CompiledOnce
+from torchrl_her.curriculum import Curriculum, CurriculumLayer, CurriculumProgress, zero_unused_inputs
+from torchrl_her.curriculum_transforms import StateToObs, ZeroPad
 from torchrl_her.episodes import Episodes, find_episodes
 from torchrl_her.exploration import DecayingEpsilon, explore
-from torchrl_her.fused import FusedDDPGLearner, can_fuse
+from torchrl_her.fused import FusedDDPGLearner, can_fuse, is_plain_adam
+from torchrl_her.goal_grid import GoalGrid, box_target, kl_divergence, sampled_target
 from torchrl_her.goals import EnvReward, GoalReward, RewardFunction, achieved, distance
+from torchrl_her.instructiveness import GoalHistogram, Instructiveness
 from torchrl_her.losses import (
     ClampedTD0,
     Learner,
@@ -30,22 +35,32 @@ __all__ = [
     "ActorNet",
     "CheckpointError",
     "ClampedTD0",
+    "CompiledOnce",
     "CriticNet",
+    "Curriculum",
+    "CurriculumLayer",
+    "CurriculumProgress",
     "DecayingEpsilon",
     "EnvReward",
     "Episodes",
     "FusedDDPGLearner",
+    "GoalGrid",
+    "GoalHistogram",
     "GoalReward",
     "GoalWeights",
     "HERWriter",
+    "Instructiveness",
     "Learner",
     "LossLearner",
     "PenalisedDDPGLoss",
     "RewardFunction",
+    "StateToObs",
     "Strategy",
     "Trainer",
     "WriterCounts",
+    "ZeroPad",
     "achieved",
+    "box_target",
     "buffer_state_dict",
     "can_fuse",
     "candidates",
@@ -60,6 +75,8 @@ __all__ = [
     "final_distance",
     "find_episodes",
     "first_episode",
+    "is_plain_adam",
+    "kl_divergence",
     "load_buffer_state_dict",
     "load_checkpoint",
     "make_actor",
@@ -67,9 +84,11 @@ __all__ = [
     "make_ddpg_loss",
     "make_target_updater",
     "q_bias",
+    "sampled_target",
     "save_checkpoint",
     "stack_runs",
     "success",
     "take_run",
     "window",
+    "zero_unused_inputs",
 ]

@@ -1,13 +1,10 @@
-"""DDPG's gradient step written out: TorchRL's numbers, in a fraction of the time.
+"""DDPG's gradient step without autograd: TorchRL's numbers, in a fraction of the time.
 
 The loss module, its optimiser and its target networks stay what they are: this learner works on
-their very weights, so checkpoints, state dicts and users see no difference. What is left out is
-what small networks spend most of their time on, the bookkeeping around a hundred small products.
+their very weights, so checkpoints, state dicts and users see no difference.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -15,75 +12,19 @@ from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 
-from torchrl_her.losses import ClampedTD0, PenalisedDDPGLoss, clip_by_run
+from torchrl_her.compiling import CompiledOnce
+from torchrl_her.ddpg_step import (
+    Adam,
+    Rows,
+    Settings,
+    Step,
+    Weights,
+    bias_corrections,
+    ddpg_gradients,
+    ddpg_update_,
+)
+from torchrl_her.losses import ClampedTD0, PenalisedDDPGLoss
 from torchrl_her.networks import ActorNet, CriticNet
-
-
-class Layer(NamedTuple):
-    """Weights [R, inputs, outputs] and biases [R, 1, outputs] of one layer of R networks."""
-
-    weight: Tensor
-    bias: Tensor
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """[R, B, inputs] to [R, B, outputs]."""
-        return torch.baddbmm(self.bias, x, self.weight)
-
-    def back(self, slope: Tensor) -> Tensor:
-        """The slope of a loss in the inputs, from that in the outputs."""
-        return torch.bmm(slope, self.weight.mT)
-
-
-def _relu_back(slope: Tensor, output: Tensor) -> Tensor:
-    return torch.ops.aten.threshold_backward(slope, output, 0.0)
-
-
-def _gradients(inputs: Tensor, slope: Tensor) -> list[Tensor]:
-    """Gradients of a layer's weight and bias."""
-    return [torch.bmm(inputs.mT, slope), slope.sum(1, keepdim=True)]
-
-
-def run_actor(layers: list[Layer], seen: Tensor) -> list[Tensor]:
-    """Inputs and outputs of all layers of :class:`~torchrl_her.ActorNet`; the action [R, B, a] is last."""
-    outputs = [seen]
-    for layer in layers[:-1]:
-        outputs.append(layer(outputs[-1]).relu_())
-    return [*outputs, layers[-1](outputs[-1]).tanh_()]
-
-
-def actor_gradients(layers: list[Layer], outputs: list[Tensor], slope: Tensor) -> list[Tensor]:
-    """Gradients of all weights and biases, from the slope [R, B, a] of a loss in the action."""
-    slope = slope * (1.0 - outputs[-1].square())
-    gradients = _gradients(outputs[-2], slope)
-    for i in range(len(layers) - 1, 0, -1):
-        slope = _relu_back(layers[i].back(slope), outputs[i])
-        gradients = _gradients(outputs[i - 1], slope) + gradients
-    return gradients
-
-
-def run_critic(layers: list[Layer], seen: Tensor, action: Tensor) -> list[Tensor]:
-    """Inputs and outputs of all layers of :class:`~torchrl_her.CriticNet`; the value [R, B, 1] is last."""
-    outputs = [seen, torch.cat((layers[0](seen).relu_(), action), -1)]
-    for layer in layers[1:-1]:
-        outputs.append(layer(outputs[-1]).relu_())
-    return [*outputs, layers[-1](outputs[-1])]
-
-
-def critic_gradients(layers: list[Layer], outputs: list[Tensor], slope: Tensor) -> list[Tensor]:
-    """Gradients of all weights and biases, from the slope [R, B, 1] of a loss in the value."""
-    gradients = _gradients(outputs[-2], slope)
-    for i in range(len(layers) - 1, 0, -1):
-        width = layers[i - 1].bias.shape[-1]  # behind the first layer without the action
-        slope = _relu_back(layers[i].back(slope)[..., :width], outputs[i][..., :width])
-        gradients = _gradients(outputs[i - 1], slope) + gradients
-    return gradients
-
-
-def action_slope(layers: list[Layer], outputs: list[Tensor], slope: Tensor) -> Tensor:
-    """The slope of a loss in the action [R, B, a], from that in the value [R, B, 1]."""
-    for i in range(len(layers) - 1, 1, -1):
-        slope = _relu_back(layers[i].back(slope), outputs[i])
-    return layers[1].back(slope)[..., layers[0].bias.shape[-1] :]
 
 
 def can_fuse(loss: nn.Module, target: TargetNetUpdater | None) -> bool:
@@ -104,6 +45,14 @@ def can_fuse(loss: nn.Module, target: TargetNetUpdater | None) -> bool:
     )
 
 
+def is_plain_adam(optimiser: torch.optim.Optimizer) -> bool:
+    """Whether an optimiser is Adam with one group of parameters and no extras."""
+    if type(optimiser) is not torch.optim.Adam or len(optimiser.param_groups) != 1:
+        return False
+    (group,) = optimiser.param_groups
+    return not (group["weight_decay"] or group["amsgrad"] or group["maximize"] or group["differentiable"])
+
+
 class FusedDDPGLearner:
     """A :class:`~torchrl_her.Learner` for :class:`~torchrl_her.PenalisedDDPGLoss`.
 
@@ -113,9 +62,12 @@ class FusedDDPGLearner:
         optimiser: over the loss module's parameters; must treat each number by itself, as Adam does.
         target: of the loss.
         max_grad_norm: the gradients of each network of each run are clipped to this norm, apart.
+        compile_step: compiles losses, gradients and clipping into one program at the first batch of
+            a shape, and a plain Adam and the soft update with them; see :class:`~torchrl_her.CompiledOnce`.
 
     Raises:
-        ValueError: :func:`can_fuse` says no; use :class:`~torchrl_her.LossLearner`.
+        ValueError: :func:`can_fuse` says no: use :class:`~torchrl_her.LossLearner`; or the optimiser is
+            not one that can be compiled.
 
     Example:
         >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss
@@ -130,89 +82,126 @@ class FusedDDPGLearner:
         target: SoftUpdate,
         *,
         max_grad_norm: float = 3.0,
+        compile_step: bool = False,
     ) -> None:
         if not can_fuse(loss, target):
             raise ValueError("only DDPG with the networks of make_actor and make_critic can be fused")
-        self.loss, self.optimiser, self.max_grad_norm = loss, optimiser, max_grad_norm
-        self.gamma = float(loss.value_estimator.gamma)
+        if compile_step and not is_plain_adam(optimiser):
+            raise ValueError(f"only a plain torch.optim.Adam can be compiled, got {optimiser}")
+        self.loss, self.optimiser, self.compile_step = loss, optimiser, compile_step
         self.tau = 1.0 - float(target.eps)
         self.runs: int = loss.actor_network.module.runs
-        self._in_keys = list(loss.actor_network.in_keys)
-        self._next_keys = [("next", key) for key in self._in_keys]
+        self._settings = Settings(
+            gamma=float(loss.value_estimator.gamma),
+            low=loss.value_estimator.low,
+            high=loss.value_estimator.high,
+            action_penalty=loss.action_penalty,
+            max_grad_norm=max_grad_norm,
+        )
+        self._compiled: dict[tuple, CompiledOnce] = {}  # by the shape of a batch, and whether it has weights
+        self._keys = list(loss.actor_network.in_keys)
+        self._next_keys = [("next", key) for key in self._keys]
         self._action_key = loss.actor_network.out_keys[0]
-        self._networks = [
-            _parameters(loss.actor_network.module, loss.actor_network_params),
-            _parameters(loss.value_network.module, loss.value_network_params),
+        actor, critic = loss.actor_network.module, loss.value_network.module
+        self._parameters = [
+            *_parameters(actor, loss.actor_network_params),
+            *_parameters(critic, loss.value_network_params),
         ]
         targets = [
-            _parameters(loss.actor_network.module, loss.target_actor_network_params),
-            _parameters(loss.value_network.module, loss.target_value_network_params),
+            *_parameters(actor, loss.target_actor_network_params),
+            *_parameters(critic, loss.target_value_network_params),
         ]
-        self._values = [p.data for network in self._networks for p in network]
-        self._targets = [p.data for network in targets for p in network]
-        self._actor, self._critic = (_layers(network) for network in self._networks)
-        self._target_actor, self._target_critic = (_layers(network) for network in targets)
+        self._weights = Weights([p.data for p in self._parameters], [p.data for p in targets])
+        self._actor_layers = len(list(actor.parameters())) // 2
+        self._networks = self._weights.networks(self._actor_layers)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether a compiled form has been at work."""
+        return any(form.compiled for form in self._compiled.values())
 
     @torch.no_grad()
-    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """One gradient step of each run on rows [R, B]."""
-        seen = self._rows(batch, self._in_keys)
-        weight = self._weight(batch)
-        critic = run_critic(self._critic, seen, self._rows(batch, [self._action_key]))
-        error = critic[-1] - self._target(batch)
-        squares = error.square()
-        value_gradients = critic_gradients(self._critic, critic, error * weight * (2.0 / seen.shape[1]))
-
-        actor = run_actor(self._actor, seen)
-        action = actor[-1]
-        wished = run_critic(self._critic, seen, action)
-        slope = action_slope(self._critic, wished, weight.expand_as(error) / -seen.shape[1])
-        price = self.loss.action_penalty / (action.shape[1] * action.shape[2])
-        slope = slope.add(action, alpha=2.0 * price)
-        self._step(actor_gradients(self._actor, actor, slope), value_gradients)
-        batch.set(self.loss.tensor_keys.priority, squares.view(batch.batch_size))
+    def update(self, rows: TensorDictBase, steps: int = 1) -> dict[str, Tensor]:
+        """Gradient steps of each run; see :class:`~torchrl_her.Learner`."""
+        done = [self._step(part) for part in self._parts(rows, steps)]
+        squares = torch.cat([step.squares for step in done], 1)
+        rows.set(self.loss.tensor_keys.priority, squares.view(rows.batch_size))
         return {
-            "loss_actor": action.square().sum((1, 2)) * price - (wished[-1] * weight).mean((1, 2)),
-            "loss_value": (squares * weight).mean((1, 2)),
+            "loss_actor": torch.stack([step.loss_actor for step in done]),
+            "loss_value": torch.stack([step.loss_value for step in done]),
         }
 
-    def _rows(self, batch: TensorDictBase, keys: list) -> Tensor:
+    def _step(self, rows: Rows) -> Step:
+        if self.compile_step:
+            return self._compiled_step(rows)
+        step = ddpg_gradients(self._networks, rows, self._settings)
+        for parameter, gradient in zip(self._parameters, step.actor + step.critic, strict=True):
+            parameter.grad = gradient
+        self.optimiser.step()
+        torch._foreach_lerp_(self._weights.targets, self._weights.values, self.tau)
+        return step
+
+    def _compiled_step(self, rows: Rows) -> Step:
+        form = (*rows.action.shape, rows.weight is None)
+        if form not in self._compiled:
+            settings, layers, tau = self._settings, self._actor_layers, self.tau
+
+            def ddpg_step(weights: Weights, adam: Adam, rows: Rows) -> Step:
+                return ddpg_update_(weights, adam, rows, settings, actor_layers=layers, tau=tau)
+
+            self._compiled[form] = CompiledOnce(ddpg_step)
+        return self._compiled[form](self._weights, self._adam(), rows)
+
+    def _adam(self) -> Adam:
+        """The optimiser's own state: read anew each time, as loading a checkpoint replaces it."""
+        states = [self.optimiser.state[parameter] or self._start(parameter) for parameter in self._parameters]
+        (group,) = self.optimiser.param_groups
+        count = float(states[0]["step"]) + 1.0
+        size, spread = bias_corrections(count, float(group["lr"]), group["betas"])
+        number = self._weights.values[0].new_tensor
+        return Adam(
+            [state["exp_avg"] for state in states],
+            [state["exp_avg_sq"] for state in states],
+            [state["step"] for state in states],
+            number(size),
+            number(spread),
+            group["betas"],
+            group["eps"],
+        )
+
+    def _start(self, parameter: nn.Parameter) -> dict[str, Tensor]:
+        """The state that Adam begins with, which it makes at its first step."""
+        state = self.optimiser.state[parameter]
+        state["step"] = torch.zeros(())
+        state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter.data) for _ in range(2))
+        return state
+
+    def _parts(self, rows: TensorDictBase, steps: int) -> list[Rows]:
+        """The rows of each step."""
+        entries = self._rows(rows)
+        size = entries.action.shape[1] // steps
+        split = [[None] * steps if entry is None else entry.split(size, 1) for entry in entries]
+        return [Rows(*own) for own in zip(*split, strict=True)]
+
+    def _rows(self, batch: TensorDictBase) -> Rows:
+        weight = batch.get("priority_weight", None)
+        return Rows(
+            self._joined(batch, self._keys),
+            self._joined(batch, [self._action_key]),
+            self._joined(batch, self._next_keys),
+            self._joined(batch, [("next", "reward")]),
+            self._joined(batch, [("next", "terminated")]),
+            None if weight is None else weight.view(self.runs, -1, 1).to(self._weights.values[0].dtype),
+        )
+
+    def _joined(self, batch: TensorDictBase, keys: list) -> Tensor:
         """Entries beside each other, [R, B, width]."""
         values = [batch.get(key) for key in keys]
         joined = torch.cat(values, -1) if len(values) > 1 else values[0]
         return joined.reshape(self.runs, -1, joined.shape[-1])
-
-    def _weight(self, batch: TensorDictBase) -> Tensor:
-        """Importance weights [R, B, 1] of mean 1 in each run."""
-        weight = batch.get("priority_weight", None)
-        if weight is None:
-            return self._values[0].new_ones(1, 1, 1)
-        weight = weight.reshape(self.runs, -1, 1).to(self._values[0].dtype)
-        return weight / weight.mean(1, keepdim=True)
-
-    def _target(self, batch: TensorDictBase) -> Tensor:
-        """The clamped one-step targets [R, B, 1]."""
-        seen = self._rows(batch, self._next_keys)
-        value = run_critic(self._target_critic, seen, run_actor(self._target_actor, seen)[-1])[-1]
-        value.masked_fill_(self._rows(batch, [("next", "terminated")]), 0.0)
-        estimator = self.loss.value_estimator
-        reward = self._rows(batch, [("next", "reward")])
-        return value.mul_(self.gamma).add_(reward).clamp_(estimator.low, estimator.high)
-
-    def _step(self, *gradients: list[Tensor]) -> None:
-        for network, own in zip(self._networks, gradients, strict=True):
-            for parameter, gradient in zip(network, own, strict=True):
-                parameter.grad = gradient
-            clip_by_run(network, self.max_grad_norm, runs=self.runs)
-        self.optimiser.step()
-        torch._foreach_lerp_(self._targets, self._values, self.tau)
 
 
 def _parameters(net: nn.Module, weights: TensorDictBase) -> list[nn.Parameter]:
     """A network's parameters in order, out of a loss module's collection: weight, bias, weight, ..."""
     flat = weights["module"].flatten_keys(".")
     return [flat[name] for name, _ in net.named_parameters()]
-
-
-def _layers(parameters: list[nn.Parameter]) -> list[Layer]:
-    return [Layer(w.data, b.data) for w, b in zip(parameters[::2], parameters[1::2], strict=True)]

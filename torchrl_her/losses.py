@@ -13,7 +13,8 @@ from torchrl.objectives import DDPGLoss, HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import TD0Estimator
 
-_WEIGHT = "priority_weight"  # of importance sampling, as TorchRL's samplers and losses call it
+# Importance weights and priorities, as TorchRL's samplers and losses call them.
+_WEIGHT, _PRIORITY = "priority_weight", "td_error"
 
 
 class ClampedTD0(TD0Estimator):
@@ -117,10 +118,18 @@ def make_target_updater(loss: LossModule, *, tau: float, hard_interval: int) -> 
 
 
 class Learner(Protocol):
-    """What the training loop asks of an algorithm: one gradient step of each run."""
+    """What the training loop asks of an algorithm: gradient steps of each run."""
 
-    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Learns from rows [R, B], writes their priorities into them, returns what it measured: [R] each."""
+    def update(self, rows: TensorDictBase, steps: int = 1) -> dict[str, Tensor]:
+        """Learns from rows and writes their priorities into them.
+
+        Args:
+            rows: [R, S * B] of R runs; step s takes the rows [:, s * B : (s + 1) * B].
+            steps: S.
+
+        Returns:
+            What it measured, [S, R] each.
+        """
         ...
 
 
@@ -157,8 +166,17 @@ class LossLearner:
         self.max_grad_norm, self.runs = max_grad_norm, runs
         self._networks = self._find_networks()
 
-    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """One gradient step of each run; see :class:`Learner`."""
+    def update(self, rows: TensorDictBase, steps: int = 1) -> dict[str, Tensor]:
+        """Gradient steps of each run; see :class:`Learner`."""
+        last = rows.ndim - 1
+        parts = rows.split(rows.shape[last] // steps, last)
+        measured = [self._update(part) for part in parts]
+        priorities = [part.get(_PRIORITY, None) for part in parts]
+        if priorities[0] is not None:
+            rows.set(_PRIORITY, torch.cat(priorities, last))
+        return {key: torch.stack([step[key] for step in measured]) for key in measured[0]}
+
+    def _update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         weight = batch.get(_WEIGHT, None)
         if weight is not None:
             # TorchRL divides by the sum of the weights if it averages, but not if it keeps rows apart.

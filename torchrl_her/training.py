@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -13,8 +13,15 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_her.exploration import DecayingEpsilon
 from torchrl_her.losses import Learner
+
+
+class Schedule(Protocol):
+    """What changes from epoch to epoch; has state of its own."""
+
+    def step(self) -> None:
+        """One epoch has ended."""
+        ...
 
 
 def check_finite(batch: TensorDictBase, keys: tuple[str, ...] = ("action", "observation")) -> None:
@@ -39,7 +46,7 @@ class Trainer:
         collector: yields batches [R * E, T] of the exploring policy.
         buffers: one for each of R runs, usually with a :class:`~torchrl_her.HERWriter`.
         learner: learns from what is sampled.
-        exploration: decays after each epoch; None for none.
+        schedules: take a step after each epoch: exploration, weights of goals.
 
     Keyword Args:
         epoch_frames: environment steps of each run in an epoch, rounded up to whole batches.
@@ -66,19 +73,15 @@ class Trainer:
         collector: BaseCollector,
         buffers: Sequence[TensorDictReplayBuffer],
         learner: Learner,
-        exploration: DecayingEpsilon | None = None,
+        schedules: Sequence[Schedule] = (),
         epoch_frames: int = 20_480,
         frames_per_update: float = 20.0,
         warmup_frames: int = 0,
         batch_size: int = 256,
         updates_per_draw: int = 8,
     ) -> None:
-        self.collector, self.buffers, self.learner, self.exploration = (
-            collector,
-            buffers,
-            learner,
-            exploration,
-        )
+        self.collector, self.buffers, self.learner = collector, buffers, learner
+        self.schedules = list(schedules)
         self.epoch_frames, self.frames_per_update = epoch_frames, frames_per_update
         self.warmup_frames = warmup_frames
         self.batch_size, self.updates_per_draw = batch_size, updates_per_draw
@@ -95,8 +98,8 @@ class Trainer:
         end = (self.epochs + 1) * self.epoch_frames  # also where an interrupted epoch is finished
         measured = self.run(end - self.frames, on_batch)
         self.epochs += 1
-        if self.exploration is not None:
-            self.exploration.step()
+        for schedule in self.schedules:
+            schedule.step()
         return measured
 
     def run(self, frames: int, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
@@ -115,7 +118,7 @@ class Trainer:
             if on_batch is not None:
                 on_batch(self)
         keys = measured[0] if measured else {}
-        return {key: torch.stack([m[key] for m in measured]).mean(0) for key in keys}
+        return {key: torch.cat([m[key] for m in measured]).mean(0) for key in keys}
 
     def _write(self, batch: TensorDictBase) -> int:
         """Gives each run its block of environments, and returns the frames of one run."""
@@ -133,22 +136,22 @@ class Trainer:
         while self._credit >= 1.0:
             steps = min(self.updates_per_draw, int(self._credit))
             drawn = [buffer.sample(self.batch_size * steps) for buffer in self.buffers]
-            parts = torch.stack(drawn).split(self.batch_size, 1)
-            measured += [self.learner.update(part) for part in parts]
-            self._set_priorities(drawn, parts)
+            rows = torch.stack(drawn)
+            measured.append(self.learner.update(rows, steps))
+            self._set_priorities(drawn, rows)
             self._credit -= steps
             self.updates += steps
         return measured
 
-    def _set_priorities(self, drawn: list[TensorDictBase], parts: tuple[TensorDictBase, ...]) -> None:
+    def _set_priorities(self, drawn: list[TensorDictBase], rows: TensorDictBase) -> None:
         """Tells each run's sampler the new priorities of the rows that were learnt from."""
         key = self.buffers[0].priority_key
-        priorities = [part.get(key, None) for part in parts]
-        if any(priority is None for priority in priorities):
+        priorities = rows.get(key, None)
+        if priorities is None:
             return
-        for buffer, rows, own in zip(self.buffers, drawn, torch.cat(priorities, 1), strict=True):
-            rows.set(key, own.float())  # what TorchRL's priority trees hold, also for networks in float64
-            buffer.update_tensordict_priority(rows)  # does nothing under a sampler without priorities
+        for buffer, own, priority in zip(self.buffers, drawn, priorities, strict=True):
+            own.set(key, priority.float())  # what TorchRL's priority trees hold, also for networks in float64
+            buffer.update_tensordict_priority(own)  # does nothing under a sampler without priorities
 
     def state_dict(self) -> dict[str, Any]:
         """The counters; the parts have state of their own."""

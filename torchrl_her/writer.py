@@ -28,7 +28,12 @@ class GoalWeights:
     """How useful each achieved goal is as a virtual goal. Subclass it to direct HER.
 
     The base class weighs all goals alike and remembers nothing.
+
+    Attributes:
+        alike: True promises that all weights are equal, which spares the writer their look-up.
     """
+
+    alike: bool = False
 
     def __call__(self, goals: Tensor) -> Tensor:
         """Weights [...] of at least 0 for goals [..., g]."""
@@ -243,6 +248,11 @@ class HERWriter(RoundRobinWriter):
 
     # How it is done
 
+    @property
+    def _preference(self) -> GoalWeights | None:
+        """The weights, if some goals are preferred to others."""
+        return None if self.weights is None or self.weights.alike else self.weights
+
     def _with_held(self, data: TensorDictBase) -> tuple[TensorDictBase, Tensor, Tensor | None]:
         """Flat rows, those held back in front, their lanes, and trajectory ids if lanes are environments."""
         rows = data.reshape(-1)
@@ -336,7 +346,7 @@ class HERWriter(RoundRobinWriter):
         All goals of a row are accepted or rejected together. This rejection sampling spares most
         rows the likelihoods of all their candidates.
         """
-        if self.weights is not None:
+        if self._preference is not None:
             return torch.arange(len(real), device=real.device)
         if not self.filter_achieved:
             return real[:0]
@@ -352,7 +362,8 @@ class HERWriter(RoundRobinWriter):
         first, end = window(self.strategy, time, episodes.lengths[episode])
         before = rows.get(self._achieved_key)[real[which]].unsqueeze(1)
         goals = rows.get(self._next_achieved_key)[episodes.rows]
-        weight = None if self.weights is None else self.weights(goals)
+        preference = self._preference
+        weight = None if preference is None else preference(goals)
         horizon = goals.shape[1]
         for part in torch.arange(len(which), device=real.device).split(max(1, _LIKELIHOODS // horizon)):
             own = episode[part]

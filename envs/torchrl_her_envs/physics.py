@@ -54,49 +54,65 @@ class BallPhysics:
         self._space = self._build(num_worlds, world, wall)
         # pymunk lists the space's static body behind the balls: the last row is that one's, and stays 0
         self._state = np.zeros((num_worlds + 1, 4))
-        self._balls = self._state[:num_worlds]
         self._buffer = pymunk.batch.Buffer()
         self._parked = self._park(world)
+        self._parked_buffer = pymunk.batch.Buffer()
+        self._parked_buffer.set_float_buf(self._parked)
+        self._settled = np.full((num_worlds, 4), np.nan)  # of each ball, a state that a step leaves as it is
 
-    def step(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
-        """Lets all balls move freely for one time step.
+    def step(self, position: Tensor, velocity: Tensor, free: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Lets balls move for one time step.
 
         Args:
             position: [num_worlds, 2] float64, metres within the world.
             velocity: [num_worlds, 2] float64, metres a second.
+            free: [num_worlds] of bool, which of them move; None for all.
 
         Returns:
-            The new positions and velocities.
+            The new positions and velocities; those of the other balls as they were.
         """
-        self._forget()
-        np.add(position.numpy(), self._offset, out=self._balls[:, :2])
-        self._balls[:, 2:] = velocity.numpy()
+        before = np.concatenate((position.numpy(), velocity.numpy()), -1)
+        # A step depends on nothing but the state: what it left as it was, it will leave as it is.
+        moving = (before != self._settled).any(-1, keepdims=True)
+        if free is not None:
+            moving &= free.numpy()[:, None]
+        if not moving.any():
+            return position.clone(), velocity.clone()
+        after = np.where(moving, self._simulate(before, moving), before)
+        np.copyto(
+            self._settled, np.where((after == before).all(-1, keepdims=True), before, np.nan), where=moving
+        )
+        return torch.from_numpy(after[:, :2]), torch.from_numpy(after[:, 2:])
+
+    def _simulate(self, before: np.ndarray, moving: np.ndarray) -> np.ndarray:
+        """The states [num_worlds, 4] after a time step; balls that do not move are parked meanwhile."""
+        pymunk.batch.set_space_bodies(self._space, _FIELDS, self._parked_buffer)
+        self._space.step(self._substep)  # forgets the step before, see _park
+        balls = self._state[:-1]
+        balls[:] = before
+        balls[:, :2] += self._offset
+        np.copyto(balls, self._parked[:-1], where=~moving)
         self._buffer.set_float_buf(self._state)
         pymunk.batch.set_space_bodies(self._space, _FIELDS, self._buffer)
         for _ in range(self._substeps):
             self._space.step(self._substep)
         result = pymunk.batch.Buffer()
         pymunk.batch.get_space_bodies(self._space, _FIELDS, result)
-        state = np.frombuffer(result.float_buf()).reshape(-1, 4)[: len(self._balls)]
-        return torch.from_numpy(state[:, :2] - self._offset), torch.from_numpy(state[:, 2:].copy())
+        state = np.frombuffer(result.float_buf()).reshape(-1, 4)[:-1].copy()
+        state[:, :2] -= self._offset
+        return state
 
-    def _forget(self) -> None:
-        """Lets Chipmunk forget the step before, so that position and velocity are the whole state of a ball.
+    def _park(self, world: WorldConfig) -> np.ndarray:
+        """All balls at rest where they touch nothing, between the left side and the wall.
 
         A body keeps its old contacts, and the push that still moves it out of a surface, for one substep
-        more. Nobody can read or write these, so the balls spend that substep where they touch nothing.
+        more. Nobody can read or write these, so all balls spend a substep here before each step: then
+        position and velocity are the whole state of a ball.
         """
-        pymunk.batch.set_space_bodies(self._space, _FIELDS, self._parked)
-        self._space.step(self._substep)
-
-    def _park(self, world: WorldConfig) -> pymunk.batch.Buffer:
-        """All balls at rest, between the left side and the wall."""
         parked = np.zeros_like(self._state)
         middle = (world.wall_x - world.wall_thickness / 2) / 2
         parked[:-1, :2] = self._offset + np.array([middle, 0.5]) * world.size
-        buffer = pymunk.batch.Buffer()
-        buffer.set_float_buf(parked)
-        return buffer
+        return parked
 
     def _build(self, num_worlds: int, world: WorldConfig, wall: bool) -> pymunk.Space:
         space = pymunk.Space()

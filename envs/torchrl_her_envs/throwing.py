@@ -214,7 +214,8 @@ class ThrowingEnv(EnvBase):
         shown = self._show()
         off = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
         shown.update({"done": off, "terminated": off.clone(), "truncated": off.clone()})
-        return TensorDict(shown, batch_size=self.batch_size)
+        # With the device that it has anyway: otherwise TorchRL copies every entry.
+        return TensorDict(shown, batch_size=self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
@@ -227,7 +228,7 @@ class ThrowingEnv(EnvBase):
         truncated = (self.worlds.step >= self.world.max_steps).unsqueeze(-1)
         shown["reward"] = terminated.to(self.dtype_shown) - 1.0
         shown.update({"terminated": terminated, "truncated": truncated, "done": terminated | truncated})
-        return TensorDict(shown, batch_size=self.batch_size)
+        return TensorDict(shown, batch_size=self.batch_size, device=self.device)
 
     # The worlds
 
@@ -243,26 +244,23 @@ class ThrowingEnv(EnvBase):
         joints = self.effector.move(w.joints, action[:, :-1] * (self.effector.action_speed * dt))
         grip = self.effector.grip(joints)
         grip_velocity = (grip - w.grip) / dt
-        flown, flown_velocity = self._fly(w.ball, ball_velocity)
-        free_ = free.unsqueeze(-1)
-        ball = torch.where(free_, flown, w.ball)
-        ball_velocity = torch.where(free_, flown_velocity, ball_velocity)
+        flown, flown_velocity = self._fly(w.ball, ball_velocity, free)
 
-        near = (ball - grip).square().sum(-1) < self._catch**2
+        near = (flown - grip).square().sum(-1) < self._catch**2
         held = held | (closed & near)
         held_ = held.unsqueeze(-1)
         w.joint_velocity = (joints - w.joints) / dt
         w.joints, w.grip, w.grip_velocity = joints, grip, grip_velocity
-        w.ball = torch.where(held_, grip, ball)
-        w.ball_velocity = torch.where(held_, grip_velocity, ball_velocity)
+        w.ball = torch.where(held_, grip, flown)
+        w.ball_velocity = torch.where(held_, grip_velocity, flown_velocity)
         w.closed, w.held, w.free = closed, held, free & ~held
         w.step = w.step + 1
 
-    def _fly(self, ball: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
-        """One time step of all balls, as if they were free."""
+    def _fly(self, ball: Tensor, velocity: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+        """One time step of the balls that are free; the others stay as they are."""
         if len(self._physics) == 1:
-            return self._physics[0].step(ball, velocity)
-        blocks = zip(ball.chunk(len(self._physics)), velocity.chunk(len(self._physics)), strict=True)
+            return self._physics[0].step(ball, velocity, free)
+        blocks = zip(*(entry.chunk(len(self._physics)) for entry in (ball, velocity, free)), strict=True)
         flown = [physics.step(*block) for physics, block in zip(self._physics, blocks, strict=True)]
         balls, velocities = zip(*flown, strict=True)
         return torch.cat(balls), torch.cat(velocities)

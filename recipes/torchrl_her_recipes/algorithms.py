@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
+
+Instructive = Literal["simultaneous", "sequential"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -13,12 +16,15 @@ class Algorithm:
         name: the name that recipes take.
         hindsight: whether virtual rows are written at all.
         filter_achieved: whether virtual goals that were already achieved are left out.
+        instructive: how goals are preferred that instruct (IBS): less the more often they were written
+            already, or by the target alone; None for all alike.
         summary: one line for people.
     """
 
     name: str
     hindsight: bool = True
     filter_achieved: bool = False
+    instructive: Instructive | None = None
     summary: str = ""
 
 
@@ -29,6 +35,20 @@ ALGORITHMS: dict[str, Algorithm] = {
         Algorithm(name="her", summary="hindsight experience replay"),
         Algorithm(
             name="filtered_her", filter_achieved=True, summary="HER without goals that were already achieved"
+        ),
+        Algorithm(
+            name="her_ibs", instructive="simultaneous", summary="HER with goals that instruct: weights q* - q"
+        ),
+        Algorithm(
+            name="filtered_her_ibs",
+            filter_achieved=True,
+            instructive="simultaneous",
+            summary="both together",
+        ),
+        Algorithm(
+            name="her_ibs_sequential",
+            instructive="sequential",
+            summary="HER with weights q* alone, left to prioritised replay",
         ),
     )
 }

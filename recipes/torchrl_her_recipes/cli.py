@@ -1,4 +1,4 @@
-"""The command line: ``torchrl-her train | play | list``."""
+"""The command line: ``torchrl-her train | play | plot | list``."""
 
 from __future__ import annotations
 
@@ -18,10 +18,13 @@ from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_her_envs import TASKS
+from torchrl_her_envs import TASKS, make_env
 from torchrl_her_recipes.algorithms import ALGORITHMS
+from torchrl_her_recipes.goal_map import GoalMap
 from torchrl_her_recipes.playing import play
+from torchrl_her_recipes.plots import plot_goals
 from torchrl_her_recipes.recipe import Recipe
+from torchrl_her_recipes.run_folder import RunFolder
 from torchrl_her_recipes.running import RunResult, resume
 
 _BAD_INPUT = 2
@@ -34,6 +37,7 @@ commands:
                            preset=demo takes the values of a preset; --cfg job shows all values
   train --resume RUN       go on with a run from its checkpoint
   play RUN                 a GIF of a run's policy, for several goals
+  plot goals RUN           a heat map of a run's virtual goals beside the target q*
   list                     tasks, algorithms and presets
 """
 _CONF = Path(__file__).parent / "conf"
@@ -51,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit code: 0, 2 for bad input, 130 for Ctrl-C."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    commands = {"train": _train, "play": _play, "list": _list}
+    commands = {"train": _train, "play": _play, "plot": _plot, "list": _list}
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_USAGE, end="")
         return 0 if arguments else _BAD_INPUT
@@ -154,7 +158,7 @@ def _say_end(result: RunResult) -> int:
     return 0
 
 
-# play and list
+# play, plot and list
 
 
 def _play(arguments: list[str]) -> int:
@@ -174,6 +178,20 @@ def _play(arguments: list[str]) -> int:
     return 0
 
 
+def _plot(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="torchrl-her plot", description="Draw a picture of a run.")
+    parser.add_argument("what", choices=["goals"], help="virtual goals: q beside q*")
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument("--out", type=Path, help="the picture to write (default: RUN/virtual_goals.png)")
+    options = parser.parse_args(arguments)
+    home = RunFolder(options.run)
+    recipe, out = home.recipe(), options.out or home.goals
+    title = f"virtual goals: {recipe.task}, {recipe.algo}"
+    plot_goals(GoalMap.load(home.goal_map), make_env(recipe.task), out, title=title)
+    print(out)
+    return 0
+
+
 def _list(arguments: list[str]) -> int:
     argparse.ArgumentParser(prog="torchrl-her list", description="List what there is.").parse_args(arguments)
     presets = sorted((_CONF / "preset").glob("*.yaml"))
@@ -185,5 +203,5 @@ def _list(arguments: list[str]) -> int:
     for title, entries in sections.items():
         print(f"{title}:")
         for name, summary in entries.items():
-            print(f"  {name:<14} {summary}")
+            print(f"  {name:<18} {summary}")
     return 0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, Sampler
@@ -21,10 +22,12 @@ from torchrl_her import (
     EnvReward,
     FusedDDPGLearner,
     HERWriter,
+    Instructiveness,
     Learner,
     LossLearner,
     Trainer,
     can_fuse,
+    is_plain_adam,
     make_actor,
     make_critic,
     make_ddpg_loss,
@@ -33,6 +36,7 @@ from torchrl_her import (
 )
 from torchrl_her_envs import ThrowingEnv, make_env
 from torchrl_her_recipes.algorithms import get_algorithm
+from torchrl_her_recipes.goal_weights import goal_target, make_goal_weights
 from torchrl_her_recipes.recipe import Recipe
 
 if TYPE_CHECKING:
@@ -65,6 +69,7 @@ class Parts:
         loss: any TorchRL loss module.
         optimiser: over the loss module's parameters.
         target: moves the target networks.
+        goal_target: q* [cells] of the task's goals, which the divergence of virtual goals is measured to.
         generators: of each run's random numbers in Python's hands (exploration, relabelling, sampling).
     """
 
@@ -80,6 +85,7 @@ class Parts:
     loss: LossModule
     optimiser: torch.optim.Optimizer
     target: TargetNetUpdater | None
+    goal_target: Tensor
     generators: list[torch.Generator]
 
     @property
@@ -97,7 +103,13 @@ class Parts:
         """Gradient steps on the loss: fused where that is possible, through the loss module elsewhere."""
         norm = self.recipe.max_grad_norm
         if can_fuse(self.loss, self.target):
-            return FusedDDPGLearner(self.loss, self.optimiser, self.target, max_grad_norm=norm)
+            return FusedDDPGLearner(
+                self.loss,
+                self.optimiser,
+                self.target,
+                max_grad_norm=norm,
+                compile_step=self.recipe.compiles and is_plain_adam(self.optimiser),
+            )
         return LossLearner(
             self.loss, self.optimiser, self.target, max_grad_norm=norm, runs=self.recipe.num_runs
         )
@@ -109,13 +121,19 @@ class Parts:
             collector=self.collector,
             buffers=self.buffers,
             learner=self.learner(),
-            exploration=self.exploration,
+            schedules=[self.exploration, *self._goal_weights()],
             epoch_frames=recipe.epoch_frames,
             frames_per_update=recipe.frames_per_update,
             warmup_frames=recipe.warmup_frames,
             batch_size=recipe.batch_size,
             updates_per_draw=min(recipe.updates_per_draw, recipe.buffer_size // recipe.batch_size),
         )
+
+    def _goal_weights(self) -> list[Instructiveness]:
+        """Those weights of goals that change from epoch to epoch."""
+        writers = [buffer.writer for buffer in self.buffers]
+        weights = [writer.weights for writer in writers if isinstance(writer, HERWriter)]
+        return [own for own in weights if isinstance(own, Instructiveness)]
 
     def run(self, folder: str | Path | None = None, *, progress: bool = True) -> RunResult:
         """Trains to the end and returns what came of it.
@@ -160,6 +178,7 @@ def build_parts(recipe: Recipe) -> Parts:
         loss=loss,
         optimiser=torch.optim.Adam(loss.parameters(), lr=recipe.learning_rate, fused=True),
         target=make_target_updater(loss, tau=recipe.tau, hard_interval=recipe.hard_update_interval),
+        goal_target=goal_target(recipe, env),
         generators=generators,
     )
 
@@ -182,6 +201,7 @@ def make_collector(recipe: Recipe, env: EnvBase, policy: TensorDictModuleBase) -
         policy,
         frames_per_batch=env.batch_size.numel() * recipe.steps_per_batch,
         total_frames=-1,
+        device=env.device,  # all of it: where the policy's is left open, every entry is copied at every step
         auto_register_policy_transforms=False,
     )
 
@@ -196,6 +216,7 @@ def make_buffer(recipe: Recipe, env: ThrowingEnv, generator: torch.Generator) ->
             k=recipe.k if algorithm.hindsight else 0,
             strategy=recipe.strategy,  # type: ignore[arg-type]
             filter_achieved=algorithm.filter_achieved,
+            weights=make_goal_weights(recipe, env) if algorithm.hindsight else None,
             exclude=_NOT_STORED,
         ),
         sampler=_make_sampler(recipe),

@@ -7,15 +7,16 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from torch import Tensor
 
 from torchrl_her_envs import ThrowingEnv
+from torchrl_her_recipes.goal_map import GoalMap
 
 matplotlib.use("agg")
+
+_SCREEN = 300  # pixels of the picture behind a heat map
 
 _PANELS = (
     ("success", "success rate", (-0.02, 1.02)),
@@ -68,29 +69,39 @@ def by_frames(rows: Sequence[dict[str, float]], name: str) -> tuple[np.ndarray, 
     return np.array(list(groups)), np.array(list(groups.values()))
 
 
-def plot_goals(goals: Tensor, env: ThrowingEnv, path: Path, *, title: str = "", cells: int = 40) -> None:
-    """Draws where virtual goals lie on the screen, beside the box of the real goals.
+def plot_goals(goals: GoalMap, env: ThrowingEnv, path: Path, *, title: str = "") -> None:
+    """Draws where virtual goals lie on the screen beside the target q*, in the same colours.
 
     Args:
-        goals: [n, 2], in shown coordinates.
+        goals: q and q*.
         env: of the task.
         path: of the picture.
         title: above it.
-        cells: of the histogram, in each direction.
     """
-    figure = Figure(figsize=(5.6, 5), layout="constrained")
-    axes = figure.subplots()
-    draw_goals(axes, goals, env, cells=cells)
-    axes.set_title(title)
-    figure.colorbar(axes.images[0], ax=axes, label="share of virtual goals")
+    figure = Figure(figsize=(9.6, 4.6), layout="constrained")
+    figure.suptitle(title)
+    limit = max(float(goals.target.max()), 1e-9)
+    panels = figure.subplots(1, 2)
+    for axes, share, name in zip(
+        panels, (goals.share, goals.target), ("written: q", "target: q*"), strict=True
+    ):
+        draw_goals(axes, share, env, limit=limit)
+        axes.set_title(name)
+    figure.colorbar(panels[0].images[-1], ax=panels, label="share of virtual goals in a cell", extend="max")
     figure.savefig(path, dpi=110)
 
 
-def draw_goals(axes: Axes, goals: Tensor, env: ThrowingEnv, *, cells: int = 40, limit: float = 0.01) -> None:
-    """The histogram of :func:`plot_goals` on given axes; its colours end at a share of ``limit`` a cell."""
-    counts, _ = torch.histogramdd(goals.double().cpu(), bins=[cells, cells], range=[-1.0, 1.0, -1.0, 1.0])
-    share = (counts / counts.sum().clamp_min(1.0)).T
-    axes.imshow(share, origin="lower", extent=(-1, 1, -1, 1), cmap="magma", vmin=0.0, vmax=limit)
+def draw_goals(axes: Axes, share: np.ndarray, env: ThrowingEnv, *, limit: float) -> None:
+    """A heat map [n, n] over a picture of the screen, on given axes; its colours end at ``limit``.
+
+    The boxes are those of the real goals, and of where the hand or the arm can reach.
+    """
+    picture = env.render(0, size=_SCREEN).numpy()
+    screen = (-1.0, 1.0, -1.0, 1.0)
+    axes.imshow(picture, extent=screen)
+    heat = share.T
+    alpha = np.clip(heat / limit, 0.0, 1.0) ** 0.5  # what is hardly ever written leaves the screen to be seen
+    axes.imshow(heat, origin="lower", cmap="magma", vmin=0.0, vmax=limit, alpha=alpha, extent=screen)
     (x, y), (x_end, y_end) = env.goal_distribution.low.tolist(), env.goal_distribution.high.tolist()
     left, bottom, right, top = (2.0 * side - 1.0 for side in env.effector.reach)
     for corner, size, colour in (

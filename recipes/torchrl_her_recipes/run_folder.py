@@ -33,6 +33,7 @@ class RunFolder:
         self.metrics = self.path / "metrics.csv"
         self.curves = self.path / "curves.png"
         self.goals = self.path / "virtual_goals.png"
+        self.goal_map = self.path / "goal_map.npz"
         self.video = self.path / "policy.gif"
         self._events: SummaryWriter | None = None
 

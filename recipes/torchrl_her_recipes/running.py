@@ -13,10 +13,10 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import TensorDictReplayBuffer
 from tqdm import tqdm
 
 from torchrl_her import (
+    GoalHistogram,
     HERWriter,
     Trainer,
     buffer_state_dict,
@@ -30,6 +30,7 @@ from torchrl_her import (
     success,
 )
 from torchrl_her_envs import ThrowingEnv, record_episodes, write_video
+from torchrl_her_recipes.goal_map import GoalMap, goal_map
 from torchrl_her_recipes.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.parts import Parts, build_parts, eval_seeds
 from torchrl_her_recipes.plots import plot_curves, plot_goals
@@ -138,7 +139,9 @@ def load_run_state(parts: Parts, trainer: Trainer, state: dict[str, Any]) -> Non
 def _made_of(parts: Parts) -> dict[str, str]:
     """What must be the same for a run to go on."""
     writer = parts.buffer.writer
-    hindsight = [writer.k, writer.strategy, writer.filter_achieved] if isinstance(writer, HERWriter) else []
+    hindsight: list[object] = []
+    if isinstance(writer, HERWriter):
+        hindsight = [writer.k, writer.strategy, writer.filter_achieved, type(writer.weights).__name__]
     names = {
         name: type(getattr(parts, name)).__name__
         for name in ("actor", "critic", "loss", "optimiser", "target")
@@ -155,6 +158,9 @@ def _run(
     recipe = parts.recipe
     threads = torch.get_num_threads()
     torch.set_num_threads(recipe.threads)
+    torch.set_flush_denormal(
+        True
+    )  # moments of unused weights fade to such numbers, which take ten times as long
     bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
     interrupted = False
     with soft_interrupt() as check:  # also while things are saved at the end
@@ -166,11 +172,13 @@ def _run(
                     home.log(rows, len(new))
                     if trainer.epochs % recipe.checkpoint_interval == 0:
                         save_checkpoint(run_state(parts, trainer), home.checkpoint)
+                        _save_goals(parts, home)
         except Interrupted:
             interrupted = True
         finally:
             bar.close()
             torch.set_num_threads(threads)
+            torch.set_flush_denormal(False)
         if home is not None:
             _finish(parts, trainer, rows, home)
     return RunResult(rows=rows, folder=None if home is None else home.path, interrupted=interrupted)
@@ -195,7 +203,7 @@ def _epoch(
         counters = {"run": run, "seed": seed, "epoch": trainer.epochs, "frames": trainer.frames}
         times = {"updates": trainer.updates, "seconds": seconds}
         values = {name: float(value[run]) for name, value in measured.items()}
-        rows.append({**counters, **times, **values, **_counts(parts.buffers[run])})
+        rows.append({**counters, **times, **values, **_written(parts, run)})
     bar.set_postfix(success=f"{statistics.median(last_success(rows)):.2f}")
     return rows
 
@@ -228,10 +236,15 @@ def _initial_value(actor: TensorDictModule, critic: TensorDictModule, start: Ten
     return value.squeeze(-1)
 
 
-def _counts(buffer: TensorDictReplayBuffer) -> dict[str, float]:
-    if not isinstance(buffer.writer, HERWriter):
+def _written(parts: Parts, run: int) -> dict[str, float]:
+    """What the writer of one run has counted."""
+    writer = parts.buffers[run].writer
+    if not isinstance(writer, HERWriter):
         return {}
-    return {f"rows_{name}": value for name, value in asdict(buffer.writer.counts).items()}
+    counts = {f"rows_{name}": value for name, value in asdict(writer.counts).items()}
+    if isinstance(writer.weights, GoalHistogram):
+        counts["kl"] = writer.weights.divergence_to(parts.goal_target)
+    return counts
 
 
 def _finish(parts: Parts, trainer: Trainer, rows: list[dict[str, float]], home: RunFolder) -> None:
@@ -245,8 +258,8 @@ def _finish(parts: Parts, trainer: Trainer, rows: list[dict[str, float]], home: 
     )
     if rows:
         plot_curves(rows, home.curves, title=title)
-    goals = torch.cat([virtual_goals(buffer) for buffer in parts.buffers])
-    if len(goals):
+    goals = _save_goals(parts, home)
+    if goals is not None:
         plot_goals(goals, parts.env, home.goals, title=f"virtual goals: {title}")
     first = recipe.eval_episodes * (_median_run(rows) if rows else 0)
     worlds = range(first, first + min(_FILMED, recipe.eval_episodes))
@@ -259,9 +272,9 @@ def _median_run(rows: list[dict[str, float]]) -> int:
     return sorted(range(len(values)), key=values.__getitem__)[len(values) // 2]
 
 
-def virtual_goals(buffer: TensorDictReplayBuffer) -> Tensor:
-    """The goals [n, 2] of all virtual rows in a buffer."""
-    rows = buffer[:] if len(buffer) else {}
-    if "virtual" not in rows:
-        return torch.empty(0, 2)
-    return rows["desired_goal"][rows["virtual"].squeeze(-1)]
+def _save_goals(parts: Parts, home: RunFolder) -> GoalMap | None:
+    """A snapshot of where virtual goals were written."""
+    goals = goal_map(parts.buffers, parts.goal_target)
+    if goals is not None:
+        goals.save(home.goal_map)
+    return goals

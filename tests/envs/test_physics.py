@@ -7,6 +7,7 @@ world is 6 m wide and high, the ball's radius 0.18 m; the wall stands from x = 2
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -248,3 +249,31 @@ def test_constants_are_used() -> None:
     # the floor is met at y = 0.3: 0.5 * 2 = 1 m/s up, and 0.2 * (2 + 1) = 0.6 m/s lost along it
     _, velocity = physics.step(points([1.0, 0.33]), points([2.0, -2.0]))
     assert_close(velocity, points([1.4, 1.0]))
+
+
+def test_a_ball_that_has_come_to_rest_is_as_if_it_were_still_simulated() -> None:
+    resting, simulated = (BallPhysics(2, WorldConfig(), wall=False) for _ in range(2))
+    state = (torch.tensor([[1.0, 0.5], [2.0, 0.3]], dtype=torch.float64), torch.zeros(2, 2).double())
+    other = tuple(entry.clone() for entry in state)
+    skipped = 0
+    for _ in range(400):
+        before = state
+        state = resting.step(*state)
+        skipped += int(torch.equal(state[0], before[0]) and torch.equal(state[1], before[1]))
+        simulated._settled[:] = np.nan  # forgets that a ball rests
+        other = simulated.step(*other)
+        assert torch.equal(state[0], other[0])
+        assert torch.equal(state[1], other[1])
+    assert skipped > 50
+    pushed = resting.step(state[0], state[1] + torch.tensor([1.0, 0.0]))
+    assert (pushed[0][:, 0] > state[0][:, 0]).all()
+
+
+def test_balls_that_are_not_free_stay_and_the_others_do_not_care() -> None:
+    position = torch.tensor([[1.0, 3.0], [2.0, 3.0]], dtype=torch.float64)
+    velocity = torch.tensor([[1.0, 0.0], [0.0, 2.0]], dtype=torch.float64)
+    all_moved = BallPhysics(2, WorldConfig(), wall=False).step(position, velocity)
+    moved = BallPhysics(2, WorldConfig(), wall=False).step(position, velocity, torch.tensor([True, False]))
+    for before, both, one in zip((position, velocity), all_moved, moved, strict=True):
+        assert torch.equal(one[0], both[0])
+        assert torch.equal(one[1], before[1])

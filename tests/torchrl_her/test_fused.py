@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from copy import deepcopy
 
 import pytest
@@ -10,11 +11,13 @@ from tensordict import TensorDict
 from torchrl.objectives import HardUpdate, SoftUpdate
 
 from torchrl_her import (
+    CompiledOnce,
     FusedDDPGLearner,
     Learner,
     LossLearner,
     PenalisedDDPGLoss,
     can_fuse,
+    is_plain_adam,
     make_actor,
     make_critic,
     make_ddpg_loss,
@@ -73,6 +76,95 @@ def test_weights_targets_and_priorities_are_those_of_torchrl_s_loss(
     state = second.state_dict()
     for name, value in first.state_dict().items():
         torch.testing.assert_close(value, state[name], msg=name)
+
+
+def test_several_steps_of_one_call_are_those_of_several_calls() -> None:
+    first = make_loss(2)
+    second = deepcopy(first)
+    together, apart = (
+        FusedDDPGLearner(loss, torch.optim.Adam(loss.parameters(), lr=1e-2), SoftUpdate(loss, tau=0.1))
+        for loss in (first, second)
+    )
+    parts = [make_rows(2, seed, weighted=True) for seed in range(3)]
+    rows = torch.cat(parts, 1)
+    measured = together.update(rows, 3)
+    losses = [apart.update(part)["loss_value"] for part in parts]
+    assert measured["loss_value"].tolist() == torch.cat(losses).tolist()
+    torch.testing.assert_close(rows["td_error"], torch.cat([part["td_error"] for part in parts], 1))
+    for ours, theirs in zip(first.parameters(), second.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+@pytest.mark.parametrize("runs", [1, 2])
+def test_the_compiled_step_is_the_same(runs: int) -> None:
+    if shutil.which("c++") is None:
+        pytest.skip("there is no C++ compiler")
+    first = make_loss(runs)
+    second = deepcopy(first)
+    plain, compiled = (
+        FusedDDPGLearner(
+            loss,
+            torch.optim.Adam(loss.parameters(), lr=1e-2),
+            SoftUpdate(loss, tau=0.1),
+            max_grad_norm=0.1,
+            compile_step=choice,
+        )
+        for loss, choice in ((first, False), (second, True))
+    )
+    for seed in range(20):
+        rows = [make_rows(runs, seed, weighted=True) for _ in range(2)]
+        measured = [learner.update(own, 2) for learner, own in zip((plain, compiled), rows, strict=True)]
+        torch.testing.assert_close(rows[0]["td_error"], rows[1]["td_error"])
+        torch.testing.assert_close(measured[0], measured[1])
+        if seed == 10:  # as after a checkpoint: the optimiser has new tensors
+            for learner in (plain, compiled):
+                learner.optimiser.load_state_dict(deepcopy(learner.optimiser.state_dict()))
+    state = second.state_dict()
+    for name, value in first.state_dict().items():
+        torch.testing.assert_close(value, state[name], msg=name)
+    steps = [learner.optimiser.state_dict()["state"][0]["step"] for learner in (plain, compiled)]
+    assert steps[0] == steps[1] == 40
+    assert compiled.is_compiled
+
+
+def test_only_a_plain_adam_is_compiled() -> None:
+    loss = make_loss(1)
+    target = SoftUpdate(loss, tau=0.1)
+    for optimiser in (
+        torch.optim.SGD(loss.parameters()),
+        torch.optim.Adam(loss.parameters(), weight_decay=1.0),
+    ):
+        assert not is_plain_adam(optimiser)
+        with pytest.raises(ValueError, match="only a plain torch.optim.Adam can be compiled"):
+            FusedDDPGLearner(loss, optimiser, target, compile_step=True)
+
+
+def test_without_a_compiler_it_warns_once_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_compiler(*_args: object, **_options: object) -> object:
+        def fail(*_args: object) -> None:
+            raise RuntimeError("no working C++ compiler found\nand a long story")
+
+        return fail
+
+    monkeypatch.setattr(torch, "compile", no_compiler)
+    loss = make_loss(1)
+    options = {"compile_step": True}
+    learner = FusedDDPGLearner(
+        loss, torch.optim.Adam(loss.parameters()), SoftUpdate(loss, tau=0.1), **options
+    )
+    with pytest.warns(UserWarning, match="ddpg_step is not compiled: no working C\\+\\+ compiler found$"):
+        learner.update(make_rows(1, 0, weighted=True))
+    measured = learner.update(make_rows(1, 1, weighted=True))  # a second warning would be an error
+    assert measured["loss_value"].isfinite().all()
+    assert not learner.is_compiled
+
+
+def test_what_raises_uncompiled_raises() -> None:
+    def broken(x: torch.Tensor) -> torch.Tensor:
+        return x + torch.zeros(7)
+
+    with pytest.raises(RuntimeError, match="must match the size"):
+        CompiledOnce(broken)(torch.zeros(3))
 
 
 def test_it_works_on_the_loss_s_own_weights() -> None:

@@ -221,8 +221,8 @@ def same_loss(**options: Any) -> DDPGLoss:
 def test_what_is_measured_is_the_mean_loss_of_each_run() -> None:
     data = rows([-1.0, -1.0], terminated=[1, 0])
     measured = step(constant_loss(-4.0, gamma=0.5), data)
-    assert measured["loss_value"].tolist() == [6.5]
-    assert measured["loss_actor"].tolist() == [4.0]
+    assert measured["loss_value"].tolist() == [[6.5]]
+    assert measured["loss_actor"].tolist() == [[4.0]]
     assert not any(value.requires_grad for value in measured.values())
 
 
@@ -308,7 +308,7 @@ def test_kinds_of_target_updates() -> None:
 def test_importance_weights_are_used() -> None:
     data = rows([-1.0, -1.0], terminated=[1, 0])  # squared errors of 9 and 4
     data[WEIGHT] = torch.tensor([0.9, 0.3])
-    assert step(constant_loss(-4.0, gamma=0.5), data)["loss_value"].tolist() == pytest.approx(
+    assert step(constant_loss(-4.0, gamma=0.5), data)["loss_value"][0].tolist() == pytest.approx(
         [7.75]
     )  # 3 to 1
 
@@ -348,7 +348,7 @@ def test_runs_learn_together_what_they_learn_alone(weighted: bool) -> None:
         alone = make_ddpg_loss(*own, action_penalty=0.5)
         single = step(alone, rows_of_run, **options)
         for key, value in single.items():
-            assert measured[key][run].item() == pytest.approx(value.item(), rel=1e-4)
+            assert measured[key][0, run].item() == pytest.approx(value.item(), rel=1e-4)
         for part in ("actor_network_params", "value_network_params"):
             expected = dict(getattr(alone, part).flatten_keys("."))
             taken = take_run(dict(getattr(together, part).flatten_keys(".")), run, 2)
@@ -399,9 +399,25 @@ def test_other_losses_learn_as_well(kind: str, losses: set[str]) -> None:
         data[WEIGHT] = torch.rand(32) + 0.5
         measured = learner.update(data)
         assert measured.keys() == losses
-        assert all(value.shape == (1,) and value.isfinite().all() for value in measured.values())
+        assert all(value.shape == (1, 1) and value.isfinite().all() for value in measured.values())
         assert data["td_error"].shape == (32,)
     assert all(not torch.equal(before[name], p) for name, p in loss.named_parameters())
+
+
+def test_several_steps_of_one_call_are_those_of_several_calls() -> None:
+    torch.manual_seed(0)
+    loss = constant_loss(-4.0, gamma=0.5)
+    together = LossLearner(loss, torch.optim.Adam(loss.parameters(), lr=0.1), SoftUpdate(loss, tau=0.5))
+    other = deepcopy(loss)
+    apart = LossLearner(other, torch.optim.Adam(other.parameters(), lr=0.1), SoftUpdate(other, tau=0.5))
+    data = rows([-1.0, 0.0, -1.0, -1.0], terminated=[0, 1, 0, 1])
+    halves = [data[:2].clone(), data[2:].clone()]
+    measured = together.update(data, 2)
+    losses = [apart.update(half)["loss_value"] for half in halves]
+    assert measured["loss_value"].tolist() == torch.cat(losses).tolist()
+    assert data["td_error"].tolist() == torch.cat([half["td_error"] for half in halves]).tolist()
+    for ours, theirs in zip(loss.parameters(), other.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
 
 
 def test_each_network_is_clipped_by_itself_and_sacs_alpha_is_one() -> None:

@@ -104,7 +104,7 @@ def make_trainer(seed: int = 0, **options: Any) -> tuple[Trainer, TensorDictSequ
             torch.optim.Adam(loss.parameters(), lr=1e-3),
             make_target_updater(loss, tau=0.05, hard_interval=0),
         ),
-        exploration=exploration,
+        schedules=[exploration],
         **{"epoch_frames": 800, "frames_per_update": 2.0, "updates_per_draw": 8, **options},
     )
     return trainer, policy

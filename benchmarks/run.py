@@ -1,0 +1,50 @@
+"""All benchmarks one after the other, in one report.
+
+python benchmarks/run.py --out bench.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from importlib import import_module
+from pathlib import Path
+
+PARTS = {
+    "env_speed": "Environments",
+    "writer_speed": "Writing with hindsight",
+    "update_speed": "Gradient steps and the whole loop",
+    "memory": "Memory",
+    "startup": "Start-up",
+    "time_to_learn": "Time to learn",
+    "task_check": "The tasks can be solved",
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument(
+        "parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; all if none is named"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("bench.md"), help="where the report goes (%(default)s)"
+    )
+    options = parser.parse_args()
+    unknown = set(options.parts) - set(PARTS)
+    if unknown:
+        parser.error(f"there is no {', '.join(sorted(unknown))}; the parts are {', '.join(PARTS)}")
+    sections = ["# Benchmarks"]
+    for name in options.parts or PARTS:
+        print(f"\n{PARTS[name]}\n")
+        with tempfile.TemporaryDirectory() as folder:
+            table = Path(folder) / "table.md"
+            import_module(name).main(["--out", str(table)])
+            sections.append(
+                f"## {PARTS[name]}\n\n`python benchmarks/{name}.py`\n\n{table.read_text().strip()}"
+            )
+        options.out.write_text("\n\n".join(sections) + "\n")  # what there is, should a later part fail
+    print(f"\nreport: {options.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""Where a run's virtual goals lie, beside where they should: q and q* over the screen, as a file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torchrl.data import TensorDictReplayBuffer
+
+from torchrl_her import GoalHistogram, HERWriter
+
+
+@dataclass(frozen=True)
+class GoalMap:
+    """Histograms over a grid of n x n cells of the screen; the first index goes right, the second up.
+
+    Attributes:
+        counts: [R, n, n] virtual goals of each run written since its buffer was last emptied.
+        target: [n, n], q* at the final sigma.
+    """
+
+    counts: np.ndarray
+    target: np.ndarray
+
+    @property
+    def share(self) -> np.ndarray:
+        """q [n, n], the mean of the runs."""
+        totals = self.counts.sum((1, 2), keepdims=True)
+        return (self.counts / np.maximum(totals, 1)).mean(0)
+
+    def save(self, path: Path) -> None:
+        """Writes it as a file of numpy arrays."""
+        np.savez_compressed(path, counts=self.counts, target=self.target)
+
+    @classmethod
+    def load(cls, path: Path) -> GoalMap:
+        """Reads what :meth:`save` wrote.
+
+        Raises:
+            ValueError: there is no such file: the run is too young, or wrote no virtual goals.
+        """
+        if not path.is_file():
+            raise ValueError(f"{path.parent} has no {path.name}: the run wrote no virtual goals so far")
+        with np.load(path) as arrays:
+            return cls(arrays["counts"], arrays["target"])
+
+
+def histograms(buffers: Sequence[TensorDictReplayBuffer]) -> list[GoalHistogram]:
+    """What counts the virtual goals of each run; empty where nothing does."""
+    writers = [buffer.writer for buffer in buffers]
+    weights = [writer.weights for writer in writers if isinstance(writer, HERWriter)]
+    return [own for own in weights if isinstance(own, GoalHistogram)]
+
+
+def goal_map(buffers: Sequence[TensorDictReplayBuffer], target: torch.Tensor) -> GoalMap | None:
+    """The map of a run's buffers and its q* [cells]; None where nothing counts virtual goals."""
+    counted = histograms(buffers)
+    if not counted:
+        return None
+    shape = counted[0].grid.shape
+    counts = torch.stack([own.counts.view(shape) for own in counted])
+    return GoalMap(counts.cpu().numpy(), target.view(shape).cpu().numpy())
