@@ -16,17 +16,27 @@ from torchrl_her.fused import FusedDDPGLearner, can_fuse, is_plain_adam
 from torchrl_her.goal_grid import GoalGrid, box_target, kl_divergence, sampled_target
 from torchrl_her.goals import EnvReward, GoalReward, RewardFunction, achieved, distance
 from torchrl_her.instructiveness import GoalHistogram, Instructiveness
+from torchrl_her.layer_change import enter_layer, set_layer_goals
 from torchrl_her.losses import (
     ClampedTD0,
     Learner,
     LossLearner,
     PenalisedDDPGLoss,
     clip_by_run,
+    keep_runs,
     make_ddpg_loss,
     make_target_updater,
 )
 from torchrl_her.metrics import discounted_return, final_distance, first_episode, q_bias, success
-from torchrl_her.networks import ActorNet, CriticNet, make_actor, make_critic, stack_runs, take_run
+from torchrl_her.networks import (
+    ActorNet,
+    CriticNet,
+    StackedLinear,
+    make_actor,
+    make_critic,
+    stack_runs,
+    take_run,
+)
 from torchrl_her.training import Trainer, evaluate
 from torchrl_her.virtual_goals import Strategy, candidates, combine, draw, draw_alike, window
 from torchrl_her.writer import GoalWeights, HERWriter, WriterCounts
@@ -54,6 +64,7 @@ __all__ = [
     "LossLearner",
     "PenalisedDDPGLoss",
     "RewardFunction",
+    "StackedLinear",
     "StateToObs",
     "Strategy",
     "Trainer",
@@ -70,12 +81,14 @@ __all__ = [
     "distance",
     "draw",
     "draw_alike",
+    "enter_layer",
     "evaluate",
     "explore",
     "final_distance",
     "find_episodes",
     "first_episode",
     "is_plain_adam",
+    "keep_runs",
     "kl_divergence",
     "load_buffer_state_dict",
     "load_checkpoint",
@@ -86,6 +99,7 @@ __all__ = [
     "q_bias",
     "sampled_target",
     "save_checkpoint",
+    "set_layer_goals",
     "stack_runs",
     "success",
     "take_run",

@@ -114,9 +114,10 @@ class DecayingEpsilon(TensorDictModuleBase):
         """Lets epsilon decay: call it at the end of an epoch."""
         self.epsilon.mul_(self.decay).clamp_(min=self.end)
 
-    def restart(self, start: float | None = None) -> None:
-        """Sets epsilon back to a given start, or to its own."""
-        self.epsilon.fill_(self.start if start is None else start)
+    def restart(self, start: float | None = None, *, run: int | None = None) -> None:
+        """Sets epsilon back to a given start, or to its own; of one run, or of all."""
+        epsilon = self.epsilon if run is None else self.epsilon[run]
+        epsilon.fill_(self.start if start is None else start)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the greedy action by an exploring one, where exploring is asked for."""

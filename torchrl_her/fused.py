@@ -6,6 +6,8 @@ their very weights, so checkpoints, state dicts and users see no difference.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
@@ -23,7 +25,7 @@ from torchrl_her.ddpg_step import (
     ddpg_gradients,
     ddpg_update_,
 )
-from torchrl_her.losses import ClampedTD0, PenalisedDDPGLoss
+from torchrl_her.losses import ClampedTD0, PenalisedDDPGLoss, keep_runs
 from torchrl_her.networks import ActorNet, CriticNet
 
 
@@ -121,9 +123,10 @@ class FusedDDPGLearner:
         return any(form.compiled for form in self._compiled.values())
 
     @torch.no_grad()
-    def update(self, rows: TensorDictBase, steps: int = 1) -> dict[str, Tensor]:
+    def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
         """Gradient steps of each run; see :class:`~torchrl_her.Learner`."""
-        done = [self._step(part) for part in self._parts(rows, steps)]
+        with keep_runs(self.loss, self.optimiser, idle):
+            done = [self._step(part) for part in self._parts(rows, steps)]
         squares = torch.cat([step.squares for step in done], 1)
         rows.set(self.loss.tensor_keys.priority, squares.view(rows.batch_size))
         return {

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Literal, Protocol
 
 import torch
@@ -120,12 +121,13 @@ def make_target_updater(loss: LossModule, *, tau: float, hard_interval: int) -> 
 class Learner(Protocol):
     """What the training loop asks of an algorithm: gradient steps of each run."""
 
-    def update(self, rows: TensorDictBase, steps: int = 1) -> dict[str, Tensor]:
+    def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
         """Learns from rows and writes their priorities into them.
 
         Args:
             rows: [R, S * B] of R runs; step s takes the rows [:, s * B : (s + 1) * B].
             steps: S.
+            idle: runs that stay as they are, whatever their rows.
 
         Returns:
             What it measured, [S, R] each.
@@ -166,11 +168,12 @@ class LossLearner:
         self.max_grad_norm, self.runs = max_grad_norm, runs
         self._networks = self._find_networks()
 
-    def update(self, rows: TensorDictBase, steps: int = 1) -> dict[str, Tensor]:
+    def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
         """Gradient steps of each run; see :class:`Learner`."""
         last = rows.ndim - 1
         parts = rows.split(rows.shape[last] // steps, last)
-        measured = [self._update(part) for part in parts]
+        with keep_runs(self.loss, self.optimiser, idle):
+            measured = [self._update(part) for part in parts]
         priorities = [part.get(_PRIORITY, None) for part in parts]
         if priorities[0] is not None:
             rows.set(_PRIORITY, torch.cat(priorities, last))
@@ -209,6 +212,35 @@ class LossLearner:
         for name, parameter in self.loss.named_parameters():
             groups.setdefault(name.split(".")[0], []).append(parameter)
         return list(groups.values())
+
+
+@contextmanager
+def keep_runs(loss: nn.Module, optimiser: torch.optim.Optimizer, runs: Sequence[int]) -> Iterator[None]:
+    """Puts back what some runs of a stacked loss and its optimiser were, when the block ends.
+
+    Args:
+        loss: whose entries are R equal blocks, run after run.
+        optimiser: over its parameters, after its first step.
+        runs: to be kept.
+
+    Example:
+        >>> weight = nn.Linear(1, 2, bias=False)  # as if of two runs
+        >>> with keep_runs(weight, torch.optim.Adam(weight.parameters()), [1]):
+        ...     _ = nn.init.zeros_(weight.weight)
+        >>> (weight.weight == 0).flatten().tolist()
+        [True, False]
+    """
+    if not runs:
+        yield
+        return
+    moments = [entry for state in optimiser.state.values() for entry in state.values()]
+    entries = [entry for entry in (*loss.state_dict().values(), *moments) if entry.ndim > 0]
+    index = torch.tensor(list(runs))
+    kept = [entry[index].clone() for entry in entries]
+    yield
+    with torch.no_grad():
+        for entry, old in zip(entries, kept, strict=True):
+            entry[index] = old
 
 
 @torch.no_grad()

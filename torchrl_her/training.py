@@ -118,7 +118,7 @@ class Trainer:
             if on_batch is not None:
                 on_batch(self)
         keys = measured[0] if measured else {}
-        return {key: torch.cat([m[key] for m in measured]).mean(0) for key in keys}
+        return {key: torch.cat([m[key] for m in measured]).nanmean(0) for key in keys}
 
     def _write(self, batch: TensorDictBase) -> int:
         """Gives each run its block of environments, and returns the frames of one run."""
@@ -129,29 +129,40 @@ class Trainer:
 
     def _learn(self) -> list[dict[str, Tensor]]:
         """All gradient steps that the collected frames have paid for."""
-        # How full another run's buffer is must not matter; where one is empty there is nothing to draw.
-        if self.frames < self.warmup_frames or not all(len(buffer) for buffer in self.buffers):
+        # How full another run's buffer is must not matter: a run whose buffer is empty lets its steps pass.
+        if self.frames < self.warmup_frames or not self.buffers:
             return []
+        idle = [run for run, buffer in enumerate(self.buffers) if len(buffer) == 0]
         measured = []
         while self._credit >= 1.0:
             steps = min(self.updates_per_draw, int(self._credit))
-            drawn = [buffer.sample(self.batch_size * steps) for buffer in self.buffers]
-            rows = torch.stack(drawn)
-            measured.append(self.learner.update(rows, steps))
-            self._set_priorities(drawn, rows)
             self._credit -= steps
-            self.updates += steps
+            if len(idle) < len(self.buffers):
+                measured.append(self._learn_from(idle, steps))
+                self.updates += steps
         return measured
 
-    def _set_priorities(self, drawn: list[TensorDictBase], rows: TensorDictBase) -> None:
+    def _learn_from(self, idle: list[int], steps: int) -> dict[str, Tensor]:
+        """Some gradient steps of all runs but the idle ones: [steps, R] each, NaN for those."""
+        size = self.batch_size * steps
+        drawn = [None if run in idle else buffer.sample(size) for run, buffer in enumerate(self.buffers)]
+        stand_in = next(rows for rows in drawn if rows is not None)
+        rows = torch.stack([stand_in if own is None else own for own in drawn])
+        measured = self.learner.update(rows, steps, idle=idle)
+        self._set_priorities(drawn, rows)
+        nothing = torch.tensor(idle, dtype=torch.int64)
+        return {key: value.index_fill(1, nothing, torch.nan) for key, value in measured.items()}
+
+    def _set_priorities(self, drawn: list[TensorDictBase | None], rows: TensorDictBase) -> None:
         """Tells each run's sampler the new priorities of the rows that were learnt from."""
         key = self.buffers[0].priority_key
         priorities = rows.get(key, None)
         if priorities is None:
             return
         for buffer, own, priority in zip(self.buffers, drawn, priorities, strict=True):
-            own.set(key, priority.float())  # what TorchRL's priority trees hold, also for networks in float64
-            buffer.update_tensordict_priority(own)  # does nothing under a sampler without priorities
+            if own is not None:
+                own.set(key, priority.float())  # what TorchRL's trees hold, also for networks in float64
+                buffer.update_tensordict_priority(own)  # does nothing under a sampler without priorities
 
     def state_dict(self) -> dict[str, Any]:
         """The counters; the parts have state of their own."""

@@ -10,6 +10,7 @@ from torch import Tensor
 class Effector(Protocol):
     """A hand or an arm: pure functions of its joints (for a hand, its position), in metres.
 
+    ``grip_index`` says where the grip's position stands in what :meth:`observe` gives.
     ``action_speed`` is the speed that an action of 1 asks for, ``max_grip_speed`` scales the shown
     velocity of the grip, and ``goal_box`` is its task's box of goals (fractions of the screen).
     """
@@ -18,6 +19,7 @@ class Effector(Protocol):
     action_speed: float
     observation_size: int
     reach: tuple[float, float, float, float]
+    grip_index: tuple[int, int]
 
     def sample(self, u: Tensor) -> Tensor:
         """Start positions of the joints, [..., num_joints], from as many numbers in [0, 1)."""

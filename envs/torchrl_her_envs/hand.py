@@ -24,6 +24,7 @@ class Hand:
 
     num_joints = 2
     observation_size = 5
+    grip_index = (0, 1)
 
     def __init__(self, world: WorldConfig, *, wall: bool) -> None:
         margin = world.ball_radius

@@ -32,6 +32,7 @@ class Arm:
             raise ValueError(f"an arm needs at least 1 link, got num_links={num_links}")
         self.num_joints = num_links
         self.observation_size = 3 * num_links + 5
+        self.grip_index = (2 * num_links, 2 * num_links + 1)
         self.action_speed = world.joint_speed
         length = world.arm_length / world.size
         x, y = world.arm_base

@@ -18,6 +18,7 @@ class Algorithm:
         filter_achieved: whether virtual goals that were already achieved are left out.
         instructive: how goals are preferred that instruct (IBS): less the more often they were written
             already, or by the target alone; None for all alike.
+        curriculum: whether it climbs the layers of the task's curriculum (CHER).
         summary: one line for people.
     """
 
@@ -25,6 +26,7 @@ class Algorithm:
     hindsight: bool = True
     filter_achieved: bool = False
     instructive: Instructive | None = None
+    curriculum: bool = False
     summary: str = ""
 
 
@@ -49,6 +51,23 @@ ALGORITHMS: dict[str, Algorithm] = {
             name="her_ibs_sequential",
             instructive="sequential",
             summary="HER with weights q* alone, left to prioritised replay",
+        ),
+        Algorithm(
+            name="cher", curriculum=True, filter_achieved=True, summary="filtered HER up a curriculum: CHER"
+        ),
+        Algorithm(
+            name="cher_ibs",
+            curriculum=True,
+            filter_achieved=True,
+            instructive="simultaneous",
+            summary="CHER with goals that instruct in the layers that ask for it",
+        ),
+        Algorithm(name="unfiltered_cher", curriculum=True, summary="CHER without the filter"),
+        Algorithm(
+            name="unfiltered_cher_ibs",
+            curriculum=True,
+            instructive="simultaneous",
+            summary="CHER with goals that instruct and without the filter",
         ),
     )
 }

@@ -18,6 +18,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
 from torchrl_her import (
+    CurriculumProgress,
     DecayingEpsilon,
     EnvReward,
     FusedDDPGLearner,
@@ -25,17 +26,22 @@ from torchrl_her import (
     Instructiveness,
     Learner,
     LossLearner,
+    StackedLinear,
     Trainer,
+    ZeroPad,
     can_fuse,
     is_plain_adam,
     make_actor,
     make_critic,
     make_ddpg_loss,
     make_target_updater,
+    set_layer_goals,
     stack_runs,
+    zero_unused_inputs,
 )
-from torchrl_her_envs import ThrowingEnv, make_env
+from torchrl_her_envs import ThrowingEnv, base_env, make_env
 from torchrl_her_recipes.algorithms import get_algorithm
+from torchrl_her_recipes.curricula import Climb, at_the_top, get_curriculum, in_layers
 from torchrl_her_recipes.goal_weights import goal_target, make_goal_weights
 from torchrl_her_recipes.recipe import Recipe
 
@@ -43,7 +49,7 @@ if TYPE_CHECKING:
     from torchrl_her_recipes.running import RunResult
 
 # Entries of a collected batch that no loss reads: not stored.
-_NOT_STORED = ("state", "achieved_goal", "collector")
+_NOT_STORED = ("state", "achieved_goal", "input", "collector")
 # Evaluation has seeds of its own, far from those of training.
 _EVAL_SEED = 1 << 32
 
@@ -69,6 +75,7 @@ class Parts:
         loss: any TorchRL loss module.
         optimiser: over the loss module's parameters.
         target: moves the target networks.
+        climb: the curriculum of the runs; None without one.
         goal_target: q* [cells] of the task's goals, which the divergence of virtual goals is measured to.
         generators: of each run's random numbers in Python's hands (exploration, relabelling, sampling).
     """
@@ -87,6 +94,7 @@ class Parts:
     target: TargetNetUpdater | None
     goal_target: Tensor
     generators: list[torch.Generator]
+    climb: Climb | None = None
 
     @property
     def buffer(self) -> TensorDictReplayBuffer:
@@ -149,8 +157,9 @@ class Parts:
 
 def build_parts(recipe: Recipe) -> Parts:
     """Makes the parts that a recipe asks for."""
-    env = make_envs(recipe, recipe.num_envs, recipe.seeds)
-    eval_env = make_envs(recipe, recipe.eval_episodes, eval_seeds(recipe, 0))
+    task = make_envs(recipe, recipe.num_envs, recipe.seeds)
+    climb = make_climb(recipe, task)
+    env = task if climb is None else in_layers(task, climb.progress)
     generators = [torch.Generator().manual_seed(seed) for seed in recipe.seeds]
     actor, critic = make_networks(recipe, env)
     exploration = DecayingEpsilon(
@@ -168,18 +177,22 @@ def build_parts(recipe: Recipe) -> Parts:
     return Parts(
         recipe=recipe,
         env=env,
-        eval_env=eval_env,
+        eval_env=make_task_env(recipe, recipe.eval_episodes, eval_seeds(recipe, 0)),
         actor=actor,
         critic=critic,
         exploration=exploration,
         policy=policy,
         collector=make_collector(recipe, env, policy),
-        buffers=[make_buffer(recipe, env, generator) for generator in generators],
+        buffers=[
+            make_buffer(recipe, task, generator, climb=climb, run=run)
+            for run, generator in enumerate(generators)
+        ],
         loss=loss,
         optimiser=torch.optim.Adam(loss.parameters(), lr=recipe.learning_rate, fused=True),
         target=make_target_updater(loss, tau=recipe.tau, hard_interval=recipe.hard_update_interval),
-        goal_target=goal_target(recipe, env),
+        goal_target=goal_target(recipe, task),
         generators=generators,
+        climb=climb,
     )
 
 
@@ -194,6 +207,28 @@ def make_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int]) -> ThrowingEn
     )
 
 
+def make_task_env(recipe: Recipe, num_envs: int, seeds: Sequence[int]) -> EnvBase:
+    """The same as a trained policy sees it: at the top of the curriculum, if there is one."""
+    env = make_envs(recipe, num_envs, seeds)
+    if not get_algorithm(recipe.algo).curriculum:
+        return env
+    return in_layers(env, at_the_top(get_curriculum(env), len(seeds)))
+
+
+def make_climb(recipe: Recipe, env: ThrowingEnv) -> Climb | None:
+    """The curriculum that the recipe asks for, all runs in its first layer."""
+    if not get_algorithm(recipe.algo).curriculum:
+        return None
+    progress = CurriculumProgress(
+        get_curriculum(env),
+        runs=recipe.num_runs,
+        window=recipe.window,
+        success_threshold=recipe.success_threshold,
+    )
+    layer_env = make_envs(recipe, recipe.eval_episodes, eval_seeds(recipe, 0))
+    return Climb(progress.curriculum, progress, in_layers(layer_env, progress))
+
+
 def make_collector(recipe: Recipe, env: EnvBase, policy: TensorDictModuleBase) -> Collector:
     """Runs a policy in the training environments, a few steps of each at a time."""
     return Collector(
@@ -206,8 +241,15 @@ def make_collector(recipe: Recipe, env: EnvBase, policy: TensorDictModuleBase) -
     )
 
 
-def make_buffer(recipe: Recipe, env: ThrowingEnv, generator: torch.Generator) -> TensorDictReplayBuffer:
-    """The replay buffer with its hindsight writer and its sampler."""
+def make_buffer(
+    recipe: Recipe,
+    env: ThrowingEnv,
+    generator: torch.Generator,
+    *,
+    climb: Climb | None = None,
+    run: int = 0,
+) -> TensorDictReplayBuffer:
+    """The replay buffer of one run, with its hindsight writer and its sampler."""
     algorithm = get_algorithm(recipe.algo)
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(recipe.buffer_size),
@@ -223,17 +265,24 @@ def make_buffer(recipe: Recipe, env: ThrowingEnv, generator: torch.Generator) ->
         priority_key="td_error",
     )
     buffer.set_rng(generator)
+    if climb is not None:
+        set_layer_goals(buffer.writer, climb.progress.layer_of(run))
+        buffer.append_transform(ZeroPad(climb.curriculum, climb.progress, run=run))
     return buffer
 
 
-def make_networks(recipe: Recipe, env: ThrowingEnv) -> tuple[TensorDictModule, TensorDictModule]:
+def make_networks(recipe: Recipe, env: EnvBase) -> tuple[TensorDictModule, TensorDictModule]:
     """The actor and the critic; the weights of each run depend on its own seed alone."""
-    widths = [env.observation_spec[key].shape[-1] for key in ("observation", "desired_goal")]
+    climbs = get_algorithm(recipe.algo).curriculum
+    keys = ("input",) if climbs else ("observation", "desired_goal")
+    widths = [env.observation_spec[key].shape[-1] for key in keys]
     actions, dtype = env.action_spec.shape[-1], getattr(torch, recipe.dtype)
 
     def make(runs: int) -> tuple[TensorDictModule, TensorDictModule]:
-        actor = make_actor(widths, actions, hidden=recipe.hidden, runs=runs)
-        critic = make_critic(widths, actions, hidden=recipe.hidden, normalise=recipe.batch_norm, runs=runs)
+        actor = make_actor(widths, actions, hidden=recipe.hidden, runs=runs, in_keys=keys)
+        critic = make_critic(
+            widths, actions, hidden=recipe.hidden, normalise=recipe.batch_norm, runs=runs, in_keys=keys
+        )
         return actor.to(dtype), critic.to(dtype)
 
     with torch.random.fork_rng(devices=[]):
@@ -244,6 +293,11 @@ def make_networks(recipe: Recipe, env: ThrowingEnv) -> tuple[TensorDictModule, T
         actor, critic = make(recipe.num_runs)
     actor.load_state_dict(stack_runs([own.state_dict() for own, _ in alone]))
     critic.load_state_dict(stack_runs([own.state_dict() for _, own in alone]))
+    if climbs:
+        used = get_curriculum(base_env(env)).first_inputs
+        for network, alpha in ((actor, recipe.alpha_actor), (critic, recipe.alpha_critic)):
+            first = next(module for module in network.modules() if isinstance(module, StackedLinear))
+            first.weight.data.copy_(zero_unused_inputs(first.weight.data, used, alpha=alpha))
     return actor, critic
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from tensordict.nn import TensorDictModule
 
 from torchrl_her import evaluate, load_checkpoint, success, take_run
-from torchrl_her_envs import record_episodes, write_video
-from torchrl_her_recipes.parts import make_envs, make_networks
+from torchrl_her_envs import base_env, record_episodes, write_video
+from torchrl_her_recipes.parts import make_networks, make_task_env
 from torchrl_her_recipes.run_folder import RunFolder
 from torchrl_her_recipes.running import FPS
 
@@ -29,7 +29,7 @@ def load_actor(folder: str | Path, *, run: int = 0) -> TensorDictModule:
     recipe = home.recipe()
     if not 0 <= run < recipe.num_runs:
         raise ValueError(f"there is no run {run} in {folder}; it has runs 0 to {recipe.num_runs - 1}")
-    actor, _ = make_networks(replace(recipe, num_runs=1), make_envs(recipe, 1, [0]))
+    actor, _ = make_networks(replace(recipe, num_runs=1), make_task_env(recipe, 1, [0]))
     actor.load_state_dict(take_run(load_checkpoint(home.policy)["actor"], run, recipe.num_runs))
     return actor
 
@@ -52,7 +52,7 @@ def play(
     """
     recipe = RunFolder(folder).recipe()
     actor = load_actor(folder, run=run)
-    env = make_envs(recipe, goals, [seed])
+    env = make_task_env(recipe, goals, [seed])
     write_video(record_episodes(env, actor, size=size), out, fps=FPS)
     env.set_seed(seed)
-    return int(success(evaluate(env, actor, max_steps=env.world.max_steps)).sum())
+    return int(success(evaluate(env, actor, max_steps=base_env(env).world.max_steps)).sum())

@@ -61,6 +61,12 @@ class Recipe:
     ibs_floor: float = 0.002  # the least weight of a goal, as a share of the greatest
     ibs_cells: int = 20  # of the grid over the screen, in each direction
 
+    window: int = 20  # greedy episodes whose mean success ends a layer of a curriculum
+    success_threshold: float = 0.9  # that mean
+    layer_epsilon: float = 1.0  # where exploration starts again at a change of layer
+    alpha_actor: float = 0.0  # what weights of inputs that the first layer does not use are multiplied by
+    alpha_critic: float = 0.0
+
     sampler: str = "prioritised"
     priority_alpha: float = 0.6  # in Schaul's sense: of the absolute TD error
     priority_beta: float = 0.4
@@ -170,6 +176,9 @@ _AT_LEAST = {
     "ibs_start_factor": 1.0,
     "ibs_floor": 0.0,
     "ibs_cells": 1,
+    "window": 1,
+    "alpha_actor": 0.0,
+    "alpha_critic": 0.0,
     "action_penalty": 0.0,
     "hard_update_interval": 0,
     "eval_episodes": 1,
@@ -185,5 +194,15 @@ _POSITIVE = (
     "gamma",
     "ibs_sigma",
     "ibs_decay",
+    "success_threshold",
 )
-_SHARES = ("tau", "gamma", "epsilon_start", "epsilon_end", "epsilon_decay", "ibs_decay")
+_SHARES = (
+    "tau",
+    "gamma",
+    "epsilon_start",
+    "epsilon_end",
+    "epsilon_decay",
+    "ibs_decay",
+    "layer_epsilon",
+    "success_threshold",
+)

@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_her import (
@@ -21,15 +22,18 @@ from torchrl_her import (
     Trainer,
     buffer_state_dict,
     discounted_return,
+    enter_layer,
     evaluate,
     final_distance,
     load_buffer_state_dict,
     load_checkpoint,
     q_bias,
     save_checkpoint,
+    set_layer_goals,
     success,
 )
-from torchrl_her_envs import ThrowingEnv, record_episodes, write_video
+from torchrl_her_envs import ThrowingEnv, base_env, record_episodes, write_video
+from torchrl_her_recipes.curricula import Climb
 from torchrl_her_recipes.goal_map import GoalMap, goal_map
 from torchrl_her_recipes.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.parts import Parts, build_parts, eval_seeds
@@ -108,7 +112,8 @@ def run_state(parts: Parts, trainer: Trainer) -> dict[str, Any]:
         "exploration": dict(parts.exploration.state_dict()),
         "buffers": [buffer_state_dict(buffer) for buffer in parts.buffers],
         "generators": [generator.get_state() for generator in parts.generators],
-        "worlds": parts.env.world_state_dict() if isinstance(parts.env, ThrowingEnv) else None,
+        "worlds": None if (worlds := _worlds(parts)) is None else worlds.world_state_dict(),
+        "progress": None if parts.climb is None else parts.climb.progress.state_dict(),
         "trajectories": parts.collector.state_dict().get("traj_pool"),
     }
 
@@ -130,10 +135,22 @@ def load_run_state(parts: Parts, trainer: Trainer, state: dict[str, Any]) -> Non
         load_buffer_state_dict(buffer, own)
     for generator, own in zip(parts.generators, state["generators"], strict=True):
         generator.set_state(own)
-    if state["worlds"] is not None and isinstance(parts.env, ThrowingEnv):
-        parts.env.load_world_state_dict(state["worlds"])
+    if state["worlds"] is not None and (worlds := _worlds(parts)) is not None:
+        worlds.load_world_state_dict(state["worlds"])
+    if parts.climb is not None:
+        parts.climb.progress.load_state_dict(state["progress"])
+        for run, buffer in enumerate(parts.buffers):
+            set_layer_goals(buffer.writer, parts.climb.progress.layer_of(run))
     parts.collector.load_state_dict({**parts.collector.state_dict(), "traj_pool": state["trajectories"]})
     trainer.load_state_dict(state["trainer"])
+
+
+def _worlds(parts: Parts) -> ThrowingEnv | None:
+    """The environment below all transforms, if it is one of ours."""
+    try:
+        return base_env(parts.env)
+    except TypeError:
+        return None
 
 
 def _made_of(parts: Parts) -> dict[str, str]:
@@ -196,24 +213,37 @@ def _epoch(
 
     began = time.perf_counter()
     measured = trainer.epoch(on_batch)
-    measured |= _evaluate(parts, trainer.epochs)
+    rollout = _play_greedily(parts, parts.eval_env, trainer.epochs)
+    measured |= _measure(parts, rollout)
+    samples = None if parts.climb is None else _layer_success(parts, parts.climb, rollout, trainer.epochs)
+    if samples is not None:
+        measured["layer_success"] = samples.mean(1)
     seconds += time.perf_counter() - began
     rows = []
     for run, seed in enumerate(parts.recipe.seeds):
         counters = {"run": run, "seed": seed, "epoch": trainer.epochs, "frames": trainer.frames}
         times = {"updates": trainer.updates, "seconds": seconds}
         values = {name: float(value[run]) for name, value in measured.items()}
+        if parts.climb is not None:
+            values["layer"] = parts.climb.progress.layers[run]
         rows.append({**counters, **times, **values, **_written(parts, run)})
+    if parts.climb is not None and samples is not None:
+        _move_on(parts, parts.climb, samples, bar)
     bar.set_postfix(success=f"{statistics.median(last_success(rows)):.2f}")
     return rows
 
 
+def _play_greedily(parts: Parts, env: EnvBase, epoch: int) -> TensorDictBase:
+    """Greedy episodes of each run, with starts and goals of their own in each epoch."""
+    task = base_env(env)
+    task.set_seeds(eval_seeds(parts.recipe, epoch))
+    return evaluate(env, parts.policy, max_steps=task.world.max_steps)
+
+
 @torch.no_grad()
-def _evaluate(parts: Parts, epoch: int) -> dict[str, Tensor]:
+def _measure(parts: Parts, rollout: TensorDictBase) -> dict[str, Tensor]:
     """What greedy episodes of each run show, [R] each."""
     recipe = parts.recipe
-    parts.eval_env.set_seeds(eval_seeds(recipe, epoch))
-    rollout = evaluate(parts.eval_env, parts.policy, max_steps=parts.eval_env.world.max_steps)
     returns = discounted_return(rollout, recipe.gamma)
     measured = {
         "success": success(rollout).float(),
@@ -228,10 +258,33 @@ def _evaluate(parts: Parts, epoch: int) -> dict[str, Tensor]:
     return means | {"epsilon": parts.exploration.epsilon}
 
 
+def _layer_success(parts: Parts, climb: Climb, rollout: TensorDictBase, epoch: int) -> Tensor:
+    """Success [R, n] at the goals of the runs' layers; that of ``rollout`` where it is the full task."""
+    runs, last = parts.recipe.num_runs, len(climb.curriculum) - 1
+    full = success(rollout).float().view(runs, -1)
+    below = climb.progress.layer < last
+    if not bool(below.any()):
+        return full
+    own = success(_play_greedily(parts, climb.layer_env, epoch)).float().view(runs, -1)
+    return torch.where(below.unsqueeze(1), own, full)
+
+
+def _move_on(parts: Parts, climb: Climb, samples: Tensor, bar: tqdm) -> None:
+    """Lets runs that have learnt their layer begin the next one."""
+    before = climb.progress.layers
+    # As many as the window takes: more in one evaluation would give a lucky streak many chances.
+    moved = climb.progress.record(samples[:, : climb.progress.window])
+    for run in moved.nonzero().flatten().tolist():
+        old, new = climb.curriculum.layers[before[run]], climb.progress.layer_of(run)
+        seed = parts.recipe.seeds[run]
+        bar.write(f"seed {seed}: {old.name!r} learnt after {bar.n:,} frames, {new.name!r} begins")
+        enter_layer(parts.buffers[run], new, parts.exploration, epsilon=parts.recipe.layer_epsilon, run=run)
+
+
 def _initial_value(actor: TensorDictModule, critic: TensorDictModule, start: TensorDictBase) -> Tensor:
     """The critic's value [N] of first states [N]."""
     critic.eval()
-    value = critic(actor(start.select("observation", "desired_goal"))).get(critic.out_keys[0])
+    value = critic(actor(start.select(*actor.in_keys))).get(critic.out_keys[0])
     critic.train()
     return value.squeeze(-1)
 
@@ -260,7 +313,7 @@ def _finish(parts: Parts, trainer: Trainer, rows: list[dict[str, float]], home: 
         plot_curves(rows, home.curves, title=title)
     goals = _save_goals(parts, home)
     if goals is not None:
-        plot_goals(goals, parts.env, home.goals, title=f"virtual goals: {title}")
+        plot_goals(goals, base_env(parts.env), home.goals, title=f"virtual goals: {title}")
     first = recipe.eval_episodes * (_median_run(rows) if rows else 0)
     worlds = range(first, first + min(_FILMED, recipe.eval_episodes))
     write_video(record_episodes(parts.eval_env, parts.policy, worlds=worlds), home.video, fps=FPS)

@@ -32,7 +32,7 @@ def priorities(parts: Parts, run: int) -> Tensor:
     return torch.as_tensor(buffer.sampler.state_dict()["_sum_tree"][torch.arange(len(buffer))])
 
 
-@pytest.fixture(scope="module", params=["her", "filtered_her"])
+@pytest.fixture(scope="module", params=["her", "filtered_her_ibs", "cher"])
 def runs(request: pytest.FixtureRequest) -> tuple[Parts, list[Parts]]:
     options: dict[str, Any] = {
         "algo": request.param,

@@ -15,9 +15,11 @@ from torchrl.envs import EnvBase
 
 from torchrl_her import (
     DecayingEpsilon,
+    FusedDDPGLearner,
     GoalReward,
     HERWriter,
     LossLearner,
+    PenalisedDDPGLoss,
     Trainer,
     evaluate,
     make_actor,
@@ -127,8 +129,7 @@ def test_frames_updates_and_epsilon_by_hand() -> None:
     measured = trainer.epoch()
     assert (trainer.frames, trainer.updates, trainer.epochs) == (160, 16, 1)
     assert set(measured) == {"loss_actor", "loss_value"}
-    assert trainer.exploration is not None
-    assert float(trainer.exploration.epsilon) == pytest.approx(0.8)
+    assert float(trainer.schedules[0].epsilon) == pytest.approx(0.8)
 
 
 def test_frames_that_do_not_divide_are_not_lost() -> None:
@@ -168,9 +169,59 @@ def test_nan_is_noticed_and_named(key: str) -> None:
 
 def test_evaluation_is_greedy_and_leaves_training_alone() -> None:
     trainer, policy = make_trainer()
-    state = trainer.exploration.generators[0].get_state()
+    state = trainer.schedules[0].generators[0].get_state()
     rollout = evaluate(LineEnv(1), policy, max_steps=STEPS)
     assert rollout.shape == (N, STEPS)
     greedy = policy[0](rollout.select("observation", "desired_goal"))["action"]
     torch.testing.assert_close(greedy, rollout["action"])
-    assert torch.equal(trainer.exploration.generators[0].get_state(), state)
+    assert torch.equal(trainer.schedules[0].generators[0].get_state(), state)
+
+
+def test_a_run_whose_buffer_is_empty_waits_and_holds_no_other_back() -> None:
+    runs = 2
+
+    def make() -> tuple[Trainer, PenalisedDDPGLoss]:
+        torch.manual_seed(0)
+        loss = make_ddpg_loss(
+            make_actor((1, 1), 1, hidden=8, runs=runs),
+            make_critic((1, 1), 1, hidden=8, runs=runs),
+            reduction="none",
+        )
+        optimiser = torch.optim.Adam(loss.parameters(), lr=1e-2)
+        learner = FusedDDPGLearner(loss, optimiser, make_target_updater(loss, tau=0.1, hard_interval=0))
+        buffers = []
+        for run in range(runs):
+            buffer = TensorDictReplayBuffer(
+                storage=LazyTensorStorage(1_000), writer=HERWriter(GoalReward(0.1)), priority_key="td_error"
+            )
+            buffer.set_rng(torch.Generator().manual_seed(run))
+            buffers.append(buffer)
+        collector = Collector(LineEnv(), None, frames_per_batch=N * STEPS, total_frames=-1)
+        trainer = Trainer(
+            collector=collector, buffers=buffers, learner=learner, frames_per_update=4.0, batch_size=16
+        )
+        return trainer, loss
+
+    both, loss_of_both = make()
+    alone, loss_of_one = make()
+    for trainer in (both, alone):
+        torch.manual_seed(1)
+        trainer.run(N * STEPS)
+    before = {name: value.clone() for name, value in loss_of_one.state_dict().items()}
+    alone.buffers[1].empty()
+    for trainer, empty in ((both, False), (alone, True)):
+        trainer._credit = 6.0
+        measured = trainer._learn()
+        assert trainer._credit == 0.0
+        assert bool(measured[0]["loss_value"][:, 1].isnan().all()) == empty
+        assert measured[0]["loss_value"][:, 0].isfinite().all()
+    expected = loss_of_both.state_dict()
+    stacked = {name: value for name, value in loss_of_one.state_dict().items() if value.ndim > 0}
+    assert len(stacked) == 32
+    for name, value in stacked.items():
+        assert torch.equal(value[0], expected[name][0]), name  # learns as if nothing were the matter
+        assert torch.equal(value[1], before[name][1]), name  # stays as it was
+    alone.buffers[0].empty()
+    alone._credit = 3.0
+    assert alone._learn() == []
+    assert alone._credit == 0.0  # these steps pass

@@ -1,0 +1,79 @@
+"""The curriculum of each throwing task, and how far runs have come in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+
+from torchrl_her import Curriculum, CurriculumLayer, CurriculumProgress, StateToObs, ZeroPad
+from torchrl_her_envs import ThrowingEnv
+
+
+def get_curriculum(env: ThrowingEnv) -> Curriculum:
+    """Two layers: reach the ball; then throw it into the black hole.
+
+    The reach sees the hand or the arm and wants its grip at the ball. The throw also sees the ball,
+    at the very place where the goal was before, and wants it in the hole. Goals of the reach lie where
+    episodes start, so IBS weights do not apply to them.
+
+    Raises:
+        ValueError: a task without a throw is a layer by itself.
+
+    Example:
+        >>> from torchrl_her_envs import make_env
+        >>> [layer.name for layer in get_curriculum(make_env("hand_v1")).layers]
+        ['reach', 'throw']
+    """
+    if not env.task.throws:
+        raise ValueError(f"{env.task.name} has no curriculum: it has one layer; choose a throwing task")
+    seen = env.effector.observation_size
+    ball, goal = [seen, seen + 1], [seen + 4, seen + 5]
+    grip = env.effector.grip_index
+    layers = [
+        CurriculumLayer(
+            name="reach",
+            observation=range(seen),
+            achieved_goal=grip,
+            desired_goal=ball,
+            threshold=env.world.shown(env.world.ball_radius),
+            instructive=False,
+        ),
+        CurriculumLayer(
+            name="throw",
+            observation=range(seen + 4),
+            achieved_goal=ball,
+            desired_goal=goal,
+            threshold=env.threshold,
+        ),
+    ]
+    return Curriculum(layers, seen + 6)
+
+
+@dataclass
+class Climb:
+    """The curriculum of some runs, and where they are in it.
+
+    Attributes:
+        curriculum: its layers.
+        progress: the layer of each run.
+        layer_env: for evaluation at the layers' goals.
+    """
+
+    curriculum: Curriculum
+    progress: CurriculumProgress
+    layer_env: EnvBase
+
+
+def in_layers(env: EnvBase, progress: CurriculumProgress) -> TransformedEnv:
+    """An environment as the layers of its runs see it, with the networks' input."""
+    curriculum = progress.curriculum
+    return TransformedEnv(env, Compose(StateToObs(curriculum, progress), ZeroPad(curriculum, progress)))
+
+
+def at_the_top(curriculum: Curriculum, runs: int) -> CurriculumProgress:
+    """Progress of runs that are all in the last layer: the full task."""
+    progress = CurriculumProgress(curriculum, runs=runs)
+    for run in range(runs):
+        progress.set_layer(run, len(curriculum) - 1)
+    return progress

@@ -1,0 +1,168 @@
+"""Runs that climb a curriculum: what changes with a layer, and what goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_her import Instructiveness
+from torchrl_her_envs import TASKS, base_env, make_env
+from torchrl_her_recipes import Parts, Recipe, load_actor, play, resume
+from torchrl_her_recipes.curricula import get_curriculum
+from torchrl_her_recipes.running import _move_on
+
+from .small import small
+
+THROWS = [name for name, task in TASKS.items() if task.throws]
+
+
+class Bar:
+    """Stands in for a progress bar."""
+
+    n = 1_600
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def write(self, line: str) -> None:
+        self.lines.append(line)
+
+
+def climbing(**options: object) -> Recipe:
+    return small(**{"task": "hand_v1", "algo": "cher_ibs", "window": 4, **options})
+
+
+def move(parts: Parts, *, run: int) -> Bar:
+    """Lets one run learn its layer."""
+    samples = torch.zeros(parts.recipe.num_runs, 4)
+    samples[run] = 1.0
+    bar = Bar()
+    assert parts.climb is not None
+    _move_on(parts, parts.climb, samples, bar)
+    return bar
+
+
+def weights(parts: Parts) -> Tensor:
+    return torch.cat([value.flatten() for value in parts.actor.state_dict().values()])
+
+
+@pytest.mark.parametrize("task", THROWS)
+def test_every_throwing_task_has_a_curriculum_that_hands_over(task: str) -> None:
+    env = make_env(task, num_envs=2)
+    curriculum = get_curriculum(env)
+    shown = env.reset()
+    state = shown["state"]
+    reach, throw = curriculum.layers
+    assert state[:, list(reach.achieved_goal)].tolist() == env._scale(env.worlds.grip).float().tolist()
+    assert state[:, list(reach.desired_goal)].tolist() == env._scale(env.worlds.ball).float().tolist()
+    assert state[:, list(throw.achieved_goal)].tolist() == shown["achieved_goal"].tolist()
+    assert state[:, list(throw.desired_goal)].tolist() == env.worlds.goal.float().tolist()
+    # What the throw sees first is all that the reach sees, its goal included.
+    assert [*reach.observation, *reach.desired_goal] == list(throw.observation[: curriculum.first_inputs])
+
+
+def test_a_task_of_one_layer_has_none() -> None:
+    with pytest.raises(ValueError, match="hand_reach has no curriculum"):
+        small(task="hand_reach", algo="cher").build()
+
+
+def test_a_run_begins_with_the_reach_and_is_measured_at_the_full_task_too(tmp_path: Path) -> None:
+    recipe = climbing(success_threshold=1.0)
+    parts = recipe.build()
+    parts.run(tmp_path / "run", progress=False)
+    rows = pd.read_csv(tmp_path / "run" / "metrics.csv")
+    assert rows["layer"].tolist() == [0, 0]
+    assert {"success", "layer_success", "kl"} <= set(rows.columns)
+    stored = parts.buffer[:]
+    assert (stored["observation"][:, 5:] == 0).all()  # of a reach: no ball is seen
+    goals = stored["desired_goal"][~stored["virtual"].squeeze(-1)]
+    assert (goals[:, 1] == goals[0, 1]).all()  # balls on the floor
+    assert "state" not in stored
+    assert torch.equal(
+        stored["input"][:, :7], torch.cat((stored["observation"][:, :5], stored["desired_goal"]), -1)
+    )
+
+
+def test_inputs_that_the_reach_does_not_use_keep_their_weights() -> None:
+    parts = climbing(alpha_actor=0.1).build()
+    before = [next(net.parameters()).clone() for net in (parts.actor, parts.critic)]
+    parts.run(progress=False)
+    after = [next(net.parameters()) for net in (parts.actor, parts.critic)]
+    for was, now in zip(before, after, strict=True):
+        assert torch.equal(was[:, 7:], now[:, 7:])
+        assert not torch.equal(was[:, :7], now[:, :7])
+    assert (before[0][:, 7:] != 0).all()
+    assert (before[1][:, 7:] == 0).all()
+
+
+def test_a_change_of_layer_empties_and_restarts_one_run_alone() -> None:
+    parts = climbing(num_runs=2, success_threshold=1.0).build()
+    parts.run(progress=False)
+    networks = weights(parts)
+    steps = [float(state["step"]) for state in parts.optimiser.state.values()]
+    bar = move(parts, run=1)
+    assert bar.lines == ["seed 1: 'reach' learnt after 1,600 frames, 'throw' begins"]
+    assert [len(buffer) > 0 for buffer in parts.buffers] == [True, False]
+    assert parts.exploration.epsilon.tolist() == pytest.approx([0.81, 1.0])
+    first, second = (buffer.writer for buffer in parts.buffers)
+    assert first.counts.real > 0
+    assert second.counts.real == second.held_back == 0
+    assert isinstance(second.weights, Instructiveness)
+    assert (first.weights.alike, second.weights.alike) == (True, False)
+    assert second.weights.sigma == pytest.approx(3 * 0.4)
+    assert first.weights.sigma < second.weights.sigma
+    assert second.reward.threshold == pytest.approx(0.1)
+    assert first.reward.threshold == pytest.approx(0.06)
+    assert torch.equal(weights(parts), networks)
+    assert [float(state["step"]) for state in parts.optimiser.state.values()] == steps
+
+
+def test_training_goes_on_in_two_layers_at_once() -> None:
+    parts = climbing(num_runs=2, success_threshold=1.0).build()
+    trainer = parts.trainer()
+    trainer.epoch()
+    move(parts, run=1)
+    trainer.epoch()
+    reach, throw = (buffer[:] for buffer in parts.buffers)
+    assert (reach["observation"][:, 5:] == 0).all()
+    assert (throw["observation"][:, 5:7] != 0).any()
+    assert torch.equal(throw["input"], torch.cat((throw["observation"], throw["desired_goal"]), -1))
+    assert torch.isfinite(weights(parts)).all()
+
+
+def test_a_run_that_was_stopped_after_a_change_goes_on_as_if_it_had_not(tmp_path: Path) -> None:
+    # a threshold that any success meets: the reach ends after the first epoch
+    recipe = climbing(success_threshold=0.01, eval_episodes=30, window=30, epochs=4, seed=1)
+    whole = recipe.build()
+    whole.run(tmp_path / "whole", progress=False)
+    layers = pd.read_csv(tmp_path / "whole" / "metrics.csv")["layer"].tolist()
+    assert layers[0] == 0
+    assert layers[-1] == 1
+    changed = layers.index(1)
+    replace(recipe, epochs=changed + 1).build().run(tmp_path / "part", progress=False)
+    config = (tmp_path / "part" / "config.yaml").read_text()
+    (tmp_path / "part" / "config.yaml").write_text(config.replace(f"epochs: {changed + 1}", "epochs: 4"))
+    part = recipe.build()
+    resume(tmp_path / "part", parts=part, progress=False)
+    assert torch.equal(weights(part), weights(whole))
+    assert part.climb is not None
+    assert part.climb.progress.layers == (1,)
+
+
+def test_its_policy_plays_the_full_task(tmp_path: Path) -> None:
+    climbing().build().run(tmp_path / "run", progress=False)
+    actor = load_actor(tmp_path / "run")
+    assert actor.in_keys == ["input"]
+    assert 0 <= play(tmp_path / "run", tmp_path / "play.gif", goals=2, size=64) <= 2
+
+
+def test_environments_for_evaluation_show_the_full_task() -> None:
+    parts = climbing().build()
+    shown = parts.eval_env.reset()
+    assert torch.equal(shown["desired_goal"], base_env(parts.eval_env).worlds.goal.float())
+    assert (shown["observation"][:, 5:7] != 0).any()
