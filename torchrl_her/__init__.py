@@ -38,7 +38,7 @@ from torchrl_her.networks import (
     take_run,
 )
 from torchrl_her.training import Trainer, evaluate
-from torchrl_her.virtual_goals import Strategy, candidates, combine, draw, draw_alike, window
+from torchrl_her.virtual_goals import Strategy, candidates, combine, draw, draw_alike, draw_weighted, window
 from torchrl_her.writer import GoalWeights, HERWriter, WriterCounts
 
 __all__ = [
@@ -81,6 +81,7 @@ __all__ = [
     "distance",
     "draw",
     "draw_alike",
+    "draw_weighted",
     "enter_layer",
     "evaluate",
     "explore",

@@ -126,6 +126,38 @@ def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: torch.Generator
     return first.unsqueeze(-1) + (u * (end - first).unsqueeze(-1)).long()
 
 
+def draw_weighted(
+    weight: Tensor, first: Tensor, end: Tensor, k: int, *, generator: torch.Generator | None = None
+) -> Tensor:
+    """Draws k goals, with replacement, for each transition, by weights of the goals alone.
+
+    The same as :func:`draw` from a table of weights of candidates, without the table: all transitions
+    of an episode look up their draws in one running sum.
+
+    Args:
+        weight: [..., T], at least 0, of each goal of an episode.
+        first: [..., n] int64, the first candidate of each transition.
+        end: [..., n] int64, behind the last one; above ``first``.
+        k: number of draws.
+        generator: source of the random numbers.
+
+    Returns:
+        [..., n, k] of int64, the transition that achieved the goal. Where all candidates have weight 0
+        it is one of them all the same: look at the weights of what was drawn.
+
+    Example:
+        >>> weight = torch.tensor([1.0, 0.0, 2.0, 5.0])
+        >>> draw_weighted(weight, torch.tensor([1, 3]), torch.tensor([3, 4]), 2).tolist()
+        [[2, 2], [3, 3]]
+    """
+    cumulative = torch.nn.functional.pad(weight.double().cumsum(-1), (1, 0))
+    low, high = cumulative.gather(-1, first), cumulative.gather(-1, end)
+    u = torch.rand(*first.shape, k, dtype=torch.float64, device=first.device, generator=generator)
+    mass = low.unsqueeze(-1) + u * (high - low).unsqueeze(-1)
+    index = torch.searchsorted(cumulative, mass.flatten(-2), right=True).view_as(mass) - 1
+    return index.clamp_(first.unsqueeze(-1), end.unsqueeze(-1) - 1)
+
+
 def draw(likelihood: Tensor, k: int, *, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
     """Draws k goals, with replacement, for each transition.
 

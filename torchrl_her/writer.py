@@ -15,7 +15,16 @@ from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
 from torchrl_her.episodes import Episodes, find_episodes
 from torchrl_her.goals import EnvReward, RewardFunction
-from torchrl_her.virtual_goals import Strategy, between, check_strategy, combine, draw, draw_alike, window
+from torchrl_her.virtual_goals import (
+    Strategy,
+    between,
+    check_strategy,
+    combine,
+    draw,
+    draw_alike,
+    draw_weighted,
+    window,
+)
 
 # Work is done piece by piece: pieces that are too large touch fresh memory in every call, pieces that are too
 # small pay more for the calls. These are rows written at once, and likelihoods of goals [rows, T] at once.
@@ -248,11 +257,6 @@ class HERWriter(RoundRobinWriter):
 
     # How it is done
 
-    @property
-    def _preference(self) -> GoalWeights | None:
-        """The weights, if some goals are preferred to others."""
-        return None if self.weights is None or self.weights.alike else self.weights
-
     def _with_held(self, data: TensorDictBase) -> tuple[TensorDictBase, Tensor, Tensor | None]:
         """Flat rows, those held back in front, their lanes, and trajectory ids if lanes are environments."""
         rows = data.reshape(-1)
@@ -324,46 +328,68 @@ class HERWriter(RoundRobinWriter):
         """Which rows [V] are written once more, and the rows [V] whose achieved goals they take."""
         if self.k == 0:
             return real[:0], real[:0]
+        weight = self._weights_of(rows, episodes)
         episode, time = episodes.inside.nonzero(as_tuple=True)  # of each real row
-        index = draw_alike(
-            *window(self.strategy, time, episodes.lengths[episode]), self.k, generator=self._rng
-        )
+        index = self._propose(episodes, episode, time, weight)
         valid = torch.ones_like(real, dtype=torch.bool)
         begin = (episode * episodes.rows.shape[1]).unsqueeze(-1)  # of the episode in the flat table of rows
-        again = self._rejected(rows, episodes, real, begin + index)
+        again = self._rejected(rows, episodes, real, begin + index, weight)
         if len(again) > 0:
             drawn = [
                 draw(likelihood, self.k, generator=self._rng)
-                for likelihood in self._likelihoods(rows, episodes, real, again)
+                for likelihood in self._likelihoods(rows, episodes, real, again, weight)
             ]
             index[again], valid[again] = (torch.cat(part) for part in zip(*drawn, strict=True))
         source = real[valid].unsqueeze(-1).expand(-1, self.k).flatten()
         return source, episodes.rows.take(begin + index)[valid].flatten()
 
-    def _rejected(self, rows: TensorDictBase, episodes: Episodes, real: Tensor, drawn: Tensor) -> Tensor:
-        """Which real rows, by position, may not keep the goals [n, k] drawn as if all were alike.
+    def _weights_of(self, rows: TensorDictBase, episodes: Episodes) -> Tensor | None:
+        """The weights [E, T] of the achieved goals; None if none are preferred to others."""
+        if self.weights is None or self.weights.alike:
+            return None
+        return self.weights(rows.get(self._next_achieved_key)[episodes.rows])
+
+    def _propose(self, episodes: Episodes, episode: Tensor, time: Tensor, weight: Tensor | None) -> Tensor:
+        """Goals [n, k] for real rows, drawn without regard to the filter."""
+        if weight is None:
+            first, end = window(self.strategy, time, episodes.lengths[episode])
+            return draw_alike(first, end, self.k, generator=self._rng)
+        # Padding looks up goals, too: nobody asks for them.
+        steps = torch.arange(weight.shape[1], device=weight.device)
+        length = episodes.lengths.unsqueeze(-1)
+        first, end = window(self.strategy, steps.minimum(length - 1), length)
+        return draw_weighted(weight, first, end, self.k, generator=self._rng)[episode, time]
+
+    def _rejected(
+        self, rows: TensorDictBase, episodes: Episodes, real: Tensor, drawn: Tensor, weight: Tensor | None
+    ) -> Tensor:
+        """Which real rows, by position, may not keep the goals [n, k] that were proposed.
 
         All goals of a row are accepted or rejected together. This rejection sampling spares most
         rows the likelihoods of all their candidates.
         """
-        if self._preference is not None:
-            return torch.arange(len(real), device=real.device)
-        if not self.filter_achieved:
-            return real[:0]
-        before = rows.get(self._achieved_key)[real].unsqueeze(1)
-        goals = rows.get(self._next_achieved_key)[episodes.rows.take(drawn)]
-        return (~self._keep(before, goals).all(-1)).nonzero().squeeze(-1)
+        refused = real.new_zeros(drawn.shape, dtype=torch.bool)
+        if weight is not None:
+            refused |= weight.take(drawn) <= 0
+        if self.filter_achieved:
+            before = rows.get(self._achieved_key)[real].unsqueeze(1)
+            goals = rows.get(self._next_achieved_key)[episodes.rows.take(drawn)]
+            refused |= ~self._keep(before, goals)
+        return refused.any(-1).nonzero().squeeze(-1)
 
     def _likelihoods(
-        self, rows: TensorDictBase, episodes: Episodes, real: Tensor, which: Tensor
+        self,
+        rows: TensorDictBase,
+        episodes: Episodes,
+        real: Tensor,
+        which: Tensor,
+        weight: Tensor | None,
     ) -> Iterator[Tensor]:
         """The likelihoods [n, T] of all goals of their episodes for some real rows, piece by piece."""
         episode, time = (entry[which] for entry in episodes.inside.nonzero(as_tuple=True))
         first, end = window(self.strategy, time, episodes.lengths[episode])
         before = rows.get(self._achieved_key)[real[which]].unsqueeze(1)
         goals = rows.get(self._next_achieved_key)[episodes.rows]
-        preference = self._preference
-        weight = None if preference is None else preference(goals)
         horizon = goals.shape[1]
         for part in torch.arange(len(which), device=real.device).split(max(1, _LIKELIHOODS // horizon)):
             own = episode[part]

@@ -289,9 +289,7 @@ class ThrowingEnv(EnvBase):
             "free": ~held & (self.task.effector == "hand"),  # the robot's ball waits in the air
             "step": 0,
         }.items():
-            tensor = getattr(w, name).clone()
-            tensor[which] = value
-            setattr(w, name, tensor)
+            getattr(w, name)[which] = value
         w.episode[which] += 1
 
     def _scale(self, metres: Tensor) -> Tensor:

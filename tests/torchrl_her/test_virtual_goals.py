@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from torchrl_her import candidates, combine, draw, draw_alike, window
+from torchrl_her import candidates, combine, draw, draw_alike, draw_weighted, window
 
 
 @pytest.mark.parametrize(
@@ -113,3 +113,28 @@ def test_even_the_largest_random_number_stays_in_the_window(first: int, size: in
         patch.setattr(torch, "rand", lambda *shape, **_: torch.full(shape, 1.0 - 2.0**-24))
         index = draw_alike(torch.tensor(first), torch.tensor(first + size), 1)
     assert first <= index.item() < first + size
+
+
+@given(
+    weights=st.lists(st.sampled_from([0.0, 0.5, 1.0, 3.0]), min_size=2, max_size=6),
+    seed=st.integers(0, 1000),
+)
+def test_weighted_draws_stay_in_their_window_and_avoid_weight_zero(weights: list[float], seed: int) -> None:
+    weight, horizon = torch.tensor(weights), len(weights)
+    first = torch.arange(horizon)
+    end = torch.full_like(first, horizon)
+    index = draw_weighted(weight, first, end, 50, generator=torch.Generator().manual_seed(seed))
+    assert (index >= first.unsqueeze(-1)).all()
+    assert (index < horizon).all()
+    for step in range(horizon):
+        if weight[step:].sum() > 0:
+            assert (weight[index[step]] > 0).all()
+
+
+def test_weighted_draws_follow_the_weights() -> None:
+    weight = torch.tensor([[5.0, 1.0, 3.0], [0.0, 2.0, 2.0]])
+    first, end = torch.tensor([[0, 1], [0, 2]]), torch.tensor([[3, 3], [2, 3]])
+    index = draw_weighted(weight, first, end, 90_000, generator=torch.Generator().manual_seed(0))
+    share = torch.nn.functional.one_hot(index, 3).float().mean(2)
+    expected = torch.tensor([[[5 / 9, 1 / 9, 3 / 9], [0, 1 / 4, 3 / 4]], [[0, 1, 0], [0, 0, 1]]])
+    torch.testing.assert_close(share, expected, atol=0.01, rtol=0)
