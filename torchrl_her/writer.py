@@ -369,7 +369,7 @@ class HERWriter(RoundRobinWriter):
         rows the likelihoods of all their candidates.
         """
         refused = real.new_zeros(drawn.shape, dtype=torch.bool)
-        if weight is not None:
+        if weight is not None and not bool((weight > 0).all()):
             refused |= weight.take(drawn) <= 0
         if self.filter_achieved:
             before = rows.get(self._achieved_key)[real].unsqueeze(1)

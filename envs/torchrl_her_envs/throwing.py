@@ -151,10 +151,7 @@ class ThrowingEnv(EnvBase):
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """Whether the goal is achieved, which ends an episode: [..., 1] of bool."""
-        # One coordinate after the other: torch takes several times as long to sum over two numbers.
-        (x, y), (desired_x, desired_y) = achieved_goal.unbind(-1), desired_goal.unbind(-1)
-        near = (x - desired_x).square() + (y - desired_y).square() < self.threshold**2
-        return near.unsqueeze(-1)
+        return _near(achieved_goal, desired_goal, self.threshold).unsqueeze(-1)
 
     def render(self, worlds: int | Sequence[int] | None = 0, *, size: int = 300) -> Tensor:
         """Draws worlds as they are now; see :func:`~torchrl_her_envs.render` for more options.
@@ -246,8 +243,7 @@ class ThrowingEnv(EnvBase):
         grip_velocity = (grip - w.grip) / dt
         flown, flown_velocity = self._fly(w.ball, ball_velocity, free)
 
-        near = (flown - grip).square().sum(-1) < self._catch**2
-        held = held | (closed & near)
+        held = held | (closed & _near(flown, grip, self._catch))
         held_ = held.unsqueeze(-1)
         w.joint_velocity = (joints - w.joints) / dt
         w.joints, w.grip, w.grip_velocity = joints, grip, grip_velocity
@@ -362,3 +358,10 @@ class ThrowingEnv(EnvBase):
         self.action_spec = Bounded(low=-1.0, high=1.0, shape=(n, width), dtype=self.dtype_shown)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype_shown)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
+
+
+def _near(point: Tensor, other: Tensor, distance: float) -> Tensor:
+    """Whether points [..., 2] are nearer to each other than a distance: [...] of bool."""
+    # One coordinate after the other: torch takes several times as long to sum over two numbers.
+    (x, y), (other_x, other_y) = point.unbind(-1), other.unbind(-1)
+    return (x - other_x).square() + (y - other_y).square() < distance**2
