@@ -122,6 +122,11 @@ class FusedDDPGLearner:
         """Whether a compiled form has been at work."""
         return any(form.compiled for form in self._compiled.values())
 
+    @property
+    def compile_seconds(self) -> float:
+        """What compiling has taken so far."""
+        return sum(form.seconds for form in self._compiled.values())
+
     @torch.no_grad()
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
         """Gradient steps of each run; see :class:`~torchrl_her.Learner`."""

@@ -55,6 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit code: 0, 2 for bad input, 130 for Ctrl-C."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)  # compiling on a CPU is no mistake
     commands = {"train": _train, "play": _play, "plot": _plot, "list": _list}
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_USAGE, end="")

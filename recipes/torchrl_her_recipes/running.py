@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_her import (
+    FusedDDPGLearner,
     GoalHistogram,
     HERWriter,
     Trainer,
@@ -179,12 +180,13 @@ def _run(
         True
     )  # moments of unused weights fade to such numbers, which take ten times as long
     bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
-    interrupted = False
+    interrupted = compiled = False
     with soft_interrupt() as check:  # also while things are saved at the end
         try:
             while trainer.epochs < recipe.epochs:
                 new = _epoch(parts, trainer, bar, check, rows[-1]["seconds"] if rows else 0.0)
                 rows += new
+                compiled = compiled or _say_compiled(trainer, bar)
                 if home is not None:
                     home.log(rows, len(new))
                     if trainer.epochs % recipe.checkpoint_interval == 0:
@@ -231,6 +233,15 @@ def _epoch(
         _move_on(parts, parts.climb, samples, bar)
     bar.set_postfix(success=f"{statistics.median(last_success(rows)):.2f}")
     return rows
+
+
+def _say_compiled(trainer: Trainer, bar: tqdm) -> bool:
+    """A line when the gradient step has been compiled; returns whether it was."""
+    learner = trainer.learner
+    if not (isinstance(learner, FusedDDPGLearner) and learner.is_compiled):
+        return False
+    bar.write(f"gradient step compiled in {learner.compile_seconds:.0f} s (kept for later runs)")
+    return True
 
 
 def _play_greedily(parts: Parts, env: EnvBase, epoch: int) -> TensorDictBase:
