@@ -16,7 +16,7 @@ lint: $(VENV)/.ready-test  ## style, formatting, types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(VENV)/.ready-bench  ## all benchmarks, beside peers, in one report: bench.md
+bench: $(VENV)/.ready-bench  ## all benchmarks, beside peers, in one report: runs/bench.md
 	$(BIN)/python benchmarks/run.py
 
 clean:

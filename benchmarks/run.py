@@ -1,6 +1,6 @@
 """All benchmarks one after the other, in one report.
 
-python benchmarks/run.py --out bench.md
+python benchmarks/run.py --out runs/bench.md
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ def main() -> None:
         "parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; all if none is named"
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("bench.md"), help="where the report goes (%(default)s)"
+        "--out", type=Path, default=Path("runs/bench.md"), help="where the report goes (%(default)s)"
     )
     options = parser.parse_args()
     unknown = set(options.parts) - set(PARTS)
     if unknown:
         parser.error(f"there is no {', '.join(sorted(unknown))}; the parts are {', '.join(PARTS)}")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
     sections = ["# Benchmarks"]
     for name in options.parts or PARTS:
         print(f"\n{PARTS[name]}\n")

@@ -1,9 +1,9 @@
-"""Makes the pictures and the table of RESULTS.md from finished runs.
+"""Makes the pictures, tables and data of RESULTS.md from finished runs.
 
-    python docs/make_results.py runs/results
+    python docs/make_results.py runs
 
-expects the folders hand_v0_her, robot_v0_her, hand_v2_her and hand_v2_filtered_her in there, and for the
-choices that the agent leaves open batch_norm and hard_copy.
+Every study reads the folders STUDY/TASK_ALGORITHM in there, leaves out what is missing, prints a table,
+draws `images/STUDY.png`, and writes the curves behind it to `results/STUDY_TASK_ALGORITHM.csv`.
 """
 
 from __future__ import annotations
@@ -11,105 +11,167 @@ from __future__ import annotations
 import argparse
 import csv
 import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import torch
+import numpy as np
 from matplotlib.figure import Figure
-from torch import Tensor
 
-from torchrl_her import load_checkpoint
 from torchrl_her_envs import make_env
+from torchrl_her_recipes.goal_map import GoalMap
 from torchrl_her_recipes.plots import draw_curve, draw_goals
+from torchrl_her_recipes.run_folder import RunFolder
 
-IMAGES = Path(__file__).parent / "images"
-RUNS = {
-    "hand_v0, her": ("hand_v0_her", "#2b6cb0"),
-    "robot_v0, her": ("robot_v0_her", "#38a169"),
-    "hand_v2, her": ("hand_v2_her", "#dd6b20"),
-    "hand_v2, filtered_her": ("hand_v2_filtered_her", "#805ad5"),
+HERE = Path(__file__).parent
+COLOURS = {
+    "her": "#dd6b20",
+    "her_ibs": "#38a169",
+    "filtered_her": "#805ad5",
+    "filtered_her_ibs": "#2b6cb0",
+    "her_ibs_sequential": "#718096",
+    "cher": "#2b6cb0",
+    "cher_ibs": "#38a169",
+    "unfiltered_cher": "#d53f8c",
+    "unfiltered_cher_ibs": "#718096",
 }
-CHOICES = {
-    "as it is": ("hand_v0_her", "#2b6cb0"),
-    "batch normalisation": ("batch_norm", "#dd6b20"),
-    "hard copies": ("hard_copy", "#38a169"),
+COLUMNS = ("run", "epoch", "frames", "updates", "success", "kl", "layer", "q_bias")
+LAST = 3  # evaluations whose mean is a run's success at the end
+
+Rows = list[dict[str, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Tasks beside each other, and the algorithms that are compared on them."""
+
+    tasks: Sequence[str]
+    algorithms: Sequence[str]
+    goals: bool = False  # whether to draw maps of virtual goals
+
+
+STUDIES = {
+    "v0": Study(tasks=("hand_v0", "robot_v0", "hand_wall_v0"), algorithms=("her", "her_ibs"), goals=True),
+    "ibs_v0": Study(
+        tasks=("hand_v0", "robot_v0", "hand_wall_v0"),
+        algorithms=("her", "her_ibs", "her_ibs_sequential"),
+        goals=True,
+    ),
+    "ibs_v2": Study(
+        tasks=("hand_v2", "robot_v2", "hand_wall_v2"),
+        algorithms=("her", "her_ibs", "filtered_her", "filtered_her_ibs"),
+        goals=True,
+    ),
+    "curriculum": Study(
+        tasks=("hand_v1", "hand_wall_v1", "robot_v1"),
+        algorithms=("her", "filtered_her", "cher", "cher_ibs", "unfiltered_cher", "unfiltered_cher_ibs"),
+    ),
+    "draws": Study(tasks=("hand_v0_1", "hand_v0_8", "hand_v0_64"), algorithms=("her",)),
 }
-FLOOR = -0.9  # shown coordinate below which a ball lies on the floor, or nearly
 
 
-def read(path: Path) -> list[dict[str, float]]:
-    """The metrics of a run."""
-    with open(path / "metrics.csv", newline="") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
-
-
-def last(rows: list[dict[str, float]], epochs: int = 3) -> list[float]:
-    """Each run's success, mean of its last few evaluations."""
+def at_the_end(rows: Rows, name: str) -> list[float]:
+    """One metric of each run: the mean of its last evaluations."""
     end, runs = rows[-1]["epoch"], sorted({row["run"] for row in rows})
-    recent = [row for row in rows if row["epoch"] > end - epochs]
-    return [statistics.mean(row["success"] for row in recent if row["run"] == run) for run in runs]
+    recent = [row for row in rows if row["epoch"] > end - LAST]
+    return [statistics.mean(row[name] for row in recent if row["run"] == run) for run in runs]
 
 
-def goals_of(path: Path) -> Tensor:
-    """The virtual goals [n, 2] in the buffers of all runs."""
-    rows = [buffer["rows"] for buffer in load_checkpoint(path / "checkpoint.pt")["buffers"]]
-    return torch.cat([own["desired_goal"][own["virtual"].squeeze(-1)] for own in rows])
+def spread(values: Sequence[float], form: str) -> str:
+    """The median, and the 33rd to 67th percentile."""
+    low, middle, high = np.percentile(values, [33, 50, 67])
+    return f"**{middle:{form}}** ({low:{form}} to {high:{form}})"
 
 
-def draw_success(folder: Path) -> None:
-    """Curves of all runs, and the table."""
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    print("| task and algorithm | frames | median | over the whole run | each run |")
-    print("| --- | --- | --- | --- | --- |")
-    for label, (name, colour) in RUNS.items():
-        rows = read(folder / name)
-        draw_curve(right if "v2" in name else left, rows, "success", colour=colour, label=label)
-        each = last(rows)
-        listed = ", ".join(f"{value:.0%}" for value in sorted(each))
-        whole = statistics.median(last(rows, epochs=10**6))
+def read_study(study: Study, folder: Path) -> dict[tuple[str, str], RunFolder]:
+    """The runs that there are."""
+    found = {}
+    for task in study.tasks:
+        for algorithm in study.algorithms:
+            home = RunFolder(folder / f"{task}_{algorithm}")
+            if home.metrics.is_file():
+                found[task, algorithm] = home
+    return found
+
+
+def print_table(runs: dict[tuple[str, str], RunFolder]) -> None:
+    print("| task | algorithm | runs | frames | success at the end | worst run | KL(q, q*) |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for (task, algorithm), home in runs.items():
+        rows = home.rows()
+        success = at_the_end(rows, "success")
         frames = f"{rows[-1]['frames']:,.0f}"
-        print(f"| {label} | {frames} | {statistics.median(each):.0%} | {whole:.0%} | {listed} |")
-    for axes in (left, right):
-        axes.set(xlabel="environment steps of each run", ylim=(-0.02, 1.02))
+        kl = spread([row["kl"] for row in rows if row["epoch"] == rows[-1]["epoch"]], ".2f")
+        print(
+            f"| `{task}` | `{algorithm}` | {len(success)} | {frames} | {spread(success, '.0%')} "
+            f"| {min(success):.0%} | {kl} |"
+        )
+
+
+def draw_success(study: Study, runs: dict[tuple[str, str], RunFolder], path: Path) -> None:
+    tasks = [task for task in study.tasks if any(task == own for own, _ in runs)]
+    figure = Figure(figsize=(4.2 * len(tasks), 3.6), layout="constrained")
+    panels = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
+    for axes, task in zip(panels, tasks, strict=True):
+        for (own, algorithm), home in runs.items():
+            if own == task:
+                draw_curve(axes, home.rows(), "success", colour=COLOURS[algorithm], label=algorithm)
+        axes.set(title=task, xlabel="environment steps of each run", ylim=(-0.02, 1.02))
         axes.grid(alpha=0.3)
-        axes.legend(loc="upper left")
-    left.set_ylabel("success rate (median, 33rd to 67th percentile)")
-    figure.savefig(IMAGES / "success.png", dpi=100)
+        axes.legend(loc="upper left", fontsize=8)
+    panels[0].set_ylabel("success (median, 33rd to 67th percentile)")
+    figure.savefig(path, dpi=100)
 
 
-def draw_choices(folder: Path) -> None:
-    """Batch normalisation and hard target updates, beside the defaults."""
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.subplots()
-    for label, (name, colour) in CHOICES.items():
-        draw_curve(axes, read(folder / name), "success", colour=colour, label=label)
-    axes.set(xlabel="environment steps of each run", ylabel="success rate, hand_v0, her", ylim=(-0.02, 1.02))
-    axes.grid(alpha=0.3)
-    axes.legend(loc="upper left")
-    figure.savefig(IMAGES / "choices.png", dpi=100)
+def draw_maps(study: Study, runs: dict[tuple[str, str], RunFolder], path: Path) -> None:
+    """Where virtual goals lie: a row for each task, q of each algorithm, and q* at the right."""
+    tasks = [task for task in study.tasks if any(task == own for own, _ in runs)]
+    names = [name for name in study.algorithms if any(name == own for _, own in runs)]
+    figure = Figure(figsize=(3 * (len(names) + 1), 3.1 * len(tasks)), layout="constrained")
+    for line, task in zip(figure.subplots(len(tasks), len(names) + 1, squeeze=False), tasks, strict=True):
+        env, target = make_env(task), None
+        env.reset()
+        for axes, name in zip(line, names, strict=False):
+            home = runs.get((task, name))
+            axes.set_axis_off()
+            if home is not None:
+                goals = GoalMap.load(home.goal_map)
+                target = goals.target
+                axes.set_axis_on()
+                draw_goals(axes, goals.share, env, limit=float(target.max()))
+                axes.set_title(f"{task}, {name}", fontsize=9)
+        if target is not None:
+            draw_goals(line[-1], target, env, limit=float(target.max()))
+            line[-1].set_title("target q*", fontsize=9)
+    figure.savefig(path, dpi=80)
 
 
-def draw_goal_maps(folder: Path) -> None:
-    """Where the virtual goals of hand_v2 lie, with and without the filter."""
-    env = make_env("hand_v2")
-    figure = Figure(figsize=(9, 4.6), layout="constrained")
-    for axes, label in zip(figure.subplots(1, 2), ("hand_v2, her", "hand_v2, filtered_her"), strict=True):
-        goals = goals_of(folder / RUNS[label][0])
-        floor = (goals[:, 1] < FLOOR).float().mean().item()
-        draw_goals(axes, goals, env)
-        axes.set_title(f"{label}: {floor:.0%} of {len(goals):,} on the floor", fontsize=10)
-    figure.savefig(IMAGES / "virtual_goals.png", dpi=100)
+def write_data(study: str, runs: dict[tuple[str, str], RunFolder]) -> None:
+    for (task, algorithm), home in runs.items():
+        rows = home.rows()
+        columns = [name for name in COLUMNS if name in rows[-1]]
+        with open(HERE / "results" / f"{study}_{task}_{algorithm}.csv", "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            for row in rows:
+                writer.writerow(f"{row.get(name, float('nan')):.5g}" for name in columns)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("runs", type=Path, help="folder that the runs lie in")
+    parser.add_argument("runs", type=Path, help="folder that the studies lie in")
     folder = parser.parse_args().runs
-    draw_success(folder)
-    draw_goal_maps(folder)
-    draw_choices(folder)
+    for name, study in STUDIES.items():
+        runs = read_study(study, folder / name)
+        if runs:
+            print(f"\n### {name}\n")
+            print_table(runs)
+            draw_success(study, runs, HERE / "images" / f"{name}.png")
+            write_data(name, runs)
+            if study.goals:
+                draw_maps(study, runs, HERE / "images" / f"{name}_goals.png")
 
 
 if __name__ == "__main__":

@@ -13,7 +13,9 @@ from torchrl_her.curriculum_transforms import StateToObs, ZeroPad
 from torchrl_her.episodes import Episodes, find_episodes
 from torchrl_her.exploration import DecayingEpsilon, explore
 from torchrl_her.fused import FusedDDPGLearner, can_fuse, is_plain_adam
+from torchrl_her.goal_drawing import draw_goals
 from torchrl_her.goal_grid import GoalGrid, box_target, kl_divergence, sampled_target
+from torchrl_her.goal_weights import GoalWeights
 from torchrl_her.goals import EnvReward, GoalReward, RewardFunction, achieved, distance
 from torchrl_her.instructiveness import GoalHistogram, Instructiveness
 from torchrl_her.layer_change import enter_layer, set_layer_goals
@@ -39,7 +41,7 @@ from torchrl_her.networks import (
 )
 from torchrl_her.training import Trainer, evaluate
 from torchrl_her.virtual_goals import Strategy, candidates, combine, draw, draw_alike, draw_weighted, window
-from torchrl_her.writer import GoalWeights, HERWriter, WriterCounts
+from torchrl_her.writer import HERWriter, WriterCounts
 
 __all__ = [
     "ActorNet",
@@ -81,6 +83,7 @@ __all__ = [
     "distance",
     "draw",
     "draw_alike",
+    "draw_goals",
     "draw_weighted",
     "enter_layer",
     "evaluate",

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrl_her.goal_grid import GoalGrid, kl_divergence
-from torchrl_her.writer import GoalWeights
+from torchrl_her.goal_weights import GoalWeights
 
 
 class GoalHistogram(GoalWeights):

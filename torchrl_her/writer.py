@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -14,57 +14,20 @@ from torch import Tensor
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
 from torchrl_her.episodes import Episodes, find_episodes
+from torchrl_her.goal_drawing import draw_goals
+from torchrl_her.goal_weights import GoalWeights
 from torchrl_her.goals import EnvReward, RewardFunction
-from torchrl_her.virtual_goals import (
-    Strategy,
-    between,
-    check_strategy,
-    combine,
-    draw,
-    draw_alike,
-    draw_weighted,
-    window,
-)
+from torchrl_her.virtual_goals import Strategy, check_strategy
 
 # Work is done piece by piece: pieces that are too large touch fresh memory in every call, pieces that are too
-# small pay more for the calls. These are rows written at once, and likelihoods of goals [rows, T] at once.
+# small pay more for the calls. Rows written at once.
 _ROWS = 1 << 17
-_LIKELIHOODS = 1 << 17
 _STATE_FILE = "her_writer.pt"
-
-
-class GoalWeights:
-    """How useful each achieved goal is as a virtual goal. Subclass it to direct HER.
-
-    The base class weighs all goals alike and remembers nothing.
-
-    Attributes:
-        alike: True promises that all weights are equal, which spares the writer their look-up.
-    """
-
-    alike: bool = False
-
-    def __call__(self, goals: Tensor) -> Tensor:
-        """Weights [...] of at least 0 for goals [..., g]."""
-        return goals.new_ones(goals.shape[:-1])
-
-    def update(self, goals: Tensor) -> None:
-        """Told of the virtual goals [n, g] that were written."""
-
-    def clear(self) -> None:
-        """Told that the buffer was emptied."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain data that :meth:`load_state_dict` takes."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave."""
 
 
 @dataclass
 class WriterCounts:
-    """Rows written since the buffer was last emptied. Positive: the goal was achieved there.
+    """Rows written. Positive: the goal was achieved there.
 
     ``useful_virtual_positive`` counts those virtual rows whose goal was not already achieved in
     the state before: the ones that the filter keeps, or would keep.
@@ -105,6 +68,11 @@ class HERWriter(RoundRobinWriter):
             holds the real goal. Anything else that was computed from the desired goal belongs here too.
         achieved_goal, desired_goal, observed_reward, terminated, truncated, done, trajectory: keys.
         virtual: key under which rows are marked; None for no mark.
+
+    Attributes:
+        counts: rows written since the buffer was last emptied.
+        totals: rows written ever.
+        held_back: rows of open episodes that wait for their end.
 
     Raises:
         ValueError: a negative ``k`` or an unknown strategy.
@@ -171,7 +139,7 @@ class HERWriter(RoundRobinWriter):
         self.filter_achieved = filter_achieved
         self.achieved_reward = achieved_reward
         self.weights = weights
-        self.counts = WriterCounts()
+        self.counts, self.totals = WriterCounts(), WriterCounts()
         self._exclude = [unravel_key(place) for key in exclude for place in (key, ("next", key))]
         self._achieved_key = unravel_key(achieved_goal)
         self._next_achieved_key = unravel_key(("next", achieved_goal))
@@ -227,7 +195,7 @@ class HERWriter(RoundRobinWriter):
         state = super().state_dict()
         state["held"] = None if self._held is None else self._held.to_dict()
         state["held_lanes"] = self._held_lanes.clone()
-        state["counts"] = asdict(self.counts)
+        state["counts"], state["totals"] = asdict(self.counts), asdict(self.totals)
         state["weights"] = None if self.weights is None else self.weights.state_dict()
         return state
 
@@ -237,6 +205,7 @@ class HERWriter(RoundRobinWriter):
         held, shape = state_dict["held"], self._held_lanes.shape
         self._held = None if held is None else TensorDict.from_dict(held, batch_size=shape).clone()
         self.counts = WriterCounts(**state_dict["counts"])
+        self.totals = WriterCounts(**state_dict["totals"])
         if self.weights is not None and state_dict["weights"] is not None:
             self.weights.load_state_dict(state_dict["weights"])
 
@@ -281,13 +250,12 @@ class HERWriter(RoundRobinWriter):
     def _write(self, rows: TensorDictBase, episodes: Episodes, place: Tensor, written: int) -> int:
         """Stores the real and virtual rows of some episodes and notes the places of the real ones."""
         real = episodes.rows[episodes.inside]
-        source, goal_source = self._draw(rows, episodes, real)
+        source, goal_source = self._draw(rows, episodes)
         virtual = len(source)
         out = self._build(rows, real, source, self._relabel(rows, source, goal_source) if virtual else {})
         place[real] = torch.arange(written + virtual, written + len(out), device=place.device)
-        self.counts.real += len(real)
-        self.counts.virtual += virtual
-        self.counts.real_positive += self._positives(out.get(self._reward_key)[virtual:])
+        positive = self._positives(out.get(self._reward_key)[virtual:])
+        self._count(real=len(real), virtual=virtual, real_positive=positive)
         excess = max(0, len(out) - self._storage.max_size)
         self._cursor = (self._cursor + excess) % self._storage.max_size
         self._store(out[excess:])
@@ -324,80 +292,18 @@ class HERWriter(RoundRobinWriter):
                 self._bump_generation(index, part)
                 self._mark_update_entities(index)
 
-    def _draw(self, rows: TensorDictBase, episodes: Episodes, real: Tensor) -> tuple[Tensor, Tensor]:
+    def _draw(self, rows: TensorDictBase, episodes: Episodes) -> tuple[Tensor, Tensor]:
         """Which rows [V] are written once more, and the rows [V] whose achieved goals they take."""
-        if self.k == 0:
-            return real[:0], real[:0]
-        weight = self._weights_of(rows, episodes)
-        episode, time = episodes.inside.nonzero(as_tuple=True)  # of each real row
-        index = self._propose(episodes, episode, time, weight)
-        valid = torch.ones_like(real, dtype=torch.bool)
-        begin = (episode * episodes.rows.shape[1]).unsqueeze(-1)  # of the episode in the flat table of rows
-        again = self._rejected(rows, episodes, real, begin + index, weight)
-        if len(again) > 0:
-            drawn = [
-                draw(likelihood, self.k, generator=self._rng)
-                for likelihood in self._likelihoods(rows, episodes, real, again, weight)
-            ]
-            index[again], valid[again] = (torch.cat(part) for part in zip(*drawn, strict=True))
-        source = real[valid].unsqueeze(-1).expand(-1, self.k).flatten()
-        return source, episodes.rows.take(begin + index)[valid].flatten()
-
-    def _weights_of(self, rows: TensorDictBase, episodes: Episodes) -> Tensor | None:
-        """The weights [E, T] of the achieved goals; None if none are preferred to others."""
-        if self.weights is None or self.weights.alike:
-            return None
-        return self.weights(rows.get(self._next_achieved_key)[episodes.rows])
-
-    def _propose(self, episodes: Episodes, episode: Tensor, time: Tensor, weight: Tensor | None) -> Tensor:
-        """Goals [n, k] for real rows, drawn without regard to the filter."""
-        if weight is None:
-            first, end = window(self.strategy, time, episodes.lengths[episode])
-            return draw_alike(first, end, self.k, generator=self._rng)
-        # Padding looks up goals, too: nobody asks for them.
-        steps = torch.arange(weight.shape[1], device=weight.device)
-        length = episodes.lengths.unsqueeze(-1)
-        first, end = window(self.strategy, steps.minimum(length - 1), length)
-        return draw_weighted(weight, first, end, self.k, generator=self._rng)[episode, time]
-
-    def _rejected(
-        self, rows: TensorDictBase, episodes: Episodes, real: Tensor, drawn: Tensor, weight: Tensor | None
-    ) -> Tensor:
-        """Which real rows, by position, may not keep the goals [n, k] that were proposed.
-
-        All goals of a row are accepted or rejected together. This rejection sampling spares most
-        rows the likelihoods of all their candidates.
-        """
-        refused = real.new_zeros(drawn.shape, dtype=torch.bool)
-        if weight is not None and not bool((weight > 0).all()):
-            refused |= weight.take(drawn) <= 0
-        if self.filter_achieved:
-            before = rows.get(self._achieved_key)[real].unsqueeze(1)
-            goals = rows.get(self._next_achieved_key)[episodes.rows.take(drawn)]
-            refused |= ~self._keep(before, goals)
-        return refused.any(-1).nonzero().squeeze(-1)
-
-    def _likelihoods(
-        self,
-        rows: TensorDictBase,
-        episodes: Episodes,
-        real: Tensor,
-        which: Tensor,
-        weight: Tensor | None,
-    ) -> Iterator[Tensor]:
-        """The likelihoods [n, T] of all goals of their episodes for some real rows, piece by piece."""
-        episode, time = (entry[which] for entry in episodes.inside.nonzero(as_tuple=True))
-        first, end = window(self.strategy, time, episodes.lengths[episode])
-        before = rows.get(self._achieved_key)[real[which]].unsqueeze(1)
-        goals = rows.get(self._next_achieved_key)[episodes.rows]
-        horizon = goals.shape[1]
-        for part in torch.arange(len(which), device=real.device).split(max(1, _LIKELIHOODS // horizon)):
-            own = episode[part]
-            yield combine(
-                between(first[part], end[part], horizon),
-                None if weight is None else weight[own],
-                self._keep(before[part], goals[own]) if self.filter_achieved else None,
-            )
+        return draw_goals(
+            rows.get(self._achieved_key),
+            rows.get(self._next_achieved_key),
+            episodes,
+            self.k,
+            strategy=self.strategy,
+            weights=self.weights,
+            keep=self._keep if self.filter_achieved else None,
+            generator=self._rng,
+        )
 
     def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
         """The filter, [...]: False where a goal [..., g] was already achieved before the action."""
@@ -408,7 +314,7 @@ class HERWriter(RoundRobinWriter):
         achieved = rows.get(self._next_achieved_key)
         goals = achieved.index_select(0, goal_source)
         reward, terminated = self.reward(achieved.index_select(0, source), goals)
-        self._count(rows, source, goals, reward)
+        self._note(rows, source, goals, reward)
         truncated = rows.get(self._truncated_key).index_select(0, source)
         return {
             **dict.fromkeys(self._goal_keys, goals),
@@ -417,15 +323,20 @@ class HERWriter(RoundRobinWriter):
             self._done_key: terminated | truncated.view_as(terminated),
         }
 
-    def _count(self, rows: TensorDictBase, source: Tensor, goals: Tensor, reward: Tensor) -> None:
-        self.counts.virtual_positive += self._positives(reward)
+    def _note(self, rows: TensorDictBase, source: Tensor, goals: Tensor, reward: Tensor) -> None:
+        """Counts the rewards of virtual rows, and tells the weights of their goals."""
         useful = reward
         if not self.filter_achieved:  # all that the filter keeps is useful
             before = self._reward_alone(rows.get(self._achieved_key).index_select(0, source), goals)
             useful = reward[before < self.achieved_reward]
-        self.counts.useful_virtual_positive += self._positives(useful)
+        self._count(virtual_positive=self._positives(reward), useful_virtual_positive=self._positives(useful))
         if self.weights is not None:
             self.weights.update(goals)
+
+    def _count(self, **rows: int) -> None:
+        for counts in (self.counts, self.totals):
+            for name, number in rows.items():
+                setattr(counts, name, getattr(counts, name) + number)
 
     def _positives(self, reward: Tensor) -> int:
         return int((reward >= self.achieved_reward).count_nonzero())

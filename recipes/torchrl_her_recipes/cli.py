@@ -1,4 +1,4 @@
-"""The command line: ``torchrl-her train | play | plot | list``."""
+"""The command line: ``torchrl-her train | play | plot | study | list``."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from torchrl_her_recipes.plots import plot_goals
 from torchrl_her_recipes.recipe import Recipe
 from torchrl_her_recipes.run_folder import RunFolder
 from torchrl_her_recipes.running import RunResult, resume
+from torchrl_her_recipes.studies import is_done, load_study, run_study, study_names
 
 _BAD_INPUT = 2
 _INTERRUPTED = 130
@@ -38,6 +39,7 @@ commands:
   train --resume RUN       go on with a run from its checkpoint
   play RUN                 a GIF of a run's policy, for several goals
   plot goals RUN           a heat map of a run's virtual goals beside the target q*
+  study NAME               runs a whole comparison and draws its figure; --quick for a size of minutes
   list                     tasks, algorithms and presets
 """
 _CONF = Path(__file__).parent / "conf"
@@ -56,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)  # compiling on a CPU is no mistake
-    commands = {"train": _train, "play": _play, "plot": _plot, "list": _list}
+    commands = {"train": _train, "play": _play, "plot": _plot, "study": _study, "list": _list}
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_USAGE, end="")
         return 0 if arguments else _BAD_INPUT
@@ -193,12 +195,34 @@ def _plot(arguments: list[str]) -> int:
     return 0
 
 
+def _study(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="torchrl-her study", description="Run a whole comparison.")
+    parser.add_argument("name", help=f"{', '.join(study_names())}, or a .yaml file of your own")
+    parser.add_argument("--seeds", type=int, help="runs of each combination")
+    parser.add_argument("--frames", type=int, help="environment steps of each run")
+    parser.add_argument("--quick", action="store_true", help="a size that ends in minutes")
+    parser.add_argument("--folder", type=Path, help="where it goes (default: runs/NAME)")
+    options = parser.parse_args(arguments)
+    study = load_study(options.name, seeds=options.seeds, frames=options.frames, quick=options.quick)
+    folder = options.folder or Path("runs") / (study.name + ("_quick" if options.quick else ""))
+    to_go = [recipe for label, recipe in study.cells() if not is_done(RunFolder(folder / label))]
+    steps = sum(recipe.total_frames * recipe.num_runs for recipe in to_go)
+    print(f"{study.name}: {len(to_go)} batched runs to go, {steps:,} environment steps in all: {folder}")
+    figure = run_study(study, folder)
+    if figure is None:
+        print("interrupted: the same command goes on with it")
+        return _INTERRUPTED
+    print(figure)
+    return 0
+
+
 def _list(arguments: list[str]) -> int:
     argparse.ArgumentParser(prog="torchrl-her list", description="List what there is.").parse_args(arguments)
     presets = sorted((_CONF / "preset").glob("*.yaml"))
     sections = {
         "tasks": {task.name: task.summary for task in TASKS.values()},
         "algorithms": {algorithm.name: algorithm.summary for algorithm in ALGORITHMS.values()},
+        "studies": {name: load_study(name).summary for name in study_names()},
         "presets": {path.stem: path.read_text().splitlines()[1].lstrip("# ") for path in presets},
     }
     for title, entries in sections.items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib
@@ -16,6 +16,7 @@ from torchrl_her_recipes.goal_map import GoalMap
 
 matplotlib.use("agg")
 
+_COLOURS = ("#dd6b20", "#805ad5", "#2b6cb0", "#38a169", "#d53f8c", "#718096")
 _SCREEN = 300  # pixels of the picture behind a heat map
 
 _PANELS = (
@@ -23,6 +24,8 @@ _PANELS = (
     ("distance", "distance to goal at the end", None),
     ("q_bias", "Q of the start minus return", None),
     ("loss_value", "critic's loss", None),
+    ("rows_real_positive", "positive rewards, real rows", None),
+    ("rows_useful_virtual_positive", "positive rewards, virtual rows that count", None),
 )
 
 
@@ -34,16 +37,49 @@ def plot_curves(rows: Sequence[dict[str, float]], path: Path, *, title: str = ""
         path: of the picture.
         title: above it.
     """
-    figure = Figure(figsize=(10, 6), layout="constrained")
+    figure = Figure(figsize=(14, 6), layout="constrained")
     figure.suptitle(title)
-    for axes, (name, label, limits) in zip(figure.subplots(2, 2).flat, _PANELS, strict=True):
+    for axes, (name, label, limits) in zip(figure.subplots(2, 3).flat, _PANELS, strict=True):
         if all(name in row for row in rows):
             draw_curve(axes, rows, name)
+        for frames in layer_changes(rows):
+            axes.axvline(frames, color="#a0aec0", linewidth=0.8, linestyle=":")
         axes.set(xlabel="environment steps", ylabel=label)
         axes.grid(alpha=0.3)
         if limits is not None:
             axes.set_ylim(*limits)
     figure.savefig(path, dpi=110)
+
+
+def plot_comparison(panels: Mapping[str, Mapping[str, Sequence[dict[str, float]]]], path: Path) -> None:
+    """Draws success over environment steps: medians, and the 33rd to 67th percentile of the runs.
+
+    Args:
+        panels: title of each panel to the curves in it, label to table of metrics.
+        path: of the picture.
+    """
+    figure = Figure(figsize=(1.0 + 4.2 * len(panels), 3.8), layout="constrained")
+    grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, (title, curves) in zip(grid, panels.items(), strict=True):
+        for index, (label, rows) in enumerate(curves.items()):
+            draw_curve(axes, rows, "success", colour=_COLOURS[index % len(_COLOURS)], label=label)
+        axes.set(title=title, xlabel="environment steps of each run", ylim=(-0.02, 1.02))
+        axes.grid(alpha=0.3)
+        axes.legend(loc="upper left", fontsize=8)
+    grid[0].set_ylabel("success (median, 33rd to 67th percentile)")
+    figure.savefig(path, dpi=110)
+
+
+def layer_changes(rows: Sequence[dict[str, float]]) -> list[float]:
+    """After how many frames runs went on to another layer of their curriculum: one entry each."""
+    last: dict[float, dict[str, float]] = {}
+    changes = []
+    for row in rows:
+        before = last.get(row["run"], row)
+        if row.get("layer") != before.get("layer"):
+            changes.append(before["frames"])
+        last[row["run"]] = row
+    return changes
 
 
 def draw_curve(

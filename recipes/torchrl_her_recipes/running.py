@@ -305,7 +305,7 @@ def _written(parts: Parts, run: int) -> dict[str, float]:
     writer = parts.buffers[run].writer
     if not isinstance(writer, HERWriter):
         return {}
-    counts = {f"rows_{name}": value for name, value in asdict(writer.counts).items()}
+    counts = {f"rows_{name}": value for name, value in asdict(writer.totals).items()}
     if isinstance(writer.weights, GoalHistogram):
         counts["kl"] = writer.weights.divergence_to(parts.goal_target)
     return counts

@@ -150,7 +150,7 @@ def test_ctrl_c_saves_what_there_is_and_the_run_can_go_on(tmp_path: Path) -> Non
     recipe = small(epochs=3)
     interrupted_after(recipe.build(), tmp_path / "run", 50)  # in the middle of the second epoch
     saved = load_checkpoint(tmp_path / "run" / "checkpoint.pt")
-    assert saved["trainer"]["frames"] == 51 * 40
+    assert saved["trainer"]["frames"] == 51 * 80
     assert (tmp_path / "run" / "curves.png").exists()
     result = resume(tmp_path / "run", progress=False)
     assert [row["frames"] for row in result.rows] == [1_600, 3_200, 4_800]

@@ -5,6 +5,7 @@ Goals are tagged with the environment, episode and state that they come from (se
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -502,6 +503,17 @@ def test_a_goal_that_was_achieved_before_is_no_useful_positive() -> None:
     buffer.extend(batch)
     counts = buffer.writer.counts
     assert (counts.virtual_positive, counts.useful_virtual_positive) == (2, 1)
+
+
+def test_totals_outlive_an_emptied_buffer() -> None:
+    buffer = make_buffer(strategy="final", k=2)
+    buffer.extend(make_batch([[3]], terminated=True))
+    before = replace(buffer.writer.totals)
+    assert before == buffer.writer.counts
+    buffer.empty()
+    assert buffer.writer.totals == before
+    buffer.extend(make_batch([[3]], terminated=True))
+    assert (buffer.writer.totals.real, buffer.writer.counts.real) == (6, 3)
 
 
 # Options

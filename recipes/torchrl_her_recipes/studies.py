@@ -1,0 +1,145 @@
+"""Studies: the same recipe over tasks, algorithms and options, each as batched runs, with one figure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from torchrl_her_recipes.plots import plot_comparison
+from torchrl_her_recipes.recipe import Recipe
+from torchrl_her_recipes.run_folder import RunFolder
+from torchrl_her_recipes.running import resume, run
+
+_CONF = Path(__file__).parent / "conf" / "study"
+_QUICK: dict[str, Any] = {
+    "num_runs": 2,
+    "epochs": 2,
+    "epoch_frames": 3_200,
+    "num_envs": 16,
+    "eval_episodes": 20,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """What is compared with what.
+
+    Args:
+        name: of the study.
+        summary: one line for people.
+        recipe: what all of it has in common; ``num_runs`` is the number of seeds.
+        vary: option of a recipe to the values that are compared. All combinations are run. The panels of
+            the figure are the tasks, its curves the rest.
+    """
+
+    name: str
+    summary: str = ""
+    recipe: dict[str, Any] = field(default_factory=dict)
+    vary: dict[str, Sequence[Any]] = field(default_factory=dict)
+
+    def cells(self) -> Iterator[tuple[str, Recipe]]:
+        """The batched runs by name.
+
+        Raises:
+            ValueError: a recipe that cannot work.
+        """
+        for values in product(*self.vary.values()):
+            own = dict(zip(self.vary, values, strict=True))
+            label = "_".join(_word(name, value) for name, value in own.items())
+            yield label, Recipe.from_dict({**self.recipe, **own})
+
+
+def _word(name: str, value: Any) -> str:
+    return str(value) if name in ("task", "algo") else f"{name}={value}"
+
+
+def study_names() -> list[str]:
+    """All studies that come with the package."""
+    return sorted(path.stem for path in _CONF.glob("*.yaml"))
+
+
+def load_study(
+    name: str, *, seeds: int | None = None, frames: int | None = None, quick: bool = False
+) -> Study:
+    """A study by name, or from a YAML file of one's own.
+
+    Args:
+        name: one of :func:`study_names`, or the path of a .yaml file.
+        seeds: runs of each combination, in place of the study's own number.
+        frames: environment steps of each run, rounded up to whole epochs.
+        quick: shrinks it to minutes.
+
+    Raises:
+        ValueError: there is no such study, or a number below 1.
+    """
+    path = Path(name) if name.endswith((".yaml", ".yml")) else _CONF / f"{name}.yaml"
+    if not path.is_file():
+        raise ValueError(f"there is no study {name!r}; the studies are {', '.join(study_names())}")
+    for option, value in (("seeds", seeds), ("frames", frames)):
+        if value is not None and value < 1:
+            raise ValueError(f"{option} must be at least 1, got {value}")
+    study = Study(name=path.stem, **yaml.safe_load(path.read_text()))
+    recipe = {**study.recipe, **(_QUICK if quick else {})}
+    if seeds is not None:
+        recipe["num_runs"] = seeds
+    if frames is not None:
+        recipe["epochs"] = -(-frames // Recipe.from_dict({**recipe, **_first(study)}).epoch_frames)
+    return replace(study, recipe=recipe)
+
+
+def _first(study: Study) -> dict[str, Any]:
+    return {name: values[0] for name, values in study.vary.items()}
+
+
+def run_study(study: Study, folder: Path, *, progress: bool = True) -> Path | None:
+    """Runs what is not done yet, and draws the figure.
+
+    A combination that was interrupted goes on from its checkpoint.
+
+    Args:
+        study: what to run.
+        folder: a folder of each combination goes into it.
+        progress: whether to show a progress bar for each.
+
+    Returns:
+        The figure; None if it was interrupted by Ctrl-C.
+
+    Raises:
+        ValueError: the folder has a run of other options under the same name.
+    """
+    for label, recipe in study.cells():
+        home = RunFolder(folder / label)
+        if not home.config.exists():
+            result = run(recipe.build(), home.path, progress=progress)
+        elif home.recipe() != recipe:
+            raise ValueError(f"{home.path} holds a run with other options; choose another folder")
+        elif is_done(home):
+            continue
+        else:
+            result = resume(home.path, progress=progress)
+        if result.interrupted:
+            return None
+    return draw_study(study, folder)
+
+
+def is_done(home: RunFolder) -> bool:
+    """Whether a run has reached its last epoch."""
+    rows = home.rows()
+    return home.config.exists() and bool(rows) and rows[-1]["epoch"] >= home.recipe().epochs
+
+
+def draw_study(study: Study, folder: Path) -> Path:
+    """Success over environment steps: a panel for each task, a curve for each combination of the rest."""
+    panels: dict[str, dict[str, list[dict[str, float]]]] = {}
+    for label, recipe in study.cells():
+        rows = RunFolder(folder / label).rows()
+        curve = label.removeprefix(recipe.task).lstrip("_") or recipe.algo
+        panels.setdefault(recipe.task, {})[curve] = rows
+    path = folder / f"{study.name}.png"
+    plot_comparison(panels, path)
+    return path

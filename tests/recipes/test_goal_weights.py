@@ -1,0 +1,112 @@
+"""Runs that prefer instructive goals, and what every run tells of its virtual goals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from PIL import Image
+
+from torchrl_her import GoalHistogram, Instructiveness
+from torchrl_her_envs import TASKS, make_env
+from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.goal_map import GoalMap
+from torchrl_her_recipes.goal_weights import goal_target, make_goal_weights
+
+from .small import small
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    small(algo="filtered_her_ibs", num_runs=2, epochs=3).build().run(folder, progress=False)
+    return folder
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_has_a_target(task: str) -> None:
+    target = goal_target(small(task=task), make_env(task))
+    assert target.shape == (400,)
+    assert float(target.sum()) == pytest.approx(1.0)
+    greatest = int(target.argmax())
+    goals = make_env(task).goal_distribution
+    centre = torch.tensor([greatest // 20, greatest % 20]) * 0.1 - 0.95  # of the cell with most of it
+    assert (centre >= goals.low - 0.1).all()
+    assert (centre <= goals.high + 0.1).all()
+
+
+@pytest.mark.parametrize(
+    ("algo", "kind", "subtract"),
+    [
+        ("her", GoalHistogram, None),
+        ("her_ibs", Instructiveness, True),
+        ("her_ibs_sequential", Instructiveness, False),
+    ],
+)
+def test_each_algorithm_has_its_weights(algo: str, kind: type, subtract: bool | None) -> None:
+    weights = make_goal_weights(small(algo=algo), make_env("hand_v0"))
+    assert type(weights) is kind
+    assert getattr(weights, "subtract", None) is subtract
+
+
+def test_sigma_is_a_share_of_the_screen_and_smaller_beside_the_wall() -> None:
+    for task, options, sigma in (
+        ("hand_v0", {}, 0.4),
+        ("hand_wall_v0", {}, 0.2),
+        ("hand_wall_v0", {"ibs_sigma": 0.3}, 0.6),
+    ):
+        weights = make_goal_weights(small(task=task, algo="her_ibs", **options), make_env(task))
+        assert isinstance(weights, Instructiveness)
+        assert weights.final_sigma == pytest.approx(sigma)
+        assert weights.sigma == pytest.approx(3 * sigma)
+
+
+def test_goals_on_a_line_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="hand_reach: the box of goals needs a volume"):
+        small(task="hand_reach", algo="her_ibs").build()
+    small(task="hand_reach", algo="her").build()  # counting them is fine
+
+
+def test_sigma_shrinks_each_epoch_and_divergence_is_logged(finished: Path) -> None:
+    rows = pd.read_csv(finished / "metrics.csv")
+    assert rows["kl"].between(0.0, 20.0).all()
+    parts = small(algo="her_ibs").build()
+    parts.run(progress=False)
+    weights = parts.buffer.writer.weights
+    assert weights.sigma == pytest.approx(3 * 0.4 * 0.9)  # two epochs, each a root of 0.9
+
+
+def test_without_hindsight_there_is_nothing_to_tell(tmp_path: Path) -> None:
+    small(algo="ddpg").build().run(tmp_path / "run", progress=False)
+    assert "kl" not in pd.read_csv(tmp_path / "run" / "metrics.csv").columns
+    assert not (tmp_path / "run" / "virtual_goals.png").exists()
+
+
+def test_the_map_holds_all_virtual_goals_of_each_run(finished: Path) -> None:
+    goals = GoalMap.load(finished / "goal_map.npz")
+    rows = pd.read_csv(finished / "metrics.csv")
+    assert goals.counts.shape == (2, 20, 20)
+    assert goals.counts.sum((1, 2)).tolist() == rows[rows["epoch"] == 3]["rows_virtual"].tolist()
+    assert goals.share.sum() == pytest.approx(1.0)
+    assert np.allclose(goals.target.sum(), 1.0)
+
+
+def test_plot_goals_draws_them_again(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "goals.png"
+    assert main(["plot", "goals", str(finished), "--out", str(out)]) == 0
+    assert capsys.readouterr().out.strip() == str(out)
+    with Image.open(out) as picture:
+        assert picture.size[0] > picture.size[1] > 300
+
+
+def test_a_run_without_a_map_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small(algo="ddpg", epochs=1).build().run(tmp_path / "run", progress=False)
+    assert main(["plot", "goals", str(tmp_path / "run")]) == 2
+    assert (
+        capsys.readouterr().err.strip().endswith("has no goal_map.npz: the run wrote no virtual goals so far")
+    )
