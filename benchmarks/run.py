@@ -6,6 +6,7 @@ python benchmarks/run.py --out runs/bench.md
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 from importlib import import_module
 from pathlib import Path
@@ -21,7 +22,7 @@ PARTS = {
 }
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument(
         "parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; all if none is named"
@@ -34,18 +35,19 @@ def main() -> None:
     if unknown:
         parser.error(f"there is no {', '.join(sorted(unknown))}; the parts are {', '.join(PARTS)}")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    sections = ["# Benchmarks"]
+    sections, failed = ["# Benchmarks"], False
     for name in options.parts or PARTS:
         print(f"\n{PARTS[name]}\n")
         with tempfile.TemporaryDirectory() as folder:
             table = Path(folder) / "table.md"
-            import_module(name).main(["--out", str(table)])
+            failed |= bool(import_module(name).main(["--out", str(table)]))
             sections.append(
                 f"## {PARTS[name]}\n\n`python benchmarks/{name}.py`\n\n{table.read_text().strip()}"
             )
         options.out.write_text("\n\n".join(sections) + "\n")  # what there is, should a later part fail
     print(f"\nreport: {options.out}")
+    return int(failed)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -75,7 +75,8 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     """
     n = len(buffer)
     state: dict[str, Any] = {
-        "rows": buffer[:].clone().to_dict() if n else None,  # a view would bring the whole capacity along
+        # As stored, without what transforms add; a copy, since a view would bring the whole capacity along.
+        "rows": buffer.storage[:n].clone().to_dict() if n else None,
         "size": n,
         "writer": buffer.writer.state_dict(),
         "sampler": None,

@@ -23,8 +23,8 @@ class CompiledOnce:
 
     Args:
         function: takes and returns (nested) tuples and lists of tensors; may change them in place, but
-            none may come in twice. It is always called with tensors of the same shapes, types and
-            devices and without gradients: nothing checks that.
+            none may come in twice. It is always called with the same numbers, and with tensors of the
+            same shapes, strides, types and devices and without gradients: nothing checks that.
 
     Attributes:
         compiled: whether calls are served by the compiled form.

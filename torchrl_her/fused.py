@@ -67,6 +67,8 @@ class FusedDDPGLearner:
         compile_step: compiles losses, gradients and clipping into one program at the first batch of
             a shape, and a plain Adam and the soft update with them; see :class:`~torchrl_her.CompiledOnce`.
 
+    The learner holds on to the weights' memory: make it after the loss was moved to its device or type.
+
     Raises:
         ValueError: :func:`can_fuse` says no: use :class:`~torchrl_her.LossLearner`; or the optimiser is
             not one that can be compiled.
@@ -100,7 +102,7 @@ class FusedDDPGLearner:
             action_penalty=loss.action_penalty,
             max_grad_norm=max_grad_norm,
         )
-        self._compiled: dict[tuple, CompiledOnce] = {}  # by the shape of a batch, and whether it has weights
+        self._compiled: dict[tuple, CompiledOnce] = {}  # by all that was fixed when it was compiled
         self._keys = list(loss.actor_network.in_keys)
         self._next_keys = [("next", key) for key in self._keys]
         self._action_key = loss.actor_network.out_keys[0]
@@ -130,7 +132,7 @@ class FusedDDPGLearner:
     @torch.no_grad()
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
         """Gradient steps of each run; see :class:`~torchrl_her.Learner`."""
-        with keep_runs(self.loss, self.optimiser, idle):
+        with keep_runs(self.loss, self.optimiser, idle, runs=self.runs):
             done = [self._step(part) for part in self._parts(rows, steps)]
         squares = torch.cat([step.squares for step in done], 1)
         rows.set(self.loss.tensor_keys.priority, squares.view(rows.batch_size))
@@ -150,7 +152,17 @@ class FusedDDPGLearner:
         return step
 
     def _compiled_step(self, rows: Rows) -> Step:
-        form = (*rows.action.shape, rows.weight is None)
+        adam = self._adam()
+        action = rows.action
+        form = (
+            action.shape,
+            action.dtype,
+            action.device,
+            rows.weight is None,
+            adam.betas,
+            adam.eps,
+            self.tau,
+        )
         if form not in self._compiled:
             settings, layers, tau = self._settings, self._actor_layers, self.tau
 
@@ -158,7 +170,7 @@ class FusedDDPGLearner:
                 return ddpg_update_(weights, adam, rows, settings, actor_layers=layers, tau=tau)
 
             self._compiled[form] = CompiledOnce(ddpg_step)
-        return self._compiled[form](self._weights, self._adam(), rows)
+        return self._compiled[form](self._weights, adam, rows)
 
     def _adam(self) -> Adam:
         """The optimiser's own state: read anew each time, as loading a checkpoint replaces it."""
@@ -189,7 +201,9 @@ class FusedDDPGLearner:
         entries = self._rows(rows)
         size = entries.action.shape[1] // steps
         split = [[None] * steps if entry is None else entry.split(size, 1) for entry in entries]
-        return [Rows(*own) for own in zip(*split, strict=True)]
+        # A compiled form takes its rows with the strides that it was made for.
+        parts = [[entry if entry is None else entry.contiguous() for entry in own] for own in split]
+        return [Rows(*own) for own in zip(*parts, strict=True)]
 
     def _rows(self, batch: TensorDictBase) -> Rows:
         weight = batch.get("priority_weight", None)

@@ -47,6 +47,9 @@ def draw_goals(
             other, which may be drawn [...]; None for all.
         generator: source of the random numbers.
 
+    Raises:
+        ValueError: weights that are negative or not finite.
+
     Returns:
         ``(source, goal_source)``, [V] each: the rows to be written once more, k times each, and the rows
         whose ``after`` is the goal. Rows without a goal that may be drawn are left out.
@@ -61,15 +64,14 @@ def draw_goals(
     real = episodes.rows[episodes.inside]
     if k == 0:
         return real[:0], real[:0]
-    preferred = weights is not None and not weights.alike
-    weight = weights(after[episodes.rows]) if weights is not None and preferred else None
+    weight = None if weights is None or weights.alike else _checked(weights(after[episodes.rows]))
     episode, time = episodes.inside.nonzero(as_tuple=True)  # of each real row
     index = _propose(episodes, episode, time, k, strategy, weight, generator)
     valid = torch.ones_like(real, dtype=torch.bool)
     begin = (episode * episodes.rows.shape[1]).unsqueeze(-1)  # of the episode in the flat table of rows
     refused = torch.zeros_like(index, dtype=torch.bool)
     if weight is not None and not bool((weight > 0).all()):
-        refused |= weight.take(begin + index) <= 0
+        refused |= weight.take(begin + index) == 0
     if keep is not None:
         refused |= ~keep(before[real].unsqueeze(1), after[episodes.rows.take(begin + index)])
     again = refused.any(-1).nonzero().squeeze(-1)
@@ -82,6 +84,20 @@ def draw_goals(
         index[again], valid[again] = (torch.cat(part) for part in zip(*drawn, strict=True))
     source = real[valid].unsqueeze(-1).expand(-1, k).flatten()
     return source, episodes.rows.take(begin + index)[valid].flatten()
+
+
+def _checked(weight: Tensor) -> Tensor:
+    """Weights as floating numbers.
+
+    Raises:
+        ValueError: some are negative or not finite.
+    """
+    weight = weight if weight.is_floating_point() else weight.float()
+    if weight.numel() > 0:
+        least, most = weight.aminmax()
+        if not bool((least >= 0) & (most < torch.inf)):  # NaN fails both
+            raise ValueError(f"weights of goals must be finite and at least 0, got {least} to {most}")
+    return weight
 
 
 def _propose(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchrl.data import ReplayBuffer
+from torchrl.data import ReplayBuffer, Writer
 
 from torchrl_her.curriculum import CurriculumLayer
 from torchrl_her.exploration import DecayingEpsilon
@@ -11,8 +11,14 @@ from torchrl_her.instructiveness import Instructiveness
 from torchrl_her.writer import HERWriter
 
 
-def set_layer_goals(writer: HERWriter, layer: CurriculumLayer) -> None:
-    """Lets a writer relabel with the reward of a layer, and prefer goals if the layer says so."""
+def set_layer_goals(writer: Writer, layer: CurriculumLayer) -> None:
+    """Lets a writer relabel with the reward of a layer, and prefer goals if the layer says so.
+
+    Raises:
+        TypeError: the writer does not relabel.
+    """
+    if not isinstance(writer, HERWriter):
+        raise TypeError(f"a curriculum needs a buffer with a HERWriter, got a {type(writer).__name__}")
     writer.reward = GoalReward(layer.threshold)
     if isinstance(writer.weights, Instructiveness):
         writer.weights.alike = not layer.instructive
@@ -31,7 +37,8 @@ def enter_layer(
     Networks and optimiser go on as they are: what was learnt is what the next layer builds on.
 
     Args:
-        buffer: of the run, with a :class:`~torchrl_her.HERWriter`.
+        buffer: of the run, with a :class:`~torchrl_her.HERWriter` and without prefetching, which would
+            go on handing out old rows.
         layer: the one that begins.
         exploration: of all runs; None leaves it.
 

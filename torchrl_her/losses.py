@@ -14,8 +14,7 @@ from torchrl.objectives import DDPGLoss, HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import TD0Estimator
 
-# Importance weights and priorities, as TorchRL's samplers and losses call them.
-_WEIGHT, _PRIORITY = "priority_weight", "td_error"
+_WEIGHT = "priority_weight"  # of importance sampling, as TorchRL's samplers and losses call it
 
 
 class ClampedTD0(TD0Estimator):
@@ -172,11 +171,12 @@ class LossLearner:
         """Gradient steps of each run; see :class:`Learner`."""
         last = rows.ndim - 1
         parts = rows.split(rows.shape[last] // steps, last)
-        with keep_runs(self.loss, self.optimiser, idle):
+        with keep_runs(self.loss, self.optimiser, idle, runs=self.runs):
             measured = [self._update(part) for part in parts]
-        priorities = [part.get(_PRIORITY, None) for part in parts]
-        if priorities[0] is not None:
-            rows.set(_PRIORITY, torch.cat(priorities, last))
+        key = getattr(self.loss.tensor_keys, "priority", None)
+        priorities = [] if key is None else [part.get(key, None) for part in parts]
+        if priorities and priorities[0] is not None:
+            rows.set(key, torch.cat(priorities, last))
         return {key: torch.stack([step[key] for step in measured]) for key in measured[0]}
 
     def _update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -215,32 +215,44 @@ class LossLearner:
 
 
 @contextmanager
-def keep_runs(loss: nn.Module, optimiser: torch.optim.Optimizer, runs: Sequence[int]) -> Iterator[None]:
+def keep_runs(
+    loss: nn.Module, optimiser: torch.optim.Optimizer, kept: Sequence[int], *, runs: int
+) -> Iterator[None]:
     """Puts back what some runs of a stacked loss and its optimiser were, when the block ends.
 
+    What numbers of all runs have in common, as Adam's count of steps, goes on.
+
     Args:
-        loss: whose entries are R equal blocks, run after run.
-        optimiser: over its parameters, after its first step.
-        runs: to be kept.
+        loss: each of its entries is R equal blocks, run after run.
+        optimiser: over its parameters.
+        kept: the runs.
+        runs: R.
 
     Example:
         >>> weight = nn.Linear(1, 2, bias=False)  # as if of two runs
-        >>> with keep_runs(weight, torch.optim.Adam(weight.parameters()), [1]):
+        >>> with keep_runs(weight, torch.optim.Adam(weight.parameters()), [1], runs=2):
         ...     _ = nn.init.zeros_(weight.weight)
         >>> (weight.weight == 0).flatten().tolist()
         [True, False]
     """
-    if not runs:
+    if not kept:
         yield
         return
+    before = {block.data_ptr(): block[list(kept)].clone() for block in _blocks(loss, optimiser, runs)}
+    try:
+        yield
+    finally:
+        with torch.no_grad():
+            for block in _blocks(loss, optimiser, runs):
+                # an optimiser begins with zeros, which it makes at its first step
+                block[list(kept)] = before.get(block.data_ptr(), 0.0)
+
+
+def _blocks(loss: nn.Module, optimiser: torch.optim.Optimizer, runs: int) -> list[Tensor]:
+    """All numbers that belong to one of R runs, as [R, ...] each."""
     moments = [entry for state in optimiser.state.values() for entry in state.values()]
-    entries = [entry for entry in (*loss.state_dict().values(), *moments) if entry.ndim > 0]
-    index = torch.tensor(list(runs))
-    kept = [entry[index].clone() for entry in entries]
-    yield
-    with torch.no_grad():
-        for entry, old in zip(entries, kept, strict=True):
-            entry[index] = old
+    entries = [*loss.state_dict().values(), *moments]
+    return [entry.view(runs, -1) for entry in entries if entry.ndim > 0 and entry.numel() % runs == 0]
 
 
 @torch.no_grad()

@@ -15,6 +15,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_her.losses import Learner
 
+_IDLE = -torch.inf  # what a run has measured that learnt nothing; NaN would hide those that diverged
+
 
 class Schedule(Protocol):
     """What changes from epoch to epoch; has state of its own."""
@@ -118,7 +120,7 @@ class Trainer:
             if on_batch is not None:
                 on_batch(self)
         keys = measured[0] if measured else {}
-        return {key: torch.cat([m[key] for m in measured]).nanmean(0) for key in keys}
+        return {key: _mean([m[key] for m in measured]) for key in keys}
 
     def _write(self, batch: TensorDictBase) -> int:
         """Gives each run its block of environments, and returns the frames of one run."""
@@ -130,7 +132,7 @@ class Trainer:
     def _learn(self) -> list[dict[str, Tensor]]:
         """All gradient steps that the collected frames have paid for."""
         # How full another run's buffer is must not matter: a run whose buffer is empty lets its steps pass.
-        if self.frames < self.warmup_frames or not self.buffers:
+        if self.frames < self.warmup_frames:
             return []
         idle = [run for run, buffer in enumerate(self.buffers) if len(buffer) == 0]
         measured = []
@@ -143,7 +145,7 @@ class Trainer:
         return measured
 
     def _learn_from(self, idle: list[int], steps: int) -> dict[str, Tensor]:
-        """Some gradient steps of all runs but the idle ones: [steps, R] each, NaN for those."""
+        """Some gradient steps of all runs but the idle ones: [steps, R] each, -inf for those."""
         size = self.batch_size * steps
         drawn = [None if run in idle else buffer.sample(size) for run, buffer in enumerate(self.buffers)]
         stand_in = next(rows for rows in drawn if rows is not None)
@@ -151,7 +153,7 @@ class Trainer:
         measured = self.learner.update(rows, steps, idle=idle)
         self._set_priorities(drawn, rows)
         nothing = torch.tensor(idle, dtype=torch.int64)
-        return {key: value.index_fill(1, nothing, torch.nan) for key, value in measured.items()}
+        return {key: value.index_fill(1, nothing, _IDLE) for key, value in measured.items()}
 
     def _set_priorities(self, drawn: list[TensorDictBase | None], rows: TensorDictBase) -> None:
         """Tells each run's sampler the new priorities of the rows that were learnt from."""
@@ -172,6 +174,13 @@ class Trainer:
         """Puts the counters back."""
         self.frames, self.updates, self.epochs = state["frames"], state["updates"], state["epochs"]
         self._credit = state["credit"]
+
+
+def _mean(measured: list[Tensor]) -> Tensor:
+    """The means [R] over all steps [..., R] in which a run learnt; NaN where it never did."""
+    values = torch.cat(measured)
+    learnt = values != _IDLE
+    return torch.where(learnt, values, 0.0).sum(0) / learnt.sum(0)
 
 
 @torch.no_grad()

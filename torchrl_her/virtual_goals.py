@@ -150,9 +150,10 @@ def draw_weighted(
         >>> draw_weighted(weight, torch.tensor([1, 3]), torch.tensor([3, 4]), 2).tolist()
         [[2, 2], [3, 3]]
     """
-    cumulative = torch.nn.functional.pad(weight.cumsum(-1), (1, 0))
+    # In float64: differences of a running sum in float32 would drown weights that are far from the greatest.
+    cumulative = torch.nn.functional.pad(weight.double().cumsum(-1), (1, 0))
     low, high = cumulative.gather(-1, first), cumulative.gather(-1, end)
-    u = torch.rand(*first.shape, k, dtype=weight.dtype, device=first.device, generator=generator)
+    u = torch.rand(*first.shape, k, dtype=cumulative.dtype, device=first.device, generator=generator)
     mass = low.unsqueeze(-1) + u * (high - low).unsqueeze(-1)
     # 32 bits are enough, and take half the time
     index = torch.searchsorted(cumulative, mass.flatten(-2), right=True, out_int32=True).view_as(mass)

@@ -64,6 +64,10 @@ class Climb:
     progress: CurriculumProgress
     layer_env: EnvBase
 
+    def at_the_top(self, run: int) -> bool:
+        """Whether a run is in the last layer, which is the full task."""
+        return self.progress.layers[run] == len(self.curriculum) - 1
+
 
 def in_layers(env: EnvBase, progress: CurriculumProgress) -> TransformedEnv:
     """An environment as the layers of its runs see it, with the networks' input."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -33,19 +34,24 @@ class GoalMap:
 
     def save(self, path: Path) -> None:
         """Writes it as a file of numpy arrays."""
-        np.savez_compressed(path, counts=self.counts, target=self.target)
+        part = path.with_suffix(".part.npz")
+        np.savez_compressed(part, counts=self.counts, target=self.target)
+        part.replace(path)  # whole or not at all
 
     @classmethod
     def load(cls, path: Path) -> GoalMap:
         """Reads what :meth:`save` wrote.
 
         Raises:
-            ValueError: there is no such file: the run is too young, or wrote no virtual goals.
+            ValueError: there is no such file, as the run has written no virtual goals, or it is damaged.
         """
         if not path.is_file():
-            raise ValueError(f"{path.parent} has no {path.name}: the run wrote no virtual goals so far")
-        with np.load(path) as arrays:
-            return cls(arrays["counts"], arrays["target"])
+            raise ValueError(f"{path.parent} has no {path.name}: the run has written no virtual goals")
+        try:
+            with open(path, "rb") as file, np.load(file) as arrays:
+                return cls(arrays["counts"], arrays["target"])
+        except (BadZipFile, EOFError, KeyError, ValueError) as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
 
 
 def histograms(buffers: Sequence[TensorDictReplayBuffer]) -> list[GoalHistogram]:

@@ -34,12 +34,16 @@ def make_target(recipe: Recipe, env: ThrowingEnv, grid: GoalGrid) -> Callable[[f
     """q* of the task's goals, for any sigma.
 
     Raises:
-        ValueError: the algorithm prefers instructive goals, and the goals fill no box: they lie around
-            the start states.
+        ValueError: the algorithm prefers instructive goals, and those of the task lie around its start
+            states.
     """
     goals = env.goal_distribution
-    flat = bool((goals.high <= goals.low).any())
-    if goals.is_box and (not flat or get_algorithm(recipe.algo).instructive):
+    if get_algorithm(recipe.algo).instructive and not env.task.throws:
+        raise ValueError(
+            f"{recipe.algo} must not be used on {recipe.task}: its goals lie around its start states, so the "
+            "goals that it would prefer are achieved without doing anything; choose a throwing task"
+        )
+    if goals.is_box and bool((goals.high > goals.low).all()):
         return partial(box_target, grid, goals.low, goals.high, name=recipe.task)
     samples = goals.sample(_SAMPLES, generator=torch.Generator().manual_seed(0))
     return partial(sampled_target, grid, samples)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,13 +111,21 @@ class Parts:
     def learner(self) -> Learner:
         """Gradient steps on the loss: fused where that is possible, through the loss module elsewhere."""
         norm = self.recipe.max_grad_norm
-        if can_fuse(self.loss, self.target):
+        fuses = can_fuse(self.loss, self.target)
+        compiles = fuses and is_plain_adam(self.optimiser)
+        if self.recipe.compile == "always" and not compiles:
+            warnings.warn(
+                "compile=always has no effect: only DDPG with this library's networks, without batch "
+                "normalisation, with soft target updates and a plain Adam, can be compiled",
+                stacklevel=2,
+            )
+        if fuses:
             return FusedDDPGLearner(
                 self.loss,
                 self.optimiser,
                 self.target,
                 max_grad_norm=norm,
-                compile_step=self.recipe.compiles and is_plain_adam(self.optimiser),
+                compile_step=self.recipe.compiles and compiles,
             )
         return LossLearner(
             self.loss, self.optimiser, self.target, max_grad_norm=norm, runs=self.recipe.num_runs

@@ -20,6 +20,7 @@ _WORDS = {
 }
 # Gradient steps from which on compiling them pays: 15 s the first time, half a millisecond less for each.
 _WORTH_COMPILING = 25_000
+_MOST_ROWS = 2_000  # of a gradient step: with more, arithmetic is all that is left
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +135,8 @@ class Recipe:
     def compiles(self) -> bool:
         """Whether the gradient step is to be compiled."""
         if self.compile == "auto":
-            return self.total_frames / self.frames_per_update >= _WORTH_COMPILING
+            long = self.total_frames / self.frames_per_update >= _WORTH_COMPILING
+            return long and self.num_runs * self.batch_size <= _MOST_ROWS
         return self.compile == "always"
 
     @property

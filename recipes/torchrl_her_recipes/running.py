@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections.abc import Callable
@@ -13,7 +14,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_her import (
@@ -23,8 +23,6 @@ from torchrl_her import (
     Trainer,
     buffer_state_dict,
     discounted_return,
-    enter_layer,
-    evaluate,
     final_distance,
     load_buffer_state_dict,
     load_checkpoint,
@@ -34,10 +32,10 @@ from torchrl_her import (
     success,
 )
 from torchrl_her_envs import ThrowingEnv, base_env, record_episodes, write_video
-from torchrl_her_recipes.curricula import Climb
+from torchrl_her_recipes.climbing import layer_success, move_on, play_greedily
 from torchrl_her_recipes.goal_map import GoalMap, goal_map
 from torchrl_her_recipes.interrupt import Interrupted, soft_interrupt
-from torchrl_her_recipes.parts import Parts, build_parts, eval_seeds
+from torchrl_her_recipes.parts import Parts, build_parts
 from torchrl_her_recipes.plots import plot_curves, plot_goals
 from torchrl_her_recipes.run_folder import RunFolder
 
@@ -215,9 +213,9 @@ def _epoch(
 
     began = time.perf_counter()
     measured = trainer.epoch(on_batch)
-    rollout = _play_greedily(parts, parts.eval_env, trainer.epochs)
+    rollout = play_greedily(parts, parts.eval_env, trainer.epochs)
     measured |= _measure(parts, rollout)
-    samples = None if parts.climb is None else _layer_success(parts, parts.climb, rollout, trainer.epochs)
+    samples = None if parts.climb is None else layer_success(parts, parts.climb, rollout, trainer.epochs)
     if samples is not None:
         measured["layer_success"] = samples.mean(1)
     seconds += time.perf_counter() - began
@@ -230,9 +228,16 @@ def _epoch(
             values["layer"] = parts.climb.progress.layers[run]
         rows.append({**counters, **times, **values, **_written(parts, run)})
     if parts.climb is not None and samples is not None:
-        _move_on(parts, parts.climb, samples, bar)
+        for line in move_on(parts, parts.climb, samples, trainer.frames):
+            _say(bar, line)
     bar.set_postfix(success=f"{statistics.median(last_success(rows)):.2f}")
     return rows
+
+
+def _say(bar: tqdm, line: str) -> None:
+    """A line above the progress bar, if there is one."""
+    if not bar.disable:
+        bar.write(line)
 
 
 def _say_compiled(trainer: Trainer, bar: tqdm) -> bool:
@@ -240,15 +245,8 @@ def _say_compiled(trainer: Trainer, bar: tqdm) -> bool:
     learner = trainer.learner
     if not (isinstance(learner, FusedDDPGLearner) and learner.is_compiled):
         return False
-    bar.write(f"gradient step compiled in {learner.compile_seconds:.0f} s (kept for later runs)")
+    _say(bar, f"gradient step compiled in {learner.compile_seconds:.0f} s (kept for later runs)")
     return True
-
-
-def _play_greedily(parts: Parts, env: EnvBase, epoch: int) -> TensorDictBase:
-    """Greedy episodes of each run, with starts and goals of their own in each epoch."""
-    task = base_env(env)
-    task.set_seeds(eval_seeds(parts.recipe, epoch))
-    return evaluate(env, parts.policy, max_steps=task.world.max_steps)
 
 
 @torch.no_grad()
@@ -269,29 +267,6 @@ def _measure(parts: Parts, rollout: TensorDictBase) -> dict[str, Tensor]:
     return means | {"epsilon": parts.exploration.epsilon}
 
 
-def _layer_success(parts: Parts, climb: Climb, rollout: TensorDictBase, epoch: int) -> Tensor:
-    """Success [R, n] at the goals of the runs' layers; that of ``rollout`` where it is the full task."""
-    runs, last = parts.recipe.num_runs, len(climb.curriculum) - 1
-    full = success(rollout).float().view(runs, -1)
-    below = climb.progress.layer < last
-    if not bool(below.any()):
-        return full
-    own = success(_play_greedily(parts, climb.layer_env, epoch)).float().view(runs, -1)
-    return torch.where(below.unsqueeze(1), own, full)
-
-
-def _move_on(parts: Parts, climb: Climb, samples: Tensor, bar: tqdm) -> None:
-    """Lets runs that have learnt their layer begin the next one."""
-    before = climb.progress.layers
-    # As many as the window takes: more in one evaluation would give a lucky streak many chances.
-    moved = climb.progress.record(samples[:, : climb.progress.window])
-    for run in moved.nonzero().flatten().tolist():
-        old, new = climb.curriculum.layers[before[run]], climb.progress.layer_of(run)
-        seed = parts.recipe.seeds[run]
-        bar.write(f"seed {seed}: {old.name!r} learnt after {bar.n:,} frames, {new.name!r} begins")
-        enter_layer(parts.buffers[run], new, parts.exploration, epsilon=parts.recipe.layer_epsilon, run=run)
-
-
 def _initial_value(actor: TensorDictModule, critic: TensorDictModule, start: TensorDictBase) -> Tensor:
     """The critic's value [N] of first states [N]."""
     critic.eval()
@@ -307,7 +282,9 @@ def _written(parts: Parts, run: int) -> dict[str, float]:
         return {}
     counts = {f"rows_{name}": value for name, value in asdict(writer.totals).items()}
     if isinstance(writer.weights, GoalHistogram):
-        counts["kl"] = writer.weights.divergence_to(parts.goal_target)
+        # q* is that of the full task
+        full = parts.climb is None or parts.climb.at_the_top(run)
+        counts["kl"] = writer.weights.divergence_to(parts.goal_target) if full else math.nan
     return counts
 
 

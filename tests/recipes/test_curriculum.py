@@ -9,42 +9,29 @@ import pandas as pd
 import pytest
 import torch
 from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_her import Instructiveness
+from torchrl_her import Instructiveness, enter_layer
 from torchrl_her_envs import TASKS, base_env, make_env
 from torchrl_her_recipes import Parts, Recipe, load_actor, play, resume
+from torchrl_her_recipes.climbing import move_on
 from torchrl_her_recipes.curricula import get_curriculum
-from torchrl_her_recipes.running import _move_on
 
 from .small import small
 
 THROWS = [name for name, task in TASKS.items() if task.throws]
 
 
-class Bar:
-    """Stands in for a progress bar."""
-
-    n = 1_600
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def write(self, line: str) -> None:
-        self.lines.append(line)
-
-
 def climbing(**options: object) -> Recipe:
     return small(**{"task": "hand_v1", "algo": "cher_ibs", "window": 4, **options})
 
 
-def move(parts: Parts, *, run: int) -> Bar:
+def move(parts: Parts, *, run: int) -> list[str]:
     """Lets one run learn its layer."""
     samples = torch.zeros(parts.recipe.num_runs, 4)
     samples[run] = 1.0
-    bar = Bar()
     assert parts.climb is not None
-    _move_on(parts, parts.climb, samples, bar)
-    return bar
+    return move_on(parts, parts.climb, samples, 1_600)
 
 
 def weights(parts: Parts) -> Tensor:
@@ -77,7 +64,8 @@ def test_a_run_begins_with_the_reach_and_is_measured_at_the_full_task_too(tmp_pa
     parts.run(tmp_path / "run", progress=False)
     rows = pd.read_csv(tmp_path / "run" / "metrics.csv")
     assert rows["layer"].tolist() == [0, 0]
-    assert {"success", "layer_success", "kl"} <= set(rows.columns)
+    assert {"success", "layer_success"} <= set(rows.columns)
+    assert rows["kl"].isna().all()  # q* is that of the throw
     stored = parts.buffer[:]
     assert (stored["observation"][:, 5:] == 0).all()  # of a reach: no ball is seen
     goals = stored["desired_goal"][~stored["virtual"].squeeze(-1)]
@@ -105,8 +93,8 @@ def test_a_change_of_layer_empties_and_restarts_one_run_alone() -> None:
     parts.run(progress=False)
     networks = weights(parts)
     steps = [float(state["step"]) for state in parts.optimiser.state.values()]
-    bar = move(parts, run=1)
-    assert bar.lines == ["seed 1: 'reach' learnt after 1,600 frames, 'throw' begins"]
+    lines = move(parts, run=1)
+    assert lines == ["seed 1: 'reach' learnt after 1,600 frames, 'throw' begins"]
     assert [len(buffer) > 0 for buffer in parts.buffers] == [True, False]
     assert parts.exploration.epsilon.tolist() == pytest.approx([0.81, 1.0])
     first, second = (buffer.writer for buffer in parts.buffers)
@@ -166,3 +154,26 @@ def test_environments_for_evaluation_show_the_full_task() -> None:
     shown = parts.eval_env.reset()
     assert torch.equal(shown["desired_goal"], base_env(parts.eval_env).worlds.goal.float())
     assert (shown["observation"][:, 5:7] != 0).any()
+
+
+def test_checkpoints_hold_no_inputs(tmp_path: Path) -> None:
+    parts = climbing(epochs=1).build()
+    parts.run(tmp_path / "run", progress=False)
+    stored = {str(key) for key in parts.buffer.storage[:4].keys(True, True)}
+    again = climbing(epochs=1).build()
+    resume(tmp_path / "run", parts=again, progress=False)
+    assert {str(key) for key in again.buffer.storage[:4].keys(True, True)} == stored
+    assert not any("input" in key for key in stored)
+
+
+def test_a_buffer_that_does_not_relabel_is_refused() -> None:
+    parts = climbing().build()
+    with pytest.raises(
+        TypeError, match="a curriculum needs a buffer with a HERWriter, got a TensorDictRoundRobinWriter"
+    ):
+        enter_layer(TensorDictReplayBuffer(storage=LazyTensorStorage(4)), parts.climb.progress.layer_of(0))
+
+
+def test_nothing_is_said_without_a_progress_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    climbing(success_threshold=0.01, eval_episodes=30, window=30, compile="never").build().run(progress=False)
+    assert capsys.readouterr().out == ""

@@ -64,10 +64,19 @@ def test_sigma_is_a_share_of_the_screen_and_smaller_beside_the_wall() -> None:
         assert weights.sigma == pytest.approx(3 * sigma)
 
 
-def test_goals_on_a_line_are_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="hand_reach: the box of goals needs a volume"):
-        small(task="hand_reach", algo="her_ibs").build()
-    small(task="hand_reach", algo="her").build()  # counting them is fine
+@pytest.mark.parametrize("task", ["hand_reach", "robot_reach"])
+def test_goals_around_the_start_states_are_refused_by_name(task: str) -> None:
+    with pytest.raises(ValueError, match=f"her_ibs must not be used on {task}"):
+        small(task=task, algo="her_ibs").build()
+    small(task=task, algo="her").build()  # counting them is fine
+
+
+def test_a_damaged_map_is_named(finished: Path, tmp_path: Path) -> None:
+    whole = (finished / "goal_map.npz").read_bytes()
+    path = tmp_path / "goal_map.npz"
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="goal_map.npz is damaged"):
+        GoalMap.load(path)
 
 
 def test_sigma_shrinks_each_epoch_and_divergence_is_logged(finished: Path) -> None:
@@ -108,5 +117,5 @@ def test_a_run_without_a_map_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
     small(algo="ddpg", epochs=1).build().run(tmp_path / "run", progress=False)
     assert main(["plot", "goals", str(tmp_path / "run")]) == 2
     assert (
-        capsys.readouterr().err.strip().endswith("has no goal_map.npz: the run wrote no virtual goals so far")
+        capsys.readouterr().err.strip().endswith("has no goal_map.npz: the run has written no virtual goals")
     )

@@ -191,3 +191,57 @@ def test_what_it_does_not_know_it_refuses() -> None:
     assert can_fuse(plain, SoftUpdate(plain, tau=0.1))
     with pytest.raises(ValueError, match="only DDPG with the networks of make_actor"):
         FusedDDPGLearner(loss, torch.optim.Adam(loss.parameters()), SoftUpdate(loss, tau=0.1))
+
+
+def test_a_compiled_step_takes_draws_of_any_length_and_new_numbers() -> None:
+    if shutil.which("c++") is None:
+        pytest.skip("there is no C++ compiler")
+    first = make_loss(2)
+    second = deepcopy(first)
+    plain, compiled = (
+        FusedDDPGLearner(
+            loss,
+            torch.optim.Adam(loss.parameters(), lr=1e-2),
+            SoftUpdate(loss, tau=0.1),
+            compile_step=choice,
+        )
+        for loss, choice in ((first, False), (second, True))
+    )
+    for steps in (2, 3, 1):  # parts of a longer draw lie further apart in memory
+        rows = torch.cat([make_rows(2, seed, weighted=True) for seed in range(steps)], 1)
+        for learner in (plain, compiled):
+            learner.update(rows.clone(), steps)
+    for learner in (plain, compiled):
+        learner.optimiser.param_groups[0].update(betas=(0.5, 0.9), eps=1e-3, lr=5e-2)
+        learner.tau = 0.7
+        learner.update(make_rows(2, 9, weighted=True))
+    state = second.state_dict()
+    for name, value in first.state_dict().items():
+        torch.testing.assert_close(value, state[name], msg=name)
+
+
+def test_idle_runs_stay_as_they_are_from_the_first_step_on() -> None:
+    loss = make_loss(3)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    learner = FusedDDPGLearner(loss, optimiser, SoftUpdate(loss, tau=0.1))
+    before = {name: value.clone() for name, value in loss.state_dict().items()}
+    learner.update(make_rows(3, 0, weighted=False), idle=[1])
+    for name, value in loss.state_dict().items():
+        if value.ndim > 0:
+            assert torch.equal(value[1], before[name][1]), name
+            assert not torch.equal(value[0], before[name][0]) or "target" in name, name
+    for state in optimiser.state.values():
+        assert (state["exp_avg"][1] == 0).all()
+        assert (state["exp_avg_sq"][1] == 0).all()
+
+
+def test_runs_keep_their_statistics_of_batch_normalisation() -> None:
+    loss = make_loss(2, normalise=True)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    learner = LossLearner(loss, optimiser, SoftUpdate(loss, tau=0.1), runs=2)
+    learner.update(make_rows(2, 0, weighted=False))
+    blocks = [value.view(2, -1) for value in loss.state_dict().values() if value.ndim > 0]
+    before = [block.clone() for block in blocks]
+    learner.update(make_rows(2, 1, weighted=False), idle=[0])
+    assert all(torch.equal(block[0], old[0]) for block, old in zip(blocks, before, strict=True))
+    assert any(not torch.equal(block[1], old[1]) for block, old in zip(blocks, before, strict=True))

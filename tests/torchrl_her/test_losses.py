@@ -443,3 +443,11 @@ def test_the_critic_learns_what_one_step_is_worth() -> None:
     with loss.actor_network_params.to_module(loss.actor_network):
         action = loss.actor_network(data.select("observation", "desired_goal"))["action"]
     assert (action[:, 0] > 0).float().mean() > 0.95
+
+
+def test_priorities_go_where_the_loss_puts_them() -> None:
+    loss = constant_loss(-4.0, gamma=0.5)
+    loss.set_keys(priority="surprise")
+    data = rows([-1.0, -1.0], terminated=[1, 0])
+    LossLearner(loss, torch.optim.Adam(loss.parameters(), lr=0.1)).update(data)
+    assert data["surprise"].tolist() == [9.0, 4.0]

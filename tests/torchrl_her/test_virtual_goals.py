@@ -138,3 +138,13 @@ def test_weighted_draws_follow_the_weights() -> None:
     share = torch.nn.functional.one_hot(index, 3).float().mean(2)
     expected = torch.tensor([[[5 / 9, 1 / 9, 3 / 9], [0, 1 / 4, 3 / 4]], [[0, 1, 0], [0, 0, 1]]])
     torch.testing.assert_close(share, expected, atol=0.01, rtol=0)
+
+
+def test_weighted_draws_do_not_lose_what_is_small() -> None:
+    weight = torch.exp(-torch.arange(50.0) / 2)  # over ten orders of magnitude
+    first, end = torch.tensor([30]), torch.tensor([50])
+    generator = torch.Generator().manual_seed(0)
+    index = draw_weighted(weight, first, end, 100_000, generator=generator)
+    share = torch.nn.functional.one_hot(index[0], 50).double().mean(0)
+    expected = weight.double() * (torch.arange(50) >= 30)
+    torch.testing.assert_close(share, expected / expected.sum(), atol=0.006, rtol=0)

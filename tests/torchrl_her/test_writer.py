@@ -516,6 +516,26 @@ def test_totals_outlive_an_emptied_buffer() -> None:
     assert (buffer.writer.totals.real, buffer.writer.counts.real) == (6, 3)
 
 
+@pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf")])
+def test_weights_that_cannot_be_are_refused(bad: float) -> None:
+    class Bad(GoalWeights):
+        def __call__(self, goals: Tensor) -> Tensor:
+            return torch.full(goals.shape[:-1], bad)
+
+    with pytest.raises(ValueError, match="weights of goals must be finite and at least 0"):
+        make_buffer(weights=Bad()).extend(make_batch([[3]], terminated=True))
+
+
+def test_weights_may_be_yes_or_no() -> None:
+    class Never(GoalWeights):
+        def __call__(self, goals: Tensor) -> Tensor:
+            return torch.zeros(goals.shape[:-1], dtype=torch.bool)
+
+    buffer = make_buffer(weights=Never())
+    buffer.extend(make_batch([[3]], terminated=True))
+    assert buffer.writer.counts.virtual == 0
+
+
 # Options
 
 
