@@ -20,8 +20,9 @@ from matplotlib.figure import Figure
 
 from torchrl_her_envs import make_env
 from torchrl_her_recipes.goal_map import GoalMap
-from torchrl_her_recipes.plots import draw_curve, draw_goals
+from torchrl_her_recipes.plots import draw_goals, plot_comparison
 from torchrl_her_recipes.run_folder import RunFolder
+from torchrl_her_recipes.studies import is_done
 
 HERE = Path(__file__).parent
 COLOURS = {
@@ -89,7 +90,7 @@ def read_study(study: Study, folder: Path) -> dict[tuple[str, str], RunFolder]:
     for task in study.tasks:
         for algorithm in study.algorithms:
             home = RunFolder(folder / f"{task}_{algorithm}")
-            if home.metrics.is_file():
+            if is_done(home):
                 found[task, algorithm] = home
     return found
 
@@ -108,19 +109,11 @@ def print_table(runs: dict[tuple[str, str], RunFolder]) -> None:
         )
 
 
-def draw_success(study: Study, runs: dict[tuple[str, str], RunFolder], path: Path) -> None:
-    tasks = [task for task in study.tasks if any(task == own for own, _ in runs)]
-    figure = Figure(figsize=(4.2 * len(tasks), 3.6), layout="constrained")
-    panels = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
-    for axes, task in zip(panels, tasks, strict=True):
-        for (own, algorithm), home in runs.items():
-            if own == task:
-                draw_curve(axes, home.rows(), "success", colour=COLOURS[algorithm], label=algorithm)
-        axes.set(title=task, xlabel="environment steps of each run", ylim=(-0.02, 1.02))
-        axes.grid(alpha=0.3)
-        axes.legend(loc="upper left", fontsize=8)
-    panels[0].set_ylabel("success (median, 33rd to 67th percentile)")
-    figure.savefig(path, dpi=100)
+def draw_success(runs: dict[tuple[str, str], RunFolder], path: Path) -> None:
+    panels: dict[str, dict[str, Rows]] = {}
+    for (task, algorithm), home in runs.items():
+        panels.setdefault(task, {})[algorithm] = home.rows()
+    plot_comparison(panels, path, colours=COLOURS)
 
 
 def draw_maps(study: Study, runs: dict[tuple[str, str], RunFolder], path: Path) -> None:
@@ -168,7 +161,7 @@ def main() -> None:
         if runs:
             print(f"\n### {name}\n")
             print_table(runs)
-            draw_success(study, runs, HERE / "images" / f"{name}.png")
+            draw_success(runs, HERE / "images" / f"{name}.png")
             write_data(name, runs)
             if study.goals:
                 draw_maps(study, runs, HERE / "images" / f"{name}_goals.png")

@@ -108,6 +108,8 @@ class StateToObs(_LayerTransform):
     Put the transform around a ParallelEnv, not inside of its workers: these hold copies of
     ``progress``, and stay in the layers in which they were started. Change layers between episodes.
 
+    GymWrapper shows an entry ``state`` of a dict as ``observation``: put a RenameTransform in front.
+
     For environments only: in a replay buffer it would bring the real goal back into rows that were
     relabelled.
 

@@ -115,11 +115,11 @@ def make_buffer(progress: CurriculumProgress, run: int, generator: torch.Generat
 def train(
     layers: Sequence[CurriculumLayer] = (DRIVE, DELIVER),
     *,
-    epochs: int = 12,
+    epochs: int = 14,
     epoch_frames: int = 2_000,
     worlds: int = 8,
     runs: int = 1,
-    window: int = 20,
+    window: int = 40,
     success_threshold: float = 0.9,
     seed: int = 0,
 ) -> Iterator[tuple[int, list[str], list[float]]]:
@@ -132,7 +132,8 @@ def train(
     eval_env = make_env(window, progress, seed=seed + 1_000_000)  # as many episodes as the window takes
 
     actor, critic = (make_network(make, curriculum, runs) for make in (make_actor, make_critic))
-    exploration = DecayingEpsilon(-torch.ones(1), torch.ones(1), decay=0.9, generators=generators)
+    low, high = -torch.ones(1), torch.ones(1)
+    exploration = DecayingEpsilon(low, high, decay=0.9, noise=0.15, generators=generators)
     policy = TensorDictSequential(actor, exploration)
     loss = make_ddpg_loss(actor, critic, action_penalty=0.03, reduction="none")
     optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)

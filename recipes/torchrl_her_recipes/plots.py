@@ -51,18 +51,26 @@ def plot_curves(rows: Sequence[dict[str, float]], path: Path, *, title: str = ""
     figure.savefig(path, dpi=110)
 
 
-def plot_comparison(panels: Mapping[str, Mapping[str, Sequence[dict[str, float]]]], path: Path) -> None:
+def plot_comparison(
+    panels: Mapping[str, Mapping[str, Sequence[dict[str, float]]]],
+    path: Path,
+    *,
+    colours: Mapping[str, str] | None = None,
+) -> None:
     """Draws success over environment steps: medians, and the 33rd to 67th percentile of the runs.
 
     Args:
         panels: title of each panel to the curves in it, label to table of metrics.
         path: of the picture.
+        colours: of labels; others take their turn.
     """
+    chosen = colours or {}
     figure = Figure(figsize=(1.0 + 4.2 * len(panels), 3.8), layout="constrained")
     grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, (title, curves) in zip(grid, panels.items(), strict=True):
         for index, (label, rows) in enumerate(curves.items()):
-            draw_curve(axes, rows, "success", colour=_COLOURS[index % len(_COLOURS)], label=label)
+            colour = chosen.get(label, _COLOURS[index % len(_COLOURS)])
+            draw_curve(axes, rows, "success", colour=colour, label=label)
         axes.set(title=title, xlabel="environment steps of each run", ylim=(-0.02, 1.02))
         axes.grid(alpha=0.3)
         axes.legend(loc="upper left", fontsize=8)
