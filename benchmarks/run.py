@@ -15,6 +15,7 @@ PARTS = {
     "env_speed": "Environments",
     "writer_speed": "Writing with hindsight",
     "update_speed": "Gradient steps and the whole loop",
+    "ibs_update": "How often q is brought up to date",
     "memory": "Memory",
     "startup": "Start-up",
     "time_to_learn": "Time to learn",
