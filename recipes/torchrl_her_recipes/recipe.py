@@ -19,7 +19,7 @@ _WORDS = {
     "compile": ("auto", "always", "never"),
 }
 # Gradient steps from which on compiling them pays: 15 s the first time, half a millisecond less for each.
-_WORTH_COMPILING = 25_000
+_WORTH_COMPILING = 20_000
 _MOST_ROWS = 2_000  # of a gradient step: with more, arithmetic is all that is left
 
 

@@ -160,3 +160,24 @@ def test_sac_may_take_the_place_of_ddpg() -> None:
 
 def test_actor_of_ones_own_keys() -> None:
     assert make_actor((3,), 2, in_keys=["seen"], action=("deep", "action")).out_keys == [("deep", "action")]
+
+
+@pytest.mark.parametrize(
+    ("options", "compiles"),
+    [
+        ({"epochs": 30}, True),  # 30,720 gradient steps
+        ({"epochs": 10}, False),
+        ({"epochs": 10, "compile": "always"}, True),
+        ({"epochs": 30, "compile": "never"}, False),
+        ({"epochs": 30, "num_runs": 15}, False),  # 3,840 rows: nothing to win
+        ({"epochs": 30, "num_runs": 15, "batch_size": 64}, True),
+    ],
+)
+def test_long_runs_of_few_rows_are_compiled(options: dict[str, Any], compiles: bool) -> None:
+    assert Recipe(**options).compiles is compiles
+
+
+def test_compiling_what_cannot_be_is_said() -> None:
+    parts = small(compile="always", batch_norm=True).build()
+    with pytest.warns(UserWarning, match="compile=always has no effect"):
+        parts.learner()
