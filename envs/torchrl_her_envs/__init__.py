@@ -9,6 +9,7 @@ from torchrl_her_envs.recording import base_env, record_episodes
 from torchrl_her_envs.registry import get_task, make_env
 from torchrl_her_envs.rendering import render
 from torchrl_her_envs.robot import Arm
+from torchrl_her_envs.small_worlds import BitFlip, Chain, LatticeGoals, TreasureHunt
 from torchrl_her_envs.task import TASKS, Task, WorldConfig
 from torchrl_her_envs.throwing import ThrowingEnv, WorldState
 from torchrl_her_envs.video import write_video
@@ -17,13 +18,17 @@ __all__ = [
     "TASKS",
     "Arm",
     "BallPhysics",
+    "BitFlip",
     "BoxGoals",
+    "Chain",
     "Controller",
     "GoalDistribution",
     "Hand",
+    "LatticeGoals",
     "SectorGoals",
     "Task",
     "ThrowingEnv",
+    "TreasureHunt",
     "WorldConfig",
     "WorldState",
     "base_env",

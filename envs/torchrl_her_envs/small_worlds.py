@@ -57,7 +57,7 @@ class LatticeGoals:
 
     def from_uniform(self, u: Tensor) -> Tensor:
         """Maps [..., g] numbers in [0, 1) to points of the lattice."""
-        steps = (u * self.count).floor()
+        steps = (u * self.count).floor().clamp(max=self.count - 1)  # float32 rounds up to the count
         return self.low + steps * (self.high - self.low) / max(self.count - 1, 1)
 
     def sample(self, n: int, *, generator: torch.Generator | None = None) -> Tensor:
@@ -128,8 +128,8 @@ class SmallWorld(EnvBase):
         num_envs: int,
         seed: int | Sequence[int],
     ) -> None:
-        _check_whole("max_steps", max_steps, 1, _MOST_STEPS)
-        _check_whole("num_envs", num_envs, 1, None)
+        max_steps = _check_whole("max_steps", max_steps, 1, _MOST_STEPS)
+        num_envs = _check_whole("num_envs", num_envs, 1, None)
         super().__init__(device="cpu", batch_size=(num_envs,))
         self.max_steps, self.num_actions = max_steps, num_actions
         self._goals, self._low, self._high = goals, low, high
@@ -257,9 +257,8 @@ class SmallWorld(EnvBase):
     def _check_action(self, action: Tensor) -> None:
         (n,) = self.batch_size
         if action.shape != (n,) or action.is_floating_point():
-            raise ValueError(
-                f"actions must be {n} whole numbers, one a world, got shape {list(action.shape)} of {action.dtype}"
-            )
+            got = f"shape {list(action.shape)} of {action.dtype}"
+            raise ValueError(f"actions must be whole numbers of shape [{n}], got {got}")
         wrong = (action < 0) | (action >= self.num_actions)
         if bool(wrong.any()):
             world = int(wrong.nonzero()[0])
@@ -304,7 +303,7 @@ class SmallWorld(EnvBase):
 
 
 class BitFlip(SmallWorld):
-    """N bits, of which each action flips one, until they are the bits that are wanted.
+    """A row of bits, of which each action flips one, until they are the bits that are wanted.
 
     Thesis, section 5.1, after Andrychowicz et al. (2017): bits and wanted bits are drawn uniformly
     (here: among those that differ), and each step costs 1. The thesis adds an action that has no
@@ -312,7 +311,7 @@ class BitFlip(SmallWorld):
     virtual reward is always 0: the bias that Filtered-HER removes.
 
     Such an end is ``truncated``, not ``terminated``: it says nothing about the goal. Were it
-    terminal, giving up would cost 1 in all, less than three flips do, and so would be no useless action.
+    terminal, giving up would cost 1 in all, less than three flips do: it would not be useless.
 
     Args:
         bits: n, the number of bits, which are shown as 0 and 1.
@@ -345,7 +344,7 @@ class BitFlip(SmallWorld):
         num_envs: int = 1,
         seed: int | Sequence[int] = 0,
     ) -> None:
-        _check_whole("bits", bits, 1, _MOST_BITS)
+        bits = _check_whole("bits", bits, 1, _MOST_BITS)
         super().__init__(
             LatticeGoals([0.0] * bits, [1.0] * bits, count=2),
             places=2,
@@ -396,11 +395,11 @@ class TreasureHunt(SmallWorld):
         ValueError: a number out of its range, or worlds that cannot be shared out among the seeds.
 
     Example:
-        >>> env = TreasureHunt(num_envs=3, seed=0)
-        >>> shown = env.reset()
-        >>> steps = env.rollout(
-        ...     100, lambda now: now.set("action", (now["desired_goal"] > now["observation"]).squeeze(-1).long())
-        ... )
+        >>> from tensordict.nn import TensorDictModule
+        >>> env = TreasureHunt(10, num_envs=2, seed=0)
+        >>> walk = lambda place, goal: (goal > place).squeeze(-1).long()
+        >>> policy = TensorDictModule(walk, ["observation", "desired_goal"], ["action"])
+        >>> steps = env.rollout(10, policy)
         >>> steps["next", "terminated"][:, -1].any().item()
         True
     """
@@ -413,7 +412,7 @@ class TreasureHunt(SmallWorld):
         num_envs: int = 1,
         seed: int | Sequence[int] = 0,
     ) -> None:
-        _check_whole("step", step, 1, _LINE)
+        step = _check_whole("step", step, 1, _LINE)
         if _LINE % step:
             divisors = ", ".join(str(d) for d in range(1, _LINE + 1) if _LINE % d == 0)
             raise ValueError(f"step must divide {_LINE}, so be one of {divisors}; got {step}")
@@ -467,8 +466,10 @@ class Chain(SmallWorld):
         ValueError: a number out of its range, or worlds that cannot be shared out among the seeds.
 
     Example:
-        >>> env = Chain(4, 1.0, num_envs=2)
-        >>> steps = env.rollout(4, lambda now: now.set("action", torch.ones(2, dtype=torch.int64)))
+        >>> from tensordict.nn import TensorDictModule
+        >>> ones = torch.ones(2, dtype=torch.int64)
+        >>> forward = TensorDictModule(lambda place: ones, ["observation"], ["action"])
+        >>> steps = Chain(4, 1.0, num_envs=2).rollout(4, forward)
         >>> steps["next", "observation"][0].flatten().tolist()
         [-0.5, 0.0, 0.5, 1.0]
         >>> steps["next", "reward"][0].flatten().tolist()
@@ -485,7 +486,7 @@ class Chain(SmallWorld):
         num_envs: int = 1,
         seed: int | Sequence[int] = 0,
     ) -> None:
-        _check_whole("length", length, 1, _MOST_STEPS)
+        length = _check_whole("length", length, 1, _MOST_STEPS)
         if not 0.0 < forward_probability <= 1.0:
             raise ValueError(f"forward_probability must be in (0, 1], got {forward_probability}")
         super().__init__(
@@ -514,14 +515,11 @@ class Chain(SmallWorld):
         return torch.where(forward, place + 1, back).clamp(0, self.length), None
 
 
-def _check_whole(name: str, value: object, low: int, high: int | None) -> None:
-    """Raises where an option is not a whole number in its range."""
-    if (
-        isinstance(value, Integral)
-        and not isinstance(value, bool)
-        and low <= value
-        and (high is None or value <= high)
-    ):
-        return
+def _check_whole(name: str, value: int, low: int, high: int | None) -> int:
+    """An option as an int; raises where it is not a whole number in its range."""
+    if isinstance(value, Integral) and not isinstance(value, bool):
+        whole = int(value)
+        if low <= whole and (high is None or whole <= high):
+            return whole
     allowed = f"at least {low}" if high is None else f"from {low} to {high}"
     raise ValueError(f"{name} must be a whole number {allowed}, got {value!r}")
