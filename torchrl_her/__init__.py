@@ -39,6 +39,7 @@ from torchrl_her.networks import (
     stack_runs,
     take_run,
 )
+from torchrl_her.sampler import HERSampleUnit
 from torchrl_her.training import Trainer, evaluate
 from torchrl_her.virtual_goals import Strategy, candidates, combine, draw, draw_alike, draw_weighted, window
 from torchrl_her.writer import HERWriter, WriterCounts
@@ -60,6 +61,7 @@ __all__ = [
     "GoalHistogram",
     "GoalReward",
     "GoalWeights",
+    "HERSampleUnit",
     "HERWriter",
     "Instructiveness",
     "Learner",
