@@ -85,7 +85,7 @@ def test_every_preset_runs(preset: Path) -> None:
         (["train", "--resume", "nowhere"], "nowhere is no folder of a run"),
         (["train", "--resume=nowhere"], "nowhere is no folder of a run"),
         (["play", "nowhere"], "nowhere is no folder of a run"),
-        (["fly"], "unknown command 'fly'; the commands are train, play, list"),
+        (["fly"], "unknown command 'fly'; the commands are train, play, plot, study, list"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

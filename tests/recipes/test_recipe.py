@@ -28,7 +28,7 @@ from .small import small
         ({"sampler": "best"}, "sampler must be one of prioritised, uniform, got 'best'"),
         ({"threshold": -0.1}, "threshold must be above 0, got -0.1"),
         ({"batch_size": 256, "buffer_size": 100}, "batch_size=256 must fit buffer_size=100"),
-        ({"epoch_frames": 100}, "epoch_frames=100 must be at least num_envs times steps_per_batch, 320"),
+        ({"epoch_frames": 100}, "epoch_frames=100 must be at least num_envs times steps_per_batch, 640"),
         ({"seed": 2**40}, "seed must be below 2147483648, got 1099511627776"),
         ({"k": -1}, "k must be at least 0, got -1"),
         ({"seed": -1}, "seed must be at least 0, got -1"),
@@ -57,7 +57,8 @@ def test_every_algorithm_runs_with_every_sampler(algo: str, sampler: str) -> Non
     assert isinstance(parts.buffer.sampler, PrioritizedSampler if sampler == "prioritised" else RandomSampler)
     assert len(result.rows) == 2
     assert (result.rows[-1]["rows_virtual"] > 0) == (algo != "ddpg")
-    assert parts.buffer.writer.filter_achieved == (algo == "filtered_her")
+    filtered = {"filtered_her", "filtered_her_ibs", "cher", "cher_ibs"}
+    assert parts.buffer.writer.filter_achieved == (algo in filtered)
 
 
 @pytest.mark.parametrize("strategy", ["future", "final", "episode"])
@@ -77,7 +78,9 @@ def test_every_goal_strategy_runs(strategy: str) -> None:
 )
 def test_other_options_run(options: dict[str, Any]) -> None:
     rows = small(epochs=1, **options).build().run(progress=False).rows
-    assert torch.tensor([value for row in rows for value in row.values()]).isfinite().all()
+    # without virtual goals there is no distribution of them
+    values = [value for row in rows for name, value in row.items() if name != "kl" or options.get("k")]
+    assert torch.tensor(values).isfinite().all()
 
 
 def test_schaul_s_alpha_is_halved_because_errors_come_squared() -> None:
