@@ -15,6 +15,8 @@ from torch import Tensor
 
 Strategy = Literal["future", "final", "episode"]
 
+_NARROW = 1e3  # greatest weight over the least one for which float32 draws them to a thousandth
+
 
 def check_strategy(strategy: str) -> None:
     """Raises a ValueError that lists the strategies if there is no such one."""
@@ -150,8 +152,9 @@ def draw_weighted(
         >>> draw_weighted(weight, torch.tensor([1, 3]), torch.tensor([3, 4]), 2).tolist()
         [[2, 2], [3, 3]]
     """
-    # In float64: differences of a running sum in float32 would drown weights that are far from the greatest.
-    cumulative = torch.nn.functional.pad(weight.double().cumsum(-1), (1, 0))
+    # Differences of a running sum in float32 drown weights that are far from the greatest.
+    wide = weight.numel() > 0 and bool(weight.max() > _NARROW * weight.min())
+    cumulative = torch.nn.functional.pad((weight.double() if wide else weight).cumsum(-1), (1, 0))
     low, high = cumulative.gather(-1, first), cumulative.gather(-1, end)
     u = torch.rand(*first.shape, k, dtype=cumulative.dtype, device=first.device, generator=generator)
     mass = low.unsqueeze(-1) + u * (high - low).unsqueeze(-1)
