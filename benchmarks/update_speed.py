@@ -36,21 +36,29 @@ class SB3Env(PeerEnv):
         return (gap < self._threshold2).astype(np.float32) - 1.0
 
 
-def ours(runs: int, *, frames_per_update: float = 20.0, fused: bool = True, per_draw: int = 8) -> Trainer:
+def ours(
+    runs: int,
+    *,
+    frames_per_update: float = 20.0,
+    fused: bool = True,
+    per_draw: int = 8,
+    batch: int = BATCH,
+    compiled: str = "always",
+) -> Trainer:
     """A trainer with filled buffers."""
     recipe = Recipe(
         task=TASK,
         algo="her",
         num_runs=runs,
         num_envs=ENVS,
-        batch_size=BATCH,
+        batch_size=batch,
         frames_per_update=frames_per_update,
         updates_per_draw=per_draw,
         epoch_frames=FILL,
         warmup_frames=FILL,
         buffer_size=200_000,
         eval_episodes=1,
-        compile="always",
+        compile=compiled,
     )
     parts = recipe.build()
     trainer = parts.trainer()
@@ -147,6 +155,22 @@ def loop_table(repeats: int) -> str:
     return table(header, rows)
 
 
+def runs_table(repeats: int) -> str:
+    rows = []
+    for batch in (64, 256):
+        contenders = {
+            runs: frames_of(
+                ours(runs, batch=batch, compiled="never" if runs * batch > 2_000 else "always"), 1_280
+            )
+            for runs in (1, 15)
+        }
+        seconds = medians({str(runs): work for runs, work in contenders.items()}, repeats=repeats)
+        one, fifteen = seconds.values()
+        rows.append([str(batch), f"{fifteen / one:.1f}x", f"{1 / one:,.0f}", f"{15 / fifteen:,.0f}"])
+    header = ("batch", "wall-clock of 15 runs over one", "one run, frames/s", "15 runs together, frames/s")
+    return table(header, rows)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -159,7 +183,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)  # as in runs
     machine = describe("torch", "torchrl", "stable-baselines3")
-    text = "\n\n".join((machine, update_table(options.repeats), loop_table(options.repeats)))
+    tables = (update_table, loop_table, runs_table)
+    text = "\n\n".join((machine, *(make(options.repeats) for make in tables)))
     print(text)
     if options.out is not None:
         options.out.write_text(text + "\n")

@@ -52,7 +52,7 @@ class Study:
 
 
 STUDIES = {
-    "v0": Study(tasks=("hand_v0", "robot_v0", "hand_wall_v0"), algorithms=("her", "her_ibs"), goals=True),
+    "v0": Study(tasks=("hand_v0", "robot_v0", "hand_wall_v0"), algorithms=("her", "her_ibs")),
     "ibs_v0": Study(
         tasks=("hand_v0", "robot_v0", "hand_wall_v0"),
         algorithms=("her", "her_ibs", "her_ibs_sequential"),
