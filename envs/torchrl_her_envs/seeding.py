@@ -6,6 +6,8 @@ others do. A stateful generator cannot give that; a hash of a counter can.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -36,6 +38,28 @@ def world_keys(seed: int, num_worlds: int) -> np.ndarray:
     """
     base = _mix(np.array([seed], dtype=np.uint64) + _GOLDEN)
     return _mix(base + np.arange(1, num_worlds + 1, dtype=np.uint64) * _GOLDEN)
+
+
+def block_keys(seeds: Sequence[int], num_worlds: int) -> np.ndarray:
+    """One key for each world of a batch that is R equal blocks, each as if it were alone.
+
+    Args:
+        seeds: R of them.
+        num_worlds: number of worlds in all.
+
+    Raises:
+        ValueError: the worlds cannot be shared out among R blocks, or a seed is out of range.
+
+    Example:
+        >>> bool((block_keys([3, 4], 4)[2:] == world_keys(4, 2)).all())
+        True
+    """
+    if not seeds or num_worlds % len(seeds):
+        raise ValueError(f"{num_worlds} worlds cannot be shared out among {len(seeds)} seeds")
+    for seed in seeds:
+        if not 0 <= seed < 1 << 64:
+            raise ValueError(f"a seed must be at least 0 and below 2**64, got {seed}")
+    return np.concatenate([world_keys(seed, num_worlds // len(seeds)) for seed in seeds])
 
 
 def uniform(keys: np.ndarray, episodes: Tensor, count: int) -> Tensor:

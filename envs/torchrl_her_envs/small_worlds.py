@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_her_envs.seeding import uniform, world_keys
+from torchrl_her_envs.seeding import block_keys, uniform
 
 _MOST_STEPS = (1 << 20) - 1  # each episode has room for so many moments of random numbers
 _MOST_BITS = 127  # a start takes two numbers a bit and one more, and a moment has 256
@@ -194,13 +194,7 @@ class SmallWorld(EnvBase):
         Raises:
             ValueError: the worlds cannot be shared out among R blocks, or a seed is out of range.
         """
-        (n,) = self.batch_size
-        if not seeds or n % len(seeds):
-            raise ValueError(f"{n} worlds cannot be shared out among {len(seeds)} seeds")
-        for seed in seeds:
-            if not 0 <= seed < 1 << 64:
-                raise ValueError(f"a seed must be at least 0 and below 2**64, got {seed}")
-        self._keys = np.concatenate([world_keys(seed, n // len(seeds)) for seed in seeds])
+        self._keys = block_keys(seeds, self.batch_size[0])
         self.worlds.episode.zero_()
 
     # What a world is made of

@@ -19,7 +19,7 @@ from torchrl_her_envs.hand import Hand
 from torchrl_her_envs.physics import BallPhysics
 from torchrl_her_envs.rendering import render
 from torchrl_her_envs.robot import Arm
-from torchrl_her_envs.seeding import uniform, world_keys
+from torchrl_her_envs.seeding import block_keys, uniform
 from torchrl_her_envs.task import Task, WorldConfig
 
 
@@ -187,13 +187,7 @@ class ThrowingEnv(EnvBase):
         Raises:
             ValueError: the worlds cannot be shared out among R blocks, or a seed is out of range.
         """
-        (n,) = self.batch_size
-        if not seeds or n % len(seeds):
-            raise ValueError(f"{n} worlds cannot be shared out among {len(seeds)} seeds")
-        for seed in seeds:
-            if not 0 <= seed < 1 << 64:
-                raise ValueError(f"a seed must be at least 0 and below 2**64, got {seed}")
-        self._keys = np.concatenate([world_keys(seed, n // len(seeds)) for seed in seeds])
+        self._keys = block_keys(seeds, self.batch_size[0])
         self.worlds.episode.zero_()
 
     # TorchRL's hooks
