@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 
 .PHONY: demo test lint bench clean
 
-demo: $(VENV)/.ready  ## train hand_v0 in a few minutes; ends with a curve and a GIF
+demo: $(VENV)/.ready  ## learn to pick up a ball and throw it, in two minutes; ends with a curve and a GIF
 	$(BIN)/torchrl-her train preset=demo
 
 test: $(VENV)/.ready-test  ## all tests and doctests
