@@ -15,19 +15,18 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from machine import describe, table
-from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv
 from tensordict import TensorDictBase
-from update_speed import SB3Env, np
+from update_speed import ENVS, TASK, make_sb3
 
 from torchrl_her import evaluate, success
-from torchrl_her_envs import get_task, make_env
+from torchrl_her_envs import make_env
 from torchrl_her_recipes import Recipe
 
-TASK, ENVS, EVERY, CAP, AIM = "hand_v0", 64, 20_480, 614_400, 0.8
+EVERY, CAP, AIM = 20_480, 614_400, 0.8
 
 Progress = Iterator[Callable[[TensorDictBase], TensorDictBase]]
 
@@ -43,23 +42,12 @@ def ours(seed: int) -> Progress:
 
 
 def peer(seed: int) -> Progress:
-    env = DummyVecEnv([lambda: SB3Env(get_task(TASK))] * ENVS)
-    env.seed(seed)
-    model = DDPG(
-        "MultiInputPolicy",
-        env,
-        replay_buffer_class=HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
-        policy_kwargs={"net_arch": [64, 64, 64]},
+    model = make_sb3(
         action_noise=NormalActionNoise(np.zeros(3), np.full(3, 0.1)),
         batch_size=256,
-        gamma=0.98,
-        tau=0.02,
-        train_freq=(1, "step"),
         gradient_steps=3,  # 64 frames are worth 3.2; it counts in whole ones
         learning_starts=3_200,
-        device="cpu",
-        seed=seed,
+        seed=seed,  # of its environments, too
     )
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:

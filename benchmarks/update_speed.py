@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -90,23 +91,26 @@ def frames_of(trainer: Trainer, frames: int) -> Callable[[], int]:
     return work
 
 
-def sb3(*, gradient_steps: int) -> DDPG:
-    """Stable-Baselines3's DDPG with its HER, networks and batch as ours, its buffer filled."""
-    env = DummyVecEnv([lambda: SB3Env(get_task(TASK))] * ENVS)
-    model = DDPG(
+def make_sb3(**options: Any) -> DDPG:
+    """Stable-Baselines3's DDPG with its HER, networks, discount and target update as ours."""
+    return DDPG(
         "MultiInputPolicy",
-        env,
+        DummyVecEnv([lambda: SB3Env(get_task(TASK))] * ENVS),
         replay_buffer_class=HerReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
         policy_kwargs={"net_arch": [64, 64, 64]},
-        batch_size=BATCH,
-        buffer_size=200_000,
         gamma=0.98,
         tau=0.02,
         train_freq=(1, "step"),
-        gradient_steps=gradient_steps,
-        learning_starts=FILL,
         device="cpu",
+        **options,
+    )
+
+
+def sb3(*, gradient_steps: int) -> DDPG:
+    """The same with its buffer filled."""
+    model = make_sb3(
+        batch_size=BATCH, buffer_size=200_000, gradient_steps=gradient_steps, learning_starts=FILL
     )
     model.learn(FILL + ENVS)
     return model

@@ -153,9 +153,14 @@ def action_slope(layers: Layers, outputs: list[Tensor], slope: Tensor) -> Tensor
 def clip_each_run(gradients: Sequence[Tensor], max_norm: float) -> list[Tensor]:
     """The gradients [R, ...] of one network, those of each run scaled down to a norm of their own."""
     runs = len(gradients[0])
-    norms = torch.cat([gradient.reshape(runs, -1) for gradient in gradients], 1).norm(dim=1)
-    scale = (max_norm / (norms + 1e-6)).clamp(max=1.0).view(runs, 1, 1)  # as torch's clip_grad_norm_
-    return [gradient * scale for gradient in gradients]
+    _, scale = norms_of_runs([gradient.reshape(runs, -1) for gradient in gradients], max_norm)
+    return [gradient * scale.view(runs, 1, 1) for gradient in gradients]
+
+
+def norms_of_runs(blocks: Sequence[Tensor], max_norm: float) -> tuple[Tensor, Tensor]:
+    """Norms [R] of gradients [R, n], all together, and what to multiply each run's by to clip them."""
+    norms = torch.cat(list(blocks), 1).norm(dim=1)
+    return norms, (max_norm / (norms + 1e-6)).clamp(max=1.0)  # as torch's clip_grad_norm_
 
 
 def clamped_targets(networks: Networks, rows: Rows, settings: Settings) -> Tensor:

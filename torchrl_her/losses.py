@@ -14,6 +14,8 @@ from torchrl.objectives import DDPGLoss, HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import TD0Estimator
 
+from torchrl_her.ddpg_step import norms_of_runs
+
 _WEIGHT = "priority_weight"  # of importance sampling, as TorchRL's samplers and losses call it
 
 
@@ -276,8 +278,7 @@ def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float, *, runs: in
         [3.0, 2.0]
     """
     blocks = [parameter.grad.view(runs, -1) for parameter in parameters if parameter.grad is not None]
-    norms = torch.cat(blocks, 1).norm(dim=1)
-    scale = (max_norm / (norms + 1e-6)).clamp(max=1.0)  # as torch's clip_grad_norm_
+    norms, scale = norms_of_runs(blocks, max_norm)
     for block in blocks:
         block.mul_(scale.unsqueeze(1))
     return norms

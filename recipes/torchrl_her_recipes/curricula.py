@@ -55,14 +55,17 @@ class Climb:
     """The curriculum of some runs, and where they are in it.
 
     Attributes:
-        curriculum: its layers.
         progress: the layer of each run.
         layer_env: for evaluation at the layers' goals.
     """
 
-    curriculum: Curriculum
     progress: CurriculumProgress
     layer_env: EnvBase
+
+    @property
+    def curriculum(self) -> Curriculum:
+        """Its layers."""
+        return self.progress.curriculum
 
     def at_the_top(self, run: int) -> bool:
         """Whether a run is in the last layer, which is the full task."""

@@ -43,6 +43,7 @@ from torchrl_her import (
 from torchrl_her_envs import ThrowingEnv, base_env, make_env
 from torchrl_her_recipes.algorithms import get_algorithm
 from torchrl_her_recipes.curricula import Climb, at_the_top, get_curriculum, in_layers
+from torchrl_her_recipes.goal_map import histograms
 from torchrl_her_recipes.goal_weights import goal_target, make_goal_weights
 from torchrl_her_recipes.recipe import Recipe
 
@@ -148,9 +149,7 @@ class Parts:
 
     def _goal_weights(self) -> list[Instructiveness]:
         """Those weights of goals that change from epoch to epoch."""
-        writers = [buffer.writer for buffer in self.buffers]
-        weights = [writer.weights for writer in writers if isinstance(writer, HERWriter)]
-        return [own for own in weights if isinstance(own, Instructiveness)]
+        return [own for own in histograms(self.buffers) if isinstance(own, Instructiveness)]
 
     def run(self, folder: str | Path | None = None, *, progress: bool = True) -> RunResult:
         """Trains to the end and returns what came of it.
@@ -235,7 +234,7 @@ def make_climb(recipe: Recipe, env: ThrowingEnv) -> Climb | None:
         success_threshold=recipe.success_threshold,
     )
     layer_env = make_envs(recipe, recipe.eval_episodes, eval_seeds(recipe, 0))
-    return Climb(progress.curriculum, progress, in_layers(layer_env, progress))
+    return Climb(progress, in_layers(layer_env, progress))
 
 
 def make_collector(recipe: Recipe, env: EnvBase, policy: TensorDictModuleBase) -> Collector:

@@ -83,13 +83,24 @@ def load_study(
     for option, value in (("seeds", seeds), ("frames", frames)):
         if value is not None and value < 1:
             raise ValueError(f"{option} must be at least 1, got {value}")
-    study = Study(name=path.stem, **yaml.safe_load(path.read_text()))
-    recipe = {**study.recipe, **(_QUICK if quick else {})}
+    values = yaml.safe_load(path.read_text())
+    preset = values.pop("preset", None)
+    study = Study(name=path.stem, **values)
+    recipe = {**(_preset(preset) if preset else {}), **study.recipe, **(_QUICK if quick else {})}
     if seeds is not None:
         recipe["num_runs"] = seeds
     if frames is not None:
         recipe["epochs"] = -(-frames // Recipe.from_dict({**recipe, **_first(study)}).epoch_frames)
     return replace(study, recipe=recipe)
+
+
+def _preset(name: str) -> dict[str, Any]:
+    """The values of a preset."""
+    path = _CONF.parent / "preset" / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(preset.stem for preset in path.parent.glob("*.yaml")))
+        raise ValueError(f"there is no preset {name!r}; the presets are {known}")
+    return yaml.safe_load(path.read_text())
 
 
 def _first(study: Study) -> dict[str, Any]:
