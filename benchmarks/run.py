@@ -18,6 +18,7 @@ PARTS = {
     "ibs_update": "How often q is brought up to date",
     "memory": "Memory",
     "startup": "Start-up",
+    "checkpoint_cost": "Checkpoints",
     "time_to_learn": "Time to learn",
     "task_check": "The tasks can be solved",
 }

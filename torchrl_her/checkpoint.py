@@ -3,45 +3,115 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import pickle
+import warnings
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from tensordict import TensorDict
+from torch import Tensor
+from torch.utils.serialization import config
+from torchrl.collectors import BaseCollector
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler
 
 _MAGIC = b"torchrl-her checkpoint 1\n"
+_PIECE = 1 << 26  # bytes that are written before they are put onto the disk
+_BODY = len(_MAGIC) + hashlib.sha256().digest_size  # where it begins
 
 
 class CheckpointError(ValueError):
     """A file that is no whole checkpoint."""
 
 
-def save_checkpoint(state: dict[str, Any], path: str | Path) -> None:
+class _Stream:
+    """What torch.save writes to: a file, and the checksum of what went into it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file, self.hash = file, hashlib.sha256()
+        self.flush = file.flush
+        self._waiting = 0
+
+    def write(self, data: bytes) -> int:
+        self.hash.update(data)
+        written = self.file.write(data)
+        self._waiting += written
+        if self._waiting >= _PIECE:
+            self.sync()
+        return written
+
+    def sync(self) -> None:
+        """Puts what was written onto the disk, and frees its memory: filling ever more of it takes longer."""
+        self.file.flush()
+        os.fsync(self.file.fileno())
+        if hasattr(os, "posix_fadvise"):
+            os.posix_fadvise(self.file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        self._waiting = 0
+
+
+def save_checkpoint(state: dict[str, Any], path: str | Path, *, keep: int = 1) -> None:
     """Writes a checkpoint so that the file is always whole: the new one or the one before.
 
     Args:
         state: nested dicts and lists of tensors and plain data.
         path: the file; a temporary one beside it is renamed to it when it is on the disk.
 
+    Keyword Args:
+        keep: how many there are in the end: ``checkpoint.pt`` is the newest, ``checkpoint.1.pt`` the one
+            before it, and so on.
+
     Raises:
         OSError: it cannot be written; what was there before is untouched.
     """
     path = Path(path)
-    payload = io.BytesIO()
-    torch.save(state, payload)
-    body = payload.getbuffer()
     part = path.with_name(path.name + ".part")
-    with open(part, "wb") as file:
-        file.write(_MAGIC + hashlib.sha256(body).digest())
-        file.write(body)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
+    try:
+        with open(part, "wb") as file:
+            _write(state, file)
+        for newer, older in reversed(list(pairwise(_generations(path, keep)))):
+            if newer.exists():
+                os.replace(newer, older)
+        os.replace(part, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        part.unlink(missing_ok=True)  # which it is if all went well; on a full disk it would be in the way
+    _sync_folder(path.parent)
+
+
+def _write(state: dict[str, Any], file: BinaryIO) -> None:
+    """Mark, checksum and torch's file, down to the disk. It is in memory at no time."""
+    file.write(_MAGIC.ljust(_BODY, b"\0"))
+    stream = _Stream(file)
+    try:
+        # A second checksum would take half as long as the first.
+        with config.patch("save.compute_crc32", False):  # type: ignore[attr-defined]
+            torch.save(state, stream)  # type: ignore[arg-type]
+    except RuntimeError as error:
+        if isinstance(error.__context__, OSError):  # torch hides why it could not write
+            raise error.__context__ from None
+        raise
+    file.seek(len(_MAGIC))
+    file.write(stream.hash.digest())
+    stream.sync()
+
+
+def _generations(path: Path, keep: int) -> list[Path]:
+    """The names of a checkpoint and of those before it, the newest first."""
+    return [path, *(path.with_name(f"{path.stem}.{age}{path.suffix}") for age in range(1, keep))]
+
+
+def _sync_folder(folder: Path) -> None:
+    """Lets the renaming of files outlive a loss of power."""
+    if os.name == "posix":  # elsewhere a folder cannot be opened
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
 
 
 def load_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -54,29 +124,98 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
         CheckpointError: it is not whole, not a checkpoint, or holds more than tensors and plain data.
         OSError: it cannot be read.
     """
-    data = Path(path).read_bytes()
-    head = len(_MAGIC)
-    digest, body = data[head : head + 32], data[head + 32 :]
-    if data[:head] != _MAGIC:
-        raise CheckpointError(f"{path} is not a checkpoint of torchrl-her")
-    if hashlib.sha256(body).digest() != digest:
-        raise CheckpointError(f"{path} is damaged: its checksum does not match")
-    try:
-        return torch.load(io.BytesIO(body), weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise CheckpointError(f"{path} holds more than tensors and plain data") from error
+    with open(path, "rb") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise CheckpointError(f"{path} is not a checkpoint of torchrl-her")
+        digest = file.read(_BODY - len(_MAGIC))
+        if hashlib.file_digest(file, "sha256").digest() != digest:
+            raise CheckpointError(f"{path} is damaged: its checksum does not match")
+        file.seek(_BODY)
+        try:
+            return torch.load(file, weights_only=True)
+        except pickle.UnpicklingError as error:
+            raise CheckpointError(f"{path} holds more than tensors and plain data") from error
+        except Exception as error:  # of any type: whoever makes the checksum can put anything behind it
+            reason = str(error).split("\n")[0]
+            raise CheckpointError(f"{path} cannot be read: {reason}") from error
 
 
-def buffer_state_dict(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
+def load_newest_checkpoint(path: str | Path, *, keep: int = 2) -> dict[str, Any]:
+    """Reads the newest whole checkpoint, and warns if there was a newer one.
+
+    Args:
+        path: as given to :func:`save_checkpoint`.
+
+    Keyword Args:
+        keep: likewise.
+
+    Raises:
+        CheckpointError: there are some, but none is whole.
+        OSError: there is none, or it cannot be read.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for epoch in (1, 2):
+        ...         save_checkpoint({"epoch": epoch}, f"{folder}/checkpoint.pt", keep=2)
+        ...     load_newest_checkpoint(f"{folder}/checkpoint.pt")
+        {'epoch': 2}
+    """
+    path, damage = Path(path), []
+    for own in [file for file in _generations(path, keep) if file.exists()] or [path]:
+        try:
+            state = load_checkpoint(own)
+        except CheckpointError as error:
+            damage.append(str(error))
+            continue
+        if damage:
+            warnings.warn(f"{'; '.join(damage)}; {own.name}, the one before, is used instead", stacklevel=2)
+        return state
+    raise CheckpointError("; ".join(damage))
+
+
+def collector_state_dict(collector: BaseCollector) -> dict[str, Any]:
+    """Where a collector stands between two batches, without its policy: counters and half-played episodes.
+
+    TorchRL's own state leaves out the episodes, as most environments cannot go on with them. Where
+    the environment can be put back too, a run goes on from here exactly. Collectors over several
+    processes keep their episodes to themselves: with them it goes on with new ones.
+    """
+    state = {name: value for name, value in collector.state_dict().items() if name != "policy_state_dict"}
+    carrier = getattr(collector, "_carrier", None)
+    return {**state, "carrier": None if carrier is None else carrier.clone().to_dict()}
+
+
+def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -> None:
+    """Puts a collector of the same make to where :func:`collector_state_dict` was taken."""
+    own = {name: value for name, value in state.items() if name != "carrier"}
+    if state.get("carrier") is None:
+        collector.load_state_dict(own)
+        return
+    collector.load_state_dict(own, strict=False)  # its policy stays
+    carrier = collector._carrier
+    shown = TensorDict.from_dict(state["carrier"], batch_size=carrier.batch_size)
+    collector._carrier = carrier.empty().update(shown)
+    if "traj_pool" in own:  # TorchRL has drawn new ids, but the episodes have theirs
+        collector._traj_pool.load_state_dict(own["traj_pool"])
+
+
+def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> dict[str, Any]:
     """What a replay buffer holds: filled rows, writer, and priorities if it has any.
 
     TorchRL's own state holds the whole capacity, and for a prioritised sampler objects that a safe
     load refuses.
+
+    Args:
+        buffer: the buffer.
+
+    Keyword Args:
+        copy: whether the rows are copied. Without it they are only good for being written at once.
     """
     n = len(buffer)
     state: dict[str, Any] = {
-        # As stored, without what transforms add; a copy, since a view would bring the whole capacity along.
-        "rows": buffer.storage[:n].clone().to_dict() if n else None,
+        # as stored, without what transforms add
+        "rows": buffer.storage[:n].apply(torch.clone if copy else _alone).to_dict() if n else None,
         "size": n,
         "writer": buffer.writer.state_dict(),
         "sampler": None,
@@ -92,6 +231,15 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
             ],
         }
     return state
+
+
+def _alone(rows: Tensor) -> Tensor:
+    """Rows of a longer tensor, in the same memory: torch.save would write the other rows, too."""
+    if not rows.is_contiguous():
+        return rows.clone()
+    start = rows.storage_offset() * rows.itemsize
+    own = rows.untyped_storage()[start : start + rows.nbytes]
+    return torch.empty(0, dtype=rows.dtype, device=rows.device).set_(own, 0, rows.shape, rows.stride())
 
 
 def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:

@@ -38,8 +38,7 @@ def check_finite(batch: TensorDictBase, keys: tuple[str, ...] = ("action", "obse
 class Trainer:
     """Trains in epochs of a fixed number of frames, each beginning with fresh episodes.
 
-    That epochs begin afresh is what lets a run go on exactly from a checkpoint between two of
-    them: nothing of a half-played episode needs to be kept.
+    An epoch that was broken off, by an exception of ``on_batch``, is one that :meth:`epoch` goes on with.
 
     One loop serves a single run and many independent ones. The environments of R runs are R equal
     blocks of one batch; each run has a replay buffer of its own.
@@ -67,6 +66,7 @@ class Trainer:
         frames: environment steps of each run so far.
         updates: gradient steps of each run so far.
         epochs: epochs so far.
+        in_epoch: whether one is under way; not so between two of them.
     """
 
     def __init__(
@@ -89,16 +89,24 @@ class Trainer:
         self.batch_size, self.updates_per_draw = batch_size, updates_per_draw
         self.frames = self.updates = self.epochs = 0
         self._credit = 0.0  # gradient steps that frames have paid for
+        self._measured: list[dict[str, Tensor]] | None = None  # so far in the epoch that is under way
+
+    @property
+    def in_epoch(self) -> bool:
+        """Whether an epoch is under way."""
+        return self._measured is not None
 
     def epoch(self, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
-        """Runs one epoch and returns the means of what the learner measured, [R] each.
+        """Runs one epoch, or the rest of one, and returns the means of what the learner measured, [R] each.
 
         Args:
             on_batch: called after each batch, for a progress bar.
         """
-        self.collector.reset()
-        end = (self.epochs + 1) * self.epoch_frames  # also where an interrupted epoch is finished
-        measured = self.run(end - self.frames, on_batch)
+        if self._measured is None:
+            self.collector.reset()
+            self._measured = []
+        self._work((self.epochs + 1) * self.epoch_frames, self._measured, on_batch)
+        measured, self._measured = _means(self._measured), None
         self.epochs += 1
         for schedule in self.schedules:
             schedule.step()
@@ -106,8 +114,14 @@ class Trainer:
 
     def run(self, frames: int, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
         """Collects and learns for a number of frames of each run, rounded up to whole batches."""
-        end = self.frames + frames
         measured: list[dict[str, Tensor]] = []
+        self._work(self.frames + frames, measured, on_batch)
+        return _means(measured)
+
+    def _work(
+        self, end: int, measured: list[dict[str, Tensor]], on_batch: Callable[[Trainer], None] | None
+    ) -> None:
+        """Collects and learns up to a number of frames, and notes what the learner measures."""
         while self.frames < end:
             batch = self.collector.next()
             check_finite(batch)
@@ -119,8 +133,6 @@ class Trainer:
             measured += self._learn()
             if on_batch is not None:
                 on_batch(self)
-        keys = measured[0] if measured else {}
-        return {key: _mean([m[key] for m in measured]) for key in keys}
 
     def _write(self, batch: TensorDictBase) -> int:
         """Gives each run its block of environments, and returns the frames of one run."""
@@ -167,18 +179,30 @@ class Trainer:
                 buffer.update_tensordict_priority(own)  # does nothing under a sampler without priorities
 
     def state_dict(self) -> dict[str, Any]:
-        """The counters; the parts have state of their own."""
-        return {"frames": self.frames, "updates": self.updates, "epochs": self.epochs, "credit": self._credit}
+        """The counters, and what was measured in an epoch under way; the parts have state of their own."""
+        counters = {"frames": self.frames, "updates": self.updates, "epochs": self.epochs}
+        measured = None if self._measured is None else _joined(self._measured)
+        return {**counters, "credit": self._credit, "measured": measured}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts the counters back."""
+        """Puts back what :meth:`state_dict` gave."""
         self.frames, self.updates, self.epochs = state["frames"], state["updates"], state["epochs"]
         self._credit = state["credit"]
+        measured = state.get("measured")
+        self._measured = None if measured is None else [measured] if measured else []
 
 
-def _mean(measured: list[Tensor]) -> Tensor:
-    """The means [R] over all steps [..., R] in which a run learnt; NaN where it never did."""
-    values = torch.cat(measured)
+def _joined(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """All steps [..., R] of each entry, behind each other."""
+    return {key: torch.cat([own[key] for own in measured]) for key in (measured[0] if measured else {})}
+
+
+def _means(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """The means [R] of each entry over the steps in which a run learnt; NaN where it never did."""
+    return {key: _mean(values) for key, values in _joined(measured).items()}
+
+
+def _mean(values: Tensor) -> Tensor:
     learnt = values != _IDLE
     return torch.where(learnt, values, 0.0).sum(0) / learnt.sum(0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import platform
 from collections.abc import Sequence
@@ -22,13 +23,13 @@ class RunFolder:
     """Paths and tables of one run.
 
     Args:
-        path: of the folder; :meth:`describe` makes it.
+        path: of the folder; :meth:`create` makes it.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.config = self.path / "config.yaml"
-        self.checkpoint = self.path / "checkpoint.pt"
+        self.checkpoint = self.path / "checkpoint.pt"  # the newest
         self.policy = self.path / "policy.pt"
         self.metrics = self.path / "metrics.csv"
         self.curves = self.path / "curves.png"
@@ -37,19 +38,21 @@ class RunFolder:
         self.video = self.path / "policy.gif"
         self._events: SummaryWriter | None = None
 
-    def describe(self, recipe: Recipe) -> None:
-        """Makes the folder, and writes the recipe and the versions that run it.
+    def create(self) -> None:
+        """Makes the folder.
 
         Raises:
             ValueError: there is a run in it already.
-            OSError: it cannot be made or written.
+            OSError: it cannot be made.
         """
         if self.config.exists():
             raise ValueError(
                 f"{self.path} holds a run already; go on with it by --resume, or choose another folder"
             )
         self.path.mkdir(parents=True, exist_ok=True)
-        self.config.write_text(yaml.safe_dump(asdict(recipe), sort_keys=False))
+
+    def describe(self, recipe: Recipe) -> None:
+        """Writes the recipe and the versions that run it."""
         about = {
             "seed": recipe.seed,
             "python": platform.python_version(),
@@ -57,6 +60,7 @@ class RunFolder:
             "versions": {name: version(name) for name in _PACKAGES},
         }
         (self.path / "run.json").write_text(json.dumps(about, indent=2) + "\n")
+        _write_whole(self.config, yaml.safe_dump(asdict(recipe), sort_keys=False))
 
     def recipe(self) -> Recipe:
         """The recipe of the run.
@@ -79,17 +83,17 @@ class RunFolder:
             new: how many rows at its end are new.
         """
         columns = list(dict.fromkeys(name for row in rows for name in row))
-        part = self.metrics.with_suffix(".part")
-        with open(part, "w", newline="") as file:
-            writer = csv.DictWriter(file, columns, restval="nan")
-            writer.writeheader()
-            writer.writerows(rows)
-        part.replace(self.metrics)
+        table = io.StringIO()
+        writer = csv.DictWriter(table, columns, restval="nan")
+        writer.writeheader()
+        writer.writerows(rows)
+        _write_whole(self.metrics, table.getvalue())
         if self._events is None:
             self._events = SummaryWriter(str(self.path / "tensorboard"), purge_step=int(rows[-new]["frames"]))
         for row in rows[-new:]:
             for name, value in row.items():
                 self._events.add_scalar(f"{name}/run_{row['run']}", value, int(row["frames"]))
+        self._events.flush()  # what is behind a checkpoint must be on the disk when the run goes on from it
 
     def rows(self) -> list[dict[str, float]]:
         """The table so far."""
@@ -103,6 +107,13 @@ class RunFolder:
         if self._events is not None:
             self._events.close()
             self._events = None
+
+
+def _write_whole(path: Path, text: str) -> None:
+    """Writes a file that is never seen in part."""
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, newline="")
+    part.replace(path)
 
 
 def _number(text: str) -> float:

@@ -1,8 +1,10 @@
-"""Recipes shrunk to seconds."""
+"""Recipes shrunk to seconds, and comparing what comes of them."""
 
 from __future__ import annotations
 
 from typing import Any
+
+import torch
 
 from torchrl_her_recipes import Recipe
 
@@ -26,3 +28,20 @@ def small(**options: Any) -> Recipe:
 def overrides(**options: Any) -> list[str]:
     """The same for the command line."""
     return [f"{name}={value}" for name, value in {**SMALL, **options}.items()]
+
+
+def assert_same(first: Any, second: Any, *, path: str = "") -> None:
+    """Nested plain data and tensors, bit for bit."""
+    assert type(first) is type(second), path
+    if isinstance(first, dict):
+        assert first.keys() == second.keys(), path
+        for key in first:
+            assert_same(first[key], second[key], path=f"{path}/{key}")
+    elif isinstance(first, list | tuple):
+        for index, pair in enumerate(zip(first, second, strict=True)):
+            assert_same(*pair, path=f"{path}/{index}")
+    elif isinstance(first, torch.Tensor):
+        assert first.dtype == second.dtype, path
+        assert torch.equal(first, second), path
+    else:
+        assert first == second, path

@@ -1,11 +1,8 @@
-"""A run leaves behind what it promises, and goes on from its checkpoint as if it had never stopped."""
+"""A run leaves behind what it promises, and comes out the same from the same seed."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torchrl_her import load_checkpoint
 from torchrl_her_recipes import Parts, Recipe, load_actor, play, resume
 
-from .small import small
+from .small import assert_same, small
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +80,7 @@ def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
         load_actor(folder, run=4)
 
 
-# Going on
+# The same again
 
 
 def everything(parts: Parts) -> dict[str, Any]:
@@ -92,78 +89,6 @@ def everything(parts: Parts) -> dict[str, Any]:
     for index, own in parts.optimiser.state_dict()["state"].items():
         state |= {f"optimiser {index} {name}": value for name, value in own.items()}
     return {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
-
-
-def interrupted_after(parts: Parts, folder: Path, batches: int, signal_number: int = signal.SIGINT) -> None:
-    """Runs, and presses Ctrl-C after a number of batches."""
-    collect, count = parts.collector.next, iter(range(10**6))
-
-    def next_batch() -> Any:
-        if next(count) == batches:
-            os.kill(os.getpid(), signal_number)
-        return collect()
-
-    parts.collector.next = next_batch  # type: ignore[method-assign]
-    assert parts.run(folder, progress=False).interrupted
-
-
-@pytest.mark.parametrize(
-    "options", [{"task": "hand_wall_v2"}, {"task": "robot_v2", "num_runs": 2}, {"sampler": "uniform"}]
-)
-def test_a_run_resumed_between_epochs_ends_bit_for_bit_as_one_that_was_not_stopped(
-    options: dict[str, Any], tmp_path: Path
-) -> None:
-    recipe = small(epochs=4, checkpoint_interval=2, **options)
-    whole = recipe.build()
-    whole.run(tmp_path / "whole", progress=False)
-
-    part = replace(recipe, epochs=2).build()
-    part.run(tmp_path / "part", progress=False)
-    (tmp_path / "part" / "config.yaml").write_text((tmp_path / "whole" / "config.yaml").read_text())
-    result = resume(tmp_path / "part", progress=False)
-
-    first = load_checkpoint(tmp_path / "whole" / "checkpoint.pt")
-    second = load_checkpoint(tmp_path / "part" / "checkpoint.pt")
-    assert_same(first, second, skip=("trajectories", "traj_ids"))
-    assert len(result.rows) == 4 * recipe.num_runs
-    columns = ["frames", "updates", "success", "distance", "q", "loss_value", "rows_virtual"]
-    tables = [pd.read_csv(tmp_path / name / "metrics.csv")[columns] for name in ("whole", "part")]
-    pd.testing.assert_frame_equal(*tables)
-
-
-def assert_same(first: Any, second: Any, *, skip: tuple[str, ...] = (), path: str = "") -> None:
-    """Nested plain data and tensors, bit for bit."""
-    if isinstance(first, dict):
-        assert first.keys() == second.keys(), path
-        for key in first.keys() - set(skip):
-            assert_same(first[key], second[key], skip=skip, path=f"{path}/{key}")
-    elif isinstance(first, list | tuple):
-        for index, pair in enumerate(zip(first, second, strict=True)):
-            assert_same(*pair, skip=skip, path=f"{path}/{index}")
-    elif isinstance(first, torch.Tensor):
-        assert torch.equal(first, second), path
-    else:
-        assert first == second, path
-
-
-def test_ctrl_c_saves_what_there_is_and_the_run_can_go_on(tmp_path: Path) -> None:
-    recipe = small(epochs=3)
-    interrupted_after(recipe.build(), tmp_path / "run", 50)  # in the middle of the second epoch
-    saved = load_checkpoint(tmp_path / "run" / "checkpoint.pt")
-    assert saved["trainer"]["frames"] == 51 * 80
-    assert (tmp_path / "run" / "curves.png").exists()
-    result = resume(tmp_path / "run", progress=False)
-    assert [row["frames"] for row in result.rows] == [1_600, 3_200, 4_800]
-
-
-def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
-    small(epochs=1).build().run(tmp_path / "run", progress=False)
-    path = tmp_path / "run" / "checkpoint.pt"
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
-    with pytest.raises(ValueError, match="checksum"):
-        resume(tmp_path / "run", progress=False)
 
 
 def test_the_same_seed_gives_the_same_run() -> None:
@@ -182,24 +107,3 @@ def test_epochs_without_an_update_leave_a_table_that_fits(tmp_path: Path) -> Non
     assert table["loss_value"].isna().tolist() == [True, True, False]
     assert table["success"].between(0, 1).all()
     assert (tmp_path / "run" / "policy.gif").exists()
-
-
-def test_parts_that_were_swapped_must_be_given_to_resume(tmp_path: Path) -> None:
-    def build(recipe: Recipe) -> Parts:
-        parts = recipe.build()
-        parts.optimiser = torch.optim.AdamW(parts.loss.parameters(), lr=1e-3)
-        parts.critic = None
-        return parts
-
-    recipe = small(epochs=2, checkpoint_interval=1)
-    build(replace(recipe, epochs=1)).run(tmp_path / "run", progress=False)
-    with pytest.raises(ValueError, match="the run's critic was NoneType, not TensorDictModule"):
-        resume(tmp_path / "run", progress=False)
-    assert resume(tmp_path / "run", parts=build(recipe), progress=False).rows[-1]["epoch"] == 2
-
-
-@pytest.mark.parametrize("text", ["epochs: [", "epochs: many", ""])
-def test_a_spoilt_configuration_is_named(text: str, tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(ValueError, match="config.yaml cannot be read"):
-        resume(tmp_path)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import os
+import tracemalloc
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
 
@@ -21,10 +25,14 @@ from torchrl_her import (
     GoalReward,
     HERWriter,
     buffer_state_dict,
+    collector_state_dict,
     load_buffer_state_dict,
     load_checkpoint,
+    load_collector_state_dict,
+    load_newest_checkpoint,
     save_checkpoint,
 )
+from torchrl_her_envs import make_env
 
 from .her_data import make_batch
 
@@ -85,6 +93,13 @@ def test_damage_in_the_body_is_called_damage(whole: Path) -> None:
         load_checkpoint(damaged)
 
 
+def test_anything_else_behind_a_right_checksum_is_refused(whole: Path) -> None:
+    strange, body = whole.with_name("strange.pt"), b"not torch's"
+    strange.write_bytes(b"torchrl-her checkpoint 1\n" + hashlib.sha256(body).digest() + body)
+    with pytest.raises(CheckpointError, match=r"strange\.pt (cannot be read: \S|holds more than tensors)"):
+        load_checkpoint(strange)
+
+
 def test_other_files_are_no_checkpoints(tmp_path: Path) -> None:
     path = tmp_path / "weights.pt"
     torch.save(STATE, path)
@@ -132,16 +147,36 @@ def test_a_failing_write_leaves_the_old_checkpoint(
     save_checkpoint({"epoch": 1}, path)
 
     def fail(*_: object) -> None:
-        raise OSError("No space left on device")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
         patch.setattr(os, failing, fail)
-        with pytest.raises(OSError, match="No space left"):
+        with pytest.raises(OSError, match=r"No space left on device: '.*checkpoint\.pt'"):
             save_checkpoint({"epoch": 2}, path)
     assert load_checkpoint(path) == {"epoch": 1}
-    save_checkpoint({"epoch": 3}, path)  # nor does what was left behind disturb the next one
-    assert load_checkpoint(path) == {"epoch": 3}
     assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no disk that is always full")
+@pytest.mark.parametrize("numbers", [10, 10_000_000])
+def test_a_full_disk_leaves_the_old_checkpoint(tmp_path: Path, numbers: int) -> None:
+    path = tmp_path / "checkpoint.pt"
+    save_checkpoint({"epoch": 1}, path)
+    (tmp_path / "checkpoint.pt.part").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=r"No space left on device: '.*checkpoint\.pt'"):
+        save_checkpoint({"epoch": 2, "weights": torch.zeros(numbers)}, path, keep=2)
+    assert load_checkpoint(path) == {"epoch": 1}
+    assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+def test_a_checkpoint_is_not_in_memory_while_it_is_written(tmp_path: Path) -> None:
+    state = {"weights": torch.arange(30_000_000.0)}
+    save_checkpoint({}, tmp_path / "checkpoint.pt")  # what is imported on the way
+    tracemalloc.start()
+    save_checkpoint(state, tmp_path / "checkpoint.pt")
+    assert tracemalloc.get_traced_memory()[1] < 2_000_000  # bytes, of 120 million
+    tracemalloc.stop()
+    assert torch.equal(load_checkpoint(tmp_path / "checkpoint.pt")["weights"], state["weights"])
 
 
 def test_the_old_checkpoint_is_whole_until_the_new_one_is_on_the_disk(
@@ -164,6 +199,65 @@ def test_the_format_is_a_mark_a_checksum_and_torchs_file(whole: Path) -> None:
     body = data[len(mark) + 32 :]
     assert data[len(mark) : len(mark) + 32] == hashlib.sha256(body).digest()
     assert torch.load(io.BytesIO(body), weights_only=True)["epoch"] == 3
+
+
+# The last ones
+
+
+def saved(folder: Path, epochs: int, keep: int = 2) -> Path:
+    """The path of checkpoints after some epochs."""
+    path = folder / "checkpoint.pt"
+    for epoch in range(1, epochs + 1):
+        save_checkpoint({"epoch": epoch}, path, keep=keep)
+    return path
+
+
+def test_the_last_ones_are_kept(tmp_path: Path) -> None:
+    saved(tmp_path, epochs=5, keep=3)
+    found = {path.name: load_checkpoint(path)["epoch"] for path in tmp_path.iterdir()}
+    assert found == {"checkpoint.pt": 5, "checkpoint.1.pt": 4, "checkpoint.2.pt": 3}
+
+
+def test_the_newest_is_used(tmp_path: Path) -> None:
+    with warnings.catch_warnings(action="error"):
+        assert load_newest_checkpoint(saved(tmp_path, epochs=3)) == {"epoch": 3}
+
+
+@pytest.mark.parametrize("data", [b"", b"torchrl-her checkpoint 1\nhalf a check", b"something else"])
+def test_the_one_before_a_damaged_one_is_used(tmp_path: Path, data: bytes) -> None:
+    path = saved(tmp_path, epochs=3)
+    path.write_bytes(data)
+    said = r"^\S+/checkpoint\.pt is [^;\n]+; checkpoint\.1\.pt, the one before, is used instead$"
+    with pytest.warns(UserWarning, match=said):
+        assert load_newest_checkpoint(path) == {"epoch": 2}
+
+
+def test_the_one_before_is_the_newest_while_files_are_renamed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, replace = saved(tmp_path, epochs=2), os.replace
+    seen = []
+
+    def look(old: Path, new: Path) -> None:
+        replace(old, new)
+        seen.append(load_newest_checkpoint(path))
+
+    monkeypatch.setattr(os, "replace", look)
+    save_checkpoint({"epoch": 3}, path, keep=2)
+    assert seen == [{"epoch": 2}, {"epoch": 3}]
+
+
+def test_none_that_is_whole_is_an_error(tmp_path: Path) -> None:
+    path = saved(tmp_path, epochs=2)
+    for file in tmp_path.iterdir():
+        file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match=r"checkpoint\.pt is damaged.*; .*checkpoint\.1\.pt is damaged"):
+        load_newest_checkpoint(path)
+
+
+def test_none_at_all_is_an_os_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"checkpoint\.pt"):
+        load_newest_checkpoint(tmp_path / "checkpoint.pt")
 
 
 # Replay buffers
@@ -277,3 +371,40 @@ def test_a_state_is_small_and_apart_from_the_buffer(sampler: str, tmp_path: Path
     assert torch.equal(state["rows"]["observation"], before)
     save_checkpoint(state, tmp_path / "buffer.pt")
     assert (tmp_path / "buffer.pt").stat().st_size < 30_000  # rows of 15, not of 100,000
+
+
+def test_a_state_without_a_copy_is_as_small(tmp_path: Path) -> None:
+    buffer = make_buffer("uniform", capacity=100_000)
+    buffer.extend(make_batch([[5]]))
+    state, copied = buffer_state_dict(buffer, copy=False), buffer_state_dict(buffer)
+    save_checkpoint(state, tmp_path / "buffer.pt")
+    assert (tmp_path / "buffer.pt").stat().st_size < 30_000
+    rows, expected = (
+        TensorDict(own["rows"], [15]) for own in (load_checkpoint(tmp_path / "buffer.pt"), copied)
+    )
+    assert same(rows, expected)
+    buffer.storage[:]["observation"].fill_(9.0)
+    assert (state["rows"]["observation"] == 9.0).all()
+
+
+# Collectors
+
+
+def test_a_collector_goes_on_in_the_middle_of_episodes(tmp_path: Path) -> None:
+    def make() -> Collector:
+        env = make_env("hand_v2", num_envs=4, seed=3)
+        return Collector(env, frames_per_batch=4 * 30, total_frames=-1)
+
+    def batches(collector: Collector, n: int) -> TensorDict:
+        torch.manual_seed(5)
+        return torch.cat([collector.next() for _ in range(n)], 1)
+
+    unbroken, other = make(), make()
+    batches(unbroken, 3)  # 90 steps: 40 into the second episodes
+    worlds = unbroken.env.world_state_dict()
+    save_checkpoint({"collector": collector_state_dict(unbroken)}, tmp_path / "collector.pt")
+    load_collector_state_dict(other, load_checkpoint(tmp_path / "collector.pt")["collector"])
+    other.env.load_world_state_dict(worlds)
+    expected = batches(unbroken, 2)
+    assert same(batches(other, 2), expected)
+    assert expected["collector", "traj_ids"].unique().tolist() == list(range(4, 12))  # of 150 steps
