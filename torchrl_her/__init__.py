@@ -3,15 +3,25 @@
 from torchrl_her.checkpoint import (
     CheckpointError,
     buffer_state_dict,
+    collector_state_dict,
     load_buffer_state_dict,
     load_checkpoint,
+    load_collector_state_dict,
+    load_newest_checkpoint,
     save_checkpoint,
 )
 from torchrl_her.compiling import CompiledOnce
 from torchrl_her.curriculum import Curriculum, CurriculumLayer, CurriculumProgress, zero_unused_inputs
 from torchrl_her.curriculum_transforms import StateToObs, ZeroPad
+from torchrl_her.dqn import QNet, make_dqn_loss, make_q_actor
 from torchrl_her.episodes import Episodes, find_episodes
-from torchrl_her.exploration import DecayingEpsilon, explore
+from torchrl_her.exploration import (
+    DecayingEpsilon,
+    DecayingEpsilonGreedy,
+    Exploration,
+    explore,
+    explore_actions,
+)
 from torchrl_her.fused import FusedDDPGLearner, can_fuse, is_plain_adam
 from torchrl_her.goal_drawing import draw_goals
 from torchrl_her.goal_grid import GoalGrid, box_target, kl_divergence, sampled_target
@@ -24,6 +34,7 @@ from torchrl_her.losses import (
     Learner,
     LossLearner,
     PenalisedDDPGLoss,
+    clamped_td0,
     clip_by_run,
     keep_runs,
     make_ddpg_loss,
@@ -39,7 +50,9 @@ from torchrl_her.networks import (
     stack_runs,
     take_run,
 )
+from torchrl_her.sac import StochasticActorNet, make_sac_loss, make_stochastic_actor
 from torchrl_her.sampler import HERSampleUnit
+from torchrl_her.td3 import make_td3_loss
 from torchrl_her.training import Trainer, evaluate
 from torchrl_her.virtual_goals import Strategy, candidates, combine, draw, draw_alike, draw_weighted, window
 from torchrl_her.writer import HERWriter, WriterCounts
@@ -54,8 +67,10 @@ __all__ = [
     "CurriculumLayer",
     "CurriculumProgress",
     "DecayingEpsilon",
+    "DecayingEpsilonGreedy",
     "EnvReward",
     "Episodes",
+    "Exploration",
     "FusedDDPGLearner",
     "GoalGrid",
     "GoalHistogram",
@@ -67,9 +82,11 @@ __all__ = [
     "Learner",
     "LossLearner",
     "PenalisedDDPGLoss",
+    "QNet",
     "RewardFunction",
     "StackedLinear",
     "StateToObs",
+    "StochasticActorNet",
     "Strategy",
     "Trainer",
     "WriterCounts",
@@ -79,7 +96,9 @@ __all__ = [
     "buffer_state_dict",
     "can_fuse",
     "candidates",
+    "clamped_td0",
     "clip_by_run",
+    "collector_state_dict",
     "combine",
     "discounted_return",
     "distance",
@@ -90,6 +109,7 @@ __all__ = [
     "enter_layer",
     "evaluate",
     "explore",
+    "explore_actions",
     "final_distance",
     "find_episodes",
     "first_episode",
@@ -98,10 +118,17 @@ __all__ = [
     "kl_divergence",
     "load_buffer_state_dict",
     "load_checkpoint",
+    "load_collector_state_dict",
+    "load_newest_checkpoint",
     "make_actor",
     "make_critic",
     "make_ddpg_loss",
+    "make_dqn_loss",
+    "make_q_actor",
+    "make_sac_loss",
+    "make_stochastic_actor",
     "make_target_updater",
+    "make_td3_loss",
     "q_bias",
     "sampled_target",
     "save_checkpoint",

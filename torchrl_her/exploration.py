@@ -1,7 +1,8 @@
-"""Exploration by a mixture of greedy, noisy and uniform actions, with a decaying share of the latter two."""
+"""Exploration: now and then another action than the greedy one, less often as training goes on."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -53,22 +54,37 @@ def explore(
     return torch.where(choice < uniform_share * epsilon, anywhere, action)
 
 
-class DecayingEpsilon(TensorDictModuleBase):
-    """Turns greedy actions into exploring ones; put it behind a policy in a TensorDictSequential.
-
-    Actions stay greedy under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` (or MODE, MEAN).
+def explore_actions(
+    greedy: Tensor, actions: int, epsilon: Tensor | float, *, generator: torch.Generator | None = None
+) -> Tensor:
+    """Epsilon-greedy: any of the actions with probability epsilon.
 
     Args:
-        low: [a], least actions.
-        high: [a], greatest actions.
+        greedy: [...] of whole numbers, the actions of the policy.
+        actions: how many there are.
+        epsilon: share of actions that are drawn uniformly.
+        generator: source of the random numbers.
+
+    Example:
+        >>> explore_actions(torch.tensor([1, 2]), 3, 0.0).tolist()
+        [1, 2]
+    """
+    choice = torch.rand(greedy.shape, device=greedy.device, generator=generator)
+    anything = torch.randint(actions, greedy.shape, device=greedy.device, generator=generator)
+    return torch.where(choice < epsilon, anything, greedy)
+
+
+class Exploration(TensorDictModuleBase):
+    """Turns greedy actions into exploring ones, with a share epsilon of each run's own that decays.
+
+    Actions stay greedy under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` (or MODE, MEAN).
 
     Keyword Args:
         start: epsilon before the first :meth:`step`.
         decay: what each step multiplies it by.
         end: where it stops.
-        noise, uniform_share: see :func:`explore`.
-        generators: sources of the random numbers, one for each of R independent runs; actions
-            [..., a] are then R equal blocks of rows, run after run. None for torch's own.
+        generators: sources of the random numbers, one for each of R independent runs; actions are then
+            R equal blocks of rows, run after run. None for torch's own.
         action: key.
 
     Attributes:
@@ -76,24 +92,14 @@ class DecayingEpsilon(TensorDictModuleBase):
 
     Raises:
         ValueError: not ``0 <= end <= start <= 1``, or a decay outside of (0, 1].
-
-    Example:
-        >>> exploration = DecayingEpsilon(-torch.ones(3), torch.ones(3), start=1.0, decay=0.5)
-        >>> exploration.step()
-        >>> exploration.epsilon.tolist()
-        [0.5]
     """
 
     def __init__(
         self,
-        low: Tensor,
-        high: Tensor,
         *,
         start: float = 1.0,
         decay: float = 0.95,
         end: float = 0.05,
-        noise: float = 0.05,
-        uniform_share: float = 0.2,
         generators: Sequence[torch.Generator] | None = None,
         action: NestedKey = "action",
     ) -> None:
@@ -104,10 +110,7 @@ class DecayingEpsilon(TensorDictModuleBase):
         super().__init__()
         self.in_keys = self.out_keys = [action]
         self.start, self.decay, self.end = start, decay, end
-        self.noise, self.uniform_share = noise, uniform_share
         self.generators = [None] if generators is None else list(generators)
-        self.register_buffer("low", low.clone())
-        self.register_buffer("high", high.clone())
         self.register_buffer("epsilon", torch.full((len(self.generators),), start, dtype=torch.float64))
 
     def step(self) -> None:
@@ -125,21 +128,80 @@ class DecayingEpsilon(TensorDictModuleBase):
             return tensordict
         key = self.in_keys[0]
         greedy = tensordict.get(key)
+        blocks = greedy.chunk(len(self.generators))
         actions = [
-            explore(
-                own,
-                self.low,
-                self.high,
-                epsilon,
-                noise=self.noise,
-                uniform_share=self.uniform_share,
-                generator=generator,
-            )
-            for own, epsilon, generator in zip(
-                greedy.reshape(len(self.generators), -1, greedy.shape[-1]),
-                self.epsilon.to(greedy.dtype),
-                self.generators,
-                strict=True,
-            )
+            self._explore(block, epsilon, generator)
+            for block, epsilon, generator in zip(blocks, self.epsilon, self.generators, strict=True)
         ]
-        return tensordict.set(key, torch.stack(actions).view_as(greedy))
+        return tensordict.set(key, torch.cat(actions))
+
+    @abstractmethod
+    def _explore(self, greedy: Tensor, epsilon: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Exploring actions of one run in place of its greedy ones."""
+
+
+class DecayingEpsilon(Exploration):
+    """Exploration of continuous actions; put it behind a policy in a TensorDictSequential.
+
+    Args:
+        low: [a], least actions.
+        high: [a], greatest actions.
+
+    Keyword Args:
+        noise, uniform_share: see :func:`explore`.
+        **options: of :class:`Exploration`.
+
+    Example:
+        >>> exploration = DecayingEpsilon(-torch.ones(3), torch.ones(3), start=1.0, decay=0.5)
+        >>> exploration.step()
+        >>> exploration.epsilon.tolist()
+        [0.5]
+    """
+
+    def __init__(
+        self, low: Tensor, high: Tensor, *, noise: float = 0.05, uniform_share: float = 0.2, **options: Any
+    ) -> None:
+        super().__init__(**options)
+        self.noise, self.uniform_share = noise, uniform_share
+        self.register_buffer("low", low.clone())
+        self.register_buffer("high", high.clone())
+
+    def _explore(self, greedy: Tensor, epsilon: Tensor, generator: torch.Generator | None) -> Tensor:
+        return explore(
+            greedy,
+            self.low,
+            self.high,
+            epsilon.to(greedy.dtype),
+            noise=self.noise,
+            uniform_share=self.uniform_share,
+            generator=generator,
+        )
+
+
+class DecayingEpsilonGreedy(Exploration):
+    """Exploration of a finite number of actions, given as whole numbers (``Categorical``).
+
+    Args:
+        actions: how many there are.
+
+    Keyword Args:
+        **options: of :class:`Exploration`.
+
+    Raises:
+        ValueError: fewer than one action.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> exploration = DecayingEpsilonGreedy(4, start=0.0, end=0.0)
+        >>> exploration(TensorDict({"action": torch.tensor([3, 0])}, [2]))["action"].tolist()
+        [3, 0]
+    """
+
+    def __init__(self, actions: int, **options: Any) -> None:
+        if actions < 1:
+            raise ValueError(f"actions must be at least 1, got {actions}")
+        super().__init__(**options)
+        self.actions = actions
+
+    def _explore(self, greedy: Tensor, epsilon: Tensor, generator: torch.Generator | None) -> Tensor:
+        return explore_actions(greedy, self.actions, epsilon.to(torch.float32), generator=generator)

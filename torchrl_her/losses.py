@@ -40,6 +40,30 @@ class ClampedTD0(TD0Estimator):
         return super().value_estimate(tensordict, *args, **kwargs).clamp(self.low, self.high)
 
 
+def clamped_td0(
+    gamma: float, reward_range: tuple[float, float], value_network: TensorDictModule | None = None
+) -> ClampedTD0:
+    """One-step targets within what rewards of a range allow; for ``loss.make_value_estimator``.
+
+    Args:
+        gamma: discount, in [0, 1).
+        reward_range: least and greatest reward.
+        value_network: gives the value of the next state; None for a loss that brings it along.
+
+    Raises:
+        ValueError: a discount outside of [0, 1).
+    """
+    if not 0.0 <= gamma < 1.0:
+        raise ValueError(f"gamma must be in [0, 1), got {gamma}")
+    least, greatest = reward_range
+    return ClampedTD0(
+        low=min(least, least / (1.0 - gamma)),  # paid once, if the episode ends there, or for ever
+        high=max(greatest, greatest / (1.0 - gamma)),
+        gamma=gamma,
+        value_network=value_network,
+    )
+
+
 class PenalisedDDPGLoss(DDPGLoss):
     """TorchRL's DDPG loss with a price on large actions, which keeps tanh off its flat ends.
 
@@ -94,18 +118,10 @@ def make_ddpg_loss(
         >>> round(loss.value_estimator.low), round(loss.value_estimator.high)
         (-50, 0)
     """
-    if not 0.0 <= gamma < 1.0:
-        raise ValueError(f"gamma must be in [0, 1), got {gamma}")
     loss = PenalisedDDPGLoss(
         actor, critic, delay_actor=True, delay_value=True, action_penalty=action_penalty, reduction=reduction
     )
-    least, greatest = reward_range
-    estimator = ClampedTD0(
-        low=min(least, least / (1.0 - gamma)),  # paid once, if the episode ends there, or for ever
-        high=max(greatest, greatest / (1.0 - gamma)),
-        gamma=gamma,
-        value_network=loss.actor_critic,
-    )
+    estimator = clamped_td0(gamma, reward_range, loss.actor_critic)
     estimator.set_keys(value="state_action_value")
     loss.make_value_estimator(estimator)
     return loss
@@ -144,7 +160,7 @@ class LossLearner:
     gradient that it would have alone.
 
     Args:
-        loss: its ``loss_*`` outputs are summed; each of them must reach networks of its own.
+        loss: its outputs that begin with ``loss`` are summed; each of them must reach networks of its own.
         optimiser: over the loss module's parameters; must treat each number by itself, as Adam does.
         target: moves the target networks; None for a loss without them.
         max_grad_norm: the gradients of each network of each run are clipped to this norm, apart.
@@ -191,7 +207,7 @@ class LossLearner:
         losses = {
             key: value.reshape(self.runs, -1).mean(1)
             for key, value in output.items()
-            if key.startswith("loss_")
+            if key.startswith("loss")
         }
         self.optimiser.zero_grad(set_to_none=True)
         torch.stack(list(losses.values())).sum().backward()

@@ -65,7 +65,8 @@ class StackedBatchNorm(nn.Module):
         return self.norm(flat).view(rows, runs, width).transpose(0, 1)
 
 
-def _layer(inputs: int, outputs: int, *, runs: int, normalise: bool) -> nn.Sequential:
+def hidden_layer(inputs: int, outputs: int, *, runs: int = 1, normalise: bool = False) -> nn.Sequential:
+    """A stacked linear layer and a ReLU, with batch normalisation between them if asked for."""
     norm = [StackedBatchNorm(outputs, runs=runs)] if normalise else []
     return nn.Sequential(StackedLinear(inputs, outputs, runs=runs), *norm, nn.ReLU())
 
@@ -88,7 +89,7 @@ class ActorNet(nn.Module):
         super().__init__()
         self.runs = runs
         widths = [inputs, hidden, hidden, hidden]
-        layers = [_layer(widths[i], widths[i + 1], runs=runs, normalise=False) for i in range(3)]
+        layers = [hidden_layer(widths[i], widths[i + 1], runs=runs) for i in range(3)]
         self.layers = nn.Sequential(
             *layers, StackedLinear(hidden, actions, runs=runs, bound=_LAST_LAYER), nn.Tanh()
         )
@@ -96,7 +97,7 @@ class ActorNet(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         """[..., widths] of the inputs to [..., actions]."""
         x = torch.cat(inputs, -1)
-        return self.layers(_by_run(x, self.runs)).view(*x.shape[:-1], -1)
+        return self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
 
 
 class CriticNet(nn.Module):
@@ -120,22 +121,22 @@ class CriticNet(nn.Module):
         super().__init__()
         self.runs = runs
         norm = [StackedBatchNorm(inputs, runs=runs)] if normalise else []
-        self.first = nn.Sequential(*norm, _layer(inputs, hidden, runs=runs, normalise=normalise))
+        self.first = nn.Sequential(*norm, hidden_layer(inputs, hidden, runs=runs, normalise=normalise))
         self.rest = nn.Sequential(
-            _layer(hidden + actions, hidden, runs=runs, normalise=normalise),
-            _layer(hidden, hidden, runs=runs, normalise=normalise),
+            hidden_layer(hidden + actions, hidden, runs=runs, normalise=normalise),
+            hidden_layer(hidden, hidden, runs=runs, normalise=normalise),
             StackedLinear(hidden, 1, runs=runs, bound=_LAST_LAYER),
         )
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """[..., widths] of the inputs, the action last, to [..., 1]."""
         *seen, action = inputs
-        hidden = self.first(_by_run(torch.cat(seen, -1), self.runs))
-        return self.rest(torch.cat((hidden, _by_run(action, self.runs)), -1)).view(*action.shape[:-1], 1)
+        hidden = self.first(by_run(torch.cat(seen, -1), self.runs))
+        return self.rest(torch.cat((hidden, by_run(action, self.runs)), -1)).view(*action.shape[:-1], 1)
 
 
-def _by_run(x: Tensor, runs: int) -> Tensor:
-    """[..., width] to [R, rows, width]."""
+def by_run(x: Tensor, runs: int) -> Tensor:
+    """Rows of R runs, run after run: [..., width] to [R, rows, width]."""
     return x.reshape(runs, -1, x.shape[-1])
 
 

@@ -6,8 +6,15 @@ from collections.abc import Sequence
 
 import torch
 
+from torchrl_her_envs.small_worlds import BitFlip, Chain, SmallWorld, TreasureHunt
 from torchrl_her_envs.task import TASKS, Task, WorldConfig
 from torchrl_her_envs.throwing import ThrowingEnv
+
+SMALL_WORLDS: dict[str, type[SmallWorld]] = {
+    "bit_flip": BitFlip,
+    "treasure_hunt": TreasureHunt,
+    "chain": Chain,
+}
 
 
 def get_task(name: str) -> Task:

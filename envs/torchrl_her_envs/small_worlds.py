@@ -11,6 +11,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from numbers import Integral
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -115,6 +116,8 @@ class SmallWorld(EnvBase):
     Raises:
         ValueError: a number out of its range, or worlds that cannot be shared out among the seeds.
     """
+
+    summary: ClassVar[str]  # one line for people
 
     def __init__(
         self,
@@ -329,6 +332,8 @@ class BitFlip(SmallWorld):
         ([-1.0, -1.0, -1.0], False)
     """
 
+    summary = "flip bits until they are the ones that are wanted"
+
     def __init__(
         self,
         bits: int,
@@ -397,6 +402,8 @@ class TreasureHunt(SmallWorld):
         >>> steps["next", "terminated"][:, -1].any().item()
         True
     """
+
+    summary = "walk on a line from 0 to 100 to a treasure"
 
     def __init__(
         self,
@@ -469,6 +476,8 @@ class Chain(SmallWorld):
         >>> steps["next", "reward"][0].flatten().tolist()
         [-1.0, -1.0, -1.0, 0.0]
     """
+
+    summary = "walk a chain from its first place to its last"
 
     def __init__(
         self,

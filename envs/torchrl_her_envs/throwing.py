@@ -137,6 +137,11 @@ class ThrowingEnv(EnvBase):
         """Where desired goals come from, in the coordinates that the agent sees."""
         return self._goals
 
+    @property
+    def max_steps(self) -> int:
+        """Steps after which an episode is truncated."""
+        return self.world.max_steps
+
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """The reward of having achieved one goal when another was desired.
 

@@ -10,7 +10,7 @@ Instructive = Literal["simultaneous", "sequential"]
 
 @dataclass(frozen=True, kw_only=True)
 class Algorithm:
-    """One way to use hindsight on top of DDPG.
+    """One way to use hindsight on top of a learner.
 
     Args:
         name: the name that recipes take.
@@ -33,7 +33,7 @@ class Algorithm:
 ALGORITHMS: dict[str, Algorithm] = {
     algorithm.name: algorithm
     for algorithm in (
-        Algorithm(name="ddpg", hindsight=False, summary="DDPG without hindsight"),
+        Algorithm(name="no_hindsight", hindsight=False, summary="the learner alone"),
         Algorithm(name="her", summary="hindsight experience replay"),
         Algorithm(
             name="filtered_her", filter_achieved=True, summary="HER without goals that were already achieved"

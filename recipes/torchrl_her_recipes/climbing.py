@@ -8,16 +8,16 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_her import enter_layer, evaluate, success
-from torchrl_her_envs import base_env
+from torchrl_her_envs import goal_env
 from torchrl_her_recipes.curricula import Climb
 from torchrl_her_recipes.parts import Parts, eval_seeds
 
 
 def play_greedily(parts: Parts, env: EnvBase, epoch: int) -> TensorDictBase:
     """Greedy episodes of each run, with starts and goals of their own in each epoch."""
-    task = base_env(env)
+    task = goal_env(env)
     task.set_seeds(eval_seeds(parts.recipe, epoch))
-    return evaluate(env, parts.policy, max_steps=task.world.max_steps)
+    return evaluate(env, parts.policy, max_steps=task.max_steps)
 
 
 def layer_success(parts: Parts, climb: Climb, rollout: TensorDictBase, epoch: int) -> Tensor:

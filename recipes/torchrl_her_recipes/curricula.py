@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import CatTensors, Compose, EnvBase, TransformedEnv
 
 from torchrl_her import Curriculum, CurriculumLayer, CurriculumProgress, StateToObs, ZeroPad
-from torchrl_her_envs import ThrowingEnv
+from torchrl_her_envs import GoalEnv, ThrowingEnv
+
+_STATE = ("observation", "desired_goal")  # what the state is made of, in this order
 
 
 def get_curriculum(env: ThrowingEnv) -> Curriculum:
@@ -50,6 +54,39 @@ def get_curriculum(env: ThrowingEnv) -> Curriculum:
     return Curriculum(layers, seen + 6)
 
 
+def read_curriculum(layers: object, env: GoalEnv) -> Curriculum:
+    """A curriculum from plain values, for an environment whose state they index.
+
+    The state is the observation with the desired goal behind it.
+
+    Args:
+        layers: a list of mappings with the options of :class:`~torchrl_her.CurriculumLayer`.
+        env: tells how wide the state is.
+
+    Raises:
+        ValueError: it is no such list, or a layer that cannot be.
+
+    Example:
+        >>> from torchrl_her_envs import make_env
+        >>> env = make_env("hand_v1")
+        >>> full = {"name": "all", "observation": list(range(9)), "achieved_goal": [5, 6]}
+        >>> layers = [full | {"desired_goal": [9, 10], "threshold": 0.05}]
+        >>> len(read_curriculum(layers, env))
+        1
+    """
+    if not isinstance(layers, Sequence) or isinstance(layers, str):
+        raise ValueError(f"curriculum must be a list of layers, got {type(layers).__name__}")
+    width = sum(env.observation_spec[key].shape[-1] for key in _STATE)
+    return Curriculum([_read_layer(layer) for layer in layers], width)
+
+
+def _read_layer(options: Any) -> CurriculumLayer:
+    try:
+        return CurriculumLayer(**options)
+    except TypeError as error:  # missing or unknown options, or no options at all
+        raise ValueError(f"{options!r} is no layer of a curriculum: {error}") from error
+
+
 @dataclass
 class Climb:
     """The curriculum of some runs, and where they are in it.
@@ -75,7 +112,10 @@ class Climb:
 def in_layers(env: EnvBase, progress: CurriculumProgress) -> TransformedEnv:
     """An environment as the layers of its runs see it, with the networks' input."""
     curriculum = progress.curriculum
-    return TransformedEnv(env, Compose(StateToObs(curriculum, progress), ZeroPad(curriculum, progress)))
+    transforms = [StateToObs(curriculum, progress), ZeroPad(curriculum, progress)]
+    if "state" not in env.observation_spec:
+        transforms.insert(0, CatTensors(_STATE, "state", del_keys=False, sort=False))
+    return TransformedEnv(env, Compose(*transforms))
 
 
 def at_the_top(curriculum: Curriculum, runs: int) -> CurriculumProgress:

@@ -61,10 +61,10 @@ def histograms(buffers: Sequence[TensorDictReplayBuffer]) -> list[GoalHistogram]
     return [own for own in weights if isinstance(own, GoalHistogram)]
 
 
-def goal_map(buffers: Sequence[TensorDictReplayBuffer], target: torch.Tensor) -> GoalMap | None:
+def goal_map(buffers: Sequence[TensorDictReplayBuffer], target: torch.Tensor | None) -> GoalMap | None:
     """The map of a run's buffers and its q* [cells]; None where nothing counts virtual goals."""
     counted = histograms(buffers)
-    if not counted:
+    if not counted or target is None:
         return None
     shape = counted[0].grid.shape
     counts = torch.stack([own.counts.view(shape) for own in counted])

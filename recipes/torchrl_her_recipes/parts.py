@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -19,33 +19,29 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
 from torchrl_her import (
+    Curriculum,
     CurriculumProgress,
-    DecayingEpsilon,
     EnvReward,
+    Exploration,
     FusedDDPGLearner,
     HERWriter,
     Instructiveness,
     Learner,
     LossLearner,
-    StackedLinear,
     Trainer,
     ZeroPad,
     can_fuse,
     is_plain_adam,
-    make_actor,
-    make_critic,
-    make_ddpg_loss,
-    make_target_updater,
     set_layer_goals,
-    stack_runs,
-    zero_unused_inputs,
 )
-from torchrl_her_envs import ThrowingEnv, base_env, make_env
+from torchrl_her_envs import ThrowingEnv, goal_env, reward_range
+from torchrl_her_recipes.agents import make_agent
 from torchrl_her_recipes.algorithms import get_algorithm
-from torchrl_her_recipes.curricula import Climb, at_the_top, get_curriculum, in_layers
+from torchrl_her_recipes.curricula import Climb, at_the_top, get_curriculum, in_layers, read_curriculum
 from torchrl_her_recipes.goal_map import histograms
-from torchrl_her_recipes.goal_weights import goal_target, make_goal_weights
+from torchrl_her_recipes.goal_weights import GoalSpace, goal_space, make_goal_weights
 from torchrl_her_recipes.recipe import Recipe
+from torchrl_her_recipes.worlds import make_worlds
 
 if TYPE_CHECKING:
     from torchrl_her_recipes.running import RunResult
@@ -78,8 +74,10 @@ class Parts:
         optimiser: over the loss module's parameters.
         target: moves the target networks.
         climb: the curriculum of the runs; None without one.
-        goal_target: q* [cells] of the task's goals, which the divergence of virtual goals is measured to.
+        goal_target: q* [cells] of the task's goals, which the divergence of virtual goals is measured to;
+            None where they are not counted.
         generators: of each run's random numbers in Python's hands (exploration, relabelling, sampling).
+        rewards: of a missed goal and of an achieved one.
     """
 
     recipe: Recipe
@@ -87,15 +85,16 @@ class Parts:
     eval_env: EnvBase
     actor: TensorDictModule
     critic: TensorDictModule | None
-    exploration: DecayingEpsilon
+    exploration: Exploration
     policy: TensorDictModuleBase
     collector: BaseCollector
     buffers: list[TensorDictReplayBuffer]
     loss: LossModule
     optimiser: torch.optim.Optimizer
     target: TargetNetUpdater | None
-    goal_target: Tensor
+    goal_target: Tensor | None
     generators: list[torch.Generator]
+    rewards: tuple[float, float] = (-1.0, 0.0)
     climb: Climb | None = None
 
     @property
@@ -165,75 +164,63 @@ class Parts:
 
 def build_parts(recipe: Recipe) -> Parts:
     """Makes the parts that a recipe asks for."""
-    task = make_envs(recipe, recipe.num_envs, recipe.seeds)
-    climb = make_climb(recipe, task)
+    task = make_worlds(recipe, recipe.num_envs, recipe.seeds)
+    curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
+    climb = None if curriculum is None else make_climb(recipe, curriculum)
     env = task if climb is None else in_layers(task, climb.progress)
     generators = [torch.Generator().manual_seed(seed) for seed in recipe.seeds]
-    actor, critic = make_networks(recipe, env)
-    exploration = DecayingEpsilon(
-        env.action_spec.low[0],
-        env.action_spec.high[0],
-        start=recipe.epsilon_start,
-        decay=recipe.epsilon_decay,
-        end=recipe.epsilon_end,
-        generators=generators,
-    )
-    policy = TensorDictSequential(actor, exploration)
-    loss = make_ddpg_loss(
-        actor, critic, gamma=recipe.gamma, action_penalty=recipe.action_penalty, reduction="none"
-    )
+    # A curriculum gives the rewards of its layers, whatever the environment's own are.
+    rewards = reward_range(goal_env(task)) if curriculum is None else (-1.0, 0.0)
+    agent = make_agent(recipe, env, generators, rewards=rewards, curriculum=curriculum)
     return Parts(
         recipe=recipe,
         env=env,
         eval_env=make_task_env(recipe, recipe.eval_episodes, eval_seeds(recipe, 0)),
-        actor=actor,
-        critic=critic,
-        exploration=exploration,
-        policy=policy,
-        collector=make_collector(recipe, env, policy),
+        collector=make_collector(recipe, env, agent.policy),
         buffers=[
-            make_buffer(recipe, task, generator, climb=climb, run=run)
+            make_buffer(recipe, task, generator, rewards=rewards, space=space, climb=climb, run=run)
             for run, generator in enumerate(generators)
         ],
-        loss=loss,
-        optimiser=torch.optim.Adam(loss.parameters(), lr=recipe.learning_rate, fused=True),
-        target=make_target_updater(loss, tau=recipe.tau, hard_interval=recipe.hard_update_interval),
-        goal_target=goal_target(recipe, task),
+        goal_target=None if space is None else space.target,
         generators=generators,
+        rewards=rewards,
         climb=climb,
-    )
-
-
-def make_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int]) -> ThrowingEnv:
-    """Worlds of the recipe's task: ``num_envs`` for each seed."""
-    return make_env(
-        recipe.task,
-        num_envs=num_envs * len(seeds),
-        seed=seeds,
-        threshold=recipe.threshold,
-        dtype=getattr(torch, recipe.dtype),
+        **vars(agent),
     )
 
 
 def make_task_env(recipe: Recipe, num_envs: int, seeds: Sequence[int]) -> EnvBase:
     """The same as a trained policy sees it: at the top of the curriculum, if there is one."""
-    env = make_envs(recipe, num_envs, seeds)
-    if not get_algorithm(recipe.algo).curriculum:
-        return env
-    return in_layers(env, at_the_top(get_curriculum(env), len(seeds)))
+    env = make_worlds(recipe, num_envs, seeds)
+    curriculum = make_curriculum(recipe, env)
+    return env if curriculum is None else in_layers(env, at_the_top(curriculum, len(seeds)))
 
 
-def make_climb(recipe: Recipe, env: ThrowingEnv) -> Climb | None:
-    """The curriculum that the recipe asks for, all runs in its first layer."""
+def make_curriculum(recipe: Recipe, env: EnvBase) -> Curriculum | None:
+    """The curriculum that the recipe asks for: its own layers, or those of a throwing task.
+
+    Raises:
+        ValueError: the task has no curriculum of its own, or the recipe's layers cannot be.
+    """
     if not get_algorithm(recipe.algo).curriculum:
         return None
+    worlds = goal_env(env)
+    if recipe.curriculum is not None:
+        return read_curriculum(recipe.curriculum, worlds)
+    if not isinstance(worlds, ThrowingEnv):
+        raise ValueError(f"{recipe.task} has no curriculum: give its layers as curriculum=FILE.yaml")
+    return get_curriculum(worlds)
+
+
+def make_climb(recipe: Recipe, curriculum: Curriculum) -> Climb:
+    """The recipe's runs in a curriculum, all in its first layer."""
     progress = CurriculumProgress(
-        get_curriculum(env),
+        curriculum,
         runs=recipe.num_runs,
         window=recipe.window,
         success_threshold=recipe.success_threshold,
     )
-    layer_env = make_envs(recipe, recipe.eval_episodes, eval_seeds(recipe, 0))
+    layer_env = make_worlds(recipe, recipe.eval_episodes, eval_seeds(recipe, 0))
     return Climb(progress, in_layers(layer_env, progress))
 
 
@@ -251,22 +238,26 @@ def make_collector(recipe: Recipe, env: EnvBase, policy: TensorDictModuleBase) -
 
 def make_buffer(
     recipe: Recipe,
-    env: ThrowingEnv,
+    env: EnvBase,
     generator: torch.Generator,
     *,
+    rewards: tuple[float, float] = (-1.0, 0.0),
+    space: GoalSpace | None = None,
     climb: Climb | None = None,
     run: int = 0,
 ) -> TensorDictReplayBuffer:
     """The replay buffer of one run, with its hindsight writer and its sampler."""
-    algorithm = get_algorithm(recipe.algo)
+    algorithm, worlds = get_algorithm(recipe.algo), goal_env(env)
+    weights = make_goal_weights(recipe, space) if space is not None and algorithm.hindsight else None
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(recipe.buffer_size),
         writer=HERWriter(
-            EnvReward(env.compute_reward, env.compute_terminated),
+            EnvReward(worlds.compute_reward, worlds.compute_terminated),
             k=recipe.k if algorithm.hindsight else 0,
             strategy=recipe.strategy,  # type: ignore[arg-type]
             filter_achieved=algorithm.filter_achieved,
-            weights=make_goal_weights(recipe, env) if algorithm.hindsight else None,
+            achieved_reward=rewards[1],
+            weights=weights,
             exclude=_NOT_STORED,
         ),
         sampler=_make_sampler(recipe),
@@ -277,36 +268,6 @@ def make_buffer(
         set_layer_goals(buffer.writer, climb.progress.layer_of(run))
         buffer.append_transform(ZeroPad(climb.curriculum, climb.progress, run=run))
     return buffer
-
-
-def make_networks(recipe: Recipe, env: EnvBase) -> tuple[TensorDictModule, TensorDictModule]:
-    """The actor and the critic; the weights of each run depend on its own seed alone."""
-    climbs = get_algorithm(recipe.algo).curriculum
-    keys = ("input",) if climbs else ("observation", "desired_goal")
-    widths = [env.observation_spec[key].shape[-1] for key in keys]
-    actions, dtype = env.action_spec.shape[-1], getattr(torch, recipe.dtype)
-
-    def make(runs: int) -> tuple[TensorDictModule, TensorDictModule]:
-        actor = make_actor(widths, actions, hidden=recipe.hidden, runs=runs, in_keys=keys)
-        critic = make_critic(
-            widths, actions, hidden=recipe.hidden, normalise=recipe.batch_norm, runs=runs, in_keys=keys
-        )
-        return actor.to(dtype), critic.to(dtype)
-
-    with torch.random.fork_rng(devices=[]):
-        alone = []
-        for seed in recipe.seeds:
-            torch.manual_seed(seed)
-            alone.append(make(1))
-        actor, critic = make(recipe.num_runs)
-    actor.load_state_dict(stack_runs([own.state_dict() for own, _ in alone]))
-    critic.load_state_dict(stack_runs([own.state_dict() for _, own in alone]))
-    if climbs:
-        used = get_curriculum(base_env(env)).first_inputs
-        for network, alpha in ((actor, recipe.alpha_actor), (critic, recipe.alpha_critic)):
-            first = next(module for module in network.modules() if isinstance(module, StackedLinear))
-            first.weight.data.copy_(zero_unused_inputs(first.weight.data, used, alpha=alpha))
-    return actor, critic
 
 
 def eval_seeds(recipe: Recipe, epoch: int) -> list[int]:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
 
 from torchrl_her.virtual_goals import check_strategy
-from torchrl_her_envs import get_task
 from torchrl_her_recipes.algorithms import get_algorithm
+from torchrl_her_recipes.worlds import check_task
 
 if TYPE_CHECKING:
     from torchrl_her_recipes.parts import Parts
 
 _SEEDS = 1 << 31  # so that those of evaluations, which are made of it, have room
 _WORDS = {
+    "learner": ("auto", "ddpg", "td3", "sac", "dqn"),
     "sampler": ("prioritised", "uniform"),
     "dtype": ("float32", "float64"),
     "compile": ("auto", "always", "never"),
@@ -39,8 +44,10 @@ class Recipe:
         (0.98, 614400)
     """
 
-    task: str = "hand_v0"  # see `torchrl-her list`
-    algo: str = "filtered_her"  # likewise
+    task: str = "hand_v0"  # see `torchrl-her list`, or gym:ID for any environment of gymnasium with goals
+    task_options: Any = None  # a mapping: options of a small world, or for gymnasium.make
+    algo: str = "filtered_her"  # see `torchrl-her list`
+    learner: str = "auto"  # ddpg, td3, sac or dqn; auto: ddpg, or dqn where actions are counted
     seed: int = 0
     num_runs: int = 1  # independent runs side by side; run i has the seed ``seed + i``
 
@@ -62,6 +69,7 @@ class Recipe:
     ibs_floor: float = 0.002  # the least weight of a goal, as a share of the greatest
     ibs_cells: int = 20  # of the grid over the screen, in each direction
 
+    curriculum: Any = None  # layers, as a list of their options or a YAML file of it; None: the task's own
     window: int = 20  # greedy episodes whose mean success ends a layer of a curriculum
     success_threshold: float = 0.9  # that mean
     layer_epsilon: float = 1.0  # where exploration starts again at a change of layer
@@ -89,14 +97,19 @@ class Recipe:
 
     eval_episodes: int = 100
     checkpoint_interval: int = 10  # epochs
+    keep_checkpoints: int = 2  # the newest, and those before it in case that it gets damaged
     threads: int = 1  # of torch: small networks are fastest with one
     compile: str = "auto"  # the gradient step: always, never, or auto: if the run is long enough to win by it
     dtype: str = "float32"  # of observations and networks
 
     def __post_init__(self) -> None:
-        get_task(self.task)
+        check_task(self.task)
         get_algorithm(self.algo)
         check_strategy(self.strategy)
+        if self.task_options is not None and not isinstance(self.task_options, Mapping):
+            raise ValueError(f"task_options must be a mapping of options, got {self.task_options!r}")
+        if isinstance(self.curriculum, str):
+            object.__setattr__(self, "curriculum", _read_layers(Path(self.curriculum)))
         for name, words in _WORDS.items():
             if getattr(self, name) not in words:
                 raise ValueError(f"{name} must be one of {', '.join(words)}, got {getattr(self, name)!r}")
@@ -160,6 +173,13 @@ class Recipe:
         return cls(**values)  # type: ignore[arg-type]
 
 
+def _read_layers(path: Path) -> Any:
+    """The layers that a YAML file lists, so that the recipe holds all of itself."""
+    if not path.is_file():
+        raise ValueError(f"curriculum must be a list of layers or a YAML file of one, got {str(path)!r}")
+    return yaml.safe_load(path.read_text())
+
+
 _AT_LEAST = {
     "seed": 0,
     "num_runs": 1,
@@ -185,6 +205,7 @@ _AT_LEAST = {
     "hard_update_interval": 0,
     "eval_episodes": 1,
     "checkpoint_interval": 1,
+    "keep_checkpoints": 1,
     "threads": 1,
 }
 _POSITIVE = (

@@ -14,7 +14,7 @@ from torchrl_her import GoalHistogram, Instructiveness
 from torchrl_her_envs import TASKS, make_env
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.goal_map import GoalMap
-from torchrl_her_recipes.goal_weights import goal_target, make_goal_weights
+from torchrl_her_recipes.goal_weights import goal_space, make_goal_weights
 
 from .small import small
 
@@ -28,7 +28,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_has_a_target(task: str) -> None:
-    target = goal_target(small(task=task), make_env(task))
+    target = goal_space(small(task=task), make_env(task)).target
     assert target.shape == (400,)
     assert float(target.sum()) == pytest.approx(1.0)
     greatest = int(target.argmax())
@@ -47,7 +47,8 @@ def test_every_task_has_a_target(task: str) -> None:
     ],
 )
 def test_each_algorithm_has_its_weights(algo: str, kind: type, subtract: bool | None) -> None:
-    weights = make_goal_weights(small(algo=algo), make_env("hand_v0"))
+    recipe = small(algo=algo)
+    weights = make_goal_weights(recipe, goal_space(recipe, make_env("hand_v0")))
     assert type(weights) is kind
     assert getattr(weights, "subtract", None) is subtract
 
@@ -58,7 +59,8 @@ def test_sigma_is_a_share_of_the_screen_and_smaller_beside_the_wall() -> None:
         ("hand_wall_v0", {}, 0.2),
         ("hand_wall_v0", {"ibs_sigma": 0.3}, 0.6),
     ):
-        weights = make_goal_weights(small(task=task, algo="her_ibs", **options), make_env(task))
+        recipe = small(task=task, algo="her_ibs", **options)
+        weights = make_goal_weights(recipe, goal_space(recipe, make_env(task)))
         assert isinstance(weights, Instructiveness)
         assert weights.final_sigma == pytest.approx(sigma)
         assert weights.sigma == pytest.approx(3 * sigma)
@@ -89,7 +91,7 @@ def test_sigma_shrinks_each_epoch_and_divergence_is_logged(finished: Path) -> No
 
 
 def test_without_hindsight_there_is_nothing_to_tell(tmp_path: Path) -> None:
-    small(algo="ddpg").build().run(tmp_path / "run", progress=False)
+    small(algo="no_hindsight").build().run(tmp_path / "run", progress=False)
     assert "kl" not in pd.read_csv(tmp_path / "run" / "metrics.csv").columns
     assert not (tmp_path / "run" / "virtual_goals.png").exists()
 
@@ -114,7 +116,7 @@ def test_plot_goals_draws_them_again(
 
 
 def test_a_run_without_a_map_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    small(algo="ddpg", epochs=1).build().run(tmp_path / "run", progress=False)
+    small(algo="no_hindsight", epochs=1).build().run(tmp_path / "run", progress=False)
     assert main(["plot", "goals", str(tmp_path / "run")]) == 2
     assert (
         capsys.readouterr().err.strip().endswith("has no goal_map.npz: the run has written no virtual goals")

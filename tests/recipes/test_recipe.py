@@ -23,7 +23,7 @@ from .small import small
     ("options", "message"),
     [
         ({"task": "hand_v9"}, "unknown task 'hand_v9'; the tasks are hand_reach, hand_v0"),
-        ({"algo": "sarsa"}, "unknown algorithm 'sarsa'; the algorithms are ddpg, her, filtered_her"),
+        ({"algo": "sarsa"}, "unknown algorithm 'sarsa'; the algorithms are no_hindsight, her, filtered_her"),
         ({"strategy": "past"}, "unknown goal strategy 'past'; the strategies are future, final, episode"),
         ({"sampler": "best"}, "sampler must be one of prioritised, uniform, got 'best'"),
         ({"threshold": -0.1}, "threshold must be above 0, got -0.1"),
@@ -56,7 +56,7 @@ def test_every_algorithm_runs_with_every_sampler(algo: str, sampler: str) -> Non
     result = parts.run(progress=False)
     assert isinstance(parts.buffer.sampler, PrioritizedSampler if sampler == "prioritised" else RandomSampler)
     assert len(result.rows) == 2
-    assert (result.rows[-1]["rows_virtual"] > 0) == (algo != "ddpg")
+    assert (result.rows[-1]["rows_virtual"] > 0) == (algo != "no_hindsight")
     filtered = {"filtered_her", "filtered_her_ibs", "cher", "cher_ibs"}
     assert parts.buffer.writer.filter_achieved == (algo in filtered)
 

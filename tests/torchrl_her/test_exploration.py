@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_her import DecayingEpsilon, explore, make_actor
+from torchrl_her import DecayingEpsilon, DecayingEpsilonGreedy, explore, explore_actions, make_actor
 from torchrl_her_envs import make_env
 
 ROWS = 100_000  # a share has a standard deviation of at most 0.0016: all bounds below are six of them
@@ -228,3 +228,29 @@ def test_behind_an_actor_in_a_collector() -> None:
     module.restart(0.0)
     assert share_of_greedy_actions() == 1.0
     collector.shutdown()
+
+
+# A finite number of actions
+
+
+def test_counted_actions_explore_with_probability_epsilon() -> None:
+    greedy = torch.full((20_000,), 2)
+    actions = explore_actions(greedy, 4, 0.4, generator=torch.Generator().manual_seed(0))
+    assert float((actions != 2).float().mean()) == pytest.approx(0.4 * 3 / 4, abs=0.01)
+    assert actions.unique().tolist() == [0, 1, 2, 3]
+
+
+def test_counted_actions_of_each_run_come_from_its_own_generator() -> None:
+    def explored(seeds: list[int]) -> torch.Tensor:
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        exploration = DecayingEpsilonGreedy(50, start=1.0, generators=generators)
+        return exploration(
+            TensorDict({"action": torch.zeros(6 * len(seeds), dtype=torch.int64)}, [6 * len(seeds)])
+        )["action"]
+
+    assert torch.equal(explored([3, 5]), torch.cat([explored([3]), explored([5])]))
+
+
+def test_no_actions_are_refused() -> None:
+    with pytest.raises(ValueError, match="actions must be at least 1, got 0"):
+        DecayingEpsilonGreedy(0)
