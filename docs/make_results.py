@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-import statistics
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,22 +22,22 @@ from torchrl_her_envs import make_env
 from torchrl_her_recipes.goal_map import GoalMap
 from torchrl_her_recipes.plots import draw_goals, plot_comparison
 from torchrl_her_recipes.run_folder import RunFolder
-from torchrl_her_recipes.studies import is_done
+from torchrl_her_recipes.studies import draw_study, is_done, load_study
+from torchrl_her_recipes.study_results import at_the_end
 
 HERE = Path(__file__).parent
-COLOURS = {
-    "her": "#dd6b20",
-    "her_ibs": "#38a169",
-    "filtered_her": "#805ad5",
-    "filtered_her_ibs": "#2b6cb0",
-    "her_ibs_sequential": "#718096",
-    "cher": "#2b6cb0",
-    "cher_ibs": "#38a169",
-    "unfiltered_cher": "#d53f8c",
-    "unfiltered_cher_ibs": "#718096",
-}
-COLUMNS = ("run", "epoch", "frames", "updates", "success", "kl", "layer", "q_bias")
-LAST = 3  # evaluations whose mean is a run's success at the end
+COLUMNS = (
+    "run",
+    "epoch",
+    "frames",
+    "updates",
+    "success",
+    "kl",
+    "layer",
+    "q_bias",
+    "rows_real_positive",
+    "rows_useful_virtual_positive",
+)
 
 Rows = list[dict[str, float]]
 
@@ -53,12 +53,12 @@ class Study:
 
 STUDIES = {
     "v0": Study(tasks=("hand_v0", "robot_v0", "hand_wall_v0"), algorithms=("her", "her_ibs")),
-    "ibs_v0": Study(
+    "ibs": Study(
         tasks=("hand_v0", "robot_v0", "hand_wall_v0"),
         algorithms=("her", "her_ibs", "her_ibs_sequential"),
         goals=True,
     ),
-    "ibs_v2": Study(
+    "bias": Study(
         tasks=("hand_v2", "robot_v2", "hand_wall_v2"),
         algorithms=("her", "her_ibs", "filtered_her", "filtered_her_ibs"),
         goals=True,
@@ -67,15 +67,10 @@ STUDIES = {
         tasks=("hand_v1", "hand_wall_v1", "robot_v1"),
         algorithms=("her", "filtered_her", "cher", "cher_ibs", "unfiltered_cher", "unfiltered_cher_ibs"),
     ),
+    "climb": Study(tasks=("hand_v1", "hand_wall_v1", "robot_v1"), algorithms=("cher",)),
     "draws": Study(tasks=("hand_v0_1", "hand_v0_8", "hand_v0_64"), algorithms=("her",)),
 }
-
-
-def at_the_end(rows: Rows, name: str) -> list[float]:
-    """One metric of each run: the mean of its last evaluations."""
-    end, runs = rows[-1]["epoch"], sorted({row["run"] for row in rows})
-    recent = [row for row in rows if row["epoch"] > end - LAST]
-    return [statistics.mean(row[name] for row in recent if row["run"] == run) for run in runs]
+OPTIONS = ("window", "initialisation")
 
 
 def spread(values: Sequence[float], form: str) -> str:
@@ -113,7 +108,7 @@ def draw_success(runs: dict[tuple[str, str], RunFolder], path: Path) -> None:
     panels: dict[str, dict[str, Rows]] = {}
     for (task, algorithm), home in runs.items():
         panels.setdefault(task, {})[algorithm] = home.rows()
-    plot_comparison(panels, path, colours=COLOURS)
+    plot_comparison(panels, path)
 
 
 def draw_maps(study: Study, runs: dict[tuple[str, str], RunFolder], path: Path) -> None:
@@ -150,6 +145,17 @@ def write_data(study: str, runs: dict[tuple[str, str], RunFolder]) -> None:
                 writer.writerow(f"{row.get(name, float('nan')):.5g}" for name in columns)
 
 
+def make_options(name: str, folder: Path) -> None:
+    """The same for a study of one option: one panel, a curve for each value."""
+    study = load_study(name)
+    runs = {(label, study.name): RunFolder(folder / label) for label, _ in study.cells()}
+    if all(is_done(home) for home in runs.values()):
+        print(f"\n### {name}\n")
+        print_table(runs)
+        shutil.copy(draw_study(study, folder), HERE / "images" / f"{name}.png")
+        write_data(name, runs)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -165,6 +171,8 @@ def main() -> None:
             write_data(name, runs)
             if study.goals:
                 draw_maps(study, runs, HERE / "images" / f"{name}_goals.png")
+    for name in OPTIONS:
+        make_options(name, folder / name)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,20 @@ from torchrl_her_recipes.goal_map import GoalMap
 
 matplotlib.use("agg")
 
+Rows = Sequence[dict[str, float]]
+
+COLOURS = {  # of algorithms, the same in every picture
+    "no_hindsight": "#1a202c",
+    "her": "#dd6b20",
+    "her_ibs": "#38a169",
+    "her_ibs_sequential": "#718096",
+    "filtered_her": "#805ad5",
+    "filtered_her_ibs": "#2b6cb0",
+    "cher": "#c53030",
+    "cher_ibs": "#0bc5ea",
+    "unfiltered_cher": "#d53f8c",
+    "unfiltered_cher_ibs": "#975a16",
+}
 _COLOURS = ("#dd6b20", "#805ad5", "#2b6cb0", "#38a169", "#d53f8c", "#718096")
 _SCREEN = 300  # pixels of the picture behind a heat map
 
@@ -27,9 +41,13 @@ _PANELS = (
     ("rows_real_positive", "positive rewards, real rows", None),
     ("rows_useful_virtual_positive", "positive rewards, virtual rows that count", None),
 )
+_AXES = {name: (label, limits) for name, label, limits in _PANELS} | {
+    "q": ("Q of the start, return", None),
+    "rows_virtual_positive": ("positive rewards, virtual rows", None),
+}
 
 
-def plot_curves(rows: Sequence[dict[str, float]], path: Path, *, title: str = "") -> None:
+def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
     """Draws the curves of a run; of several ones the median, and the 33rd to 67th percentile.
 
     Args:
@@ -51,34 +69,45 @@ def plot_curves(rows: Sequence[dict[str, float]], path: Path, *, title: str = ""
     figure.savefig(path, dpi=110)
 
 
-def plot_comparison(
-    panels: Mapping[str, Mapping[str, Sequence[dict[str, float]]]],
-    path: Path,
-    *,
-    colours: Mapping[str, str] | None = None,
-) -> None:
+def plot_comparison(panels: Mapping[str, Mapping[str, Rows]], path: Path) -> None:
     """Draws success over environment steps: medians, and the 33rd to 67th percentile of the runs.
 
     Args:
         panels: title of each panel to the curves in it, label to table of metrics.
         path: of the picture.
-        colours: of labels; others take their turn.
     """
-    chosen = colours or {}
     figure = Figure(figsize=(1.0 + 4.2 * len(panels), 3.8), layout="constrained")
     grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, (title, curves) in zip(grid, panels.items(), strict=True):
-        for index, (label, rows) in enumerate(curves.items()):
-            colour = chosen.get(label, _COLOURS[index % len(_COLOURS)])
-            draw_curve(axes, rows, "success", colour=colour, label=label)
-        axes.set(title=title, xlabel="environment steps of each run", ylim=(-0.02, 1.02))
-        axes.grid(alpha=0.3)
+        draw_curves(axes, curves, "success", colours(list(curves)))
+        axes.set(title=title, xlabel="environment steps of each run")
         axes.legend(loc="upper left", fontsize=8)
     grid[0].set_ylabel("success (median, 33rd to 67th percentile)")
     figure.savefig(path, dpi=110)
 
 
-def layer_changes(rows: Sequence[dict[str, float]]) -> list[float]:
+def colours(labels: Sequence[str]) -> dict[str, str]:
+    """A colour for each label: algorithms have their own, others take their turn.
+
+    Example:
+        >>> colours(["her", "window=20"])
+        {'her': '#dd6b20', 'window=20': '#805ad5'}
+    """
+    return {label: COLOURS.get(label, _COLOURS[index % len(_COLOURS)]) for index, label in enumerate(labels)}
+
+
+def draw_curves(axes: Axes, curves: Mapping[str, Rows], name: str, palette: Mapping[str, str]) -> None:
+    """One metric of several algorithms over environment steps, on given axes."""
+    for label, rows in curves.items():
+        draw_curve(axes, rows, name, colour=palette[label], label=label)
+    label, limits = _AXES[name]
+    axes.set_ylabel(label)
+    axes.grid(alpha=0.3)
+    if limits is not None:
+        axes.set_ylim(*limits)
+
+
+def layer_changes(rows: Rows) -> list[float]:
     """After how many frames runs went on to another layer of their curriculum: one entry each."""
     last: dict[float, dict[str, float]] = {}
     changes = []
@@ -92,20 +121,26 @@ def layer_changes(rows: Sequence[dict[str, float]]) -> list[float]:
 
 def draw_curve(
     axes: Axes,
-    rows: Sequence[dict[str, float]],
+    rows: Rows,
     name: str,
     *,
     colour: str = "#2b6cb0",
     label: str | None = None,
 ) -> None:
     """One metric over environment steps, on given axes: median, and 33rd to 67th percentile."""
-    frames, values = by_frames(rows, name)
-    low, middle, high = np.percentile(values, [33, 50, 67], axis=1)
+    frames, low, middle, high = band(rows, name)
     axes.plot(frames, middle, color=colour, label=label)
     axes.fill_between(frames, low, high, color=colour, alpha=0.25, linewidth=0)
 
 
-def by_frames(rows: Sequence[dict[str, float]], name: str) -> tuple[np.ndarray, np.ndarray]:
+def band(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Frames, and the 33rd, 50th and 67th percentile of one metric there, [n] each."""
+    frames, values = by_frames(rows, name)
+    low, middle, high = np.percentile(values, [33, 50, 67], axis=1)
+    return frames, low, middle, high
+
+
+def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
     """One metric as (frames [n], values [n, R])."""
     groups: dict[float, list[float]] = {}
     for row in rows:

@@ -1,0 +1,104 @@
+"""Interquartile means and their bootstrap intervals: those of SciPy and `arch`, put together.
+
+What Agarwal et al., *Deep Reinforcement Learning at the Edge of the Statistical Precipice*, 2021, recommend
+for few runs on several tasks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+try:
+    from arch.bootstrap import IndependentSamplesBootstrap
+    from scipy.stats import trim_mean
+except ImportError as error:  # they are large, and only reports need them
+    raise ImportError("reports need the package arch: pip install 'torchrl-her[report]'") from error
+
+REPETITIONS = 2_000
+_SIZE = 0.95
+_CUT = 0.25  # of the runs at either end
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number, and where it is with 95 % confidence; the ends are NaN where there is too little to tell."""
+
+    value: float
+    low: float
+    high: float
+
+    def overlaps(self, other: Interval) -> bool:
+        """Whether the two have a point in common.
+
+        Example:
+            >>> Interval(0.2, 0.1, 0.3).overlaps(Interval(0.5, 0.3, 0.6))
+            True
+        """
+        return not (self.low > other.high or self.high < other.low)
+
+
+def interquartile_means(groups: Sequence[Sequence[float] | np.ndarray]) -> np.ndarray:
+    """The mean of the middle half of each group of values, [G].
+
+    Example:
+        >>> interquartile_means([[0.0, 0.5, 0.7, 9.0], [1.0, 2.0]]).tolist()
+        [0.6, 1.5]
+    """
+    means = np.empty(len(groups))
+    for size in {len(group) for group in groups}:  # one call for all of a size: a bootstrap makes thousands
+        places = [place for place, group in enumerate(groups) if len(group) == size]
+        means[places] = trim_mean(np.array([groups[place] for place in places]), _CUT, axis=1)
+    return means
+
+
+def bootstrap(
+    samples: Sequence[Sequence[float]],
+    groups: Sequence[Sequence[int]],
+    pairs: Sequence[tuple[int, int]] = (),
+    *,
+    repetitions: int = REPETITIONS,
+    seed: int = 0,
+) -> tuple[list[Interval], list[Interval]]:
+    """Interquartile means of groups of samples and differences of such means, with 95 % intervals.
+
+    The bootstrap is stratified: each repetition draws every sample anew from its own runs, so a group (an
+    algorithm on several tasks) always has as many runs of each task as there are.
+
+    Args:
+        samples: the runs of each algorithm on each task.
+        groups: which samples are taken together in each mean.
+        pairs: of groups, whose means are subtracted: the first minus the second.
+        repetitions: of the bootstrap.
+        seed: of its random numbers.
+
+    Returns:
+        One interval for each group, and one for each pair. The ends of those that one run alone stands
+        for are NaN.
+
+    Example:
+        >>> means, differences = bootstrap([[0.5, 0.5], [0.25, 0.25]], [[0], [1]], [(0, 1)])
+        >>> differences
+        [Interval(value=0.25, low=0.25, high=0.25)]
+    """
+    if not groups:
+        return [], []
+
+    firsts, seconds = (np.array([pair[end] for pair in pairs], dtype=int) for end in (0, 1))
+
+    def statistic(*drawn: np.ndarray) -> np.ndarray:
+        means = interquartile_means([np.concatenate([drawn[index] for index in group]) for group in groups])
+        return np.concatenate([means, means[firsts] - means[seconds]])
+
+    arrays = [np.asarray(sample, dtype=float) for sample in samples]
+    drawing = IndependentSamplesBootstrap(*arrays, seed=seed)
+    ends = drawing.conf_int(statistic, repetitions, method="percentile", size=_SIZE)
+    enough = [all(len(arrays[index]) > 1 for index in group) for group in groups]
+    enough += [enough[first] and enough[second] for first, second in pairs]
+    intervals = [
+        Interval(float(value), *((float(low), float(high)) if known else (np.nan, np.nan)))
+        for value, low, high, known in zip(statistic(*arrays), *ends, enough, strict=True)
+    ]
+    return intervals[: len(groups)], intervals[len(groups) :]
