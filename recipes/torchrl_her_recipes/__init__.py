@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from torchrl_her_recipes.algorithms import ALGORITHMS, Algorithm, get_algorithm
     from torchrl_her_recipes.parts import Parts, build_parts
     from torchrl_her_recipes.playing import load_actor, play
+    from torchrl_her_recipes.policies import TrainedPolicy, export_policy, load_policy, load_trained
     from torchrl_her_recipes.recipe import Recipe
     from torchrl_her_recipes.running import RunResult, resume, run
 
@@ -20,9 +21,13 @@ __all__ = [
     "Parts",
     "Recipe",
     "RunResult",
+    "TrainedPolicy",
     "build_parts",
+    "export_policy",
     "get_algorithm",
     "load_actor",
+    "load_policy",
+    "load_trained",
     "play",
     "resume",
     "run",
@@ -33,9 +38,13 @@ _HOMES = {
     "Parts": "parts",
     "Recipe": "recipe",
     "RunResult": "running",
+    "TrainedPolicy": "policies",
     "build_parts": "parts",
+    "export_policy": "policies",
     "get_algorithm": "algorithms",
     "load_actor": "playing",
+    "load_policy": "policies",
+    "load_trained": "policies",
     "play": "playing",
     "resume": "running",
     "run": "running",
