@@ -69,7 +69,8 @@ def test_the_wheel_installs_three_packages_and_no_module_called_envs_or_recipes(
     assert {top for top in tops if not top.endswith(".dist-info")} == set(PACKAGES)
     for package in PACKAGES:
         assert f"{package}/py.typed" in names
-    assert "torchrl_her_recipes/conf/train.yaml" in names
+    for data in ("conf/train.yaml", "conf/thesis.yaml", "templates/report.html"):
+        assert f"torchrl_her_recipes/{data}" in names
     check = (
         "import importlib.util, torchrl_her, torchrl_her_envs, torchrl_her_recipes\n"
         "packages = torchrl_her, torchrl_her_envs, torchrl_her_recipes\n"

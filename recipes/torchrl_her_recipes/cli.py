@@ -1,4 +1,4 @@
-"""The command line: ``torchrl-her train | play | plot | study | list``."""
+"""The command line: ``torchrl-her train | play | plot | study | report | list``."""
 
 from __future__ import annotations
 
@@ -18,16 +18,22 @@ from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_her_envs import TASKS, make_env
+from torchrl_her_envs import SMALL_WORLDS, TASKS, make_env
 from torchrl_her_recipes.algorithms import ALGORITHMS
 from torchrl_her_recipes.goal_map import GoalMap
+from torchrl_her_recipes.planning import Plan, duration
 from torchrl_her_recipes.playing import play
 from torchrl_her_recipes.plots import plot_goals
+from torchrl_her_recipes.policies import export_policy, load_trained, policy_names
 from torchrl_her_recipes.recipe import Recipe
 from torchrl_her_recipes.run_folder import RunFolder
 from torchrl_her_recipes.running import RunResult, resume
-from torchrl_her_recipes.studies import is_done, load_study, run_study, study_names
+from torchrl_her_recipes.small_world_values import plot_values
+from torchrl_her_recipes.studies import StudyResult, load_study, plan_study, run_study, study_names
+from torchrl_her_recipes.workers import LocalWorkers, Workers
+from torchrl_her_recipes.worlds import GYM
 
+_FAILED = 1
 _BAD_INPUT = 2
 _INTERRUPTED = 130
 _USAGE = """usage: torchrl-her COMMAND ...
@@ -37,9 +43,13 @@ commands:
                            -m sweeps: torchrl-her train -m algo=her,filtered_her seed=0,1,2
                            preset=demo takes the values of a preset; --cfg job shows all values
   train --resume RUN       go on with a run from its checkpoint
-  play RUN                 a GIF of a run's policy, for several goals
+  play RUN|TASK            a GIF of a run's policy, or of the trained one of a task, for several goals
+  export RUN               a run's policy as a small file of its own
   plot goals RUN           a heat map of a run's virtual goals beside the target q*
-  study NAME               runs a whole comparison and draws its figure; --quick for a size of minutes
+  plot values RUN ...      what agents make of a small world: bit_flip or treasure_hunt
+  study NAME               runs a whole comparison on all cores and draws its figure; --quick for a size of
+                           minutes, --plan says how long it takes, --ray ADDRESS runs it on a cluster
+  report NAME              a page about a study: figures, intervals, the thesis's numbers beside ours
   list                     tasks, algorithms and presets
 """
 _CONF = Path(__file__).parent / "conf"
@@ -58,7 +68,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)  # compiling on a CPU is no mistake
-    commands = {"train": _train, "play": _play, "plot": _plot, "study": _study, "list": _list}
+    commands = {
+        "train": _train,
+        "play": _play,
+        "export": _export,
+        "plot": _plot,
+        "study": _study,
+        "report": _report,
+        "list": _list,
+    }
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_USAGE, end="")
         return 0 if arguments else _BAD_INPUT
@@ -165,15 +183,16 @@ def _say_end(result: RunResult) -> int:
 
 
 def _play(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="torchrl-her play", description="Make a GIF of a run's policy.")
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
-    parser.add_argument("--out", type=Path, help="the .gif or .mp4 to write (default: RUN/play.gif)")
+    parser = argparse.ArgumentParser(prog="torchrl-her play", description="Make a GIF of a policy.")
+    parser.add_argument("run", metavar="RUN", help="folder of a run, or a task for its trained policy")
+    parser.add_argument("--out", type=Path, help="the .gif or .mp4 (default: RUN/play.gif, or TASK.gif)")
     parser.add_argument("--run", type=int, default=0, dest="index", help="which, of several side by side")
     parser.add_argument("--goals", type=int, default=6, help="how many goals, side by side (default: 6)")
     parser.add_argument("--seed", type=int, default=0, help="of the goals and starts (default: 0)")
     parser.add_argument("--size", type=int, default=240, help="pixels of one world (default: 240)")
     options = parser.parse_args(arguments)
-    out = options.out or options.run / "play.gif"
+    folder = Path(options.run)
+    out = options.out or (folder / "play.gif" if folder.is_dir() else Path(f"{options.run}.gif"))
     achieved = play(
         options.run, out, run=options.index, goals=options.goals, seed=options.seed, size=options.size
     )
@@ -181,16 +200,37 @@ def _play(arguments: list[str]) -> int:
     return 0
 
 
-def _plot(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="torchrl-her plot", description="Draw a picture of a run.")
-    parser.add_argument("what", choices=["goals"], help="virtual goals: q beside q*")
+def _export(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="torchrl-her export", description="Write a run's policy as a file.")
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
-    parser.add_argument("--out", type=Path, help="the picture to write (default: RUN/virtual_goals.png)")
+    parser.add_argument("--out", type=Path, help="the .pt file (default: RUN/TASK.pt)")
+    parser.add_argument("--run", type=int, dest="index", help="which, of several (default: the median)")
     options = parser.parse_args(arguments)
-    home = RunFolder(options.run)
-    recipe, out = home.recipe(), options.out or home.goals
-    title = f"virtual goals: {recipe.task}, {recipe.algo}"
-    plot_goals(GoalMap.load(home.goal_map), make_env(recipe.task), out, title=title)
+    out = options.out or options.run / f"{RunFolder(options.run).recipe().task}.pt"
+    policy = export_policy(options.run, out, run=options.index)
+    print(f"seed {policy.recipe.seed}, success {policy.success:.0%}: {out}")
+    return 0
+
+
+def _plot(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="torchrl-her plot", description="Draw a picture of runs.")
+    parser.add_argument(
+        "what", choices=["goals", "values"], help="virtual goals beside q*, or values in a small world"
+    )
+    parser.add_argument("runs", type=Path, metavar="RUN", nargs="+", help="folder of a run")
+    parser.add_argument("--out", type=Path, help="the picture (default: in the folder of the first run)")
+    options = parser.parse_args(arguments)
+    homes = {folder.name: RunFolder(folder) for folder in options.runs}
+    if options.what == "values":
+        out = options.out or options.runs[0] / "values.png"
+        plot_values(homes, out)
+    else:
+        if len(homes) > 1:
+            raise ValueError(f"goals are drawn of one run, got {len(homes)}")
+        (home,) = homes.values()
+        recipe, out = home.recipe(), options.out or home.goals
+        title = f"virtual goals: {recipe.task}, {recipe.algo}"
+        plot_goals(GoalMap.load(home.goal_map), make_env(recipe.task), out, title=title)
     print(out)
     return 0
 
@@ -202,17 +242,63 @@ def _study(arguments: list[str]) -> int:
     parser.add_argument("--frames", type=int, help="environment steps of each run")
     parser.add_argument("--quick", action="store_true", help="a size that ends in minutes")
     parser.add_argument("--folder", type=Path, help="where it goes (default: runs/NAME)")
+    parser.add_argument("--plan", action="store_true", help="only say what is to do, and how long it takes")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--jobs", type=int, help="batched runs at once (default: one for each core)")
+    where.add_argument("--ray", metavar="ADDRESS", help="over a Ray cluster: auto, or HOST:PORT")
     options = parser.parse_args(arguments)
     study = load_study(options.name, seeds=options.seeds, frames=options.frames, quick=options.quick)
     folder = options.folder or Path("runs") / (study.name + ("_quick" if options.quick else ""))
-    to_go = [recipe for label, recipe in study.cells() if not is_done(RunFolder(folder / label))]
-    steps = sum(recipe.total_frames * recipe.num_runs for recipe in to_go)
-    print(f"{study.name}: {len(to_go)} batched runs to go, {steps:,} environment steps in all: {folder}")
-    figure = run_study(study, folder)
-    if figure is None:
-        print("interrupted: the same command goes on with it")
-        return _INTERRUPTED
-    print(figure)
+    plan = plan_study(study, folder)
+    workers = _ray_workers(options.ray) if options.ray else LocalWorkers(options.jobs)
+    _say_plan(study.name, folder, plan, workers.at_once)
+    if options.plan:
+        workers.close()
+        return 0
+    return _say_study(run_study(study, folder, workers=workers))
+
+
+def _ray_workers(address: str) -> Workers:
+    try:
+        from torchrl_her_recipes.ray_workers import RayWorkers  # noqa: PLC0415  (an extra)
+    except ModuleNotFoundError as error:
+        raise ImportError("--ray needs Ray: pip install 'torchrl-her[cluster]'") from error
+    return RayWorkers(address)
+
+
+def _say_plan(name: str, folder: Path, plan: Plan, at_once: int) -> None:
+    to_go = plan.to_go
+    steps = f"{plan.steps_to_go(to_go):,} environment steps in all"
+    print(f"{name}: {len(to_go)} batched runs to go, {steps}: {folder}")
+    print("\n".join(plan.table()))
+    if to_go:
+        together = min(at_once, len(to_go))
+        print(f"about {duration(plan.wall_clock(to_go, at_once))}, {together} at once", flush=True)
+
+
+def _say_study(result: StudyResult) -> int:
+    for label, reason in result.failed.items():
+        print(f"torchrl-her: {label} failed: {reason}", file=sys.stderr)
+    if result.figure is not None:
+        print(result.figure)
+        return 0
+    print("interrupted: " * result.interrupted + "the same command goes on with it")
+    return _INTERRUPTED if result.interrupted else _FAILED
+
+
+def _report(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(
+        prog="torchrl-her report", description="Write a page about what there is of a study; trains nothing."
+    )
+    parser.add_argument("name", help=f"{', '.join(study_names())}, or a .yaml file of your own")
+    parser.add_argument("--folder", type=Path, help="where its runs are (default: runs/NAME)")
+    parser.add_argument("--out", type=Path, help="where the page goes (default: FOLDER/report)")
+    options = parser.parse_args(arguments)
+    from torchrl_her_recipes.report import write_report  # noqa: PLC0415  (an extra, and slow to import)
+
+    study = load_study(options.name)
+    folder = options.folder or Path("runs") / study.name
+    print(write_report(study, folder, options.out or folder / "report"))
     return 0
 
 
@@ -220,13 +306,15 @@ def _list(arguments: list[str]) -> int:
     argparse.ArgumentParser(prog="torchrl-her list", description="List what there is.").parse_args(arguments)
     presets = sorted((_CONF / "preset").glob("*.yaml"))
     sections = {
-        "tasks": {task.name: task.summary for task in TASKS.values()},
+        "tasks": {name: task.summary for name, task in (TASKS | SMALL_WORLDS).items()}
+        | {f"{GYM}ID": "any environment of gymnasium with goals, by its id"},
         "algorithms": {algorithm.name: algorithm.summary for algorithm in ALGORITHMS.values()},
         "studies": {name: load_study(name).summary for name in study_names()},
+        "trained policies": {name: f"{load_trained(name).success:.0%} success" for name in policy_names()},
         "presets": {path.stem: path.read_text().splitlines()[1].lstrip("# ") for path in presets},
     }
     for title, entries in sections.items():
         print(f"{title}:")
         for name, summary in entries.items():
-            print(f"  {name:<18} {summary}")
+            print(f"  {name:<20} {summary}")
     return 0

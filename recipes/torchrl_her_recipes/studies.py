@@ -9,11 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from filelock import FileLock, Timeout
 
+from torchrl_her_recipes.jobs import Job
+from torchrl_her_recipes.planning import Plan
 from torchrl_her_recipes.plots import plot_comparison
 from torchrl_her_recipes.recipe import Recipe
 from torchrl_her_recipes.run_folder import RunFolder
-from torchrl_her_recipes.running import resume, run
+from torchrl_her_recipes.scheduling import run_jobs
+from torchrl_her_recipes.workers import LocalWorkers, Workers
 
 _CONF = Path(__file__).parent / "conf" / "study"
 _QUICK: dict[str, Any] = {
@@ -107,35 +111,72 @@ def _first(study: Study) -> dict[str, Any]:
     return {name: values[0] for name, values in study.vary.items()}
 
 
-def run_study(study: Study, folder: Path, *, progress: bool = True) -> Path | None:
-    """Runs what is not done yet, and draws the figure.
+@dataclass(frozen=True, kw_only=True)
+class StudyResult:
+    """What came of a study.
+
+    Attributes:
+        figure: the picture, if all runs are done.
+        interrupted: whether somebody stopped it. It goes on if it is run again.
+        failed: why, by the name of the batched run. The others are not held back by it.
+    """
+
+    figure: Path | None
+    interrupted: bool = False
+    failed: dict[str, str] = field(default_factory=dict)
+
+
+def plan_study(study: Study, folder: Path) -> Plan:
+    """What there is to do, and about how long it takes.
+
+    Args:
+        study: what to run.
+        folder: a folder of each combination goes into it, or is there already.
+
+    Raises:
+        ValueError: the folder has a run of other options under the same name.
+    """
+    jobs = [Job(label=label, recipe=recipe, folder=folder / label) for label, recipe in study.cells()]
+    for job in jobs:
+        home = RunFolder(job.folder)
+        if home.config.exists() and home.recipe() != job.recipe:
+            raise ValueError(f"{home.path} holds a run with other options; choose another folder")
+    return Plan(jobs)
+
+
+def run_study(
+    study: Study, folder: Path, *, workers: Workers | None = None, progress: bool = True
+) -> StudyResult:
+    """Runs what is not done yet, several at once, and draws the figure.
 
     A combination that was interrupted goes on from its checkpoint.
 
     Args:
         study: what to run.
         folder: a folder of each combination goes into it.
-        progress: whether to show a progress bar for each.
-
-    Returns:
-        The figure; None if it was interrupted by Ctrl-C.
+        workers: who does it; by default a process for each core. They are closed in the end.
+        progress: whether to show a progress bar over all of it.
 
     Raises:
-        ValueError: the folder has a run of other options under the same name.
+        ValueError: the folder has a run of other options under the same name, or somebody is at work
+            in it.
+        KeyboardInterrupt: by a second Ctrl-C.
     """
-    for label, recipe in study.cells():
-        home = RunFolder(folder / label)
-        if not home.config.exists():
-            result = run(recipe.build(), home.path, progress=progress)
-        elif home.recipe() != recipe:
-            raise ValueError(f"{home.path} holds a run with other options; choose another folder")
-        elif is_done(home):
-            continue
-        else:
-            result = resume(home.path, progress=progress)
-        if result.interrupted:
-            return None
-    return draw_study(study, folder)
+    workers = workers or LocalWorkers()
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / ".lock", timeout=0):
+            plan = plan_study(study, folder)
+            outcomes = run_jobs(plan, workers, progress=progress)
+    except Timeout as error:
+        raise ValueError(f"another process is running a study in {folder}") from error
+    finally:
+        workers.close()
+    return StudyResult(
+        figure=None if plan.to_go else draw_study(study, folder),
+        interrupted=any(outcome.interrupted for outcome in outcomes.values()),
+        failed={label: outcome.error for label, outcome in outcomes.items() if outcome.error},
+    )
 
 
 def is_done(home: RunFolder) -> bool:

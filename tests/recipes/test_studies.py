@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from filelock import FileLock
 from PIL import Image
 
 from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.jobs import Job, Outcome, Progress, run_job
 from torchrl_her_recipes.run_folder import RunFolder
-from torchrl_her_recipes.studies import Study, is_done, load_study, run_study, study_names
+from torchrl_her_recipes.studies import Study, StudyResult, is_done, load_study, run_study, study_names
 
 from .small import SMALL
+
+
+class Here:
+    """Does jobs in this process, one after the other."""
+
+    at_once = 1
+
+    def run(self, job: Job) -> Outcome:
+        return run_job(job)
+
+    def progress(self) -> dict[str, Progress]:
+        return {}
+
+    def stop(self) -> None: ...
+
+    def close(self) -> None: ...
 
 
 @pytest.mark.parametrize("name", study_names())
@@ -26,60 +45,89 @@ def test_every_study_is_made_of_recipes_that_work_and_can_be_shrunk(name: str) -
 
 
 def test_seeds_and_frames_take_the_place_of_the_study_s() -> None:
-    recipe = next(recipe for _, recipe in load_study("ibs_v0", seeds=3, frames=20_000).cells())
+    recipe = next(recipe for _, recipe in load_study("ibs", seeds=3, frames=20_000).cells())
     assert recipe.num_runs == 3
     assert recipe.total_frames == 24_000  # whole epochs of 8,000
 
 
-def test_a_study_of_ones_own_runs_skips_what_is_done_and_draws(
-    tmp_path: Path, capsys: pytest.CaptureFixture
+def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draws(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text(
-        yaml.safe_dump({"recipe": {**SMALL, "task": "hand_v0"}, "vary": {"algo": ["her", "ddpg"]}})
-    )
-    folder = tmp_path / "runs"
-    command = ["study", str(path), "--folder", str(folder), "--seeds", "2"]
+    path, folder = tmp_path / "mine.yaml", tmp_path / "runs"
+    vary = {"algo": ["her", "filtered_her"]}
+    path.write_text(yaml.safe_dump({"recipe": {**SMALL, "task": "hand_v0"}, "vary": vary}))
+    command = ["study", str(path), "--folder", str(folder), "--jobs", "1"]
+    assert main([*command, "--plan"]) == 0
+    said = capsys.readouterr().out
+    assert "2 batched runs to go, 6,400 environment steps in all" in said
+    assert "her           to do                      3,200 steps to go, about" in said
+    assert not folder.exists()
+
+    folder.mkdir()
+    (folder / "her").write_text("in the way")
+    assert main(command) == 1
+    said, failed = capsys.readouterr()
+    assert "torchrl-her: her failed: NotADirectoryError: " in failed
+    assert "the same command goes on with it" in said
+
+    (folder / "her").unlink()
     assert main(command) == 0
-    out = capsys.readouterr().out
-    assert "2 batched runs to go, 12,800 environment steps in all" in out
+    assert "1 batched runs to go, 3,200 environment steps in all" in capsys.readouterr().out
     with Image.open(folder / "mine.png") as picture:
         assert min(picture.size) > 200
-    metrics = {name: (folder / name / "metrics.csv") for name in ("her", "ddpg")}
-    before = {name: file.stat().st_mtime_ns for name, file in metrics.items()}
+
+    metrics = [folder / name / "metrics.csv" for name in vary["algo"]]
+    before = [file.stat().st_mtime_ns for file in metrics]
     assert main(command) == 0
     assert "0 batched runs to go, 0 environment steps" in capsys.readouterr().out
-    assert {name: file.stat().st_mtime_ns for name, file in metrics.items()} == before
+    assert [file.stat().st_mtime_ns for file in metrics] == before
 
 
 def test_a_combination_that_was_cut_short_goes_on(tmp_path: Path) -> None:
     short = Study(name="cut", recipe={**SMALL, "epochs": 1}, vary={"algo": ["her"]})
-    run_study(short, tmp_path, progress=False)
+    run_study(short, tmp_path, workers=Here(), progress=False)
     home = RunFolder(tmp_path / "her")
     home.config.write_text(home.config.read_text().replace("epochs: 1", "epochs: 2"))
     assert not is_done(home)
-    run_study(
-        Study(name="cut", recipe={**SMALL, "epochs": 2}, vary={"algo": ["her"]}), tmp_path, progress=False
-    )
+    whole = Study(name="cut", recipe={**SMALL, "epochs": 2}, vary={"algo": ["her"]})
+    result = run_study(whole, tmp_path, workers=Here(), progress=False)
+    assert result == StudyResult(figure=tmp_path / "cut.png")
     assert is_done(home)
     assert [row["epoch"] for row in home.rows()] == [1, 2]
 
 
 def test_other_options_under_the_same_name_are_refused(tmp_path: Path) -> None:
-    run_study(
-        Study(name="one", recipe={**SMALL, "epochs": 1}, vary={"algo": ["her"]}), tmp_path, progress=False
-    )
-    other = Study(name="one", recipe={**SMALL, "epochs": 1, "k": 2}, vary={"algo": ["her"]})
+    (tmp_path / "her").mkdir()
+    RunFolder(tmp_path / "her").config.write_text(yaml.safe_dump({**SMALL, "algo": "her", "k": 2}))
+    study = Study(name="one", recipe=SMALL, vary={"algo": ["her"]})
     with pytest.raises(ValueError, match="holds a run with other options"):
-        run_study(other, tmp_path, progress=False)
+        run_study(study, tmp_path, workers=Here(), progress=False)
+
+
+def test_one_process_at_a_time_is_at_work_in_a_folder(tmp_path: Path) -> None:
+    study = Study(name="one", recipe=SMALL, vary={"algo": ["her"]})
+    with (
+        FileLock(tmp_path / ".lock"),
+        pytest.raises(ValueError, match=f"another process is running a study in {tmp_path}"),
+    ):
+        run_study(study, tmp_path, workers=Here(), progress=False)
+
+
+def test_without_ray_its_name_and_the_remedy_are_given(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "torchrl_her_recipes.ray_workers", None)
+    assert main(["study", study_names()[0], "--plan", "--ray", "auto"]) == 2
+    said = capsys.readouterr().err
+    assert said == "torchrl-her: --ray needs Ray: pip install 'torchrl-her[cluster]'\n"
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nothing"], "there is no study 'nothing'; the studies are curriculum, ibs_v0"),
-        (["ibs_v0", "--seeds", "0"], "seeds must be at least 1, got 0"),
-        (["ibs_v0", "--frames", "-5"], "frames must be at least 1, got -5"),
+        (["nothing"], "there is no study 'nothing'; the studies are bias, "),
+        (["ibs", "--seeds", "0"], "seeds must be at least 1, got 0"),
+        (["ibs", "--frames", "-5"], "frames must be at least 1, got -5"),
     ],
 )
 def test_bad_input_is_one_clear_line(
