@@ -33,6 +33,9 @@ class GoalGrid:
         low, high: d numbers each, corners of the box, in the unit of the goals.
         shape: d numbers of cells.
 
+    Keyword Args:
+        warn: whether to say once that a goal lies outside the box.
+
     Raises:
         ValueError: a box without volume, lengths that differ, less than one cell, or too many.
 
@@ -44,7 +47,7 @@ class GoalGrid:
         [0.75, 0.625]
     """
 
-    def __init__(self, low: Numbers, high: Numbers, shape: Sequence[int]) -> None:
+    def __init__(self, low: Numbers, high: Numbers, shape: Sequence[int], *, warn: bool = True) -> None:
         self.low, self.high = _floats(low), _floats(high)
         self.shape = tuple(operator.index(n) for n in shape)
         if not len(self.low) == len(self.high) == len(self.shape) > 0:
@@ -61,7 +64,7 @@ class GoalGrid:
                 f"a grid has at most {_MAX_CELLS} cells, got {self.num_cells} of shape {self.shape}"
             )
         self.cell_size = tuple(size / n for size, n in zip(sizes, self.shape, strict=True))
-        self._warned = False
+        self._warned = not warn
 
     @property
     def axes(self) -> list[Tensor]:
@@ -78,7 +81,7 @@ class GoalGrid:
         """The cell [...] of int64 of each goal [..., d]; the last dimension varies fastest.
 
         Goals outside are counted in the cell at the edge, NaN in the first one of its dimension.
-        The first time that it happens, a warning names the first such goal.
+        The first time that it happens, a warning names the first such goal (if the grid is to warn).
         """
         if goals.shape[-1] != len(self.shape):
             raise ValueError(f"the grid has {len(self.shape)} dimensions, got goals of {goals.shape[-1]}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from functools import partial
@@ -13,7 +12,6 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -21,11 +19,16 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import GymWrapper
 
 from torchrl_her_envs.goal_functions import GoalFunction
+from torchrl_her_envs.gym_check import (
+    KEYS,
+    METHODS,
+    check_goal_env,
+    goals_to_try,
+    make_one,
+    shown_of,
+    spec_of,
+)
 from torchrl_her_envs.seeding import block_keys
-
-_KEYS = ("observation", "achieved_goal", "desired_goal")
-_METHODS = ("compute_reward", "compute_terminated")
-_EPISODES = 8  # whose goals the environment's functions are tried with
 
 
 def make_gym_env(
@@ -64,11 +67,11 @@ def make_gym_env(
     if max_steps is not None:
         options["max_episode_steps"] = max_steps
     with ExitStack() as opened:
-        judge = opened.enter_context(closing(_make_one(id, options)))
-        _check(id, judge)
+        judge = opened.enter_context(closing(make_one(id, options)))
+        check_goal_env(id, judge)
         # By what gymnasium knows of it: a new process need neither register anything nor load TorchRL.
         make = partial(
-            gymnasium.make, gymnasium.registry[_spec(judge).id], disable_env_checker=True, **options
+            gymnasium.make, gymnasium.registry[spec_of(judge).id], disable_env_checker=True, **options
         )
         vector = AsyncVectorEnv if parallel else SyncVectorEnv
         worlds = opened.enter_context(
@@ -106,11 +109,11 @@ class GymGoalEnv(GymWrapper):
     ) -> None:
         super().__init__(worlds, device="cpu", **kwargs)  # TorchRL's metaclass adds some
         self._judge = judge
-        self._goal_dtype = _shown(judge.observation_space)["achieved_goal"].dtype
-        self._limit = _spec(judge).max_episode_steps or 0
-        id, goals = _spec(judge).id, _goals_to_try(judge)
+        self._goal_dtype = shown_of(judge.observation_space)["achieved_goal"].dtype
+        self._limit = spec_of(judge).max_episode_steps or 0
+        id, goals = spec_of(judge).id, goals_to_try(judge)
         self._reward_of, self._terminated_of = (
-            GoalFunction(judge.get_wrapper_attr(name), *goals, name=f"{id}'s {name}") for name in _METHODS
+            GoalFunction(judge.get_wrapper_attr(name), *goals, name=f"{id}'s {name}") for name in METHODS
         )
         self.missed_reward, self.achieved_reward = (self._reward_of.tried[:2] + 0.0).tolist()  # never -0.0
         self.set_seeds([int(seed)] if isinstance(seed, int | Integral) else list(seed))
@@ -171,14 +174,14 @@ class GymGoalEnv(GymWrapper):
         return answers.to(pair[0].device).view(*pair[0].shape[:-1], 1)
 
     def _rows(self, goals: Tensor) -> np.ndarray:
-        """Goals [..., g] as rows of the environment's own type: copies, which its functions may write into."""
+        """Goals [..., g] as rows of the environment's type: copies, as its functions may write into them."""
         return goals.detach().cpu().reshape(-1, goals.shape[-1]).numpy().astype(self._goal_dtype)
 
     # TorchRL's hooks
 
     def _make_specs(self, env: VectorEnv, batch_size: torch.Size | None = None) -> None:
-        n, space, shown = env.num_envs, env.single_action_space, _shown(env.single_observation_space)
-        seen = {key: Unbounded(shape=(n, *(shown[key].shape or ())), dtype=torch.float32) for key in _KEYS}
+        n, space, shown = env.num_envs, env.single_action_space, shown_of(env.single_observation_space)
+        seen = {key: Unbounded(shape=(n, *(shown[key].shape or ())), dtype=torch.float32) for key in KEYS}
         self.observation_spec = Composite(seen, shape=(n,))
         if isinstance(space, spaces.Discrete):
             self.action_spec = Categorical(n=int(space.n), shape=(n,), dtype=torch.int64)
@@ -196,7 +199,7 @@ class GymGoalEnv(GymWrapper):
 
     def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
         """What GoalEnv asks for of what the environment shows, in float32."""
-        return super().read_obs({key: observations[key] for key in _KEYS})
+        return super().read_obs({key: observations[key] for key in KEYS})
 
     def _set_seed(self, seed: int | None) -> None:
         self.set_seeds([seed or 0])
@@ -210,77 +213,3 @@ class GymGoalEnv(GymWrapper):
             None if reset else seed for reset, seed in zip(which, self._next_seeds, strict=True)
         ]
         return TensorDict(self.read_obs(observations), batch_size=self.batch_size, device=self.device)
-
-
-def _spec(env: gymnasium.Env) -> EnvSpec:
-    return cast(EnvSpec, env.spec)  # None only where gymnasium.make was not asked
-
-
-def _shown(space: spaces.Space) -> spaces.Dict:
-    return cast(spaces.Dict, space)  # _check sees to it
-
-
-def _make_one(id: str, options: dict[str, Any]) -> gymnasium.Env:
-    """One world, with a message of one line where that fails."""
-    hint = _register_robotics(id)
-    try:
-        return gymnasium.make(id, disable_env_checker=True, **options)
-    except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
-        raise ImportError(f"cannot make the gymnasium environment {id!r}: {_line(error)}") from error
-    except gymnasium.error.Error as error:
-        raise ValueError(f"cannot make the gymnasium environment {id!r}: {_line(error)}{hint}") from error
-
-
-def _register_robotics(id: str) -> str:
-    """Lets gymnasium know the environments of gymnasium-robotics; what to say if they are not installed."""
-    if ":" not in id and id not in gymnasium.registry:
-        try:
-            importlib.import_module("gymnasium_robotics")
-        except ModuleNotFoundError:
-            return " (gymnasium-robotics is not installed: pip install 'torchrl-her[robotics]')"
-    return ""
-
-
-def _line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
-
-
-def _check(id: str, env: gymnasium.Env) -> None:
-    """Raises a ValueError that names what an environment lacks of GoalEnv."""
-    shown = env.observation_space
-    if not isinstance(shown, spaces.Dict):
-        raise ValueError(f"{id} shows no dict of {', '.join(_KEYS)}, but a {type(shown).__name__}")
-    for key in _KEYS:
-        if key not in shown.spaces:
-            raise ValueError(f"{id} lacks {key!r} in what it shows: {', '.join(shown.spaces)}")
-        if len(shown[key].shape or ()) != 1:
-            raise ValueError(f"{id} must show {key!r} as a row of numbers, got {shown[key]}")
-    if shown["achieved_goal"].shape != shown["desired_goal"].shape:
-        sizes = [shown[key].shape for key in _KEYS[1:]]
-        raise ValueError(
-            f"{id}'s achieved and desired goals must have one shape, got {sizes[0]} and {sizes[1]}"
-        )
-    for name in _METHODS:
-        if not env.has_wrapper_attr(name):
-            raise ValueError(
-                f"{id} lacks the method {name!r}, which tells what another goal would have given"
-            )
-    if not isinstance(env.action_space, spaces.Box | spaces.Discrete):
-        raise ValueError(f"{id}'s actions must be a Box or Discrete, got {env.action_space}")
-    if isinstance(env.action_space, spaces.Box) and not env.action_space.is_bounded():
-        raise ValueError(f"{id}'s actions must have bounds, got {env.action_space}")
-    if _spec(env).max_episode_steps is None:
-        raise ValueError(f"{id} has no time limit: give max_steps")
-
-
-def _goals_to_try(env: gymnasium.Env) -> tuple[np.ndarray, np.ndarray]:
-    """Achieved and desired goals [M, g] of real episodes: one missed by far, then some that are met."""
-    shown = [env.reset(seed=seed)[0] for seed in range(_EPISODES)]
-    achieved, desired = (np.stack([own[key] for own in shown]) for key in _KEYS[1:])
-    gap = np.abs(achieved[:, None].astype(np.float64) - desired).sum(-1)
-    here, there = np.unravel_index(gap.argmax(), gap.shape)
-    met = 3 if achieved.shape[1] == 3 else 2  # as many pairs as numbers in a goal would tell less
-    return (
-        np.concatenate([achieved[here, None], desired[:met]]),
-        np.concatenate([desired[there, None], desired[:met]]),
-    )

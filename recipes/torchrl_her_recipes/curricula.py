@@ -11,7 +11,7 @@ from torchrl.envs import CatTensors, Compose, EnvBase, TransformedEnv
 from torchrl_her import Curriculum, CurriculumLayer, CurriculumProgress, StateToObs, ZeroPad
 from torchrl_her_envs import GoalEnv, ThrowingEnv
 
-_STATE = ("observation", "desired_goal")  # what the state is made of, in this order
+_STATE = ["observation", "desired_goal"]  # what the state is made of, in this order
 
 
 def get_curriculum(env: ThrowingEnv) -> Curriculum:

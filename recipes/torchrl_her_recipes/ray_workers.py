@@ -77,7 +77,10 @@ class RayWorkers:
 
     def progress(self) -> dict[str, Progress]:
         """How far the jobs are that are being done, by label."""
-        board = ray.get(self._board.read.remote())
+        try:
+            board = ray.get(self._board.read.remote())
+        except RayError:  # this machine's node is gone, which run() gets to hear, too
+            board = {}
         return {label: board[label] for label in list(self._tasks) if label in board}
 
     def stop(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -81,6 +82,20 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     assert main(command) == 0
     assert "0 batched runs to go, 0 environment steps" in capsys.readouterr().out
     assert [file.stat().st_mtime_ns for file in metrics] == before
+
+
+def test_the_guide_s_study_is_planned_as_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    guide = (Path(__file__).parents[2] / "docs" / "studies.md").read_text()
+    (mine,) = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text(mine)
+    assert main(["study", "mine.yaml", "--plan", "--jobs", "2"]) == 0
+    first, *lines, last = capsys.readouterr().out.splitlines()
+    assert len(lines) == 6
+    for line in (first, lines[0], last):
+        assert line in guide
 
 
 def test_a_combination_that_was_cut_short_goes_on(tmp_path: Path) -> None:

@@ -133,3 +133,31 @@ def test_a_curriculum_comes_from_a_file(tmp_path: Path) -> None:
     assert main(["train", *options, "task_options={step: 10}"]) == 0
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["curriculum"] == layers
+
+
+# Gymnasium's environments
+
+
+@pytest.mark.parametrize("algo", ["her", "filtered_her_ibs", "cher"])
+def test_an_environment_of_gymnasium_trains_by_its_id(algo: str, tmp_path: Path) -> None:
+    """One of ours, on its way out to gymnasium and in again: its state is [hand, 5 | ball, 2]."""
+    layer = {"observation": [0, 1, 2, 3, 4], "achieved_goal": [0, 1], "desired_goal": [5, 6]}
+    curriculum = [layer | {"name": name, "threshold": far} for name, far in (("near", 0.5), ("at", 0.1))]
+    recipe = small(
+        task="gym:torchrl_her/HandReach-v0",
+        algo=algo,
+        epochs=1,
+        epoch_frames=480,
+        num_envs=4,
+        warmup_frames=200,
+        curriculum=curriculum if algo == "cher" else None,
+    )
+    rows = recipe.build().run(tmp_path / "run", progress=False).rows
+    assert rows[-1]["rows_virtual"] > 0
+    assert 0.0 <= rows[-1]["success"] <= 1.0
+    assert ("kl" in rows[-1]) == (algo == "filtered_her_ibs")
+
+
+def test_an_id_that_gymnasium_does_not_know_is_named() -> None:
+    with pytest.raises(ValueError, match="cannot make the gymnasium environment 'Nowhere-v7'"):
+        small(task="gym:Nowhere-v7").build()
