@@ -100,5 +100,5 @@ def test_the_repository_names_no_package_index_and_no_path_of_a_machine() -> Non
     forbidden = re.compile(f"{index}|pythonhosted|/({'|'.join(('root', 'home', 'tmp'))})/")
     for name in listed.stdout.split():
         path = ROOT / name
-        if path.suffix not in {".png", ".gif"} and path != Path(__file__):
+        if path.suffix not in {".png", ".gif", ".pt"} and path != Path(__file__):
             assert not forbidden.search(path.read_text()), name

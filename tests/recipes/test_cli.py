@@ -45,11 +45,11 @@ def test_the_default_folder_names_task_algorithm_and_seed() -> None:
 
 
 def test_sweeps(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["train", "-m", "algo=her,ddpg", *overrides(epochs=1)]) == 0
+    assert cli.main(["train", "-m", "algo=her,no_hindsight", *overrides(epochs=1)]) == 0
     (sweep,) = Path("runs").iterdir()
     assert sorted(path.name for path in sweep.iterdir() if path.is_dir()) == [
-        "hand_v0_ddpg_s0_1",
         "hand_v0_her_s0_0",
+        "hand_v0_no_hindsight_s0_1",
     ]
 
 
@@ -75,7 +75,7 @@ def test_every_preset_runs(preset: Path) -> None:
     ("arguments", "message"),
     [
         (["train", "task=hand_v9"], "unknown task 'hand_v9'; the tasks are hand_reach"),
-        (["train", "algo=sarsa"], "unknown algorithm 'sarsa'; the algorithms are ddpg, her, filtered_her"),
+        (["train", "algo=sarsa"], "unknown algorithm 'sarsa'; the algorithms are no_hindsight, her, filtered_her"),
         (["train", "speed=3"], "Could not override 'speed'"),
         (["train", "epochs=many"], "Value 'many' of type 'str' could not be converted to Integer"),
         (["train", "preset=no"], "Could not find 'preset/no'"),
@@ -84,8 +84,8 @@ def test_every_preset_runs(preset: Path) -> None:
         (["train", "folder=/proc/nothing/here"], "cannot use /proc/nothing"),
         (["train", "--resume", "nowhere"], "nowhere is no folder of a run"),
         (["train", "--resume=nowhere"], "nowhere is no folder of a run"),
-        (["play", "nowhere"], "nowhere is no folder of a run"),
-        (["fly"], "unknown command 'fly'; the commands are train, play, plot, study, list"),
+        (["play", "nowhere"], "nowhere is neither the folder of a run nor one of the trained"),
+        (["fly"], "unknown command 'fly'; the commands are train, play, export, plot, study, report, list"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(
