@@ -205,10 +205,11 @@ def _export(arguments: list[str]) -> int:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--out", type=Path, help="the .pt file (default: RUN/TASK.pt)")
     parser.add_argument("--run", type=int, dest="index", help="which, of several (default: the median)")
+    parser.add_argument("--task", help="that it is for, if not the run's own")
     options = parser.parse_args(arguments)
-    out = options.out or options.run / f"{RunFolder(options.run).recipe().task}.pt"
-    policy = export_policy(options.run, out, run=options.index)
-    print(f"seed {policy.recipe.seed}, success {policy.success:.0%}: {out}")
+    out = options.out or options.run / f"{options.task or RunFolder(options.run).recipe().task}.pt"
+    policy = export_policy(options.run, out, run=options.index, task=options.task)
+    print(f"seed {policy.recipe.seed}, success {policy.success:.0%} on {policy.task}: {out}")
     return 0
 
 

@@ -71,7 +71,7 @@ def _played(source: str | Path, run: int, goals: int, seed: int) -> tuple[EnvBas
     """Worlds, and the policy that plays in them."""
     if not Path(source).is_dir() and str(source) in policy_names():
         trained = load_trained(source)
-        return make_worlds(trained.recipe, goals, [seed]), trained.actor
+        return make_worlds(replace(trained.recipe, task=trained.task), goals, [seed]), trained.actor
     home = RunFolder(source)
     if not home.path.is_dir():
         known = ", ".join(policy_names())

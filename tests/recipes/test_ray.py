@@ -97,7 +97,5 @@ def under_way(workers: RayWorkers) -> bool:
 
 
 def test_no_cluster_is_one_clear_line() -> None:
-    with pytest.raises(
-        ConnectionError, match="there is no Ray cluster at 127.0.0.1:1; `ray start` makes one"
-    ):
+    with pytest.raises(ConnectionError, match="no Ray cluster at 127.0.0.1:1 lets us in: .*refused"):
         RayWorkers("127.0.0.1:1")

@@ -38,8 +38,8 @@ class Here:
 @pytest.mark.parametrize("name", study_names())
 def test_every_study_is_made_of_recipes_that_work_and_can_be_shrunk(name: str) -> None:
     cells = dict(load_study(name).cells())
-    assert len(cells) >= 3
-    assert all(recipe.num_runs >= 5 for recipe in cells.values())
+    assert len(cells) >= 2
+    assert all(recipe.num_runs >= 3 for recipe in cells.values())
     quick = dict(load_study(name, quick=True).cells())
     assert quick.keys() == cells.keys()
     assert sum(recipe.total_frames * recipe.num_runs for recipe in quick.values()) < 300_000
