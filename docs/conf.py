@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 from importlib.metadata import version as version_of
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from sphinx.application import Sphinx
 
 project = "torchrl-her"
@@ -21,25 +21,31 @@ exclude_patterns = ["examples", "results"]  # a program, and the numbers behind 
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
 # What lies outside of this folder, and the page that shows it here.
-PAGES = {"../RESULTS.md": "results.md", "../CHANGELOG.md": "changelog.md", "benchmarks/PROFILE.md": "profile.md"}
+PAGES = {
+    "../RESULTS.md": "results.md",
+    "../CHANGELOG.md": "changelog.md",
+    "benchmarks/PROFILE.md": "profile.md",
+}
 
 # Docstrings.
-autodoc_default_options = {"members": True, "show-inheritance": True, "member-order": "bysource"}
-autodoc_class_signature = "mixed"
+autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"
 autodoc_type_aliases = {"NestedKey": "NestedKey", "Strategy": "Strategy"}
 napoleon_numpy_docstring = False
-napoleon_use_ivar = True  # attributes are listed, not defined a second time
-napoleon_custom_sections = []
+napoleon_use_param = napoleon_use_keyword = False  # keeps several names of one line together
+napoleon_custom_sections = [("Attributes", "params_style")]  # listed, not defined a second time
 python_maximum_signature_line_length = 88
 python_use_unqualified_type_names = True
 
 html_theme = "furo"
 html_title = f"torchrl-her {release}"
-html_theme_options = {"navigation_with_keys": True}
+html_theme_options = {
+    "navigation_with_keys": True,
+    "light_css_variables": {"code-font-size": "75%", "api-font-size": "85%"},
+}
 html_copy_source = False
-html_show_sphinx = False
+html_show_sphinx = html_show_copyright = False
 
 
 def link_to_pages(text: str) -> str:
@@ -54,14 +60,42 @@ def link_to_pages(text: str) -> str:
     return text
 
 
-def on_read(app: Sphinx, document: str, source: list[str]) -> None:
-    source[0] = link_to_pages(source[0])
+def on_read(*event: Any) -> None:
+    """A page, or what it includes, was read: its text comes last, in a list."""
+    event[-1][0] = link_to_pages(event[-1][0])
 
 
-def on_include(app: Sphinx, path: Path, document: str, source: list[str]) -> None:
-    source[0] = link_to_pages(source[0])
+class Unquoted(str):
+    """An annotation that is shown as it is written."""
+
+    __slots__ = ()
+    __repr__ = str.__str__
+
+
+def own_signature(cls: type) -> str:
+    """How a class is called whose metaclass takes anything: as its ``__init__``. Protocols are not called."""
+    if getattr(cls, "_is_protocol", False):
+        return ""
+    parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]
+    written = [
+        one if one.annotation is one.empty else one.replace(annotation=Unquoted(one.annotation))
+        for one in parameters
+    ]
+    return str(inspect.Signature(written))
+
+
+def on_signature(*event: Any) -> tuple[str, str | None] | None:
+    """Classes are shown with their own parameters; types that have a name by it, also within others."""
+    _, what, _, documented, _, signature, returned = event
+    if what == "class" and signature == "(*args, **kwargs)":
+        signature = own_signature(documented)
+    signature, returned = (
+        text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in (signature, returned)
+    )
+    return None if signature is None else (signature, returned)
 
 
 def setup(app: Sphinx) -> None:
     app.connect("source-read", on_read)
-    app.connect("include-read", on_include)
+    app.connect("include-read", on_read)
+    app.connect("autodoc-process-signature", on_signature)

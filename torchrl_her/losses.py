@@ -71,7 +71,8 @@ class PenalisedDDPGLoss(DDPGLoss):
     the mean square of the actions, times ``action_penalty``, is added to the actor's loss.
 
     Args:
-        *args, **kwargs: of :class:`torchrl.objectives.DDPGLoss`.
+        *args: of :class:`torchrl.objectives.DDPGLoss`.
+        **kwargs: of the same.
         action_penalty: at least 0.
     """
 
