@@ -144,9 +144,7 @@ def _first_layer(network: nn.Module) -> StackedLinear:
     return next(module for module in network.modules() if isinstance(module, StackedLinear))
 
 
-def _make_networks(
-    learner: str, recipe: Recipe, env: EnvBase, in_keys: Sequence[str], runs: int
-) -> Networks:
+def _make_networks(learner: str, recipe: Recipe, env: EnvBase, in_keys: Sequence[str], runs: int) -> Networks:
     widths, spec = [env.observation_spec[key].shape[-1] for key in in_keys], env.action_spec_unbatched
     options: dict[str, Any] = {"hidden": recipe.hidden, "in_keys": in_keys}
     if learner == "dqn":
@@ -161,9 +159,7 @@ def _make_networks(
     return actor.to(dtype), critic.to(dtype)
 
 
-def _make_exploration(
-    recipe: Recipe, env: EnvBase, generators: Sequence[torch.Generator]
-) -> Exploration:
+def _make_exploration(recipe: Recipe, env: EnvBase, generators: Sequence[torch.Generator]) -> Exploration:
     start, end = recipe.epsilon_start, recipe.epsilon_end
     if check_learner(recipe, env) == "sac":
         start = end = 0.0  # its policy explores by itself

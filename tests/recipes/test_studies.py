@@ -11,6 +11,7 @@ import yaml
 from filelock import FileLock
 from PIL import Image
 
+from torchrl_her_recipes import cli
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.jobs import Job, Outcome, Progress, run_job
 from torchrl_her_recipes.run_folder import RunFolder
@@ -52,7 +53,7 @@ def test_seeds_and_frames_take_the_place_of_the_study_s() -> None:
 
 
 def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draws(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, folder = tmp_path / "mine.yaml", tmp_path / "runs"
     vary = {"algo": ["her", "filtered_her"]}
@@ -72,6 +73,9 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     assert "the same command goes on with it" in said
 
     (folder / "her").unlink()
+    monkeypatch.setattr(
+        cli, "LocalWorkers", lambda jobs: Here()
+    )  # another process would take seconds to start
     assert main(command) == 0
     assert "1 batched runs to go, 3,200 environment steps in all" in capsys.readouterr().out
     with Image.open(folder / "mine.png") as picture:

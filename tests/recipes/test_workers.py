@@ -44,8 +44,9 @@ def job(folder: Path, **options: Any) -> Job:
     return Job(label=label, recipe=recipe, folder=folder / label)
 
 
-def wait_until(happened: Callable[[], bool]) -> None:
+def wait_until(happened: Callable[[], bool], *, during: Future[Outcome]) -> None:
     while not happened():
+        assert not during.done()
         time.sleep(0.05)
 
 
@@ -57,7 +58,7 @@ def test_one_process_does_several_jobs_until_it_is_told_to_stop(
     assert submit(broken).result().error.startswith("NotADirectoryError: ")
     assert submit(whole).result() == Outcome()
     outcome = submit(endless)
-    wait_until(lambda: workers.progress().get(endless.label, Progress()).epochs > 0)
+    wait_until(lambda: workers.progress().get(endless.label, Progress()).epochs > 0, during=outcome)
     workers.stop()
     assert outcome.result() == Outcome(interrupted=True)
     assert can_resume(endless.folder)
@@ -68,7 +69,7 @@ def test_a_process_that_dies_takes_only_its_job_along(
     tmp_path: Path, workers: LocalWorkers, submit: Callable[[Job], Future[Outcome]]
 ) -> None:
     outcome = submit(job(tmp_path, epochs=LONG))
-    wait_until(lambda: bool(workers.progress()))
+    wait_until(lambda: bool(workers.progress()), during=outcome)
     (pid,) = children()
     os.kill(pid, signal.SIGKILL)
     assert outcome.result().error == "its process was ended by SIGKILL, perhaps for want of memory"
