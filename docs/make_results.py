@@ -90,8 +90,8 @@ def read_study(study: Study, folder: Path) -> dict[tuple[str, str], RunFolder]:
     return found
 
 
-def print_table(runs: dict[tuple[str, str], RunFolder]) -> None:
-    print("| task | algorithm | runs | frames | success at the end | worst run | KL(q, q*) |")
+def print_table(runs: dict[tuple[str, str], RunFolder], heads: str = "task | algorithm") -> None:
+    print(f"| {heads} | runs | frames | success at the end | worst run | KL(q, q*) |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for (task, algorithm), home in runs.items():
         rows = home.rows()
@@ -151,7 +151,7 @@ def make_options(name: str, folder: Path) -> None:
     runs = {(label, study.name): RunFolder(folder / label) for label, _ in study.cells()}
     if all(is_done(home) for home in runs.values()):
         print(f"\n### {name}\n")
-        print_table(runs)
+        print_table(runs, "option | study")
         shutil.copy(draw_study(study, folder), HERE / "images" / f"{name}.png")
         write_data(name, runs)
 

@@ -6,6 +6,7 @@ whoever started it is gone: what it has is saved, and nothing goes on unseen.
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import pickle
@@ -36,6 +37,7 @@ def _serve(answers: BinaryIO) -> None:
     for job in iter(jobs.get, None):
         pickle.dump(run_job(job), answers)
         answers.flush()
+        gc.collect()  # the buffers of a run are gigabytes, and its parts hold on to each other
 
 
 def _listen(jobs: SimpleQueue[Job | None]) -> None:

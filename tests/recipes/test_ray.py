@@ -56,7 +56,7 @@ def study(**recipe: Any) -> Study:
 def test_a_node_that_dies_loses_only_its_run_which_is_done_again(
     tmp_path: Path, cluster: Cluster, node: Node
 ) -> None:
-    workers, epochs = RayWorkers(cluster.address), 20
+    workers, epochs = RayWorkers(cluster.address), 14
     with ThreadPoolExecutor(1) as threads:
         result = threads.submit(run_study, study(epochs=epochs), tmp_path, workers=workers, progress=False)
         while not (first := list(tmp_path.glob("*/metrics.csv"))) or not under_way(workers):
