@@ -97,6 +97,7 @@ def test_dqn_learns_the_value_of_a_lost_game(runs: int) -> None:
 # TD3 and SAC
 
 
+@torch.no_grad()
 def test_a_stochastic_actor_acts_within_its_bounds_and_greedily_by_its_location() -> None:
     torch.manual_seed(0)
     actor = make_stochastic_actor((4, 2), SPEC)
@@ -110,6 +111,7 @@ def test_a_stochastic_actor_acts_within_its_bounds_and_greedily_by_its_location(
     torch.testing.assert_close(acted["action"], 2.0 * acted["loc"].tanh())
 
 
+@torch.no_grad()
 def test_scales_are_bounded() -> None:
     net = StochasticActorNet(2, 1)
     _, scale = net(torch.full((1, 2), 1e6))
