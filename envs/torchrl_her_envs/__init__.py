@@ -12,6 +12,7 @@ from torchrl_her_envs.recording import base_env, record_episodes
 from torchrl_her_envs.registry import SMALL_WORLDS, get_task, make_env
 from torchrl_her_envs.rendering import render
 from torchrl_her_envs.robot import Arm
+from torchrl_her_envs.seeded_worlds import SeededWorlds
 from torchrl_her_envs.small_worlds import BitFlip, Chain, LatticeGoals, SmallWorld, TreasureHunt
 from torchrl_her_envs.task import TASKS, Task, WorldConfig
 from torchrl_her_envs.throwing import ThrowingEnv, WorldState
@@ -32,6 +33,7 @@ __all__ = [
     "Hand",
     "LatticeGoals",
     "SectorGoals",
+    "SeededWorlds",
     "SmallWorld",
     "Task",
     "ThrowingEnv",

@@ -9,18 +9,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from numbers import Integral
 from typing import ClassVar
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
-from torchrl_her_envs.seeding import block_keys, uniform
+from torchrl_her_envs.seeded_worlds import SeededWorlds
+from torchrl_her_envs.seeding import uniform
 
 _MOST_STEPS = (1 << 20) - 1  # each episode has room for so many moments of random numbers
 _MOST_BITS = 127  # a start takes two numbers a bit and one more, and a moment has 256
@@ -84,7 +83,7 @@ class SmallWorldState:
     episode: Tensor
 
 
-class SmallWorld(EnvBase):
+class SmallWorld(SeededWorlds):
     """What the small worlds share: N worlds on a lattice of places, where the goal is a place too.
 
     Keys: ``observation`` and ``achieved_goal`` (both the place), ``desired_goal``, ``state`` (the
@@ -176,30 +175,6 @@ class SmallWorld(EnvBase):
         apart = (achieved_goal - desired_goal).square().sum(-1, keepdim=True)
         return apart < self.threshold**2
 
-    def world_state_dict(self) -> dict[str, Tensor]:
-        """A copy of all that the worlds are, row by row; they resume exactly from it."""
-        state = {field.name: getattr(self.worlds, field.name).clone() for field in fields(SmallWorldState)}
-        return state | {"key": torch.from_numpy(self._keys.view(np.int64).copy())}
-
-    def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts the worlds back to where :meth:`world_state_dict` was taken."""
-        self.worlds = SmallWorldState(
-            **{field.name: state[field.name].clone() for field in fields(SmallWorldState)}
-        )
-        self._keys = state["key"].numpy().copy().view(np.uint64)
-
-    def set_seeds(self, seeds: Sequence[int]) -> None:
-        """Seeds R equal blocks of worlds, each as if it were alone.
-
-        Args:
-            seeds: R of them.
-
-        Raises:
-            ValueError: the worlds cannot be shared out among R blocks, or a seed is out of range.
-        """
-        self._keys = block_keys(seeds, self.batch_size[0])
-        self.worlds.episode.zero_()
-
     # What a world is made of
 
     @abstractmethod
@@ -211,9 +186,6 @@ class SmallWorld(EnvBase):
         """The places [N, g] that actions [N] lead to, and which worlds [N] end there, if any can."""
 
     # TorchRL's hooks
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.set_seeds([seed or 0])
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from numbers import Integral
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from torchrl_her_envs.effector import Effector
 from torchrl_her_envs.goals import BoxGoals, GoalDistribution, SectorGoals
@@ -19,7 +17,8 @@ from torchrl_her_envs.hand import Hand
 from torchrl_her_envs.physics import BallPhysics
 from torchrl_her_envs.rendering import render
 from torchrl_her_envs.robot import Arm
-from torchrl_her_envs.seeding import block_keys, uniform
+from torchrl_her_envs.seeded_worlds import SeededWorlds
+from torchrl_her_envs.seeding import uniform
 from torchrl_her_envs.task import Task, WorldConfig
 
 
@@ -63,7 +62,7 @@ class WorldState:
         )
 
 
-class ThrowingEnv(EnvBase):
+class ThrowingEnv(SeededWorlds):
     """N worlds in which a hand or an arm reaches for a ball or throws it into a black hole.
 
     Keys: ``observation``, ``achieved_goal``, ``desired_goal`` (gymnasium's GoalEnv convention),
@@ -173,32 +172,7 @@ class ThrowingEnv(EnvBase):
         """
         return render(self, worlds, size=size)
 
-    def world_state_dict(self) -> dict[str, Tensor]:
-        """A copy of all that the worlds are, row by row; they resume exactly from it."""
-        state = {field.name: getattr(self.worlds, field.name).clone() for field in fields(WorldState)}
-        return state | {"key": torch.from_numpy(self._keys.view(np.int64).copy())}
-
-    def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts the worlds back to where :meth:`world_state_dict` was taken."""
-        self.worlds = WorldState(**{field.name: state[field.name].clone() for field in fields(WorldState)})
-        self._keys = state["key"].numpy().copy().view(np.uint64)
-
-    def set_seeds(self, seeds: Sequence[int]) -> None:
-        """Seeds R equal blocks of worlds, each as if it were alone.
-
-        Args:
-            seeds: R of them.
-
-        Raises:
-            ValueError: the worlds cannot be shared out among R blocks, or a seed is out of range.
-        """
-        self._keys = block_keys(seeds, self.batch_size[0])
-        self.worlds.episode.zero_()
-
     # TorchRL's hooks
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.set_seeds([seed or 0])
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)

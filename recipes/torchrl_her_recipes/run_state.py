@@ -16,7 +16,7 @@ from torchrl_her import (
     load_collector_state_dict,
     set_layer_goals,
 )
-from torchrl_her_envs import SmallWorld, ThrowingEnv, goal_env
+from torchrl_her_envs import SeededWorlds, goal_env
 from torchrl_her_recipes.parts import Parts
 
 
@@ -71,10 +71,10 @@ def load_run_state(parts: Parts, trainer: Trainer, state: dict[str, Any]) -> Non
         parts.collector.reset()  # such an environment cannot go on with its episodes
 
 
-def _worlds(parts: Parts) -> ThrowingEnv | SmallWorld | None:
+def _worlds(parts: Parts) -> SeededWorlds | None:
     """The environment below all transforms, if it is one of ours."""
     worlds = goal_env(parts.env)
-    return worlds if isinstance(worlds, ThrowingEnv | SmallWorld) else None
+    return worlds if isinstance(worlds, SeededWorlds) else None
 
 
 def _made_of(parts: Parts) -> dict[str, str]:
