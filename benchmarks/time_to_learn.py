@@ -1,39 +1,54 @@
-"""Wall-clock to 80 % success on `hand_v0`, beside Stable-Baselines3's DDPG with HER.
+"""Wall-clock and frames to a success rate, beside Stable-Baselines3's DDPG with HER: one curve a seed.
 
     python benchmarks/time_to_learn.py --out time_to_learn.md
+    python benchmarks/time_to_learn.py --preset fetch_push --aim 2 --repeats 1 --noise 0.2 --curves curves.csv
 
-Both train in 64 worlds of the same task with the same networks, batches, discount and number of gradient
-steps; both are asked every so often for the success of 100 greedy episodes in the same environment, which is
-not timed. Ours is the default recipe with `algo=her`. Runs are taken in turns.
+Both train in as many worlds of the same task with the same networks, batches, discount and number of
+gradient steps; both are asked every epoch for the success of greedy episodes in the same environment, which
+is not timed. Runs are taken in turns, and end where the aim is reached (never, if it is above 1).
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import torch
 from machine import describe, table
+from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv
 from tensordict import TensorDictBase
-from update_speed import ENVS, TASK, make_sb3
+from update_speed import SB3Env
 
 from torchrl_her import evaluate, success
-from torchrl_her_envs import make_env
+from torchrl_her_envs import TASKS, get_task, goal_env
 from torchrl_her_recipes import Recipe
+from torchrl_her_recipes.studies import load_preset
+from torchrl_her_recipes.worlds import GYM, make_worlds
 
-EVERY, CAP, AIM = 20_480, 614_400, 0.8
+HAND = {"task": "hand_v0", "algo": "her"}  # all else is the default
 
-Progress = Iterator[Callable[[TensorDictBase], TensorDictBase]]
+Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
-def ours(seed: int) -> Progress:
-    """Trains, and hands out the greedy policy every so many frames."""
-    recipe = Recipe(task=TASK, algo="her", seed=seed, num_envs=ENVS, epoch_frames=EVERY, compile="always")
+class Point(NamedTuple):
+    """A curve's: what an evaluation found after so many frames, and seconds of training."""
+
+    frames: int
+    seconds: float
+    success: float
+
+
+def ours(recipe: Recipe, _noise: float) -> Iterator[Policy]:
+    """Trains, and hands out the greedy policy after each epoch. Explores as the recipe says."""
     parts = recipe.build()
     trainer = parts.trainer()
     while True:
@@ -41,13 +56,33 @@ def ours(seed: int) -> Progress:
         yield parts.policy
 
 
-def peer(seed: int) -> Progress:
-    model = make_sb3(
-        action_noise=NormalActionNoise(np.zeros(3), np.full(3, 0.1)),
-        batch_size=256,
-        gradient_steps=3,  # 64 frames are worth 3.2; it counts in whole ones
-        learning_starts=3_200,
-        seed=seed,  # of its environments, too
+def peer(recipe: Recipe, noise: float) -> Iterator[Policy]:
+    """The same of Stable-Baselines3, which keeps real rows only and has no prioritised replay."""
+
+    def make() -> gymnasium.Env:
+        if recipe.task in TASKS:
+            return SB3Env(get_task(recipe.task))
+        return gymnasium.make(recipe.task.removeprefix(GYM))
+
+    worlds = DummyVecEnv([make] * recipe.num_envs)
+    actions = worlds.action_space.shape
+    model = DDPG(
+        "MultiInputPolicy",
+        worlds,
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": recipe.k, "goal_selection_strategy": "future"},
+        policy_kwargs={"net_arch": [recipe.hidden] * 3},
+        gamma=recipe.gamma,
+        tau=recipe.tau,
+        learning_rate=recipe.learning_rate,
+        buffer_size=recipe.buffer_size // (recipe.k + 1),
+        batch_size=recipe.batch_size,
+        train_freq=(1, "step"),
+        gradient_steps=int(recipe.num_envs / recipe.frames_per_update),  # it counts in whole ones
+        learning_starts=recipe.warmup_frames,
+        action_noise=NormalActionNoise(np.zeros(actions), np.full(actions, noise)),
+        seed=recipe.seed,  # of its environments, too
+        device="cpu",
     )
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
@@ -56,23 +91,28 @@ def peer(seed: int) -> Progress:
         return tensordict.set("action", torch.from_numpy(action))
 
     while True:
-        model.learn(EVERY, reset_num_timesteps=False)
+        model.learn(recipe.epoch_frames, reset_num_timesteps=False)
         yield policy
 
 
-def race(contender: Callable[[int], Progress], seed: int) -> tuple[float, int, float]:
-    """Seconds and frames until the aim, or until the cap, and the best success on the way."""
-    test = make_env(TASK, num_envs=100, seed=seed + (1 << 32))
-    seconds, frames, best = 0.0, 0, 0.0
-    training = contender(seed)
-    while best < AIM and frames < CAP:
+CONTENDERS = {"this": ours, "Stable-Baselines3": peer}
+
+
+def race(name: str, recipe: Recipe, *, noise: float, aim: float) -> list[Point]:
+    """The curve until the aim, or until the recipe's last epoch."""
+    test = make_worlds(recipe, recipe.eval_episodes, [recipe.seed + (1 << 32)])
+    curve: list[Point] = []
+    training, seconds = CONTENDERS[name](recipe, noise), 0.0
+    for epoch in range(1, recipe.epochs + 1):
         began = time.perf_counter()
         policy = next(training)
         seconds += time.perf_counter() - began
-        frames += EVERY
-        rollout = evaluate(test, policy, max_steps=test.world.max_steps)
-        best = max(best, float(success(rollout).float().mean()))
-    return seconds, frames, best
+        rollout = evaluate(test, policy, max_steps=goal_env(test).max_steps)
+        curve.append(Point(epoch * recipe.epoch_frames, seconds, float(success(rollout).float().mean())))
+        print(f"{name}, seed {recipe.seed}: {curve[-1]}", flush=True)
+        if curve[-1].success >= aim:
+            break
+    return curve
 
 
 def column(values: Sequence[float], form: str) -> str:
@@ -81,42 +121,56 @@ def column(values: Sequence[float], form: str) -> str:
     )
 
 
+def line(name: str, curves: Sequence[Sequence[Point]], aim: float) -> list[str]:
+    """A row of the table: one number a seed."""
+    best = [max(point.success for point in curve) for curve in curves]
+    return [
+        name,
+        f"{sum(value >= aim for value in best)} of {len(curves)}",
+        column([curve[-1].seconds for curve in curves], ".0f"),
+        column([curve[-1].frames for curve in curves], ",.0f"),
+        column([curve[-1].success for curve in curves], ".0%"),
+        column(best, ".0%"),
+    ]
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--preset", help="of torchrl-her (default: HER on hand_v0)")
+    parser.add_argument("--only", choices=CONTENDERS, help="one of the two")
+    parser.add_argument("--aim", type=float, default=0.8, help="success at which a run ends")
+    parser.add_argument("--noise", type=float, default=0.1, help="of Stable-Baselines3's actions")
     parser.add_argument("--repeats", type=int, default=3, help="seeds")
     parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
+    parser.add_argument("--curves", type=Path, help="a CSV file for all points")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
-    contenders = {"this": ours, "Stable-Baselines3": peer}
-    results: dict[str, list[tuple[float, int, float]]] = {name: [] for name in contenders}
+    values: dict[str, Any] = load_preset(options.preset) if options.preset else HAND
+    names = [options.only] if options.only else list(CONTENDERS)
+    curves: dict[str, list[list[Point]]] = {name: [] for name in names}
     for seed in range(options.repeats):
-        for name, contender in contenders.items():
-            results[name].append(race(contender, seed))
-    rows = []
-    for name, runs in results.items():
-        seconds, frames, best = (list(values) for values in zip(*runs, strict=True))
-        reached = sum(value >= AIM for value in best)
-        rows.append(
-            [
-                name,
-                f"{reached} of {len(runs)}",
-                column(seconds, ".0f"),
-                column(frames, ",.0f"),
-                column(best, ".0%"),
-            ]
-        )
-    header = (
-        f"{TASK} to {AIM:.0%}",
-        "reached",
-        "seconds: median (each)",
-        f"frames, at most {CAP:,}",
-        "best success",
-    )
+        recipe = Recipe.from_dict({**values, "seed": seed})
+        for name in names:
+            curves[name].append(race(name, recipe, noise=options.noise, aim=options.aim))
+    header = (recipe.task, f"reached {options.aim:.0%}", "seconds: median (each)", "frames", "last", "best")
+    rows = [line(name, curves[name], options.aim) for name in names]
     text = "\n\n".join((describe("torch", "torchrl", "stable-baselines3"), table(header, rows)))
     print(text)
     if options.out is not None:
         options.out.write_text(text + "\n")
+    if options.curves is not None:
+        with open(options.curves, "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(("contender", "seed", *Point._fields))
+            writer.writerows(
+                (name, seed, *point)
+                for name in names
+                for seed, curve in enumerate(curves[name])
+                for point in curve
+            )
 
 
 if __name__ == "__main__":

@@ -19,10 +19,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchrl_her_envs import make_env
-from torchrl_her_recipes.goal_map import GoalMap
+from torchrl_her_recipes.batches import Batches
 from torchrl_her_recipes.plots import draw_goals, plot_comparison
-from torchrl_her_recipes.run_folder import RunFolder
-from torchrl_her_recipes.studies import draw_study, is_done, load_study
+from torchrl_her_recipes.studies import draw_study, load_study
 from torchrl_her_recipes.study_results import at_the_end
 
 HERE = Path(__file__).parent
@@ -79,22 +78,22 @@ def spread(values: Sequence[float], form: str) -> str:
     return f"**{middle:{form}}** ({low:{form}} to {high:{form}})"
 
 
-def read_study(study: Study, folder: Path) -> dict[tuple[str, str], RunFolder]:
+def read_study(study: Study, folder: Path) -> dict[tuple[str, str], Batches]:
     """The runs that there are."""
     found = {}
     for task in study.tasks:
         for algorithm in study.algorithms:
-            home = RunFolder(folder / f"{task}_{algorithm}")
-            if is_done(home):
-                found[task, algorithm] = home
+            runs = Batches(folder / f"{task}_{algorithm}")
+            if runs.is_done:
+                found[task, algorithm] = runs
     return found
 
 
-def print_table(runs: dict[tuple[str, str], RunFolder], heads: str = "task | algorithm") -> None:
+def print_table(runs: dict[tuple[str, str], Batches], heads: str = "task | algorithm") -> None:
     print(f"| {heads} | runs | frames | success at the end | worst run | KL(q, q*) |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
-    for (task, algorithm), home in runs.items():
-        rows = home.rows()
+    for (task, algorithm), own in runs.items():
+        rows = own.rows()
         success = at_the_end(rows, "success")
         frames = f"{rows[-1]['frames']:,.0f}"
         kl = spread([row["kl"] for row in rows if row["epoch"] == rows[-1]["epoch"]], ".2f")
@@ -104,14 +103,14 @@ def print_table(runs: dict[tuple[str, str], RunFolder], heads: str = "task | alg
         )
 
 
-def draw_success(runs: dict[tuple[str, str], RunFolder], path: Path) -> None:
+def draw_success(runs: dict[tuple[str, str], Batches], path: Path) -> None:
     panels: dict[str, dict[str, Rows]] = {}
-    for (task, algorithm), home in runs.items():
-        panels.setdefault(task, {})[algorithm] = home.rows()
+    for (task, algorithm), own in runs.items():
+        panels.setdefault(task, {})[algorithm] = own.rows()
     plot_comparison(panels, path)
 
 
-def draw_maps(study: Study, runs: dict[tuple[str, str], RunFolder], path: Path) -> None:
+def draw_maps(study: Study, runs: dict[tuple[str, str], Batches], path: Path) -> None:
     """Where virtual goals lie: a row for each task, q of each algorithm, and q* at the right."""
     tasks = [task for task in study.tasks if any(task == own for own, _ in runs)]
     names = [name for name in study.algorithms if any(name == own for _, own in runs)]
@@ -120,10 +119,9 @@ def draw_maps(study: Study, runs: dict[tuple[str, str], RunFolder], path: Path) 
         env, target = make_env(task), None
         env.reset()
         for axes, name in zip(line, names, strict=False):
-            home = runs.get((task, name))
+            own = runs.get((task, name))
             axes.set_axis_off()
-            if home is not None:
-                goals = GoalMap.load(home.goal_map)
+            if own is not None and (goals := own.goal_map()) is not None:
                 target = goals.target
                 axes.set_axis_on()
                 draw_goals(axes, goals.share, env, limit=float(target.max()))
@@ -134,9 +132,9 @@ def draw_maps(study: Study, runs: dict[tuple[str, str], RunFolder], path: Path) 
     figure.savefig(path, dpi=80)
 
 
-def write_data(study: str, runs: dict[tuple[str, str], RunFolder]) -> None:
-    for (task, algorithm), home in runs.items():
-        rows = home.rows()
+def write_data(study: str, runs: dict[tuple[str, str], Batches]) -> None:
+    for (task, algorithm), own in runs.items():
+        rows = own.rows()
         columns = [name for name in COLUMNS if name in rows[-1]]
         with open(HERE / "results" / f"{study}_{task}_{algorithm}.csv", "w", newline="") as file:
             writer = csv.writer(file)
@@ -148,8 +146,8 @@ def write_data(study: str, runs: dict[tuple[str, str], RunFolder]) -> None:
 def make_options(name: str, folder: Path) -> None:
     """The same for a study of one option: one panel, a curve for each value."""
     study = load_study(name)
-    runs = {(label, study.name): RunFolder(folder / label) for label, _ in study.cells()}
-    if all(is_done(home) for home in runs.values()):
+    runs = {(label, study.name): Batches(folder / label) for label, _ in study.cells()}
+    if all(own.is_done for own in runs.values()):
         print(f"\n### {name}\n")
         print_table(runs, "option | study")
         shutil.copy(draw_study(study, folder), HERE / "images" / f"{name}.png")

@@ -71,9 +71,15 @@ def read_progress(folder: Path) -> Progress:
 
 
 def kept_progress(job: Job) -> Progress:
-    """How far a job is that nobody is at work on: what was done behind its last checkpoint may be lost."""
-    done = read_progress(job.folder)
-    return done if done.epochs >= job.recipe.epochs or can_resume(job.folder) else Progress()
+    """How far a job is that nobody is at work on: what was done behind its last checkpoint may be lost.
+
+    One that was killed between its last epoch and its pictures is an epoch short of its end.
+    """
+    done, home = read_progress(job.folder), RunFolder(job.folder)
+    if done.epochs >= job.recipe.epochs and home.is_done:
+        return done
+    short = done._replace(epochs=min(done.epochs, job.recipe.epochs - 1))
+    return short if can_resume(job.folder) else Progress()
 
 
 def run_job(job: Job) -> Outcome:

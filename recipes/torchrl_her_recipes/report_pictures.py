@@ -12,7 +12,6 @@ import numpy as np
 
 from torchrl_her_envs import ThrowingEnv, make_env
 from torchrl_her_recipes.comparing import Final, values_of
-from torchrl_her_recipes.goal_map import GoalMap
 from torchrl_her_recipes.plots import Rows, band, colours
 from torchrl_her_recipes.report_words import MEASURES, show, show_interval
 from torchrl_her_recipes.study_plots import plot_finals, plot_measure, plot_share
@@ -91,11 +90,8 @@ def _final(
 
 def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Picture]:
     """A heat map of each algorithm's virtual goals, and one of where they should be."""
-    maps = {
-        cell.algorithm: GoalMap.load(cell.home.goal_map)
-        for cell in cells
-        if not cell.missing and cell.home.goal_map.is_file()
-    }
+    found = {cell.algorithm: cell.batches.goal_map() for cell in cells}
+    maps = {label: goals for label, goals in found.items() if goals is not None}
     if not maps:
         return []
     env = make_env(task)

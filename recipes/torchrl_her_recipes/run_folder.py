@@ -69,11 +69,19 @@ class RunFolder:
             ValueError: this is no folder of a run, or its configuration cannot be read.
         """
         if not self.config.is_file():
-            raise ValueError(f"{self.path} is no folder of a run: it has no config.yaml")
+            inside = sorted(config.parent.name for config in self.path.glob("*/config.yaml"))
+            hint = f"; choose one of {', '.join(inside)} in it" if inside else ""
+            raise ValueError(f"{self.path} is no folder of a run: it has no config.yaml{hint}")
         try:
             return Recipe.from_dict(yaml.safe_load(self.config.read_text()))
         except (yaml.YAMLError, TypeError) as error:
             raise ValueError(f"{self.config} cannot be read: {' '.join(str(error).split())}") from error
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the run has reached its last epoch and left all behind; its policy comes last."""
+        rows = self.rows() if self.config.exists() and self.policy.exists() else []
+        return bool(rows) and rows[-1]["epoch"] >= self.recipe().epochs
 
     def log(self, rows: Sequence[dict[str, float]], new: int) -> None:
         """Writes the table, and the last rows of it to the events.

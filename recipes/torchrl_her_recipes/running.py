@@ -83,6 +83,7 @@ def resume(folder: str | Path, *, parts: Parts | None = None, progress: bool = T
     parts = parts or build_parts(home.recipe())
     trainer = parts.trainer()
     state = load_newest_checkpoint(home.checkpoint, keep=parts.recipe.keep_checkpoints)
+    home.policy.unlink(missing_ok=True)  # of an earlier stop
     with torch.random.fork_rng(devices=[]):
         load_run_state(parts, trainer, state)
         rows = home.rows()[: trainer.epochs * parts.recipe.num_runs]  # not those behind the checkpoint
@@ -182,9 +183,13 @@ def _save(parts: Parts, trainer: Trainer, home: RunFolder) -> bool:
 
 
 def _finish(parts: Parts, rows: list[dict[str, float]], home: RunFolder) -> None:
-    """Leaves behind what people want to look at."""
-    recipe = parts.recipe
+    """Leaves behind what people want to look at, and last of all the policy: then the run has ended."""
+    _draw(parts, rows, home)
     save_checkpoint({"actor": dict(parts.actor.state_dict())}, home.policy)
+
+
+def _draw(parts: Parts, rows: list[dict[str, float]], home: RunFolder) -> None:
+    recipe = parts.recipe
     home.close()
     title = f"{recipe.task}, {recipe.algo}, " + (
         f"seed {recipe.seed}" if recipe.num_runs == 1 else f"{recipe.num_runs} runs"

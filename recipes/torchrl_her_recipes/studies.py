@@ -11,11 +11,10 @@ from typing import Any
 import yaml
 from filelock import FileLock, Timeout
 
-from torchrl_her_recipes.jobs import Job
+from torchrl_her_recipes.batches import Batches, plan_batches
 from torchrl_her_recipes.planning import Plan
 from torchrl_her_recipes.plots import plot_comparison
 from torchrl_her_recipes.recipe import Recipe
-from torchrl_her_recipes.run_folder import RunFolder
 from torchrl_her_recipes.scheduling import run_jobs
 from torchrl_her_recipes.workers import LocalWorkers, Workers
 
@@ -47,7 +46,7 @@ class Study:
     vary: dict[str, Sequence[Any]] = field(default_factory=dict)
 
     def cells(self) -> Iterator[tuple[str, Recipe]]:
-        """The batched runs by name.
+        """The combinations by name, each with all of its seeds.
 
         Raises:
             ValueError: a recipe that cannot work.
@@ -90,7 +89,7 @@ def load_study(
     values = yaml.safe_load(path.read_text())
     preset = values.pop("preset", None)
     study = Study(name=path.stem, **values)
-    recipe = {**(_preset(preset) if preset else {}), **study.recipe, **(_QUICK if quick else {})}
+    recipe = {**(load_preset(preset) if preset else {}), **study.recipe, **(_QUICK if quick else {})}
     if seeds is not None:
         recipe["num_runs"] = seeds
     if frames is not None:
@@ -98,8 +97,12 @@ def load_study(
     return replace(study, recipe=recipe)
 
 
-def _preset(name: str) -> dict[str, Any]:
-    """The values of a preset."""
+def load_preset(name: str) -> dict[str, Any]:
+    """The values of a preset.
+
+    Raises:
+        ValueError: there is no such preset.
+    """
     path = _CONF.parent / "preset" / f"{name}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(preset.stem for preset in path.parent.glob("*.yaml")))
@@ -131,17 +134,13 @@ def plan_study(study: Study, folder: Path) -> Plan:
 
     Args:
         study: what to run.
-        folder: a folder of each combination goes into it, or is there already.
+        folder: a folder of each combination goes into it, or is there already. Seeds that it lacks are
+            added to those that it has.
 
     Raises:
         ValueError: the folder has a run of other options under the same name.
     """
-    jobs = [Job(label=label, recipe=recipe, folder=folder / label) for label, recipe in study.cells()]
-    for job in jobs:
-        home = RunFolder(job.folder)
-        if home.config.exists() and home.recipe() != job.recipe:
-            raise ValueError(f"{home.path} holds a run with other options; choose another folder")
-    return Plan(jobs)
+    return Plan(job for label, recipe in study.cells() for job in plan_batches(label, recipe, folder))
 
 
 def run_study(
@@ -179,17 +178,11 @@ def run_study(
     )
 
 
-def is_done(home: RunFolder) -> bool:
-    """Whether a run has reached its last epoch."""
-    rows = home.rows()
-    return home.config.exists() and bool(rows) and rows[-1]["epoch"] >= home.recipe().epochs
-
-
 def draw_study(study: Study, folder: Path) -> Path:
     """Success over environment steps: a panel for each task, a curve for each combination of the rest."""
     panels: dict[str, dict[str, list[dict[str, float]]]] = {}
     for label, recipe in study.cells():
-        rows = RunFolder(folder / label).rows()
+        rows = Batches(folder / label).rows()
         curve = label.removeprefix(recipe.task).lstrip("_") or recipe.algo
         panels.setdefault(recipe.task, {})[curve] = rows
     path = folder / f"{study.name}.png"

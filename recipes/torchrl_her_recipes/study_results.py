@@ -7,32 +7,32 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from torchrl_her_recipes.batches import Batches
 from torchrl_her_recipes.recipe import Recipe
-from torchrl_her_recipes.run_folder import RunFolder
-from torchrl_her_recipes.studies import Study, is_done
+from torchrl_her_recipes.studies import Study
 
 LAST = 3  # evaluations whose mean is what a run reached in the end
 
 
 @dataclass(frozen=True, kw_only=True)
 class Combination:
-    """One batch of runs of a study, and what there is of it so far.
+    """One combination of a study, and what there is of its runs so far.
 
     Attributes:
         label: its folder's name.
         task: what was learnt.
         algorithm: what sets it apart from the others on the same task.
-        home: its folder; there may be none yet.
+        batches: what its folder holds.
         recipe: what was run; if nothing was, what is to be run.
         rows: its table of metrics, one row an epoch and run.
-        done: whether it has reached its last epoch.
+        done: whether all that was begun of it has reached its last epoch.
         differs: options that are not the study's, in words.
     """
 
     label: str
     task: str
     algorithm: str
-    home: RunFolder
+    batches: Batches
     recipe: Recipe
     rows: list[dict[str, float]]
     done: bool
@@ -82,15 +82,15 @@ def read_combinations(study: Study, folder: Path) -> list[Combination]:
     """
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; `torchrl-her study {study.name}` makes its runs")
-    cells = [_read(label, recipe, RunFolder(folder / label)) for label, recipe in study.cells()]
+    cells = [_read(label, recipe, Batches(folder / label)) for label, recipe in study.cells()]
     if all(cell.missing for cell in cells):
         labels = ", ".join(cell.label for cell in cells)
         raise ValueError(f"{folder} has no run of the study {study.name}; its runs are {labels}")
     return cells
 
 
-def _read(label: str, planned: Recipe, home: RunFolder) -> Combination:
-    made = home.recipe() if home.config.exists() else planned
+def _read(label: str, planned: Recipe, batches: Batches) -> Combination:
+    made = batches.recipe or planned
     ours, study_s = asdict(made), asdict(planned)
     differs = [
         f"{name}={value} (the study: {study_s[name]})"
@@ -101,10 +101,10 @@ def _read(label: str, planned: Recipe, home: RunFolder) -> Combination:
         label=label,
         task=planned.task,
         algorithm=f"_{label}_".replace(f"_{planned.task}_", "_").strip("_") or planned.algo,
-        home=home,
+        batches=batches,
         recipe=made,
-        rows=home.rows() if home.config.exists() else [],
-        done=is_done(home),
+        rows=batches.rows(),
+        done=batches.is_done,
         differs=", ".join(differs),
     )
 

@@ -8,7 +8,16 @@ from pathlib import Path
 import pytest
 
 from torchrl_her_recipes import jobs
-from torchrl_her_recipes.jobs import Job, Outcome, can_resume, pack, read_progress, run_job, unpack
+from torchrl_her_recipes.jobs import (
+    Job,
+    Outcome,
+    can_resume,
+    kept_progress,
+    pack,
+    read_progress,
+    run_job,
+    unpack,
+)
 
 from .small import small
 
@@ -28,6 +37,19 @@ def test_a_job_without_a_checkpoint_begins_again(job: Job) -> None:
     assert read_progress(job.folder).epochs == 2
     assert can_resume(job.folder)
     assert not (job.folder / "error.txt").exists()
+
+
+def test_a_job_that_was_killed_while_it_drew_its_pictures_draws_them(job: Job) -> None:
+    assert run_job(job) == Outcome()
+    assert kept_progress(job).epochs == 2
+    (job.folder / "policy.pt").unlink()
+    (job.folder / "curves.png").unlink()
+    rows = (job.folder / "metrics.csv").read_text()
+    assert kept_progress(job).epochs == 1
+    assert run_job(job) == Outcome()
+    assert kept_progress(job).epochs == 2
+    assert (job.folder / "curves.png").exists()
+    assert (job.folder / "metrics.csv").read_text() == rows
 
 
 def test_what_goes_wrong_is_an_outcome_and_its_story_is_kept(

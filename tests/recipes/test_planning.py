@@ -8,6 +8,7 @@ import pytest
 
 from torchrl_her_recipes.jobs import Job, Progress
 from torchrl_her_recipes.planning import Plan, duration, expected_seconds, wall_clock
+from torchrl_her_recipes.run_folder import RunFolder
 
 from .small import small
 
@@ -29,6 +30,8 @@ def test_what_is_done_is_left_out_and_the_longest_comes_first(tmp_path: Path) ->
     assert [job.label for job in plan.to_go] == ["long", "short"]
     assert plan.steps == plan.steps_to_go(plan.jobs) == 5 * 16_000
     write(tmp_path / "long", epochs=10, seconds=30.0, checkpoint=False)
+    RunFolder(tmp_path / "long").describe(plan.jobs[1].recipe)
+    RunFolder(tmp_path / "long").policy.touch()
     plan = Plan(jobs(tmp_path))
     assert [job.label for job in plan.to_go] == ["short"]
     assert plan.steps_to_go(plan.jobs) == 16_000

@@ -26,7 +26,8 @@ from ray.cluster_utils import Cluster
 from torchrl_her_recipes.ray_workers import RayWorkers
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray's own files and processes
-LABELS = ("her", "filtered_her")
+ALGORITHMS = ("her", "filtered_her")
+LABELS = [f"{name}/seeds_0" for name in ALGORITHMS]
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,7 @@ def node(cluster: Cluster) -> Iterator[Node]:
 
 def study(**recipe: Any) -> Study:
     common = {**SMALL, "task": "hand_v0", "compile": "never", **recipe}
-    return Study(name="small", recipe=common, vary={"algo": list(LABELS)})
+    return Study(name="small", recipe=common, vary={"algo": ALGORITHMS})
 
 
 def test_a_node_that_dies_loses_only_its_run_which_is_done_again(
@@ -59,7 +60,7 @@ def test_a_node_that_dies_loses_only_its_run_which_is_done_again(
     workers, epochs = RayWorkers(cluster.address), 14
     with ThreadPoolExecutor(1) as threads:
         result = threads.submit(run_study, study(epochs=epochs), tmp_path, workers=workers, progress=False)
-        while not (first := list(tmp_path.glob("*/metrics.csv"))) or not under_way(workers):
+        while not (first := list(tmp_path.glob("*/*/metrics.csv"))) or not under_way(workers):
             assert not result.done()
             time.sleep(0.1)
         written = [path.stat().st_mtime_ns for path in first]
@@ -71,7 +72,7 @@ def test_a_node_that_dies_loses_only_its_run_which_is_done_again(
         assert read_progress(tmp_path / label).epochs == epochs
         assert (tmp_path / label / "policy.gif").exists()
         assert not can_resume(tmp_path / label)  # buffers of what is done stay where they were
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", *sorted(LABELS), "small.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", *sorted(ALGORITHMS), "small.png"]
 
 
 @pytest.mark.usefixtures("node")

@@ -12,10 +12,11 @@ from filelock import FileLock
 from PIL import Image
 
 from torchrl_her_recipes import cli
+from torchrl_her_recipes.batches import Batches
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.jobs import Job, Outcome, Progress, run_job
 from torchrl_her_recipes.run_folder import RunFolder
-from torchrl_her_recipes.studies import Study, StudyResult, is_done, load_study, run_study, study_names
+from torchrl_her_recipes.studies import Study, StudyResult, load_study, run_study, study_names
 
 from .small import SMALL
 
@@ -62,14 +63,14 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     assert main([*command, "--plan"]) == 0
     said = capsys.readouterr().out
     assert "2 batched runs to go, 6,400 environment steps in all" in said
-    assert "her           to do                      3,200 steps to go, about" in said
+    assert "her/seeds_0           to do                      3,200 steps to go, about" in said
     assert not folder.exists()
 
     folder.mkdir()
     (folder / "her").write_text("in the way")
     assert main(command) == 1
     said, failed = capsys.readouterr()
-    assert "torchrl-her: her failed: NotADirectoryError: " in failed
+    assert "torchrl-her: her/seeds_0 failed: NotADirectoryError: " in failed
     assert "the same command goes on with it" in said
 
     (folder / "her").unlink()
@@ -81,7 +82,7 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     with Image.open(folder / "mine.png") as picture:
         assert min(picture.size) > 200
 
-    metrics = [folder / name / "metrics.csv" for name in vary["algo"]]
+    metrics = [folder / name / "seeds_0" / "metrics.csv" for name in vary["algo"]]
     before = [file.stat().st_mtime_ns for file in metrics]
     assert main(command) == 0
     assert "0 batched runs to go, 0 environment steps" in capsys.readouterr().out
@@ -105,13 +106,13 @@ def test_the_guide_s_study_is_planned_as_it_says(
 def test_a_combination_that_was_cut_short_goes_on(tmp_path: Path) -> None:
     short = Study(name="cut", recipe={**SMALL, "epochs": 1}, vary={"algo": ["her"]})
     run_study(short, tmp_path, workers=Here(), progress=False)
-    home = RunFolder(tmp_path / "her")
+    (home,) = Batches(tmp_path / "her").homes
     home.config.write_text(home.config.read_text().replace("epochs: 1", "epochs: 2"))
-    assert not is_done(home)
+    assert not Batches(tmp_path / "her").is_done
     whole = Study(name="cut", recipe={**SMALL, "epochs": 2}, vary={"algo": ["her"]})
     result = run_study(whole, tmp_path, workers=Here(), progress=False)
     assert result == StudyResult(figure=tmp_path / "cut.png")
-    assert is_done(home)
+    assert Batches(tmp_path / "her").is_done
     assert [row["epoch"] for row in home.rows()] == [1, 2]
 
 
