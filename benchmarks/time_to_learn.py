@@ -18,21 +18,16 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium
-import numpy as np
 import torch
 from machine import describe, table
-from stable_baselines3 import DDPG, HerReplayBuffer
-from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv
+from peer_sb3 import make_sb3
 from tensordict import TensorDictBase
-from update_speed import SB3Env
 
 from torchrl_her import evaluate, success
-from torchrl_her_envs import TASKS, get_task, goal_env
+from torchrl_her_envs import goal_env
 from torchrl_her_recipes import Recipe
 from torchrl_her_recipes.studies import load_preset
-from torchrl_her_recipes.worlds import GYM, make_worlds
+from torchrl_her_recipes.worlds import make_worlds
 
 HAND = {"task": "hand_v0", "algo": "her"}  # all else is the default
 
@@ -57,33 +52,8 @@ def ours(recipe: Recipe, _noise: float) -> Iterator[Policy]:
 
 
 def peer(recipe: Recipe, noise: float) -> Iterator[Policy]:
-    """The same of Stable-Baselines3, which keeps real rows only and has no prioritised replay."""
-
-    def make() -> gymnasium.Env:
-        if recipe.task in TASKS:
-            return SB3Env(get_task(recipe.task))
-        return gymnasium.make(recipe.task.removeprefix(GYM))
-
-    worlds = DummyVecEnv([make] * recipe.num_envs)
-    actions = worlds.action_space.shape
-    model = DDPG(
-        "MultiInputPolicy",
-        worlds,
-        replay_buffer_class=HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": recipe.k, "goal_selection_strategy": "future"},
-        policy_kwargs={"net_arch": [recipe.hidden] * 3},
-        gamma=recipe.gamma,
-        tau=recipe.tau,
-        learning_rate=recipe.learning_rate,
-        buffer_size=recipe.buffer_size // (recipe.k + 1),
-        batch_size=recipe.batch_size,
-        train_freq=(1, "step"),
-        gradient_steps=int(recipe.num_envs / recipe.frames_per_update),  # it counts in whole ones
-        learning_starts=recipe.warmup_frames,
-        action_noise=NormalActionNoise(np.zeros(actions), np.full(actions, noise)),
-        seed=recipe.seed,  # of its environments, too
-        device="cpu",
-    )
+    """The same of Stable-Baselines3."""
+    model = make_sb3(recipe, noise=noise)
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         keys = ("observation", "achieved_goal", "desired_goal")

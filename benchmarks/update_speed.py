@@ -11,30 +11,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from machine import describe, medians, table
-from peer_env import PeerEnv
-from stable_baselines3 import DDPG, HerReplayBuffer
-from stable_baselines3.common.vec_env import DummyVecEnv
+from peer_sb3 import make_sb3
+from stable_baselines3 import DDPG
 
 from torchrl_her import LossLearner, Trainer
-from torchrl_her_envs import get_task
 from torchrl_her_recipes import Recipe
 
 TASK, ENVS, BATCH = "hand_v0", 64, 64
 FILL = 6_400  # frames in the buffers before anything is timed
 UPDATES = 40  # in one measurement
-
-
-class SB3Env(PeerEnv):
-    """The peer environment with the reward function that Stable-Baselines3 relabels with."""
-
-    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, _info: object) -> np.ndarray:
-        gap = np.square(achieved - desired).sum(-1)
-        return (gap < self._threshold2).astype(np.float32) - 1.0
 
 
 def ours(
@@ -91,27 +79,10 @@ def frames_of(trainer: Trainer, frames: int) -> Callable[[], int]:
     return work
 
 
-def make_sb3(**options: Any) -> DDPG:
-    """Stable-Baselines3's DDPG with its HER, networks, discount and target update as ours."""
-    return DDPG(
-        "MultiInputPolicy",
-        DummyVecEnv([lambda: SB3Env(get_task(TASK))] * ENVS),
-        replay_buffer_class=HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
-        policy_kwargs={"net_arch": [64, 64, 64]},
-        gamma=0.98,
-        tau=0.02,
-        train_freq=(1, "step"),
-        device="cpu",
-        **options,
-    )
-
-
 def sb3(*, gradient_steps: int) -> DDPG:
-    """The same with its buffer filled."""
-    model = make_sb3(
-        batch_size=BATCH, buffer_size=200_000, gradient_steps=gradient_steps, learning_starts=FILL
-    )
+    """Stable-Baselines3's model with its buffer filled."""
+    recipe = Recipe(task=TASK, num_envs=ENVS, batch_size=BATCH, warmup_frames=FILL)
+    model = make_sb3(recipe, gradient_steps=gradient_steps)
     model.learn(FILL + ENVS)
     return model
 
