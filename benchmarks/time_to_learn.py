@@ -1,7 +1,7 @@
 """Wall-clock and frames to a success rate, beside Stable-Baselines3's DDPG with HER: one curve a seed.
 
     python benchmarks/time_to_learn.py --out time_to_learn.md
-    python benchmarks/time_to_learn.py --preset fetch_push --aim 2 --repeats 1 --noise 0.2 --curves curves.csv
+    python benchmarks/time_to_learn.py --preset fetch_push --aim 2 --repeats 1 --noise 0.2 --curves fetch_push
 
 Both train in as many worlds of the same task with the same networks, batches, discount and number of
 gradient steps; both are asked every epoch for the success of greedy episodes in the same environment, which
@@ -14,12 +14,13 @@ import argparse
 import csv
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from machine import describe, table
+from matplotlib.figure import Figure
 from peer_sb3 import make_sb3
 from tensordict import TensorDictBase
 
@@ -65,6 +66,8 @@ def peer(recipe: Recipe, noise: float) -> Iterator[Policy]:
         yield policy
 
 
+Curves = Mapping[str, Sequence[Sequence[Point]]]  # of each seed, by contender
+
 CONTENDERS = {"this": ours, "Stable-Baselines3": peer}
 
 
@@ -104,6 +107,34 @@ def line(name: str, curves: Sequence[Sequence[Point]], aim: float) -> list[str]:
     ]
 
 
+def write_curves(curves: Curves, stem: Path) -> None:
+    with open(stem.with_suffix(".csv"), "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("contender", "seed", *Point._fields))
+        for name, seeds in curves.items():
+            for seed, curve in enumerate(seeds):
+                writer.writerows((name, seed, *(f"{value:.5g}" for value in point)) for point in curve)
+
+
+def draw_curves(curves: Curves, path: Path, *, title: str) -> None:
+    """Success over frames, and over seconds of training: a line for each seed."""
+    figure = Figure(figsize=(9.4, 3.8), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, field in zip(panels, ("frames", "seconds"), strict=True):
+        for name, colour in zip(curves, ("#2b6cb0", "#dd6b20"), strict=False):
+            for seed, curve in enumerate(curves[name]):
+                label = name if seed == 0 else None
+                places = [getattr(point, field) for point in curve]
+                axes.plot(places, [point.success for point in curve], color=colour, label=label)
+        axes.set(
+            xlabel="environment steps" if field == "frames" else "seconds of training", ylim=(-0.02, 1.02)
+        )
+        axes.grid(alpha=0.3)
+    panels[0].set(ylabel="success", title=title)
+    panels[0].legend(loc="upper left")
+    figure.savefig(path, dpi=110)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -114,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--noise", type=float, default=0.1, help="of Stable-Baselines3's actions")
     parser.add_argument("--repeats", type=int, default=3, help="seeds")
     parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
-    parser.add_argument("--curves", type=Path, help="a CSV file for all points")
+    parser.add_argument("--curves", type=Path, help="write all points to this name with .csv, and draw .png")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
@@ -132,15 +163,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.out is not None:
         options.out.write_text(text + "\n")
     if options.curves is not None:
-        with open(options.curves, "w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(("contender", "seed", *Point._fields))
-            writer.writerows(
-                (name, seed, *point)
-                for name in names
-                for seed, curve in enumerate(curves[name])
-                for point in curve
-            )
+        write_curves(curves, options.curves)
+        draw_curves(curves, options.curves.with_suffix(".png"), title=recipe.task)
 
 
 if __name__ == "__main__":

@@ -38,6 +38,14 @@ napoleon_custom_sections = [("Attributes", "params_style")]  # listed, not defin
 python_maximum_signature_line_length = 88
 python_use_unqualified_type_names = True
 
+# Every reference within the project has a target; other libraries' pages are not read in.
+nitpicky = True
+nitpick_ignore_regex = [
+    ("py:.*", r"(collections|pathlib|torch|tensordict|torchrl|numpy|gymnasium)\..*"),
+    ("py:class", r"[^.]*"),  # types that are written as text
+    ("py:class", r"torchrl_her_recipes\.curricula\.Climb"),  # not for others to use
+]
+
 html_theme = "furo"
 html_title = f"torchrl-her {release}"
 html_theme_options = {

@@ -53,7 +53,7 @@ from torchrl_her.networks import (
 from torchrl_her.sac import StochasticActorNet, make_sac_loss, make_stochastic_actor
 from torchrl_her.sampler import HERSampleUnit
 from torchrl_her.td3 import make_td3_loss
-from torchrl_her.training import Trainer, evaluate
+from torchrl_her.training import Schedule, Trainer, evaluate
 from torchrl_her.virtual_goals import Strategy, candidates, combine, draw, draw_alike, draw_weighted, window
 from torchrl_her.writer import HERWriter, WriterCounts
 
@@ -84,6 +84,7 @@ __all__ = [
     "PenalisedDDPGLoss",
     "QNet",
     "RewardFunction",
+    "Schedule",
     "StackedLinear",
     "StateToObs",
     "StochasticActorNet",

@@ -219,7 +219,7 @@ def evaluate(
         max_steps: T.
 
     Returns:
-        The rollout [N, T]; environments that end early go on, see :mod:`torchrl_her.metrics`.
+        The rollout [N, T]; environments that end early go on, see :func:`~torchrl_her.success`.
     """
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return env.rollout(max_steps, policy, break_when_any_done=False)

@@ -87,7 +87,7 @@ def combine(candidate: Tensor, weight: Tensor | None = None, keep: Tensor | None
     """The product of the factors: how likely each goal is to be drawn, not normalised.
 
     Args:
-        candidate: [..., T] of bool, from :func:`candidates` or :func:`between`.
+        candidate: [..., T] of bool, from :func:`candidates` or ``between``.
         weight: [..., T], how useful each achieved goal is, at least 0; None for all alike.
         keep: [..., T] of bool, the filter; None to keep all. All are broadcast against each other.
 

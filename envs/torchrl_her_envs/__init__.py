@@ -2,6 +2,7 @@
 
 from torchrl_her_envs.canvas import to_pixel
 from torchrl_her_envs.controllers import Controller, make_controller
+from torchrl_her_envs.effector import Effector
 from torchrl_her_envs.goal_env import GoalEnv, goal_env, reward_range
 from torchrl_her_envs.goals import BoxGoals, GoalDistribution, SectorGoals
 from torchrl_her_envs.gym_in import GymGoalEnv, make_gym_env
@@ -27,6 +28,7 @@ __all__ = [
     "BoxGoals",
     "Chain",
     "Controller",
+    "Effector",
     "GoalDistribution",
     "GoalEnv",
     "GymGoalEnv",
