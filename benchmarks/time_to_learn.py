@@ -113,7 +113,7 @@ def write_curves(curves: Curves, stem: Path) -> None:
         writer.writerow(("contender", "seed", *Point._fields))
         for name, seeds in curves.items():
             for seed, curve in enumerate(seeds):
-                writer.writerows((name, seed, *(f"{value:.5g}" for value in point)) for point in curve)
+                writer.writerows((name, seed, *(f"{value:.6g}" for value in point)) for point in curve)
 
 
 def draw_curves(curves: Curves, path: Path, *, title: str) -> None:

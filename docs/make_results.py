@@ -136,7 +136,8 @@ def write_data(study: str, runs: dict[tuple[str, str], Batches]) -> None:
     for (task, algorithm), own in runs.items():
         rows = own.rows()
         columns = [name for name in COLUMNS if name in rows[-1]]
-        with open(HERE / "results" / f"{study}_{task}_{algorithm}.csv", "w", newline="") as file:
+        stem = "_".join(dict.fromkeys((study, task, algorithm)))  # options have the study's name for the last
+        with open(HERE / "results" / f"{stem}.csv", "w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(columns)
             for row in rows:

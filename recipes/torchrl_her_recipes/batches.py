@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_her_recipes.goal_map import GoalMap
-from torchrl_her_recipes.jobs import Job
+from torchrl_her_recipes.jobs import Job, read_progress
 from torchrl_her_recipes.recipe import Recipe
 from torchrl_her_recipes.run_folder import RunFolder
 
@@ -51,6 +51,11 @@ class Batches:
     def is_done(self) -> bool:
         """Whether all that was begun has come to its end."""
         return bool(self.homes) and all(home.is_done for home in self.homes)
+
+    @property
+    def seconds(self) -> float:
+        """How long all runs together took, their evaluations included and their pictures not."""
+        return sum(read_progress(home.path).seconds for home in self.homes)
 
     def rows(self) -> list[dict[str, float]]:
         """The tables of all runs as one, up to the last epoch that all of them have reached.

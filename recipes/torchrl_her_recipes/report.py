@@ -13,6 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from torchrl_her_recipes.comparing import ALL_TASKS, Difference, Final, Judged, Verdict, compare, judge
 from torchrl_her_recipes.intervals import REPETITIONS
+from torchrl_her_recipes.planning import duration
 from torchrl_her_recipes.plots import band
 from torchrl_her_recipes.report_pictures import draw_pictures
 from torchrl_her_recipes.report_words import MEASURES, SIGNS, show, show_gap, show_interval, show_range
@@ -73,6 +74,7 @@ def _template() -> Any:
         lstrip_blocks=True,
     )
     environment.filters |= {"show": show, "show_interval": show_interval, "show_gap": show_gap}
+    environment.filters["duration"] = duration
     environment.globals["show_range"] = show_range
     environment.globals |= {"ALL_TASKS": ALL_TASKS, "LAST": LAST, "MEASURES": MEASURES}
     environment.globals |= {"REPETITIONS": REPETITIONS, "SIGNS": SIGNS}
@@ -125,7 +127,7 @@ def _cell(value: object) -> object:
 
 
 def _about(cell: Combination) -> dict[str, Any]:
-    columns = ("label", "task", "algorithm", "state", "runs", "epoch", "frames", "differs")
+    columns = ("label", "task", "algorithm", "state", "runs", "epoch", "frames", "seconds", "differs")
     return {name: getattr(cell, name) for name in columns}
 
 

@@ -65,6 +65,11 @@ class Combination:
             return "missing"
         return "at its end" if self.done else f"at epoch {self.epoch} of {self.recipe.epochs}"
 
+    @property
+    def seconds(self) -> float:
+        """How long its runs took, one core each."""
+        return self.batches.seconds
+
     def has(self, name: str) -> bool:
         """Whether its table has a metric."""
         return bool(self.rows) and all(name in row for row in self.rows)

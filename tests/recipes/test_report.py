@@ -42,6 +42,7 @@ def write_run(folder: Path, study: Study, label: str, success: Sequence[float], 
             "seed": run,
             "epoch": epoch,
             "frames": 1_000 * epoch,
+            "seconds": 60.0 * epoch,
             "success": value,
             "distance": 1.0 - value,
             "kl": 2.0 if recipe.algo == "her" else 0.5,
@@ -213,7 +214,9 @@ def test_what_is_missing_is_named(page: str, unfinished: Path) -> None:
     assert "missing: robot_v2_filtered_her" in text
     assert "as robot_v2_her is at epoch 2 of 3, robot_v2_filtered_her is missing" in text
     assert "her so far" in text
-    states = {row["label"]: row["state"] for row in table(unfinished / "report" / "runs.csv")}
+    runs = table(unfinished / "report" / "runs.csv")
+    states = {row["label"]: row["state"] for row in runs}
+    assert {float(row["seconds"]) for row in runs if row["state"] == "at its end"} == {180.0}
     assert states["hand_v2_her"] == "at its end"
 
 
