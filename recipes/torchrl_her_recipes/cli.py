@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,6 +18,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from tqdm import tqdm
 
 from torchrl_her_envs import SMALL_WORLDS, TASKS, make_env
 from torchrl_her_recipes.algorithms import ALGORITHMS
@@ -83,12 +85,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments[0] not in commands:
         return _fail(f"unknown command {arguments[0]!r}; the commands are {', '.join(commands)}")
     try:
-        return commands[arguments[0]](arguments[1:])
+        with warnings.catch_warnings():
+            warnings.showwarning = _say_warning
+            return commands[arguments[0]](arguments[1:])
     except KeyboardInterrupt:
         print("torchrl-her: interrupted", file=sys.stderr)
         return _INTERRUPTED
     except _BAD as error:
         return _fail(_one_line(error))
+
+
+def _say_warning(message: Warning | str, *_where: object) -> None:
+    """In one line, above a progress bar if there is one."""
+    tqdm.write(f"torchrl-her: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def _fail(message: str, code: int = _BAD_INPUT) -> int:

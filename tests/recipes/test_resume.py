@@ -192,6 +192,17 @@ def test_the_last_checkpoints_are_kept(no_pictures: None, tmp_path: Path) -> Non
     assert epochs == {"checkpoint.pt": 4, "checkpoint.1.pt": 3, "checkpoint.2.pt": 2}
 
 
+@pytest.mark.filterwarnings("always")
+def test_on_the_command_line_a_warning_is_one_line(
+    no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small(epochs=2, epoch_frames=800).build().run(tmp_path, progress=False)
+    damage(tmp_path / "checkpoint.pt")
+    assert cli.main(["train", "--resume", str(tmp_path)]) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "damaged" in line]
+    assert line.strip().startswith(f"torchrl-her: warning: {tmp_path / 'checkpoint.pt'} is damaged: ")
+
+
 def test_the_one_before_a_damaged_checkpoint_is_used(no_pictures: None, tmp_path: Path) -> None:
     recipe = small(epochs=3, epoch_frames=800)
     for name in ("whole", "part"):
