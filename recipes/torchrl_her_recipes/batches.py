@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -20,49 +21,47 @@ _ROWS = (
 
 
 class Batches:
-    """What a folder holds of one combination.
+    """What a folder holds of one combination: its folders ``seeds_*``, or itself if it is that of a run.
 
-    A batched run in the folder itself counts, and so do those in its folders ``seeds_*``.
+    What is read are the batches that have come to their end; as long as none has, those that are under
+    way, up to the last epoch that all of them have reached.
 
     Args:
         path: of the folder; there may be none yet.
 
     Attributes:
-        homes: folders of the runs that were begun, in the order of their seeds.
+        homes: the batches that were begun, in the order of their seeds.
+        shown: those of them that are read.
+        is_done: whether they have come to their end.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        found = [RunFolder(folder) for folder in (path, *path.glob("seeds_*"))]
-        begun = [home for home in found if home.config.exists()]
-        self.homes = sorted(begun, key=lambda home: home.recipe().seed)
+        found = [RunFolder(path)]
+        if not found[0].config.exists():
+            found = [RunFolder(folder) for folder in sorted(path.glob("seeds_*"), key=_seeds_of)]
+        self.homes = [home for home in found if home.config.exists()]
+        done = [home for home in self.homes if home.is_done]
+        self.is_done = bool(done)
+        self.shown = done or [home for home in self.homes if home.rows()]
 
     @property
     def recipe(self) -> Recipe | None:
-        """What was run, with all seeds together; None if nothing was.
+        """What was run, with all seeds together; None if there is nothing to read.
 
         Raises:
             ValueError: a configuration cannot be read.
         """
-        recipes = [home.recipe() for home in self.homes]
+        recipes = [home.recipe() for home in self.shown]
         return replace(recipes[0], num_runs=sum(own.num_runs for own in recipes)) if recipes else None
 
     @property
-    def is_done(self) -> bool:
-        """Whether all that was begun has come to its end."""
-        return bool(self.homes) and all(home.is_done for home in self.homes)
-
-    @property
     def seconds(self) -> float:
-        """How long all runs together took, their evaluations included and their pictures not."""
-        return sum(read_progress(home.path).seconds for home in self.homes)
+        """How long the runs took, one core for each batch, without their pictures."""
+        return sum(read_progress(home.path).seconds for home in self.shown)
 
     def rows(self) -> list[dict[str, float]]:
-        """The tables of all runs as one, up to the last epoch that all of them have reached.
-
-        One row an epoch and run, in this order; runs are counted in the order of their seeds.
-        """
-        tables = [table for table in (home.rows() for home in self.homes) if table]
+        """The tables of the runs as one: a row an epoch and run, in this order; runs are counted anew."""
+        tables = [home.rows() for home in self.shown]
         if not tables:
             return []
         seeds = sorted({row["seed"] for table in tables for row in table})
@@ -76,8 +75,8 @@ class Batches:
         return sorted(rows, key=lambda row: (row["epoch"], row["run"]))
 
     def goal_map(self) -> GoalMap | None:
-        """Where the virtual goals of all runs lie; None where no run has written its map."""
-        maps = [GoalMap.load(home.goal_map) for home in self.homes if home.goal_map.is_file()]
+        """Where the virtual goals of the runs lie; None where no run has written its map."""
+        maps = [GoalMap.load(home.goal_map) for home in self.shown if home.goal_map.is_file()]
         return GoalMap(np.concatenate([own.counts for own in maps]), maps[0].target) if maps else None
 
 
@@ -90,21 +89,47 @@ def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
         folder: of the study.
 
     Raises:
-        ValueError: the folder has a run of other options under the same name.
+        ValueError: the folder has a run of other options under the same name, or one that is no batch.
     """
-    jobs = []
-    for home in Batches(folder / label).homes:
-        own = home.recipe()
-        if replace(own, seed=recipe.seed, num_runs=recipe.num_runs) != recipe:
-            raise ValueError(f"{home.path} holds a run with other options; choose another folder")
-        jobs.append(Job(label=home.path.relative_to(folder).as_posix(), recipe=own, folder=home.path))
+    home = folder / label
+    if (home / "config.yaml").exists():
+        raise ValueError(
+            f"{home} is the folder of a run; move it to {home / _name(recipe.seeds)} for the study to count it, "
+            "or choose another folder"
+        )
+    jobs = [_begun(recipe, own.path) for own in Batches(home).homes]
     there = {seed for job in jobs for seed in job.recipe.seeds}
     missing = [seed for seed in recipe.seeds if seed not in there]
     for seeds in share_out(missing, most=max(_ROWS // recipe.batch_size, 1)):
         own = replace(recipe, seed=seeds[0], num_runs=len(seeds))
-        name = f"{label}/seeds_{'-'.join(dict.fromkeys(map(str, (seeds[0], seeds[-1]))))}"
-        jobs.append(Job(label=name, recipe=own, folder=folder / name))
-    return jobs
+        jobs.append(Job(label="", recipe=own, folder=home / _name(seeds)))
+    return [replace(job, label=job.folder.relative_to(folder).as_posix()) for job in jobs]
+
+
+def _begun(recipe: Recipe, path: Path) -> Job:
+    """A batch that was begun. One whose configuration was torn by a power failure is as planned."""
+    first, last = _seeds_of(path)
+    planned = replace(recipe, seed=first, num_runs=last - first + 1)
+    try:
+        own = RunFolder(path).recipe()
+    except ValueError:
+        own = planned
+    if own != planned:
+        raise ValueError(f"{path} holds a run with other options; choose another folder")
+    return Job(label="", recipe=own, folder=path)
+
+
+def _name(seeds: Sequence[int]) -> str:
+    ends = dict.fromkeys((seeds[0], seeds[-1]))
+    return f"seeds_{'-'.join(map(str, ends))}"
+
+
+def _seeds_of(path: Path) -> tuple[int, int]:
+    """The first and the last seed of a batch, by the name of its folder."""
+    match = re.fullmatch(r"seeds_(\d+)(?:-(\d+))?", path.name)
+    if match is None:
+        raise ValueError(f"{path} is not the name of a batch, which is for instance seeds_0-4")
+    return int(match[1]), int(match[2] or match[1])
 
 
 def share_out(seeds: Sequence[int], *, most: int) -> list[list[int]]:

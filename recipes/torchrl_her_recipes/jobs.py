@@ -51,8 +51,8 @@ class Outcome:
 
 
 def can_resume(folder: Path) -> bool:
-    """Whether a run's folder has a checkpoint to go on from."""
-    return any(folder.glob(_CHECKPOINTS))
+    """Whether a run's folder has a checkpoint to go on from, and says of which run."""
+    return RunFolder(folder).config.exists() and any(folder.glob(_CHECKPOINTS))
 
 
 def read_progress(folder: Path) -> Progress:

@@ -7,16 +7,16 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
 from torchrl_her.virtual_goals import check_strategy
 from torchrl_her_recipes.algorithms import get_algorithm
+from torchrl_her_recipes.plain import as_kind, read_yaml
 from torchrl_her_recipes.worlds import check_task
 
 if TYPE_CHECKING:
     from torchrl_her_recipes.parts import Parts
 
 _SEEDS = 1 << 31  # so that those of evaluations, which are made of it, have room
+_KINDS = {"str": str, "bool": bool, "int": int, "float": float, "float | None": float}  # by annotation
 _WORDS = {
     "learner": ("auto", "ddpg", "td3", "sac", "dqn"),
     "sampler": ("prioritised", "uniform"),
@@ -103,6 +103,10 @@ class Recipe:
     dtype: str = "float32"  # of observations and networks
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            kind, value = _KINDS.get(str(field.type)), getattr(self, field.name)
+            if kind is not None and not (value is None and field.default is None):
+                object.__setattr__(self, field.name, as_kind(field.name, value, kind))
         check_task(self.task)
         get_algorithm(self.algo)
         check_strategy(self.strategy)
@@ -177,7 +181,7 @@ def _read_layers(path: Path) -> Any:
     """The layers that a YAML file lists, so that the recipe holds all of itself."""
     if not path.is_file():
         raise ValueError(f"curriculum must be a list of layers or a YAML file of one, got {str(path)!r}")
-    return yaml.safe_load(path.read_text())
+    return read_yaml(path)
 
 
 _AT_LEAST = {

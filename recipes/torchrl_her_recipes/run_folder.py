@@ -14,6 +14,7 @@ from pathlib import Path
 import yaml
 from torch.utils.tensorboard import SummaryWriter
 
+from torchrl_her_recipes.plain import read_mapping
 from torchrl_her_recipes.recipe import Recipe
 
 _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict", "gymnasium", "pymunk", "numpy")
@@ -72,10 +73,11 @@ class RunFolder:
             inside = sorted(config.parent.name for config in self.path.glob("*/config.yaml"))
             hint = f"; choose one of {', '.join(inside)} in it" if inside else ""
             raise ValueError(f"{self.path} is no folder of a run: it has no config.yaml{hint}")
+        values = read_mapping(self.config)
         try:
-            return Recipe.from_dict(yaml.safe_load(self.config.read_text()))
-        except (yaml.YAMLError, TypeError) as error:
-            raise ValueError(f"{self.config} cannot be read: {' '.join(str(error).split())}") from error
+            return Recipe.from_dict(values)
+        except ValueError as error:
+            raise ValueError(f"{self.config} cannot be read: {error}") from error
 
     @property
     def is_done(self) -> bool:
@@ -120,8 +122,12 @@ class RunFolder:
 def _write_whole(path: Path, text: str) -> None:
     """Writes a file that is never seen in part."""
     part = path.with_name(path.name + ".part")
-    part.write_text(text, newline="")
-    part.replace(path)
+    try:
+        part.write_text(text, newline="")
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)  # what there is of it takes up room
+        raise
 
 
 def _number(text: str) -> float:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import statistics
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,9 +84,9 @@ def resume(folder: str | Path, *, parts: Parts | None = None, progress: bool = T
     parts = parts or build_parts(home.recipe())
     trainer = parts.trainer()
     state = load_newest_checkpoint(home.checkpoint, keep=parts.recipe.keep_checkpoints)
-    home.policy.unlink(missing_ok=True)  # of an earlier stop
     with torch.random.fork_rng(devices=[]):
         load_run_state(parts, trainer, state)
+        home.policy.unlink(missing_ok=True)  # of an earlier stop: it comes last, when the run has ended
         rows = home.rows()[: trainer.epochs * parts.recipe.num_runs]  # not those behind the checkpoint
         return _run(parts, trainer, home, rows, progress=progress)
 
@@ -99,6 +100,7 @@ def _run(
     torch.set_flush_denormal(True)  # moments of unused weights fade to numbers that take ten times as long
     bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
     interrupted = compiled = saved = False
+    unlogged = 0  # rows that are not on the disk yet
     with soft_interrupt() as check:  # also while things are saved at the end
         try:
             while trainer.epochs < recipe.epochs:
@@ -106,10 +108,14 @@ def _run(
                 rows += new
                 compiled = compiled or _say_compiled(trainer, bar)
                 if home is not None:
-                    home.log(rows, len(new))
+                    unlogged += len(new)
+                    with _whatever_the_disk_does("table", trainer):
+                        home.log(rows, unlogged)
+                        unlogged = 0
                     saved = trainer.epochs % recipe.checkpoint_interval == 0 and _save(parts, trainer, home)
                     if saved:
-                        _save_goals(parts, home)
+                        with _whatever_the_disk_does("map of goals", trainer):
+                            _save_goals(parts, home)
         except Interrupted:
             interrupted, saved = True, False
         finally:
@@ -172,14 +178,20 @@ def _say_compiled(trainer: Trainer, bar: tqdm) -> bool:
 
 
 def _save(parts: Parts, trainer: Trainer, home: RunFolder) -> bool:
-    """Writes a checkpoint; returns whether it could: a full disk is no reason to lose the run."""
-    try:
+    """Writes a checkpoint; returns whether it could."""
+    with _whatever_the_disk_does("checkpoint", trainer):
         save_checkpoint(run_state(parts, trainer), home.checkpoint, keep=parts.recipe.keep_checkpoints)
+        return True
+    return False
+
+
+@contextmanager
+def _whatever_the_disk_does(what: str, trainer: Trainer) -> Iterator[None]:
+    """A full disk is no reason to lose the run: what could not be written is said, and comes next time."""
+    try:
+        yield
     except OSError as error:
-        message = f"no checkpoint after {trainer.frames:,} frames, the run goes on: {error}"
-        warnings.warn(message, stacklevel=2)
-        return False
-    return True
+        warnings.warn(f"no {what} after {trainer.frames:,} frames, the run goes on: {error}", stacklevel=4)
 
 
 def _finish(parts: Parts, rows: list[dict[str, float]], home: RunFolder) -> None:

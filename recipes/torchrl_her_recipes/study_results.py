@@ -25,7 +25,8 @@ class Combination:
         batches: what its folder holds.
         recipe: what was run; if nothing was, what is to be run.
         rows: its table of metrics, one row an epoch and run.
-        done: whether all that was begun of it has reached its last epoch.
+        done: whether the runs in its table are at their end.
+        planned: how many runs the study has of it.
         differs: options that are not the study's, in words.
     """
 
@@ -36,6 +37,7 @@ class Combination:
     recipe: Recipe
     rows: list[dict[str, float]]
     done: bool
+    planned: int
     differs: str
 
     @property
@@ -63,7 +65,14 @@ class Combination:
         """How far it is, in words."""
         if self.missing:
             return "missing"
-        return "at its end" if self.done else f"at epoch {self.epoch} of {self.recipe.epochs}"
+        if not self.done:
+            return f"at epoch {self.epoch} of {self.recipe.epochs}"
+        return "at its end" if self.whole else f"at its end with {self.runs} of {self.planned} runs"
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is at its end with all of the study's runs."""
+        return self.done and self.runs >= self.planned
 
     @property
     def seconds(self) -> float:
@@ -110,6 +119,7 @@ def _read(label: str, planned: Recipe, batches: Batches) -> Combination:
         recipe=made,
         rows=batches.rows(),
         done=batches.is_done,
+        planned=planned.num_runs,
         differs=", ".join(differs),
     )
 

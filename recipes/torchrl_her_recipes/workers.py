@@ -51,7 +51,7 @@ class LocalWorkers:
     def __init__(self, at_once: int | None = None) -> None:
         if at_once is not None and at_once < 1:
             raise ValueError(f"jobs must be at least 1, got {at_once}")
-        self.at_once = at_once or os.cpu_count() or 1
+        self.at_once = at_once or _cores()
         self._places: LifoQueue[_Worker | None] = LifoQueue()  # with the process that waits there, if any
         for _ in range(self.at_once):
             self._places.put(None)
@@ -93,6 +93,13 @@ class LocalWorkers:
             if place is not None:
                 place.end()
             self._places.put(None)
+
+
+def _cores() -> int:
+    """How many cores this process may use: fewer than there are, under taskset or a scheduler of jobs."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 class _Worker:

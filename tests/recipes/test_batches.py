@@ -73,7 +73,9 @@ def test_other_options_are_refused_whatever_the_seeds(tmp_path: Path) -> None:
 def test_batches_are_read_as_one_in_the_order_of_their_seeds(tmp_path: Path) -> None:
     leave(tmp_path / "seeds_10-11", replace(FIVE, seed=10, num_runs=2), epochs=1)
     leave(tmp_path / "seeds_5-9", replace(FIVE, seed=5), epochs=2)
-    leave(tmp_path, FIVE, epochs=2)  # by `torchrl-her train folder=...`
+    leave(tmp_path / "seeds_0-4", FIVE, epochs=1)
+    for name in ("seeds_0-4", "seeds_5-9", "seeds_10-11"):
+        RunFolder(tmp_path / name).policy.unlink()
     batches = Batches(tmp_path)
     assert batches.recipe == replace(FIVE, num_runs=12)
     assert not batches.is_done
@@ -84,6 +86,33 @@ def test_batches_are_read_as_one_in_the_order_of_their_seeds(tmp_path: Path) -> 
     assert goals is not None
     assert goals.counts.shape == (12, 2, 2)
     np.testing.assert_array_equal(goals.share, [[0.25, 0.25], [0.25, 0.25]])
+
+
+def test_what_is_done_is_read_without_what_is_under_way(tmp_path: Path) -> None:
+    leave(tmp_path / "seeds_0-4", FIVE, epochs=2)
+    leave(tmp_path / "seeds_5-9", replace(FIVE, seed=5), epochs=1)
+    batches = Batches(tmp_path)
+    assert batches.is_done
+    assert batches.recipe == FIVE
+    assert {row["epoch"] for row in batches.rows()} == {1, 2}
+    assert len(batches.rows()) == 10
+    assert len(batches.homes) == 2
+
+
+def test_a_run_of_train_is_read_but_a_study_does_not_count_it(tmp_path: Path) -> None:
+    leave(tmp_path / "her", FIVE, epochs=2)
+    assert Batches(tmp_path / "her").is_done
+    with pytest.raises(ValueError, match=r"is the folder of a run; move it to .*her.seeds_0-9 for the study"):
+        plan_batches("her", replace(FIVE, num_runs=10), tmp_path)
+
+
+def test_a_batch_whose_configuration_is_torn_is_as_planned(tmp_path: Path) -> None:
+    leave(tmp_path / "her" / "seeds_0-4", FIVE, epochs=2)
+    home = RunFolder(tmp_path / "her" / "seeds_0-4")
+    home.config.write_text("")
+    home.policy.unlink()
+    (job,) = plan_batches("her", FIVE, tmp_path)
+    assert job.recipe == FIVE
 
 
 def test_a_run_without_its_policy_was_killed_before_its_end(tmp_path: Path) -> None:

@@ -39,6 +39,14 @@ def test_a_job_without_a_checkpoint_begins_again(job: Job) -> None:
     assert not (job.folder / "error.txt").exists()
 
 
+def test_a_job_that_was_killed_before_its_configuration_was_written_begins_again(job: Job) -> None:
+    job.folder.mkdir()
+    (job.folder / "checkpoint.pt").write_text("the first one")
+    assert not can_resume(job.folder)
+    assert run_job(job) == Outcome()
+    assert kept_progress(job).epochs == 2
+
+
 def test_a_job_that_was_killed_while_it_drew_its_pictures_draws_them(job: Job) -> None:
     assert run_job(job) == Outcome()
     assert kept_progress(job).epochs == 2

@@ -41,6 +41,7 @@ def test_what_is_done_is_left_out_and_the_longest_comes_first(tmp_path: Path) ->
 def test_only_what_a_run_can_go_on_from_counts(tmp_path: Path) -> None:
     write(tmp_path / "short", epochs=4, seconds=4.0, checkpoint=False)
     write(tmp_path / "long", epochs=5, seconds=4.0, checkpoint=True)
+    RunFolder(tmp_path / "long").describe(jobs(tmp_path)[1].recipe)
     plan = Plan(jobs(tmp_path))
     assert plan.progress == {"short": Progress(), "long": Progress(5, 4.0)}
     assert "at epoch 5 of 10" in plan.table()[1]

@@ -19,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from torchrl_her import load_checkpoint
 from torchrl_her_recipes import Parts, Recipe, cli, resume, run_state, running
+from torchrl_her_recipes.run_folder import RunFolder
 
 from .small import assert_same, small
 
@@ -244,6 +245,17 @@ def test_a_full_disk_does_not_end_a_run(no_pictures: None, tmp_path: Path) -> No
     assert load_checkpoint(tmp_path / "checkpoint.pt")["trainer"]["epochs"] == 2
 
 
+def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(
+    no_pictures: None, tmp_path: Path
+) -> None:
+    (tmp_path / "metrics.csv.part").symlink_to("/dev/full")
+    with pytest.warns(UserWarning, match=r"no table after 800 frames, the run goes on: .*No space left"):
+        result = small(epochs=2, epoch_frames=800).build().run(tmp_path, progress=False)
+    assert len(result.rows) == len(RunFolder(tmp_path).rows()) == 2
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [event.step for event in events.Scalars("success/run_0")] == [800, 1600]
+
+
 def test_parts_that_were_swapped_must_be_given_to_resume(no_pictures: None, tmp_path: Path) -> None:
     def build(recipe: Recipe) -> Parts:
         parts = recipe.build()
@@ -255,6 +267,7 @@ def test_parts_that_were_swapped_must_be_given_to_resume(no_pictures: None, tmp_
     build(replace(recipe, epochs=1)).run(tmp_path / "run", progress=False)
     with pytest.raises(ValueError, match="the run's critic was NoneType, not TensorDictModule"):
         resume(tmp_path / "run", progress=False)
+    assert (tmp_path / "run" / "policy.pt").exists()
     assert resume(tmp_path / "run", parts=build(recipe), progress=False).rows[-1]["epoch"] == 2
 
 
