@@ -15,9 +15,7 @@ from torchrl_her_recipes.jobs import Job, read_progress
 from torchrl_her_recipes.recipe import Recipe
 from torchrl_her_recipes.run_folder import RunFolder
 
-_ROWS = (
-    1_280  # of the gradient step of a batch: more runs side by side are no faster, and fill no second core
-)
+_ROWS = 1_280  # of a batch's gradient step: more runs side by side are no faster, and fill no second core
 
 
 class Batches:
@@ -93,10 +91,7 @@ def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
     """
     home = folder / label
     if (home / "config.yaml").exists():
-        raise ValueError(
-            f"{home} is the folder of a run; move it to {home / _name(recipe.seeds)} for the study to count it, "
-            "or choose another folder"
-        )
+        raise ValueError(f"{home} is the folder of a single run; choose another folder for the study")
     jobs = [_begun(recipe, own.path) for own in Batches(home).homes]
     there = {seed for job in jobs for seed in job.recipe.seeds}
     missing = [seed for seed in recipe.seeds if seed not in there]

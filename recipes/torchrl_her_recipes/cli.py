@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -95,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(_one_line(error))
 
 
-def _say_warning(message: Warning | str, *_where: object) -> None:
+def _say_warning(message: Warning | str, *_where: Any, **_more: Any) -> None:
     """In one line, above a progress bar if there is one."""
     tqdm.write(f"torchrl-her: warning: {' '.join(str(message).split())}", file=sys.stderr)
 

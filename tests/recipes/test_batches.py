@@ -102,7 +102,7 @@ def test_what_is_done_is_read_without_what_is_under_way(tmp_path: Path) -> None:
 def test_a_run_of_train_is_read_but_a_study_does_not_count_it(tmp_path: Path) -> None:
     leave(tmp_path / "her", FIVE, epochs=2)
     assert Batches(tmp_path / "her").is_done
-    with pytest.raises(ValueError, match=r"is the folder of a run; move it to .*her.seeds_0-9 for the study"):
+    with pytest.raises(ValueError, match="her is the folder of a single run; choose another folder"):
         plan_batches("her", replace(FIVE, num_runs=10), tmp_path)
 
 
