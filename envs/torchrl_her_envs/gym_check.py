@@ -42,7 +42,7 @@ def _register_robotics(id: str) -> str:
         try:
             importlib.import_module("gymnasium_robotics")
         except ModuleNotFoundError:
-            return " (gymnasium-robotics is not installed: pip install 'torchrl-her[robotics]')"
+            return " (gymnasium-robotics is not installed: pip install '.[robotics]')"
     return ""
 
 

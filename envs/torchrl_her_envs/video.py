@@ -28,7 +28,7 @@ def write_video(frames: Sequence[Tensor], path: str | Path, *, fps: float = 25) 
 
     A GIF loops for ever and shares one palette. A run of equal frames in it is stored as one that
     lasts longer, and its frames last a multiple of 0.01 s. An MP4 (H.264) needs
-    ``pip install "torchrl-her[video]"``; a side of odd length grows by one pixel in it.
+    ``pip install ".[video]"``; a side of odd length grows by one pixel in it.
 
     Args:
         frames: pictures [height, width, 3] of uint8, all of one size.
@@ -81,9 +81,7 @@ def _write_mp4(frames: Sequence[Tensor], path: Path, fps: float) -> None:
             path, format="FFMPEG", fps=fps, codec="libx264", quality=8, macro_block_size=1
         )
     except ImportError as error:  # imageio, or its plugin, is missing
-        raise ImportError(
-            'writing an MP4 needs the extra "video": pip install "torchrl-her[video]"'
-        ) from error
+        raise ImportError('writing an MP4 needs the extra "video": pip install ".[video]"') from error
     with writer:
         for frame in frames:
             writer.append_data(_even(frame))

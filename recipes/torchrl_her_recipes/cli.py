@@ -273,7 +273,7 @@ def _ray_workers(address: str) -> Workers:
     try:
         from torchrl_her_recipes.ray_workers import RayWorkers  # noqa: PLC0415  (an extra)
     except ModuleNotFoundError as error:
-        raise ImportError("--ray needs Ray: pip install 'torchrl-her[cluster]'") from error
+        raise ImportError("--ray needs Ray: pip install '.[cluster]'") from error
     return RayWorkers(address)
 
 

@@ -1,4 +1,4 @@
-"""Where a run's virtual goals lie, beside where they should: q and q* over the screen, as a file."""
+"""Where a run's virtual goals lie, beside where they should: q and q* over a grid, as a file."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from torchrl_her import GoalHistogram, HERWriter
 
 @dataclass(frozen=True)
 class GoalMap:
-    """Histograms over a grid of n x n cells of the screen; the first index goes right, the second up.
+    """Histograms over a grid of goals: n x n cells of the screen, the first index goes right, the second up.
 
     Attributes:
-        counts: [R, n, n] virtual goals of each run written since its buffer was last emptied.
+        counts: [R, n, n] virtual goals of each run written since its buffer was last emptied; [R, n] or
+            [R, n, n, n] for goals of as many coordinates.
         target: [n, n], q* at the final sigma.
     """
 
@@ -29,7 +30,7 @@ class GoalMap:
     @property
     def share(self) -> np.ndarray:
         """q [n, n], the mean of the runs."""
-        totals = self.counts.sum((1, 2), keepdims=True)
+        totals = self.counts.sum(tuple(range(1, self.counts.ndim)), keepdims=True)
         return (self.counts / np.maximum(totals, 1)).mean(0)
 
     def save(self, path: Path) -> None:

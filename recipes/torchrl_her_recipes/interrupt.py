@@ -1,4 +1,4 @@
-"""Ctrl-C that lets the work at hand finish."""
+"""Ctrl-C, or a request to end, that lets the work at hand finish."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from contextlib import contextmanager
 from types import FrameType
 
 _TOGETHER = 1.0  # seconds
+_OTHERS = ("SIGTERM", "SIGHUP")  # `kill` or a scheduler of jobs, a closed terminal: not everywhere
 
 
 class Interrupted(Exception):
-    """Somebody pressed Ctrl-C, and this is a good moment to stop."""
+    """Somebody pressed Ctrl-C, or asked for an end, and this is a good moment to stop."""
 
 
 @contextmanager
 def soft_interrupt() -> Iterator[Callable[[], None]]:
     """Defers the first Ctrl-C to the next call of what this yields; a later one strikes at once.
 
-    Signals that come together, as from a process group and its parent, count as one.
+    SIGTERM and SIGHUP are as good as Ctrl-C, unless they are ignored, as under ``nohup``. Signals that
+    come together, as from a process group and its parent, count as one.
 
     Example:
         >>> with soft_interrupt() as check:
@@ -41,8 +43,11 @@ def soft_interrupt() -> Iterator[Callable[[], None]]:
         if pressed[-1] - pressed[0] > _TOGETHER:
             raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, handle)
+    others = [getattr(signal, name) for name in _OTHERS if hasattr(signal, name)]
+    heard = [number for number in others if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, *heard)}
     try:
         yield check
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -15,7 +15,7 @@ try:
     from arch.bootstrap import IndependentSamplesBootstrap
     from scipy.stats import trim_mean
 except ImportError as error:  # they are large, and only reports need them
-    raise ImportError("reports need the package arch: pip install 'torchrl-her[report]'") from error
+    raise ImportError("reports need the package arch: pip install '.[report]'") from error
 
 REPETITIONS = 2_000
 _SIZE = 0.95

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_her_envs import ThrowingEnv, make_env
+from torchrl_her_envs import TASKS, ThrowingEnv, make_env
 from torchrl_her_recipes.comparing import Final, values_of
 from torchrl_her_recipes.plots import Rows, band, colours
 from torchrl_her_recipes.report_words import MEASURES, show, show_interval
@@ -67,13 +67,13 @@ def _curve(
     task: str, name: str, curves: Mapping[str, Rows], palette: Mapping[str, str], figures: Path
 ) -> Picture:
     beside = "return" if name == "q" else None
-    stem = figures / f"{name}_{task}"
+    stem = _stem(figures, name, task)
     plot_measure(curves, name, stem, title=task, palette=palette, beside=beside)
     ends = ", ".join(
         f"{label} {show(float(band(rows, name)[2][-1]), name)}" for label, rows in curves.items()
     )
     what = MEASURES.get(name, "Q of the initial state")
-    return Picture(stem.with_suffix(".svg"), f"{task}: {what} over environment steps. Last medians: {ends}.")
+    return Picture(Path(f"{stem}.svg"), f"{task}: {what} over environment steps. Last medians: {ends}.")
 
 
 def _final(
@@ -82,14 +82,16 @@ def _final(
     palette: Mapping[str, str],
     figures: Path,
 ) -> Picture:
-    stem = figures / f"final_{task}"
+    stem = _stem(figures, "final", task)
     plot_finals(ends, stem, title=task, palette=palette)
     said = ", ".join(f"{label} {show_interval(row, 'success')}" for label, (_, row) in ends.items())
-    return Picture(stem.with_suffix(".svg"), f"{task}: success at the end. {said}.")
+    return Picture(Path(f"{stem}.svg"), f"{task}: success at the end. {said}.")
 
 
 def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Picture]:
     """A heat map of each algorithm's virtual goals, and one of where they should be."""
+    if task not in TASKS:
+        return []  # there is no screen to draw them on
     found = {cell.algorithm: cell.batches.goal_map() for cell in cells}
     maps = {label: goals for label, goals in found.items() if goals is not None}
     if not maps:
@@ -102,6 +104,11 @@ def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Pictu
 
 
 def _map(task: str, label: str, share: np.ndarray, env: ThrowingEnv, limit: float, figures: Path) -> Picture:
-    stem = figures / re.sub(r"[^\w.=-]+", "_", f"goals_{task}_{label}")
+    stem = _stem(figures, "goals", task, label)
     plot_share(share, env, stem, limit=max(limit, 1e-9), title=f"{task}\n{label}")
     return Picture(Path(f"{stem}.png"), f"{task}: where the virtual goals of {label} lie on the screen.")
+
+
+def _stem(figures: Path, *words: str) -> Path:
+    """The name of a picture, of letters that every file system takes."""
+    return figures / re.sub(r"[^\w.=-]+", "_", "_".join(words))

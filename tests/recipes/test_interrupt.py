@@ -12,8 +12,8 @@ from torchrl_her_recipes import interrupt
 from torchrl_her_recipes.interrupt import Interrupted, soft_interrupt
 
 
-def press() -> None:
-    os.kill(os.getpid(), signal.SIGINT)
+def press(number: int = signal.SIGINT) -> None:
+    os.kill(os.getpid(), number)
 
 
 def test_the_first_one_waits_for_a_good_moment() -> None:
@@ -22,6 +22,26 @@ def test_the_first_one_waits_for_a_good_moment() -> None:
         press()
         with pytest.raises(Interrupted):
             check()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_being_asked_to_end_is_as_good_as_ctrl_c(number: int) -> None:
+    before = signal.getsignal(number)
+    with soft_interrupt() as check:
+        press(number)
+        with pytest.raises(Interrupted):
+            check()
+    assert signal.getsignal(number) is before
+
+
+def test_what_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with soft_interrupt() as check:
+            press(signal.SIGHUP)
+            check()
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_signals_that_come_together_count_as_one() -> None:

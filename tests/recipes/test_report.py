@@ -19,6 +19,7 @@ from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.comparing import ALL_TASKS, Verdict, compare, judge
 from torchrl_her_recipes.goal_map import GoalMap
 from torchrl_her_recipes.intervals import bootstrap, interquartile_means
+from torchrl_her_recipes.report import write_report
 from torchrl_her_recipes.studies import Study, load_study, study_names
 from torchrl_her_recipes.study_results import at_the_end, read_combinations
 from torchrl_her_recipes.thesis import Order, Thesis, load_thesis
@@ -167,6 +168,18 @@ def test_an_order_within_the_spread_is_undecided_and_its_sign_is_as_written(tmp_
 # the page
 
 
+@pytest.mark.parametrize("task", ["treasure_hunt", "gym:torchrl_her/HandThrow-v1"])
+def test_tasks_without_a_screen_and_with_odd_names_have_a_page(task: str, tmp_path: Path) -> None:
+    study = Study(name="odd", recipe=RECIPE, vary={"task": [task], "algo": ALGORITHMS})
+    for label, _ in study.cells():
+        write_run(tmp_path / "runs", study, label, [0.1, 0.3, 0.4, 0.9])
+    page = write_report(study, tmp_path / "runs", tmp_path / "report").read_text()
+    assert task in page
+    names = [path.name for path in (tmp_path / "report" / "figures").iterdir()]
+    assert any(name.startswith("success_") for name in names)
+    assert not any(name.startswith("goals_") for name in names)
+
+
 class Checker(HTMLParser):
     """Every element is closed in turn, every picture has words, every table a caption."""
 
@@ -296,4 +309,4 @@ def test_without_the_extra_its_name_is_in_the_message(
         monkeypatch.delitem(sys.modules, f"torchrl_her_recipes.{name}")
     monkeypatch.setitem(sys.modules, "arch.bootstrap", None)
     assert main(["report", "bias"]) == 2
-    assert "reports need the package arch: pip install 'torchrl-her[report]'" in capsys.readouterr().err
+    assert "reports need the package arch: pip install '.[report]'" in capsys.readouterr().err

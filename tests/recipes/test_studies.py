@@ -139,7 +139,7 @@ def test_without_ray_its_name_and_the_remedy_are_given(
     monkeypatch.setitem(sys.modules, "torchrl_her_recipes.ray_workers", None)
     assert main(["study", study_names()[0], "--plan", "--ray", "auto"]) == 2
     said = capsys.readouterr().err
-    assert said == "torchrl-her: --ray needs Ray: pip install 'torchrl-her[cluster]'\n"
+    assert said == "torchrl-her: --ray needs Ray: pip install '.[cluster]'\n"
 
 
 @pytest.mark.parametrize(
