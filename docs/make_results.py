@@ -42,32 +42,26 @@ Rows = list[dict[str, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Study:
+class Comparison:
     """Tasks beside each other, and the algorithms that are compared on them."""
 
     tasks: Sequence[str]
     algorithms: Sequence[str]
     goals: bool = False  # whether to draw maps of virtual goals
 
+    @classmethod
+    def of_study(cls, name: str, *, goals: bool = False) -> Comparison:
+        vary = load_study(name).vary
+        return cls(tasks=vary["task"], algorithms=vary["algo"], goals=goals)
 
-STUDIES = {
-    "v0": Study(tasks=("hand_v0", "robot_v0", "hand_wall_v0"), algorithms=("her", "her_ibs")),
-    "ibs": Study(
-        tasks=("hand_v0", "robot_v0", "hand_wall_v0"),
-        algorithms=("her", "her_ibs", "her_ibs_sequential"),
-        goals=True,
-    ),
-    "bias": Study(
-        tasks=("hand_v2", "robot_v2", "hand_wall_v2"),
-        algorithms=("her", "her_ibs", "filtered_her", "filtered_her_ibs"),
-        goals=True,
-    ),
-    "curriculum": Study(
-        tasks=("hand_v1", "hand_wall_v1", "robot_v1"),
-        algorithms=("her", "filtered_her", "cher", "cher_ibs", "unfiltered_cher", "unfiltered_cher_ibs"),
-    ),
-    "climb": Study(tasks=("hand_v1", "hand_wall_v1", "robot_v1"), algorithms=("cher",)),
-    "draws": Study(tasks=("hand_v0_1", "hand_v0_8", "hand_v0_64"), algorithms=("her",)),
+
+COMPARISONS = {
+    "v0": Comparison(tasks=("hand_v0", "robot_v0", "hand_wall_v0"), algorithms=("her", "her_ibs")),
+    "ibs": Comparison.of_study("ibs", goals=True),
+    "bias": Comparison.of_study("bias", goals=True),
+    "curriculum": Comparison.of_study("curriculum"),
+    "climb": Comparison(tasks=("hand_v1", "hand_wall_v1", "robot_v1"), algorithms=("cher",)),
+    "draws": Comparison(tasks=("hand_v0_1", "hand_v0_8", "hand_v0_64"), algorithms=("her",)),
 }
 OPTIONS = ("window", "initialisation")
 
@@ -78,7 +72,7 @@ def spread(values: Sequence[float], form: str) -> str:
     return f"**{middle:{form}}** ({low:{form}} to {high:{form}})"
 
 
-def read_study(study: Study, folder: Path) -> dict[tuple[str, str], Batches]:
+def read_study(study: Comparison, folder: Path) -> dict[tuple[str, str], Batches]:
     """The runs that there are."""
     found = {}
     for task in study.tasks:
@@ -110,7 +104,7 @@ def draw_success(runs: dict[tuple[str, str], Batches], path: Path) -> None:
     plot_comparison(panels, path)
 
 
-def draw_maps(study: Study, runs: dict[tuple[str, str], Batches], path: Path) -> None:
+def draw_maps(study: Comparison, runs: dict[tuple[str, str], Batches], path: Path) -> None:
     """Where virtual goals lie: a row for each task, q of each algorithm, and q* at the right."""
     tasks = [task for task in study.tasks if any(task == own for own, _ in runs)]
     names = [name for name in study.algorithms if any(name == own for _, own in runs)]
@@ -161,7 +155,7 @@ def main() -> None:
     )
     parser.add_argument("runs", type=Path, help="folder that the studies lie in")
     folder = parser.parse_args().runs
-    for name, study in STUDIES.items():
+    for name, study in COMPARISONS.items():
         runs = read_study(study, folder / name)
         if runs:
             print(f"\n### {name}\n")
