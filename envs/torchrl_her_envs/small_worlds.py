@@ -86,10 +86,11 @@ class SmallWorldState:
 class SmallWorld(SeededWorlds):
     """What the small worlds share: N worlds on a lattice of places, where the goal is a place too.
 
-    Keys: ``observation`` and ``achieved_goal`` (both the place, but see :class:`Chain`), ``desired_goal``, ``state`` (the
-    observation with the desired goal behind it), ``action`` (a whole number), ``reward`` (0 where
-    the goal is achieved, -1 elsewhere), ``terminated`` (the goal is achieved), ``truncated`` (the
-    last step, or an end that says nothing about the goal), ``done``.
+    Keys: ``observation`` and ``achieved_goal`` (both the place; of :class:`Chain` in layers, a part of
+    it is achieved), ``desired_goal``, ``state`` (the observation with the desired goal behind it),
+    ``action`` (a whole number), ``reward`` (0 where the goal is achieved, -1 elsewhere), ``terminated``
+    (the goal is achieved), ``truncated`` (the last step, or an end that says nothing about the goal),
+    ``done``.
 
     Actions are ``Categorical``, [N] of int64, rather than one-hot: TorchRL's ``QValueActor`` takes
     the first of several best actions then, where its one-hot action has a one for each of them;

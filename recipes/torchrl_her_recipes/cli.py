@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_her_envs import SMALL_WORLDS, TASKS, make_env
 from torchrl_her_recipes.algorithms import ALGORITHMS
+from torchrl_her_recipes.chain_times import plot_times
 from torchrl_her_recipes.goal_map import GoalMap
 from torchrl_her_recipes.planning import Plan, duration
 from torchrl_her_recipes.playing import play
@@ -28,7 +29,7 @@ from torchrl_her_recipes.policies import export_policy, load_trained, policy_nam
 from torchrl_her_recipes.recipe import Recipe
 from torchrl_her_recipes.run_folder import RunFolder
 from torchrl_her_recipes.running import RunResult, resume
-from torchrl_her_recipes.small_world_values import plot_values
+from torchrl_her_recipes.small_world_plots import plot_values
 from torchrl_her_recipes.studies import StudyResult, load_study, plan_study, run_study, study_names
 from torchrl_her_recipes.workers import LocalWorkers, Workers
 from torchrl_her_recipes.worlds import GYM
@@ -47,6 +48,7 @@ commands:
   export RUN               a run's policy as a small file of its own
   plot goals RUN           a heat map of a run's virtual goals beside the target q*
   plot values RUN ...      what agents make of a small world: bit_flip or treasure_hunt
+  plot times RUN ...       how long chains took to be solved, beside the times of ideal learners
   study NAME               runs a whole comparison on all cores and draws its figure; --quick for a size of
                            minutes, --plan says how long it takes, --ray ADDRESS runs it on a cluster
   report NAME              a page about a study: figures, intervals, the thesis's numbers beside ours
@@ -216,7 +218,9 @@ def _export(arguments: list[str]) -> int:
 def _plot(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="torchrl-her plot", description="Draw a picture of runs.")
     parser.add_argument(
-        "what", choices=["goals", "values"], help="virtual goals beside q*, or values in a small world"
+        "what",
+        choices=["goals", "values", "times"],
+        help="virtual goals beside q*, values in a small world, or times to solve chains",
     )
     parser.add_argument("runs", type=Path, metavar="RUN", nargs="+", help="folder of a run")
     parser.add_argument("--out", type=Path, help="the picture (default: in the folder of the first run)")
@@ -225,6 +229,9 @@ def _plot(arguments: list[str]) -> int:
     if options.what == "values":
         out = options.out or options.runs[0] / "values.png"
         plot_values(homes, out)
+    elif options.what == "times":
+        out = options.out or options.runs[0] / "times.png"
+        plot_times([(home.recipe(), home.rows()) for home in homes.values()], out)
     else:
         if len(homes) > 1:
             raise ValueError(f"goals are drawn of one run, got {len(homes)}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 from filelock import FileLock, Timeout
 
+from torchrl_her_recipes.chain_times import plot_times
 from torchrl_her_recipes.jobs import Job
 from torchrl_her_recipes.planning import Plan
 from torchrl_her_recipes.plots import plot_comparison
@@ -39,12 +40,14 @@ class Study:
         recipe: what all of it has in common; ``num_runs`` is the number of seeds.
         vary: option of a recipe to the values that are compared. All combinations are run. The panels of
             the figure are the tasks, its curves the rest.
+        figure: metrics that are drawn over environment steps, or "times" until the chain is solved.
     """
 
     name: str
     summary: str = ""
     recipe: dict[str, Any] = field(default_factory=dict)
     vary: dict[str, Sequence[Any]] = field(default_factory=dict)
+    figure: str | Sequence[str] = ("success",)
 
     def cells(self) -> Iterator[tuple[str, Recipe]]:
         """The batched runs by name.
@@ -54,11 +57,16 @@ class Study:
         """
         for values in product(*self.vary.values()):
             own = dict(zip(self.vary, values, strict=True))
-            label = "_".join(_word(name, value) for name, value in own.items())
-            yield label, Recipe.from_dict({**self.recipe, **own})
+            words = (_word(name, value, self.vary[name]) for name, value in own.items())
+            yield "_".join(words), Recipe.from_dict({**self.recipe, **own})
 
 
-def _word(name: str, value: Any) -> str:
+def _word(name: str, value: Any, values: Sequence[Any]) -> str:
+    """What sets a value apart from the other ``values`` of its option; of a mapping, the entries that do."""
+    if isinstance(value, Mapping):
+        entries = {key: [each.get(key) for each in values] for key in value}
+        differing = {key: own for key, own in entries.items() if any(other != own[0] for other in own)}
+        return "_".join(_word(key, value[key], own) for key, own in differing.items())
     return str(value) if name in ("task", "algo") else f"{name}={value}"
 
 
@@ -186,12 +194,18 @@ def is_done(home: RunFolder) -> bool:
 
 
 def draw_study(study: Study, folder: Path) -> Path:
-    """Success over environment steps: a panel for each task, a curve for each combination of the rest."""
+    """Metrics over environment steps: a panel for each task, a curve for each combination of the rest.
+
+    Of a study whose figure is "times": how long chains took.
+    """
+    path = folder / f"{study.name}.png"
+    if study.figure == "times":
+        plot_times([(recipe, RunFolder(folder / label).rows()) for label, recipe in study.cells()], path)
+        return path
     panels: dict[str, dict[str, list[dict[str, float]]]] = {}
     for label, recipe in study.cells():
         rows = RunFolder(folder / label).rows()
         curve = label.removeprefix(recipe.task).lstrip("_") or recipe.algo
         panels.setdefault(recipe.task, {})[curve] = rows
-    path = folder / f"{study.name}.png"
-    plot_comparison(panels, path)
+    plot_comparison(panels, path, metrics=study.figure)
     return path

@@ -88,6 +88,35 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     assert [file.stat().st_mtime_ns for file in metrics] == before
 
 
+def test_mappings_are_called_by_the_entries_that_differ() -> None:
+    vary = {"algo": ["her"], "task_options": [{"length": 4, "layers": 2}, {"length": 6, "layers": 2}]}
+    study = Study(name="one", recipe={**SMALL, "task": "chain"}, vary=vary)
+    assert [label for label, _ in study.cells()] == ["her_length=4", "her_length=6"]
+
+
+def test_chains_are_compared_by_their_times_and_others_by_the_metrics_asked_for(tmp_path: Path) -> None:
+    sizes = [{"length": n, "layers": 2, "alternating": True} for n in (2, 4)]
+    times = Study(
+        name="times",
+        recipe={**SMALL, "task": "chain", "epochs": 1},
+        vary={"algo": ["her", "cher"], "task_options": sizes},
+        figure="times",
+    )
+    assert run_study(times, tmp_path / "a", workers=Here(), progress=False).figure
+    chains = [str(tmp_path / "a" / label) for label, _ in times.cells()]
+    assert main(["plot", "times", *chains, "--out", str(tmp_path / "again.png")]) == 0
+    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "a" / "times.png").read_bytes()
+    metrics = Study(
+        name="metrics",
+        recipe={**SMALL, "task": "treasure_hunt", "task_options": {"step": 25}, "epochs": 1},
+        vary={"algo": ["her"]},
+        figure=["success", "right_way"],
+    )
+    run_study(metrics, tmp_path / "b", workers=Here(), progress=False)
+    with Image.open(tmp_path / "b" / "metrics.png") as picture:
+        assert picture.size[0] > 2 * picture.size[1]
+
+
 def test_the_guide_s_study_is_planned_as_it_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
