@@ -83,7 +83,10 @@ def chain(**options: object) -> Recipe:
 
 def test_times_are_drawn_whether_chains_were_solved_or_not(tmp_path: Path) -> None:
     cells = [
-        (chain(length=n, layers=2), [{"run": run, "frames": 640, "success": n < 8} for run in range(3)])
+        (
+            chain(length=n, layers=2),
+            [{"run": run, "frames": 640, "success": float(n < 8)} for run in range(3)],
+        )
         for n in (4, 8)
     ]
     plot_times(cells, tmp_path / "times.png")

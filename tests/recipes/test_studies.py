@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -89,7 +90,10 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
 
 
 def test_mappings_are_called_by_the_entries_that_differ() -> None:
-    vary = {"algo": ["her"], "task_options": [{"length": 4, "layers": 2}, {"length": 6, "layers": 2}]}
+    vary: dict[str, Sequence[object]] = {
+        "algo": ["her"],
+        "task_options": [{"length": 4, "layers": 2}, {"length": 6, "layers": 2}],
+    }
     study = Study(name="one", recipe={**SMALL, "task": "chain"}, vary=vary)
     assert [label for label, _ in study.cells()] == ["her_length=4", "her_length=6"]
 
