@@ -72,7 +72,7 @@ class LatticeGoals:
 
 @dataclass
 class SmallWorldState:
-    """All that N small worlds are: places and goals [N, g], steps and episodes [N], all int64.
+    """All that N small worlds are: places and goals [N, size], steps and episodes [N], all int64.
 
     ``step`` counts the steps of the present episode, ``episode`` the resets of a world.
     """
@@ -86,10 +86,11 @@ class SmallWorldState:
 class SmallWorld(SeededWorlds):
     """What the small worlds share: N worlds on a lattice of places, where the goal is a place too.
 
-    Keys: ``observation`` and ``achieved_goal`` (both the place), ``desired_goal``, ``state`` (the
-    observation with the desired goal behind it), ``action`` (a whole number), ``reward`` (0 where
-    the goal is achieved, -1 elsewhere), ``terminated`` (the goal is achieved), ``truncated`` (the
-    last step, or an end that says nothing about the goal), ``done``.
+    Keys: ``observation`` and ``achieved_goal`` (both the place; of :class:`Chain` in layers, a part of
+    it is achieved), ``desired_goal``, ``state`` (the observation with the desired goal behind it),
+    ``action`` (a whole number), ``reward`` (0 where the goal is achieved, -1 elsewhere), ``terminated``
+    (the goal is achieved), ``truncated`` (the last step, or an end that says nothing about the goal),
+    ``done``.
 
     Actions are ``Categorical``, [N] of int64, rather than one-hot: TorchRL's ``QValueActor`` takes
     the first of several best actions then, where its one-hot action has a one for each of them;
@@ -107,6 +108,7 @@ class SmallWorld(SeededWorlds):
         max_steps: number of steps after which an episode is truncated.
         num_envs: N, the number of worlds.
         seed: of all that is random; R seeds for R equal blocks of worlds, each as if alone.
+        size: coordinates of a place; as many as a goal has, unless only some of them are achieved.
 
     Attributes:
         threshold: half the distance of two neighbouring places, as the agent sees them.
@@ -129,6 +131,7 @@ class SmallWorld(SeededWorlds):
         max_steps: int,
         num_envs: int,
         seed: int | Sequence[int],
+        size: int | None = None,
     ) -> None:
         max_steps = _check_whole("max_steps", max_steps, 1, _MOST_STEPS)
         num_envs = _check_whole("num_envs", num_envs, 1, None)
@@ -137,11 +140,11 @@ class SmallWorld(SeededWorlds):
         self._goals, self._low, self._high = goals, low, high
         self._last = places - 1
         self.threshold = (high - low) / self._last / 2
-        size = len(goals.low)
+        size = size or len(goals.low)
         self.worlds = SmallWorldState(
             *(torch.zeros(shape, dtype=torch.int64) for shape in ((num_envs, size),) * 2 + ((num_envs,),) * 2)
         )
-        self._make_specs(size)
+        self._make_specs(size, len(goals.low))
         self.set_seeds([int(seed)] if isinstance(seed, int | Integral) else list(seed))
 
     # What the outside asks for
@@ -168,7 +171,7 @@ class SmallWorld(SeededWorlds):
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """Whether the goal is achieved, which ends an episode: [..., 1] of bool."""
-        size = self.worlds.goal.shape[-1]
+        size = len(self._goals.low)
         for goal in (achieved_goal, desired_goal):
             if goal.shape[-1:] != (size,):
                 raise ValueError(f"goals must be of shape [..., {size}], got {list(goal.shape)}")
@@ -179,11 +182,15 @@ class SmallWorld(SeededWorlds):
 
     @abstractmethod
     def _start(self, which: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the given worlds [M] start, and their goals: both [M, g] of int64, never the same."""
+        """Where the given worlds [M] start, and their goals: both [M, size] of int64, never the same."""
 
     @abstractmethod
     def _move(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The places [N, g] that actions [N] lead to, and which worlds [N] end there, if any can."""
+        """The places [N, size] that actions [N] lead to, and which worlds [N] end there, if any can."""
+
+    def _goal_of(self, place: Tensor) -> Tensor:
+        """What of places [N, size] is achieved, or wanted: [N, g]."""
+        return place
 
     # TorchRL's hooks
 
@@ -237,11 +244,11 @@ class SmallWorld(SeededWorlds):
 
     def _show(self) -> dict[str, Tensor]:
         """What the agent sees of the worlds."""
-        place, goal = self._scale(self.worlds.place), self._scale(self.worlds.goal)
+        place, goal = self._scale(self.worlds.place), self._scale(self._goal_of(self.worlds.goal))
         return {
             "state": torch.cat((place, goal), -1),
             "observation": place,
-            "achieved_goal": place.clone(),
+            "achieved_goal": self._goal_of(place).clone(),
             "desired_goal": goal,
         }
 
@@ -250,7 +257,7 @@ class SmallWorld(SeededWorlds):
         steps = place.to(torch.float64)
         return (self._low + steps * (self._high - self._low) / self._last).to(torch.float32)
 
-    def _make_specs(self, size: int) -> None:
+    def _make_specs(self, observed: int, size: int) -> None:
         (n,) = self.batch_size
 
         def seen(width: int) -> Bounded:
@@ -260,8 +267,8 @@ class SmallWorld(SeededWorlds):
             return Binary(n=1, shape=(n, 1), dtype=torch.bool)
 
         self.observation_spec = Composite(
-            state=seen(2 * size),
-            observation=seen(size),
+            state=seen(observed + size),
+            observation=seen(observed),
             achieved_goal=seen(size),
             desired_goal=seen(size),
             shape=(n,),
@@ -412,7 +419,7 @@ class TreasureHunt(SmallWorld):
 
 
 class Chain(SmallWorld):
-    """A chain of n steps from the first place to the goal: forward with probability p, else back.
+    """A chain of n steps from the first place to the last: forward with probability p, else back.
 
     Thesis, appendix C. The agent starts at the first place, its goal is always the last one, and
     there are as many steps as it takes without a mistake (premise 4). Action 1 goes forward with
@@ -423,17 +430,22 @@ class Chain(SmallWorld):
     and a policy that asks for forward with probability q arrives in one of ``q ** -n`` until it
     learns; with hindsight it learns place by place.
 
+    The agent sees n links: k of them closed (1) and the others open (-1) at place k. All closed is
+    the goal. In ``layers`` the chain is a task of sub-tasks: what is achieved are the links of the
+    last of so many equal parts alone, as in throwing it is the ball: before, hindsight has nothing to say.
+
     Args:
         length: n, the number of steps from the start to the goal.
         forward_probability: p, in (0, 1].
 
     Keyword Args:
+        layers: how many equal parts the chain has, of ``n / layers`` steps each.
+        alternating: whether it is action 0 that goes forward at odd places, so that always doing
+            the same leads nowhere: a network at random does just that, and solves the chain else.
         reset_state: whether the way back leads to the first place ("reset-state game").
         max_steps: steps of an episode; n if None.
         num_envs: number of worlds.
         seed: of all transitions; R seeds for R equal blocks of worlds, each as if alone.
-
-    Place k of 0 to n is shown as ``2 * k / n - 1``.
 
     Raises:
         ValueError: a number out of its range, or worlds that cannot be shared out among the seeds.
@@ -442,11 +454,14 @@ class Chain(SmallWorld):
         >>> from tensordict.nn import TensorDictModule
         >>> ones = torch.ones(2, dtype=torch.int64)
         >>> forward = TensorDictModule(lambda place: ones, ["observation"], ["action"])
-        >>> steps = Chain(4, 1.0, num_envs=2).rollout(4, forward)
-        >>> steps["next", "observation"][0].flatten().tolist()
-        [-0.5, 0.0, 0.5, 1.0]
+        >>> steps = Chain(3, 1.0, num_envs=2).rollout(3, forward)
+        >>> steps["next", "observation"][0].tolist()
+        [[1.0, -1.0, -1.0], [1.0, 1.0, -1.0], [1.0, 1.0, 1.0]]
         >>> steps["next", "reward"][0].flatten().tolist()
-        [-1.0, -1.0, -1.0, 0.0]
+        [-1.0, -1.0, 0.0]
+        >>> steps = Chain(4, 1.0, layers=2, num_envs=2).rollout(4, forward)
+        >>> steps["next", "achieved_goal"][0].tolist()
+        [[-1.0, -1.0], [-1.0, -1.0], [1.0, -1.0], [1.0, 1.0]]
     """
 
     summary = "walk a chain from its first place to its last"
@@ -456,38 +471,50 @@ class Chain(SmallWorld):
         length: int,
         forward_probability: float,
         *,
+        layers: int = 1,
+        alternating: bool = False,
         reset_state: bool = False,
         max_steps: int | None = None,
         num_envs: int = 1,
         seed: int | Sequence[int] = 0,
     ) -> None:
         length = _check_whole("length", length, 1, _MOST_STEPS)
+        layers = _check_whole("layers", layers, 1, length)
+        if length % layers:
+            raise ValueError(f"layers must divide length={length}, got {layers}")
         if not 0.0 < forward_probability <= 1.0:
             raise ValueError(f"forward_probability must be in (0, 1], got {forward_probability}")
+        goal = [1.0] * (length // layers)
         super().__init__(
-            LatticeGoals([1.0], [1.0], count=1),
-            places=length + 1,
+            LatticeGoals(goal, goal, count=1),
+            places=2,
             low=-1.0,
             high=1.0,
             num_actions=2,
             max_steps=length if max_steps is None else max_steps,
             num_envs=num_envs,
             seed=seed,
+            size=length,
         )
         self.length, self.forward_probability, self.reset_state = length, forward_probability, reset_state
+        self.layers, self.alternating = layers, alternating
         self._all = torch.arange(num_envs)
 
     def _start(self, which: Tensor) -> tuple[Tensor, Tensor]:
-        first = torch.zeros(len(which), 1, dtype=torch.int64)
-        return first, first + self.length
+        links = torch.zeros(len(which), self.length, dtype=torch.int64)
+        return links, links + 1
 
     def _move(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
-        place = self.worlds.place
-        forward = action.unsqueeze(-1) == 1
+        place = self.worlds.place.sum(-1, keepdim=True)
+        forward = (action.unsqueeze(-1) + place * self.alternating) % 2 == 1
         if self.forward_probability < 1.0:
             forward = forward & (self._uniform(self._all, 1) < self.forward_probability)
         back = torch.zeros_like(place) if self.reset_state else place - 1
-        return torch.where(forward, place + 1, back).clamp(0, self.length), None
+        place = torch.where(forward, place + 1, back)
+        return (place > torch.arange(self.length)).to(torch.int64), None
+
+    def _goal_of(self, place: Tensor) -> Tensor:
+        return place[:, -(self.length // self.layers) :]
 
 
 def _check_whole(name: str, value: int, low: int, high: int | None) -> int:

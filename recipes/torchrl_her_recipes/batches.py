@@ -28,12 +28,14 @@ class Batches:
         path: of the folder; there may be none yet.
 
     Attributes:
+        path: likewise.
         homes: the batches that were begun, in the order of their seeds.
         shown: those of them that are read.
         is_done: whether they have come to their end.
     """
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         found = [RunFolder(path)]
         if not found[0].config.exists():
             found = [RunFolder(folder) for folder in sorted(path.glob("seeds_*"), key=_seeds_of)]

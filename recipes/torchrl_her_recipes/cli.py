@@ -23,7 +23,8 @@ from tqdm import tqdm
 
 from torchrl_her_envs import SMALL_WORLDS, TASKS, make_env
 from torchrl_her_recipes.algorithms import ALGORITHMS
-from torchrl_her_recipes.goal_map import GoalMap
+from torchrl_her_recipes.batches import Batches
+from torchrl_her_recipes.chain_times import plot_times
 from torchrl_her_recipes.planning import Plan, duration
 from torchrl_her_recipes.playing import play
 from torchrl_her_recipes.plots import plot_goals
@@ -31,7 +32,7 @@ from torchrl_her_recipes.policies import export_policy, load_trained, policy_nam
 from torchrl_her_recipes.recipe import Recipe
 from torchrl_her_recipes.run_folder import RunFolder
 from torchrl_her_recipes.running import RunResult, resume
-from torchrl_her_recipes.small_world_values import plot_values
+from torchrl_her_recipes.small_world_plots import plot_values
 from torchrl_her_recipes.studies import StudyResult, load_study, plan_study, run_study, study_names
 from torchrl_her_recipes.workers import LocalWorkers, Workers
 from torchrl_her_recipes.worlds import GYM
@@ -50,11 +51,13 @@ commands:
   export RUN               a run's policy as a small file of its own
   plot goals RUN           a heat map of a run's virtual goals beside the target q*
   plot values RUN ...      what agents make of a small world: bit_flip or treasure_hunt
+  plot times RUN ...       how long chains took to be solved, beside the times of ideal learners
   study NAME               runs a whole comparison on all cores and draws its figure; --quick for a size of
                            minutes, --plan says how long it takes, --ray ADDRESS runs it on a cluster
   report NAME              a page about a study: figures, intervals, the thesis's numbers beside ours
   list                     tasks, algorithms and presets
 """
+_PICTURES = {"goals": "virtual_goals.png", "values": "values.png", "times": "times.png"}
 _CONF = Path(__file__).parent / "conf"
 _HINTS = (
     "full_key",
@@ -226,24 +229,38 @@ def _export(arguments: list[str]) -> int:
 def _plot(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="torchrl-her plot", description="Draw a picture of runs.")
     parser.add_argument(
-        "what", choices=["goals", "values"], help="virtual goals beside q*, or values in a small world"
+        "what",
+        choices=list(_PICTURES),
+        help="virtual goals beside q*, values in a small world, or times to solve chains",
     )
-    parser.add_argument("runs", type=Path, metavar="RUN", nargs="+", help="folder of a run")
+    folders = "folder of a run, or of the batches of a study's combination"
+    parser.add_argument("runs", type=Path, metavar="RUN", nargs="+", help=folders)
     parser.add_argument("--out", type=Path, help="the picture (default: in the folder of the first run)")
     options = parser.parse_args(arguments)
-    homes = {folder.name: RunFolder(folder) for folder in options.runs}
+    runs = [Batches(folder) for folder in options.runs]
+    for own in runs:
+        if not own.homes:
+            raise ValueError(f"{own.path} is no folder of a run")
+    out = options.out or options.runs[0] / _PICTURES[options.what]
     if options.what == "values":
-        out = options.out or options.runs[0] / "values.png"
-        plot_values(homes, out)
+        plot_values(runs, out)
+    elif options.what == "times":
+        plot_times([(own.homes[0].recipe(), own.rows()) for own in runs], out)
     else:
-        if len(homes) > 1:
-            raise ValueError(f"goals are drawn of one run, got {len(homes)}")
-        (home,) = homes.values()
-        recipe, out = home.recipe(), options.out or home.goals
-        title = f"virtual goals: {recipe.task}, {recipe.algo}"
-        plot_goals(GoalMap.load(home.goal_map), make_env(recipe.task), out, title=title)
+        if len(runs) > 1:
+            raise ValueError(f"goals are drawn of one folder, got {len(runs)}")
+        _plot_goals(runs[0], out)
     print(out)
     return 0
+
+
+def _plot_goals(runs: Batches, out: Path) -> None:
+    recipe, goals = runs.homes[0].recipe(), runs.goal_map()
+    if recipe.task not in TASKS:
+        raise ValueError(f"goals are drawn on the screen of a throwing or reaching task, got {recipe.task}")
+    if goals is None:
+        raise ValueError(f"{runs.path} has no map of goals: its runs have written no virtual goals")
+    plot_goals(goals, make_env(recipe.task), out, title=f"virtual goals: {recipe.task}, {recipe.algo}")
 
 
 def _study(arguments: list[str]) -> int:

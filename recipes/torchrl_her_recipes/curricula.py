@@ -1,4 +1,4 @@
-"""The curriculum of each throwing task, and how far runs have come in it."""
+"""The curriculum of each task that has one, and how far runs have come in it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,48 @@ from typing import Any
 from torchrl.envs import CatTensors, Compose, EnvBase, TransformedEnv
 
 from torchrl_her import Curriculum, CurriculumLayer, CurriculumProgress, StateToObs, ZeroPad
-from torchrl_her_envs import GoalEnv, ThrowingEnv
+from torchrl_her_envs import Chain, GoalEnv, ThrowingEnv
 
 _STATE = ["observation", "desired_goal"]  # what the state is made of, in this order
 
 
-def get_curriculum(env: ThrowingEnv) -> Curriculum:
+def get_curriculum(env: GoalEnv) -> Curriculum:
+    """The curriculum that comes with a task: of throwing tasks, and of the chain.
+
+    Raises:
+        ValueError: the task has none.
+
+    Example:
+        >>> from torchrl_her_envs import Chain
+        >>> [layer.name for layer in get_curriculum(Chain(6, 1.0, layers=3)).layers]
+        ['part 1', 'part 2', 'part 3']
+    """
+    if isinstance(env, ThrowingEnv):
+        return throwing_curriculum(env)
+    if isinstance(env, Chain):
+        return chain_curriculum(env)
+    raise ValueError(f"{type(env).__name__} has no curriculum: give its layers as curriculum=FILE.yaml")
+
+
+def chain_curriculum(env: Chain) -> Curriculum:
+    """Each part of the chain as a layer: the links of that part are to be closed."""
+    links = env.length // env.layers
+    return Curriculum(
+        [
+            CurriculumLayer(
+                name=f"part {end // links}",
+                observation=range(end),
+                achieved_goal=range(end - links, end),
+                desired_goal=range(env.length, env.length + links),
+                threshold=env.threshold,
+            )
+            for end in range(links, env.length + 1, links)
+        ],
+        env.length + links,
+    )
+
+
+def throwing_curriculum(env: ThrowingEnv) -> Curriculum:
     """Two layers: reach the ball; then throw it into the black hole.
 
     The reach sees the hand or the arm and wants its grip at the ball. The throw also sees the ball,
@@ -26,7 +62,7 @@ def get_curriculum(env: ThrowingEnv) -> Curriculum:
 
     Example:
         >>> from torchrl_her_envs import make_env
-        >>> [layer.name for layer in get_curriculum(make_env("hand_v1")).layers]
+        >>> [layer.name for layer in throwing_curriculum(make_env("hand_v1")).layers]
         ['reach', 'throw']
     """
     if not env.task.throws:

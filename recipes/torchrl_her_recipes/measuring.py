@@ -11,7 +11,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_her import GoalHistogram, HERWriter, discounted_return, final_distance, q_bias, success
+from torchrl_her_envs import goal_env
 from torchrl_her_recipes.parts import Parts
+from torchrl_her_recipes.small_world_values import measure_values
 
 _SATURATED = 0.99
 
@@ -33,6 +35,8 @@ def measure(parts: Parts, rollout: TensorDictBase) -> dict[str, Tensor]:
         value = _initial_value(parts.actor, parts.critic, rollout[:, 0])
         measured |= {"q": value, "q_bias": q_bias(value, returns)}
     means = {name: value.view(recipe.num_runs, -1).mean(1) for name, value in measured.items()}
+    if parts.climb is None:
+        means |= measure_values(parts.actor, goal_env(parts.eval_env), recipe.num_runs)
     return means | {"epsilon": parts.exploration.epsilon}
 
 

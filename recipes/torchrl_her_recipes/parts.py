@@ -34,7 +34,7 @@ from torchrl_her import (
     is_plain_adam,
     set_layer_goals,
 )
-from torchrl_her_envs import ThrowingEnv, goal_env, reward_range
+from torchrl_her_envs import goal_env, reward_range
 from torchrl_her_recipes.agents import make_agent
 from torchrl_her_recipes.algorithms import get_algorithm
 from torchrl_her_recipes.curricula import Climb, at_the_top, get_curriculum, in_layers, read_curriculum
@@ -197,7 +197,7 @@ def make_task_env(recipe: Recipe, num_envs: int, seeds: Sequence[int]) -> EnvBas
 
 
 def make_curriculum(recipe: Recipe, env: EnvBase) -> Curriculum | None:
-    """The curriculum that the recipe asks for: its own layers, or those of a throwing task.
+    """The curriculum that the recipe asks for: its own layers, or those of its task.
 
     Raises:
         ValueError: the task has no curriculum of its own, or the recipe's layers cannot be.
@@ -207,8 +207,6 @@ def make_curriculum(recipe: Recipe, env: EnvBase) -> Curriculum | None:
     worlds = goal_env(env)
     if recipe.curriculum is not None:
         return read_curriculum(recipe.curriculum, worlds)
-    if not isinstance(worlds, ThrowingEnv):
-        raise ValueError(f"{recipe.task} has no curriculum: give its layers as curriculum=FILE.yaml")
     return get_curriculum(worlds)
 
 

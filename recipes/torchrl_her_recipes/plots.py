@@ -45,6 +45,9 @@ _PANELS = (
 _AXES = {name: (label, limits) for name, label, limits in _PANELS} | {
     "q": ("Q of the start, return", None),
     "rows_virtual_positive": ("positive rewards, virtual rows", None),
+    "useless_share": ("the useless action is best", None),
+    "useless_margin": ("useless action minus needed flip", None),
+    "right_way": ("pairs with the right way", None),
 }
 
 
@@ -71,20 +74,26 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
     figure.savefig(path, dpi=110)
 
 
-def plot_comparison(panels: Mapping[str, Mapping[str, Rows]], path: Path) -> None:
-    """Draws success over environment steps: medians, and the 33rd to 67th percentile of the runs.
+def plot_comparison(
+    panels: Mapping[str, Mapping[str, Rows]], path: Path, *, metrics: Sequence[str] = ("success",)
+) -> None:
+    """Draws metrics over environment steps: medians, and the 33rd to 67th percentile of the runs.
 
     Args:
         panels: title of each panel to the curves in it, label to table of metrics.
         path: of the picture.
+        metrics: what is drawn, one panel each.
     """
-    figure = Figure(figsize=(1.0 + 4.2 * len(panels), 3.8), layout="constrained")
-    grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, (title, curves) in zip(grid, panels.items(), strict=True):
-        draw_curves(axes, curves, "success", colours(list(curves)))
+    columns = [(title, curves, name) for title, curves in panels.items() for name in metrics]
+    figure = Figure(figsize=(1.0 + 4.2 * len(columns), 3.8), layout="constrained")
+    grid = figure.subplots(1, len(columns), sharey=len(metrics) == 1, squeeze=False)[0]
+    for axes, (title, curves, name) in zip(grid, columns, strict=True):
+        draw_curves(axes, curves, name, colours(list(curves)))
         axes.set(title=title, xlabel="environment steps of each run")
-        axes.legend(loc="upper left", fontsize=8)
-    grid[0].set_ylabel("success (median, 33rd to 67th percentile)")
+        axes.legend(fontsize=8)
+        if axes is not grid[0] and len(metrics) == 1:
+            axes.set_ylabel("")
+    grid[0].set_ylabel(f"{grid[0].get_ylabel()} (median, 33rd to 67th percentile)")
     figure.savefig(path, dpi=110)
 
 

@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from torchrl_her_envs import BitFlip, GoalEnv, TreasureHunt, goal_env
-from torchrl_her_recipes.playing import load_actor
-from torchrl_her_recipes.run_folder import RunFolder
-from torchrl_her_recipes.worlds import make_worlds
+from torchrl_her_envs import BitFlip, GoalEnv, TreasureHunt
 
 _STATES = 256  # for each number of wrong bits
-_KINDS = {"needed": "a needed flip", "needless": "a needless flip", "useless": "the useless action"}
 
 
 @torch.no_grad()
@@ -26,6 +17,15 @@ def action_values(actor: TensorDictModule, place: Tensor, goal: Tensor) -> Tenso
     """The values [..., actions] of all actions in places [..., g] when goals [..., g] are desired."""
     seen = {"observation": place, "desired_goal": goal}
     return actor(TensorDict(seen, place.shape[:-1]))["action_value"]
+
+
+def some_wrong(
+    bits: int, wrong: int, states: int, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Random places [states, bits] that differ from their goals in ``wrong`` bits, and these goals."""
+    place = torch.randint(2, (states, bits), generator=generator).float()
+    differs = torch.rand(states, bits, generator=generator).argsort(-1) < wrong
+    return place, torch.where(differs, 1.0 - place, place)
 
 
 def values_by_wrong_bits(
@@ -45,10 +45,9 @@ def values_by_wrong_bits(
     """
     kinds: dict[str, list[Tensor]] = {}
     for wrong in range(bits + 1):
-        place = torch.randint(2, (states, bits), generator=generator).float()
-        order = torch.rand(states, bits, generator=generator).argsort(-1)
-        differs = order < wrong
-        values = action_values(actor, place, torch.where(differs, 1.0 - place, place))
+        place, goal = some_wrong(bits, wrong, states, generator)
+        differs = place != goal
+        values = action_values(actor, place, goal)
         flips = values[:, :bits]
         kinds.setdefault("needed", []).append(flips[differs].mean())
         kinds.setdefault("needless", []).append(flips[~differs].mean())
@@ -64,63 +63,55 @@ def true_values(wrong: Tensor, gamma: float) -> Tensor:
 
 def values_on_the_line(actor: TensorDictModule, env: TreasureHunt) -> Tensor:
     """The values [places, treasures, 2] of going left and right, for all places and treasures."""
+    return action_values(actor, *_all_pairs(env))
+
+
+def measure_values(actor: TensorDictModule, env: GoalEnv, runs: int) -> dict[str, Tensor]:
+    """What the values of R runs are worth, where that can be said; [R] each.
+
+    Args:
+        actor: of DQN, of all runs.
+        env: its task.
+        runs: R.
+
+    Returns:
+        In bit flipping with a useless action, over 1 to n wrong bits alike: ``useless_share``, how often
+        that action is the best one; ``useless_margin``, its value minus the mean of needed flips. In the
+        treasure hunt: ``right_way``, the share of pairs of place and treasure whose best action goes towards
+        the treasure. Nothing elsewhere.
+    """
+    if isinstance(env, BitFlip) and env.useless_action:
+        return _measure_useless(actor, env.bits, runs)
+    if isinstance(env, TreasureHunt):
+        return {"right_way": _right_way(actor, env, runs)}
+    return {}
+
+
+def _measure_useless(actor: TensorDictModule, bits: int, runs: int) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    each = [some_wrong(bits, wrong, _STATES, generator) for wrong in range(1, bits + 1)]
+    place, goal = (torch.cat(parts) for parts in zip(*each, strict=True))
+    values = action_values(actor, place.repeat(runs, 1), goal.repeat(runs, 1)).view(runs, len(place), -1)
+    needed = (place != goal).float()
+    flips, useless = values[..., :bits], values[..., bits]
+    margin = useless - (flips * needed).sum(-1) / needed.sum(-1)
+    return {
+        "useless_share": (values.argmax(-1) == bits).float().mean(1),
+        "useless_margin": margin.mean(1),
+    }
+
+
+def _right_way(actor: TensorDictModule, env: TreasureHunt, runs: int) -> Tensor:
+    place, goal = (points.reshape(-1, 1) for points in _all_pairs(env))
+    apart = (place != goal).squeeze(-1)
+    place, goal = place[apart], goal[apart]
+    values = action_values(actor, place.repeat(runs, 1), goal.repeat(runs, 1)).view(runs, len(place), 2)
+    return (values.argmax(-1) == (goal > place).squeeze(-1).long()).float().mean(1)
+
+
+def _all_pairs(env: TreasureHunt) -> tuple[Tensor, Tensor]:
+    """All places along the first dimension, all treasures along the second: [places, treasures, 1] both."""
     goals = env.goal_distribution
     points = goals.from_uniform((torch.arange(goals.count)[:, None] + 0.5) / goals.count).float()
     count = len(points)
-    place = points[:, None].expand(count, count, 1)
-    return action_values(actor, place, points[None].expand(count, count, 1))
-
-
-def plot_values(runs: Mapping[str, RunFolder], path: Path) -> None:
-    """Draws what runs make of their small world, one panel for each; the mean of the runs in a folder.
-
-    Args:
-        runs: title of each panel to the folder of its run.
-        path: of the picture.
-
-    Raises:
-        ValueError: no run, runs of different tasks, or of a task that this is not for.
-    """
-    tasks = {home.recipe().task for home in runs.values()}
-    if len(tasks) != 1 or not tasks <= {"bit_flip", "treasure_hunt"}:
-        raise ValueError(f"values are drawn of runs of bit_flip or of treasure_hunt, got {sorted(tasks)}")
-    figure = Figure(figsize=(1.0 + 4.4 * len(runs), 4.0), layout="constrained")
-    grid = figure.subplots(1, len(runs), sharey=True, squeeze=False)[0]
-    for axes, (title, home) in zip(grid, runs.items(), strict=True):
-        recipe = home.recipe()
-        actors = [load_actor(home.path, run=run) for run in range(recipe.num_runs)]
-        _draw(axes, actors, goal_env(make_worlds(recipe, 1, [0])), recipe.gamma)
-        axes.set_title(title)
-    figure.savefig(path, dpi=110)
-
-
-def _draw(axes: Axes, actors: list[TensorDictModule], env: GoalEnv, gamma: float) -> None:
-    if isinstance(env, BitFlip):
-        _draw_bits(axes, actors, env, gamma)
-    elif isinstance(env, TreasureHunt):
-        _draw_line(axes, actors, env)
-
-
-def _draw_bits(axes: Axes, actors: list[TensorDictModule], env: BitFlip, gamma: float) -> None:
-    generator = torch.Generator().manual_seed(0)
-    each = [values_by_wrong_bits(actor, env.bits, generator=generator) for actor in actors]
-    wrong = torch.arange(env.bits + 1)
-    for kind in each[0]:
-        axes.plot(wrong, torch.stack([own[kind] for own in each]).mean(0), label=_KINDS[kind])
-    axes.plot(wrong[1:], true_values(wrong[1:], gamma), "k:", label="a needed flip, in truth")
-    axes.set(xlabel="wrong bits", ylabel="estimated value")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-
-
-def _draw_line(axes: Axes, actors: list[TensorDictModule], env: TreasureHunt) -> None:
-    values = torch.stack([values_on_the_line(actor, env) for actor in actors]).mean(0)
-    picture = axes.imshow(values.amax(-1).T, origin="lower", extent=(0, 100, 0, 100), cmap="viridis")
-    axes.contour(
-        *(torch.linspace(0, 100, values.shape[0]) for _ in range(2)),
-        (values[..., 1] - values[..., 0]).T,
-        levels=[0.0],
-        colors="white",
-    )
-    axes.set(xlabel="place of the pirate (goes right above the white line)", ylabel="place of the treasure")
-    axes.figure.colorbar(picture, ax=axes, label="estimated value", shrink=0.8)
+    return points[:, None].expand(count, count, 1), points[None].expand(count, count, 1)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import yaml
 from filelock import FileLock, Timeout
 
 from torchrl_her_recipes.batches import Batches, plan_batches
+from torchrl_her_recipes.chain_times import plot_times
+from torchrl_her_recipes.plain import read_mapping
 from torchrl_her_recipes.planning import Plan
 from torchrl_her_recipes.plots import plot_comparison
 from torchrl_her_recipes.recipe import Recipe
@@ -38,26 +39,58 @@ class Study:
         recipe: what all of it has in common; ``num_runs`` is the number of seeds.
         vary: option of a recipe to the values that are compared. All combinations are run. The panels of
             the figure are the tasks, its curves the rest.
+        figure: metrics that are drawn over environment steps, or "times" until the chain is solved.
+
+    Raises:
+        ValueError: nothing to compare, or values that are no lists.
     """
 
     name: str
     summary: str = ""
     recipe: dict[str, Any] = field(default_factory=dict)
     vary: dict[str, Sequence[Any]] = field(default_factory=dict)
+    figure: str | Sequence[str] = ("success",)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.recipe, Mapping):
+            raise ValueError(f"recipe of {self.name} must hold names and values, got {self.recipe!r}")
+        wrong = not isinstance(self.vary, Mapping) or not self.vary
+        if wrong or not all(isinstance(values, list | tuple) and values for values in self.vary.values()):
+            raise ValueError(f"vary of {self.name} must hold lists of values by option, got {self.vary!r}")
 
     def cells(self) -> Iterator[tuple[str, Recipe]]:
         """The combinations by name, each with all of its seeds.
 
         Raises:
-            ValueError: a recipe that cannot work.
+            ValueError: a recipe that cannot work, or two combinations of the same name.
         """
+        labels = set()
         for values in product(*self.vary.values()):
             own = dict(zip(self.vary, values, strict=True))
-            label = "_".join(_word(name, value) for name, value in own.items())
+            words = (_word(name, value, self.vary[name]) for name, value in own.items())
+            label = "_".join(word for word in words if word).replace("/", "_") or self.name
+            if label in labels:
+                raise ValueError(f"the study {self.name} has two combinations that are called {label}")
+            labels.add(label)
             yield label, Recipe.from_dict({**self.recipe, **own})
 
 
-def _word(name: str, value: Any) -> str:
+def curve_label(label: str, recipe: Recipe) -> str:
+    """What sets a combination apart from others on the same task.
+
+    Example:
+        >>> curve_label("hand_v1_her", Recipe(task="hand_v1", algo="her"))
+        'her'
+    """
+    return f"_{label}_".replace(f"_{recipe.task.replace('/', '_')}_", "_").strip("_") or recipe.algo
+
+
+def _word(name: str, value: Any, values: Sequence[Any]) -> str:
+    """What sets a value apart from the other ``values`` of its option; of a mapping, the entries that do."""
+    if isinstance(value, Mapping):
+        entries = {key: [each.get(key) for each in values] for key in value}
+        differing = {key: own for key, own in entries.items() if any(other != own[0] for other in own)}
+        return "_".join(_word(key, value[key], own) for key, own in differing.items())
     return str(value) if name in ("task", "algo") else f"{name}={value}"
 
 
@@ -86,8 +119,11 @@ def load_study(
     for option, value in (("seeds", seeds), ("frames", frames)):
         if value is not None and value < 1:
             raise ValueError(f"{option} must be at least 1, got {value}")
-    values = yaml.safe_load(path.read_text())
+    values = read_mapping(path)
     preset = values.pop("preset", None)
+    known = [field.name for field in fields(Study) if field.name != "name"]
+    if unknown := [key for key in values if key not in known]:
+        raise ValueError(f"{path}: a study has no {', '.join(unknown)}; it has preset, {', '.join(known)}")
     study = Study(name=path.stem, **values)
     recipe = {**(load_preset(preset) if preset else {}), **study.recipe, **(_QUICK if quick else {})}
     if seeds is not None:
@@ -107,7 +143,7 @@ def load_preset(name: str) -> dict[str, Any]:
     if not path.is_file():
         known = ", ".join(sorted(preset.stem for preset in path.parent.glob("*.yaml")))
         raise ValueError(f"there is no preset {name!r}; the presets are {known}")
-    return yaml.safe_load(path.read_text())
+    return read_mapping(path)
 
 
 def _first(study: Study) -> dict[str, Any]:
@@ -179,12 +215,16 @@ def run_study(
 
 
 def draw_study(study: Study, folder: Path) -> Path:
-    """Success over environment steps: a panel for each task, a curve for each combination of the rest."""
+    """Metrics over environment steps: a panel for each task, a curve for each combination of the rest.
+
+    Of a study whose figure is "times": how long chains took.
+    """
+    path = folder / f"{study.name}.png"
+    if study.figure == "times":
+        plot_times([(recipe, Batches(folder / label).rows()) for label, recipe in study.cells()], path)
+        return path
     panels: dict[str, dict[str, list[dict[str, float]]]] = {}
     for label, recipe in study.cells():
-        rows = Batches(folder / label).rows()
-        curve = label.removeprefix(recipe.task).lstrip("_") or recipe.algo
-        panels.setdefault(recipe.task, {})[curve] = rows
-    path = folder / f"{study.name}.png"
-    plot_comparison(panels, path)
+        panels.setdefault(recipe.task, {})[curve_label(label, recipe)] = Batches(folder / label).rows()
+    plot_comparison(panels, path, metrics=study.figure)
     return path

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torchrl_her_recipes.batches import Batches
 from torchrl_her_recipes.recipe import Recipe
-from torchrl_her_recipes.studies import Study
+from torchrl_her_recipes.studies import Study, curve_label
 
 LAST = 3  # evaluations whose mean is what a run reached in the end
 
@@ -114,7 +114,7 @@ def _read(label: str, planned: Recipe, batches: Batches) -> Combination:
     return Combination(
         label=label,
         task=planned.task,
-        algorithm=f"_{label}_".replace(f"_{planned.task}_", "_").strip("_") or planned.algo,
+        algorithm=curve_label(label, planned),
         batches=batches,
         recipe=made,
         rows=batches.rows(),

@@ -30,6 +30,7 @@ WORLDS: dict[str, Make] = {
     "treasure": lambda **options: TreasureHunt(10, **options),
     "chain": lambda **options: Chain(6, 0.7, **options),
     "chain that resets": lambda **options: Chain(6, 0.7, reset_state=True, **options),
+    "chain of layers": lambda **options: Chain(6, 0.7, layers=2, alternating=True, **options),
 }
 worlds = pytest.mark.parametrize("make", WORLDS.values(), ids=WORLDS)
 some_world = st.sampled_from(list(WORLDS.values()))
@@ -80,7 +81,8 @@ def test_specs(make: Make, num_envs: int) -> None:
     for key in (*SHOWN, ("next", "reward")):
         assert steps[key].dtype == torch.float32
     assert torch.equal(steps["state"], torch.cat((steps["observation"], steps["desired_goal"]), -1))
-    assert torch.equal(steps["observation"], steps["achieved_goal"])
+    goals = steps["achieved_goal"].shape[-1]
+    assert torch.equal(steps["observation"][..., -goals:], steps["achieved_goal"])
 
 
 @worlds
@@ -152,9 +154,9 @@ def test_transitions_differ_from_start_to_start_step_to_step_and_world_to_world(
     forward = []
     for _ in range(2):
         env.reset()
-        put(env, place=[500])
-        places = torch.stack([act(env, 1)["observation"] for _ in range(50)])
-        forward.append(places.diff(dim=0).squeeze(-1) > 0)
+        put(env, place=[1] * 500 + [0] * 500)
+        places = torch.stack([act(env, 1)["observation"].sum(-1) for _ in range(50)])
+        forward.append(places.diff(dim=0) > 0)
     one, two = forward  # [49, 200]
     for a, b in ((one, two), (one[1:], one[:-1]), (one[:, 1:], one[:, :-1])):
         assert 0.46 < (a == b).double().mean() < 0.54  # 9,800 coins: eight standard deviations
@@ -229,7 +231,7 @@ def test_rewards_are_those_of_the_goals_reached(make: Make, seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "env", [TreasureHunt(), Chain(10_000, 0.5), BitFlip(100)], ids=["treasure", "chain", "bits"]
+    "env", [TreasureHunt(), Chain(100, 0.5), BitFlip(100)], ids=["treasure", "chain", "bits"]
 )
 def test_neighbours_are_told_apart(env: SmallWorld) -> None:
     goal = env.goal_distribution.sample(1000).float()
@@ -401,11 +403,19 @@ def test_the_whole_line_is_used() -> None:
 # The chain
 
 
+def closed(after: TensorDictBase) -> int:
+    """How many links are closed; they are the first ones."""
+    links = after["observation"][0].tolist()
+    count = links.count(1.0)
+    assert links == [1.0] * count + [-1.0] * (len(links) - count)
+    return count
+
+
 def test_without_chance_actions_do_what_they_say() -> None:
     env = Chain(4, 1.0, max_steps=10)
-    assert env.reset()["state"].tolist() == [[-1.0, 1.0]]
+    assert env.reset()["state"].tolist() == [[-1.0] * 4 + [1.0] * 4]
     steps = [act(env, action) for action in (0, 1, 1, 0, 1, 1, 1)]
-    assert [after["observation"].item() for after in steps] == [-1.0, -0.5, 0.0, -0.5, 0.0, 0.5, 1.0]
+    assert [closed(after) for after in steps] == [0, 1, 2, 1, 2, 3, 4]
     assert [after["reward"].item() for after in steps] == [-1.0] * 6 + [0.0]
     assert [after["terminated"].item() for after in steps] == [False] * 6 + [True]
 
@@ -414,7 +424,7 @@ def test_in_the_reset_state_form_every_mistake_leads_to_the_first_place() -> Non
     env = Chain(4, 1.0, reset_state=True)
     env.reset()
     steps = [act(env, action) for action in (1, 1, 0, 1)]
-    assert [after["observation"].item() for after in steps] == [-0.5, 0.0, -1.0, -0.5]
+    assert [closed(after) for after in steps] == [1, 2, 0, 1]
     assert [after["truncated"].item() for after in steps] == [False, False, False, True]
 
 
@@ -433,14 +443,32 @@ def test_forward_arrives_as_often_as_appendix_c_says(reset_state: bool) -> None:
 def test_steps_of_the_chain(probability: float, reset_state: bool, place: int) -> None:
     env = Chain(9, probability, reset_state=reset_state, num_envs=1000)
     env.reset()
-    put(env, place=[place])
+    links = [1] * place + [0] * (9 - place)
+    put(env, place=links)
     act(env, 1)
-    places = env.world_state_dict()["place"].squeeze(-1)
+    places = env.world_state_dict()["place"].sum(-1)
     assert set(places.tolist()) == {place + 1, 0 if reset_state else place - 1}
     assert abs((places == place + 1).double().mean() - probability) < 0.08
-    put(env, place=[place])
+    put(env, place=links)
     act(env, 0)
-    assert set(env.world_state_dict()["place"].flatten().tolist()) == {0 if reset_state else place - 1}
+    assert set(env.world_state_dict()["place"].sum(-1).tolist()) == {0 if reset_state else place - 1}
+
+
+def test_in_an_alternating_chain_odd_places_want_the_other_action() -> None:
+    env = Chain(4, 1.0, alternating=True, reset_state=True, max_steps=10)
+    env.reset()
+    assert [closed(act(env, action)) for action in (1, 1, 1, 0, 1, 0)] == [1, 0, 1, 2, 3, 4]
+
+
+def test_of_a_chain_of_layers_only_the_last_is_achieved() -> None:
+    env = Chain(6, 1.0, layers=3)
+    assert env.reset()["desired_goal"].tolist() == [[1.0, 1.0]]
+    steps = [act(env, 1) for _ in range(6)]
+    assert [after["achieved_goal"][0].tolist() for after in steps] == [[-1.0, -1.0]] * 4 + [
+        [1.0, -1.0],
+        [1.0, 1.0],
+    ]
+    assert [after["terminated"].item() for after in steps] == [False] * 5 + [True]
 
 
 # Hindsight
@@ -547,6 +575,8 @@ def test_torchrls_q_learning_takes_the_actions(make: Make) -> None:
         (lambda: TreasureHunt(3), "step must divide 100, so be one of 1, 2, 4, 5, .*, 100; got 3"),
         (lambda: TreasureHunt(0), "step must be a whole number from 1 to 100, got 0"),
         (lambda: Chain(0, 0.5), "length must be a whole number from 1 to 1048575, got 0"),
+        (lambda: Chain(6, 0.5, layers=4), "layers must divide length=6, got 4"),
+        (lambda: Chain(3, 0.5, layers=4), "layers must be a whole number from 1 to 3, got 4"),
         (lambda: Chain(3, 0.0), r"forward_probability must be in \(0, 1\], got 0.0"),
         (lambda: Chain(3, 1.1), r"forward_probability must be in \(0, 1\], got 1.1"),
         (lambda: Chain(3, float("nan")), r"forward_probability must be in \(0, 1\], got nan"),

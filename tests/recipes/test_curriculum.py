@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import Instructiveness, enter_layer
-from torchrl_her_envs import TASKS, base_env, make_env
+from torchrl_her_envs import TASKS, Chain, base_env, make_env
 from torchrl_her_recipes import Parts, Recipe, load_actor, play, resume
 from torchrl_her_recipes.climbing import move_on
 from torchrl_her_recipes.curricula import get_curriculum
@@ -51,6 +51,26 @@ def test_every_throwing_task_has_a_curriculum_that_hands_over(task: str) -> None
     assert state[:, list(throw.desired_goal)].tolist() == env.worlds.goal.float().tolist()
     # What the throw sees first is all that the reach sees, its goal included.
     assert [*reach.observation, *reach.desired_goal] == list(throw.observation[: curriculum.first_inputs])
+
+
+def test_parts_of_the_chain_are_layers_that_end_at_the_next_one_s_start() -> None:
+    env = Chain(6, 1.0, layers=3)
+    state = env.reset()["state"][0]
+    first, second, third = get_curriculum(env).layers
+    assert (first.observation, first.achieved_goal) == ((0, 1), (0, 1))
+    assert (second.observation, second.achieved_goal) == ((0, 1, 2, 3), (2, 3))
+    assert (third.observation, third.achieved_goal) == ((0, 1, 2, 3, 4, 5), (4, 5))
+    for layer in (first, second, third):
+        assert state[list(layer.desired_goal)].tolist() == [1.0, 1.0]
+        assert layer.threshold < 2.0  # what a single open link is away
+
+
+def test_a_chain_is_climbed() -> None:
+    options = {"length": 4, "layers": 2, "alternating": True}
+    recipe = small(task="chain", task_options=options, algo="cher", epochs=8, window=1, frames_per_update=4)
+    rows = recipe.build().run(progress=False).rows
+    assert rows[0]["layer"] == 0
+    assert rows[-1]["layer"] == 1
 
 
 def test_a_task_of_one_layer_has_none() -> None:

@@ -11,10 +11,11 @@ from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
 
-from torchrl_her_envs import TreasureHunt
-from torchrl_her_recipes.run_folder import RunFolder
+from torchrl_her_envs import BitFlip, TreasureHunt
+from torchrl_her_recipes.batches import Batches
+from torchrl_her_recipes.small_world_plots import plot_values
 from torchrl_her_recipes.small_world_values import (
-    plot_values,
+    measure_values,
     true_values,
     values_by_wrong_bits,
     values_on_the_line,
@@ -38,6 +39,20 @@ class KnowsTheWay(nn.Module):
 
     def forward(self, place: Tensor, goal: Tensor) -> Tensor:
         return torch.cat((place - goal, goal - place), -1)
+
+
+class TwoOpinions(nn.Module):
+    """Of two runs: the first as above, the second thinks nothing of the last action."""
+
+    def forward(self, place: Tensor, goal: Tensor) -> Tensor:
+        values = KnowsBits()(place, goal)
+        values[len(values) // 2 :, -1] = -1.0
+        return values
+
+
+class AlwaysLeft(nn.Module):
+    def forward(self, place: Tensor, goal: Tensor) -> Tensor:
+        return torch.cat((place * 0 + 1, place * 0), -1)
 
 
 def test_kinds_of_flips_are_told_apart() -> None:
@@ -65,12 +80,12 @@ def test_all_places_and_treasures_of_the_line() -> None:
     ("task", "options"), [("bit_flip", {"bits": 3, "useless_action": True}), ("treasure_hunt", {"step": 25})]
 )
 def test_runs_are_drawn_beside_each_other(task: str, options: dict[str, object], tmp_path: Path) -> None:
-    homes = {}
+    runs = []
     for algo in ("her", "filtered_her"):
         recipe = small(task=task, task_options=options, algo=algo, epochs=1, num_runs=2)
         recipe.build().run(tmp_path / algo, progress=False)
-        homes[algo] = RunFolder(tmp_path / algo)
-    plot_values(homes, tmp_path / "values.png")
+        runs.append(Batches(tmp_path / algo))
+    plot_values(runs, tmp_path / "values.png")
     with Image.open(tmp_path / "values.png") as picture:
         assert picture.size[0] > 2 * picture.size[1]
 
@@ -78,4 +93,21 @@ def test_runs_are_drawn_beside_each_other(task: str, options: dict[str, object],
 def test_runs_of_other_tasks_are_refused(tmp_path: Path) -> None:
     small(epochs=1).build().run(tmp_path / "run", progress=False)
     with pytest.raises(ValueError, match=r"of runs of bit_flip or of treasure_hunt, got \['hand_v0'\]"):
-        plot_values({"run": RunFolder(tmp_path / "run")}, tmp_path / "values.png")
+        plot_values([Batches(tmp_path / "run")], tmp_path / "values.png")
+
+
+def test_what_two_runs_make_of_the_useless_action() -> None:
+    env = BitFlip(4, useless_action=True)
+    actor = QValueActor(TwoOpinions(), spec=Categorical(5), in_keys=KEYS, action_space="categorical")
+    measured = measure_values(actor, env, 2)
+    # One value more than a needed flip for each wrong bit beyond the first, over 1 to 4; then never.
+    assert measured["useless_margin"].tolist() == [1.5, -2.0]
+    assert measured["useless_share"].tolist() == [0.75, 0.0]
+    assert measure_values(actor, BitFlip(4), 2) == {}
+
+
+def test_the_right_way_is_towards_the_treasure() -> None:
+    actor = QValueActor(KnowsTheWay(), spec=Categorical(2), in_keys=KEYS, action_space="categorical")
+    assert measure_values(actor, TreasureHunt(20), 1)["right_way"].tolist() == [1.0]
+    always_left = QValueActor(AlwaysLeft(), spec=Categorical(2), in_keys=KEYS, action_space="categorical")
+    assert measure_values(always_left, TreasureHunt(20), 1)["right_way"].tolist() == [0.5]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -89,6 +90,38 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     assert [file.stat().st_mtime_ns for file in metrics] == before
 
 
+def test_mappings_are_called_by_the_entries_that_differ() -> None:
+    vary: dict[str, Sequence[object]] = {
+        "algo": ["her"],
+        "task_options": [{"length": 4, "layers": 2}, {"length": 6, "layers": 2}],
+    }
+    study = Study(name="one", recipe={**SMALL, "task": "chain"}, vary=vary)
+    assert [label for label, _ in study.cells()] == ["her_length=4", "her_length=6"]
+
+
+def test_chains_are_compared_by_their_times_and_others_by_the_metrics_asked_for(tmp_path: Path) -> None:
+    sizes = [{"length": n, "layers": 2, "alternating": True} for n in (2, 4)]
+    times = Study(
+        name="times",
+        recipe={**SMALL, "task": "chain", "epochs": 1},
+        vary={"algo": ["her", "cher"], "task_options": sizes},
+        figure="times",
+    )
+    assert run_study(times, tmp_path / "a", workers=Here(), progress=False).figure
+    chains = [str(tmp_path / "a" / label) for label, _ in times.cells()]
+    assert main(["plot", "times", *chains, "--out", str(tmp_path / "again.png")]) == 0
+    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "a" / "times.png").read_bytes()
+    metrics = Study(
+        name="metrics",
+        recipe={**SMALL, "task": "treasure_hunt", "task_options": {"step": 25}, "epochs": 1},
+        vary={"algo": ["her"]},
+        figure=["success", "right_way"],
+    )
+    run_study(metrics, tmp_path / "b", workers=Here(), progress=False)
+    with Image.open(tmp_path / "b" / "metrics.png") as picture:
+        assert picture.size[0] > 2 * picture.size[1]
+
+
 def test_the_guide_s_study_is_planned_as_it_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -117,8 +150,9 @@ def test_a_combination_that_was_cut_short_goes_on(tmp_path: Path) -> None:
 
 
 def test_other_options_under_the_same_name_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "her").mkdir()
-    RunFolder(tmp_path / "her").config.write_text(yaml.safe_dump({**SMALL, "algo": "her", "k": 2}))
+    batch = tmp_path / "her" / "seeds_0"
+    batch.mkdir(parents=True)
+    RunFolder(batch).config.write_text(yaml.safe_dump({**SMALL, "algo": "her", "k": 2}))
     study = Study(name="one", recipe=SMALL, vary={"algo": ["her"]})
     with pytest.raises(ValueError, match="holds a run with other options"):
         run_study(study, tmp_path, workers=Here(), progress=False)
@@ -148,11 +182,26 @@ def test_without_ray_its_name_and_the_remedy_are_given(
         (["nothing"], "there is no study 'nothing'; the studies are bias, "),
         (["ibs", "--seeds", "0"], "seeds must be at least 1, got 0"),
         (["ibs", "--frames", "-5"], "frames must be at least 1, got -5"),
+        (["recipes: {}"], "a study has no recipes; it has preset, summary, recipe, vary, figure"),
+        ([""], "mine.yaml cannot be read: it must hold names and values, got None"),
+        (["vary: {algo: ["], "mine.yaml cannot be read: while parsing"),
+        (["recipe: {k: 2}"], "vary of mine must hold lists of values by option, got {}"),
+        (["vary: {algo: her}"], "vary of mine must hold lists of values by option, got {'algo': 'her'}"),
+        (["vary: {algo: [her, her]}"], "the study mine has two combinations that are called her"),
+        (["vary: {learning_rate: [1e-3, fast]}"], "learning_rate must be a number, got 'fast'"),
     ],
 )
 def test_bad_input_is_one_clear_line(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    if arguments[0] not in ("nothing", "ibs"):  # the text of a study of one's own
+        Path("mine.yaml").write_text(arguments[0])
+        arguments = ["mine.yaml"]
     assert main(["study", *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error

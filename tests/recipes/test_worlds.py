@@ -99,7 +99,7 @@ def test_other_learners_train_by_name(learner: str, loss: type, tmp_path: Path) 
         ({"task_options": {"bits": 3}}, "hand_v0 takes no task_options"),
         ({"task": "chain", "task_options": 7}, "task_options must be a mapping of options, got 7"),
         ({"task": "chain", "threshold": 0.1}, "threshold is for throwing tasks"),
-        ({"task": "chain", "algo": "cher"}, "chain has no curriculum"),
+        ({"task": "bit_flip", "algo": "cher"}, "BitFlip has no curriculum"),
         ({"task": "treasure_hunt", "algo": "cher", "curriculum": [{"name": "all"}]}, "is no layer"),
         ({"task": "hand_v1", "algo": "cher", "curriculum": {"name": "all"}}, "must be a list of layers"),
     ],
