@@ -63,7 +63,11 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("preset", PRESETS, ids=lambda path: path.stem)
 def test_every_preset_runs(preset: Path) -> None:
-    shrunk = [option for option in overrides(folder="out") if not option.startswith("num_runs")]
+    shrunk = [
+        option
+        for option in overrides(folder="out", epochs=1, epoch_frames=800)
+        if not option.startswith("num_runs")
+    ]
     assert cli.main(["train", f"preset={preset.stem}", *shrunk, "num_runs=1"]) == 0
     config = yaml.safe_load(Path("out/config.yaml").read_text())
     for name, value in yaml.safe_load(preset.read_text()).items():

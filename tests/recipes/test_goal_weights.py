@@ -119,5 +119,7 @@ def test_a_run_without_a_map_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
     small(algo="no_hindsight", epochs=1).build().run(tmp_path / "run", progress=False)
     assert main(["plot", "goals", str(tmp_path / "run")]) == 2
     assert (
-        capsys.readouterr().err.strip().endswith("has no goal_map.npz: the run has written no virtual goals")
+        capsys.readouterr()
+        .err.strip()
+        .endswith("has no map of goals: its runs have written no virtual goals")
     )
