@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from machine import describe, table
+from machine import describe, publish, table
 
 from torchrl_her import save_checkpoint
 from torchrl_her_recipes import Recipe
@@ -62,9 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             rows.append(measure(replace(recipe, num_runs=runs), Path(folder)))
     header = ("runs", "rows of each", "MB", "seconds of the last", "all checkpoints", "share of the time")
     text = "\n\n".join((describe("torch", "torchrl"), table(header, rows)))
-    print(text)
-    if options.out is not None:
-        options.out.write_text(text + "\n")
+    publish(text, options.out)
 
 
 if __name__ == "__main__":

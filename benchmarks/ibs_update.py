@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from machine import describe, table
+from machine import describe, publish, table
 from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -60,9 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     text = "\n\n".join(
         (describe("torch", "torchrl"), table(("episodes a batch", "KL(q, q*)", "seconds"), rows))
     )
-    print(text)
-    if options.out is not None:
-        options.out.write_text(text + "\n")
+    publish(text, options.out)
 
 
 if __name__ == "__main__":

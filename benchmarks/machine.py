@@ -44,3 +44,10 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def publish(text: str, out: Path | None) -> None:
+    """Prints a text, and writes it to a file if there is to be one."""
+    print(text)
+    if out is not None:
+        out.write_text(text + "\n")

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
-from machine import describe, medians, table
+from machine import describe, medians, publish, table
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -108,9 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ]
     header = ("a million rows", "over plain storage", "MB", f"ms to draw {DRAWN} rows")
     text = "\n\n".join((describe("torch", "torchrl"), table(header, rows)))
-    print(text)
-    if options.out is not None:
-        options.out.write_text(text + "\n")
+    publish(text, options.out)
 
 
 if __name__ == "__main__":

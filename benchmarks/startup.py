@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from machine import describe, medians, table
+from machine import describe, medians, publish, table
 
 PROGRAMS = {
     "import torch": ["-c", "import torch"],
@@ -51,9 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     seconds = medians(work, repeats=options.repeats)
     rows = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     text = "\n\n".join((describe("torch", "torchrl", "stable-baselines3"), table(("start", "seconds"), rows)))
-    print(text)
-    if options.out is not None:
-        options.out.write_text(text + "\n")
+    publish(text, options.out)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from machine import describe, table
+from machine import describe, publish, table
 from matplotlib.figure import Figure
 from peer_sb3 import make_sb3
 from tensordict import TensorDictBase
@@ -159,9 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     header = (recipe.task, f"reached {options.aim:.0%}", "seconds: median (each)", "frames", "last", "best")
     rows = [line(name, curves[name], options.aim) for name in names]
     text = "\n\n".join((describe("torch", "torchrl", "stable-baselines3"), table(header, rows)))
-    print(text)
-    if options.out is not None:
-        options.out.write_text(text + "\n")
+    publish(text, options.out)
     if options.curves is not None:
         write_curves(curves, options.curves)
         draw_curves(curves, options.curves.with_suffix(".png"), title=recipe.task)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
-from machine import describe, medians, table
+from machine import describe, medians, publish, table
 from peer_sb3 import make_sb3
 from stable_baselines3 import DDPG
 
@@ -160,9 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     machine = describe("torch", "torchrl", "stable-baselines3")
     tables = (update_table, loop_table, runs_table)
     text = "\n\n".join((machine, *(make(options.repeats) for make in tables)))
-    print(text)
-    if options.out is not None:
-        options.out.write_text(text + "\n")
+    publish(text, options.out)
 
 
 if __name__ == "__main__":

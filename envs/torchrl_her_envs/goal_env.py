@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol, cast
 
 from torch import Tensor
@@ -43,12 +43,18 @@ def goal_env(env: EnvBase) -> GoalEnv:
         >>> goal_env(TransformedEnv(make_env("hand_v1"), StepCounter())).max_steps
         50
     """
-    inner: object = env
-    while not _has_goals(inner):
-        inner = getattr(inner, "base_env", None)
-        if inner is None:
-            raise TypeError(f"expected an environment with goals, got {type(env).__name__}")
+    inner = first_below(env, _has_goals)
+    if inner is None:
+        raise TypeError(f"expected an environment with goals, got {type(env).__name__}")
     return cast(GoalEnv, inner)
+
+
+def first_below(env: EnvBase, fits: Callable[[object], bool]) -> object | None:
+    """The environment, or the first one below its transforms, that fits; None if none does."""
+    inner: object | None = env
+    while inner is not None and not fits(inner):
+        inner = getattr(inner, "base_env", None)
+    return inner
 
 
 def reward_range(env: GoalEnv) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_her_envs import palette
+from torchrl_her_envs.goal_env import first_below
 from torchrl_her_envs.palette import Colour
 from torchrl_her_envs.rendering import choose_worlds, render
 from torchrl_her_envs.throwing import ThrowingEnv
@@ -33,11 +34,9 @@ def base_env(env: EnvBase) -> ThrowingEnv:
         >>> base_env(TransformedEnv(make_env("hand_v1"), StepCounter())).task.name
         'hand_v1'
     """
-    inner: object = env
-    while not isinstance(inner, ThrowingEnv):
-        inner = getattr(inner, "base_env", None)
-        if inner is None:
-            raise TypeError(f"expected a ThrowingEnv, transformed or not, got {type(env).__name__}")
+    inner = first_below(env, lambda inner: isinstance(inner, ThrowingEnv))
+    if not isinstance(inner, ThrowingEnv):
+        raise TypeError(f"expected a ThrowingEnv, transformed or not, got {type(env).__name__}")
     return inner
 
 

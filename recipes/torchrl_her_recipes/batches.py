@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -30,8 +31,6 @@ class Batches:
     Attributes:
         path: likewise.
         homes: the batches that were begun, in the order of their seeds.
-        shown: those of them that are read.
-        is_done: whether they have come to their end.
     """
 
     def __init__(self, path: Path) -> None:
@@ -40,9 +39,20 @@ class Batches:
         if not found[0].config.exists():
             found = [RunFolder(folder) for folder in sorted(path.glob("seeds_*"), key=_seeds_of)]
         self.homes = [home for home in found if home.config.exists()]
-        done = [home for home in self.homes if home.is_done]
-        self.is_done = bool(done)
-        self.shown = done or [home for home in self.homes if home.rows()]
+
+    @cached_property
+    def _done(self) -> list[RunFolder]:
+        return [home for home in self.homes if home.is_done]
+
+    @cached_property
+    def shown(self) -> list[RunFolder]:
+        """Those of them that are read."""
+        return self._done or [home for home in self.homes if home.rows()]
+
+    @property
+    def is_done(self) -> bool:
+        """Whether those that are read have come to their end."""
+        return bool(self._done)
 
     @property
     def recipe(self) -> Recipe | None:
@@ -94,17 +104,19 @@ def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
     home = folder / label
     if (home / "config.yaml").exists():
         raise ValueError(f"{home} is the folder of a single run; choose another folder for the study")
-    jobs = [_begun(recipe, own.path) for own in Batches(home).homes]
-    there = {seed for job in jobs for seed in job.recipe.seeds}
+    recipes = {own.path: _begun(recipe, own.path) for own in Batches(home).homes}
+    there = {seed for own in recipes.values() for seed in own.seeds}
     missing = [seed for seed in recipe.seeds if seed not in there]
     for seeds in share_out(missing, most=max(_ROWS // recipe.batch_size, 1)):
-        own = replace(recipe, seed=seeds[0], num_runs=len(seeds))
-        jobs.append(Job(label="", recipe=own, folder=home / _name(seeds)))
-    return [replace(job, label=job.folder.relative_to(folder).as_posix()) for job in jobs]
+        recipes[home / _name(seeds)] = replace(recipe, seed=seeds[0], num_runs=len(seeds))
+    return [
+        Job(label=path.relative_to(folder).as_posix(), recipe=own, folder=path)
+        for path, own in recipes.items()
+    ]
 
 
-def _begun(recipe: Recipe, path: Path) -> Job:
-    """A batch that was begun. One whose configuration was torn by a power failure is as planned."""
+def _begun(recipe: Recipe, path: Path) -> Recipe:
+    """What a batch runs that was begun. One whose configuration was torn by a power failure is as planned."""
     first, last = _seeds_of(path)
     planned = replace(recipe, seed=first, num_runs=last - first + 1)
     try:
@@ -113,7 +125,7 @@ def _begun(recipe: Recipe, path: Path) -> Job:
         own = planned
     if own != planned:
         raise ValueError(f"{path} holds a run with other options; choose another folder")
-    return Job(label="", recipe=own, folder=path)
+    return own
 
 
 def _name(seeds: Sequence[int]) -> str:
