@@ -104,3 +104,10 @@ class EnvReward:
         return self.compute_reward(achieved_goal, desired_goal), self.compute_terminated(
             achieved_goal, desired_goal
         )
+
+
+def reward_alone(reward: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    """The reward [..., 1] without ``terminated``, which is half of the work, where they can be had apart."""
+    if isinstance(reward, EnvReward):
+        return reward.compute_reward(achieved_goal, desired_goal)
+    return reward(achieved_goal, desired_goal)[0]

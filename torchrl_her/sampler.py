@@ -21,12 +21,13 @@ from threading import get_ident
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDictBase, is_tensor_collection, unravel_key
+from tensordict import NestedKey, TensorDictBase, is_tensor_collection
 from torch import Tensor
 from torchrl.data import SampleUnit, Storage
 
 from torchrl_her.goal_weights import GoalWeights
-from torchrl_her.goals import EnvReward, RewardFunction
+from torchrl_her.goals import RewardFunction, reward_alone
+from torchrl_her.row_keys import RowKeys, in_root_and_next
 from torchrl_her.virtual_goals import Strategy, check_strategy, combine, draw, draw_alike, window
 
 # Likelihoods of goals [rows, T] that are held at once.
@@ -248,15 +249,16 @@ class HERSampleUnit(SampleUnit):
         self.achieved_reward = achieved_reward
         self.weights = weights
         self.generator = generator
-        self._exclude = [unravel_key(place) for key in exclude for place in (key, ("next", key))]
-        self._achieved_key = unravel_key(achieved_goal)
-        self._next_achieved_key = unravel_key(("next", achieved_goal))
-        self._goal_keys = (unravel_key(desired_goal), unravel_key(("next", desired_goal)))
-        self._reward_key = unravel_key(("next", observed_reward))
-        self._terminated_key = unravel_key(("next", terminated))
-        self._truncated_key = unravel_key(("next", truncated))
-        self._done_key = unravel_key(("next", done))
-        self._trajectory_key = unravel_key(trajectory)
+        self._exclude = in_root_and_next(exclude)
+        self._keys = RowKeys.of(
+            achieved_goal=achieved_goal,
+            desired_goal=desired_goal,
+            reward=observed_reward,
+            terminated=terminated,
+            truncated=truncated,
+            done=done,
+            trajectory=trajectory,
+        )
         self._virtual_key = virtual
         self._stored: _Stored | None = None
         # For each thread: a buffer that prefetches draws and collates several batches at once.
@@ -306,16 +308,10 @@ class HERSampleUnit(SampleUnit):
             out.set(self._virtual_key, marks.index_fill_(0, rows, True))
         if len(rows) == 0:
             return out
-        achieved = self._get(data, self._next_achieved_key)[rows]
+        achieved = self._get(data, self._keys.next_achieved)[rows]
         reward, terminated = self.reward(achieved, chosen.goals)
-        truncated = self._get(data, self._truncated_key)[rows]
-        changed: dict[NestedKey, Tensor] = {
-            **dict.fromkeys(self._goal_keys, chosen.goals),
-            self._reward_key: reward,
-            self._terminated_key: terminated,
-            self._done_key: terminated | truncated.view_as(terminated),
-        }
-        for key, value in changed.items():
+        truncated = self._get(data, self._keys.truncated)[rows]
+        for key, value in self._keys.changes(chosen.goals, reward, terminated, truncated).items():
             entry = self._get(data, key)
             value = value.to(entry.dtype).view(len(rows), *entry.shape[1:])
             out.set(key, entry.index_copy(0, rows, value))  # a copy: what was read might be the storage
@@ -340,15 +336,15 @@ class HERSampleUnit(SampleUnit):
                 )
             dims, shape = storage.ndim, rows.shape[: storage.ndim]
             grid = shape if dims == 1 else torch.Size([shape[0], shape[1:].numel()])
-            ids = rows.get(self._trajectory_key, None)
+            ids = rows.get(self._keys.trajectory, None)
             episodes = index_episodes(
-                self._get(rows, self._done_key).reshape(grid),
+                self._get(rows, self._keys.done).reshape(grid),
                 None if ids is None else ids.reshape(grid),
                 oldest=state[1],
             )
             before, after = (
                 self._get(rows, key).flatten(0, dims - 1)
-                for key in (self._achieved_key, self._next_achieved_key)
+                for key in (self._keys.achieved, self._keys.next_achieved)
             )
             self._stored = stored = _Stored(storage, state, before, after, episodes)
         return stored
@@ -404,11 +400,7 @@ class HERSampleUnit(SampleUnit):
 
     def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
         """The filter, [...]: False where a goal [..., g] was already achieved before the action."""
-        if isinstance(self.reward, EnvReward):
-            reward = self.reward.compute_reward(before, goals)
-        else:
-            reward = self.reward(before, goals)[0]
-        return reward.squeeze(-1) < self.achieved_reward
+        return reward_alone(self.reward, before, goals).squeeze(-1) < self.achieved_reward
 
 
 def _oldest(storage: Storage) -> int:

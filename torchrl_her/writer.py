@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
 from torch import Tensor
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
 from torchrl_her.episodes import Episodes, find_episodes
 from torchrl_her.goal_drawing import draw_goals
 from torchrl_her.goal_weights import GoalWeights
-from torchrl_her.goals import EnvReward, RewardFunction
+from torchrl_her.goals import RewardFunction, reward_alone
+from torchrl_her.row_keys import RowKeys, in_root_and_next
 from torchrl_her.virtual_goals import Strategy, check_strategy
 
 # Work is done piece by piece: pieces that are too large touch fresh memory in every call, pieces that are too
@@ -140,15 +141,16 @@ class HERWriter(RoundRobinWriter):
         self.achieved_reward = achieved_reward
         self.weights = weights
         self.counts, self.totals = WriterCounts(), WriterCounts()
-        self._exclude = [unravel_key(place) for key in exclude for place in (key, ("next", key))]
-        self._achieved_key = unravel_key(achieved_goal)
-        self._next_achieved_key = unravel_key(("next", achieved_goal))
-        self._goal_keys = (unravel_key(desired_goal), unravel_key(("next", desired_goal)))
-        self._reward_key = unravel_key(("next", observed_reward))
-        self._terminated_key = unravel_key(("next", terminated))
-        self._truncated_key = unravel_key(("next", truncated))
-        self._done_key = unravel_key(("next", done))
-        self._trajectory_key = unravel_key(trajectory)
+        self._exclude = in_root_and_next(exclude)
+        self._keys = RowKeys.of(
+            achieved_goal=achieved_goal,
+            desired_goal=desired_goal,
+            reward=observed_reward,
+            terminated=terminated,
+            truncated=truncated,
+            done=done,
+            trajectory=trajectory,
+        )
         self._virtual_key = virtual
         self._held: TensorDictBase | None = None  # rows of open episodes, oldest first
         self._held_lanes: Tensor = torch.empty(0, dtype=torch.int64)
@@ -179,7 +181,7 @@ class HERWriter(RoundRobinWriter):
             raise ValueError(f"HERWriter needs a storage of 1 dimension, got one of {self._storage.ndim}")
         held = self.held_back
         rows, lanes, ids = self._with_held(data)
-        episodes, left = find_episodes(lanes, rows.get(self._done_key).reshape(-1), ids)
+        episodes, left = find_episodes(lanes, rows.get(self._keys.done).reshape(-1), ids)
         self._held, self._held_lanes = (rows[left] if len(left) else None), lanes[left]
         cursor, written = self._cursor, 0
         place = lanes.new_full((len(lanes),), -1)  # of each row, in the order of writing
@@ -229,7 +231,7 @@ class HERWriter(RoundRobinWriter):
     def _with_held(self, data: TensorDictBase) -> tuple[TensorDictBase, Tensor, Tensor | None]:
         """Flat rows, those held back in front, their lanes, and trajectory ids if lanes are environments."""
         rows = data.reshape(-1)
-        ids = rows.get(self._trajectory_key, None)
+        ids = rows.get(self._keys.trajectory, None)
         if data.ndim > 1:
             steps = data.shape[-1]
             lanes = torch.arange(len(rows) // max(steps, 1), device=rows.device).repeat_interleave(steps)
@@ -241,7 +243,7 @@ class HERWriter(RoundRobinWriter):
             lanes = torch.cat((self._held_lanes, lanes))
         if data.ndim == 1 or ids is None:
             return rows, lanes, None
-        return rows, lanes, rows.get(self._trajectory_key).reshape(-1)
+        return rows, lanes, rows.get(self._keys.trajectory).reshape(-1)
 
     def _episodes_at_once(self, episodes: Episodes) -> int:
         rows_of_each = max(1, episodes.rows.shape[1]) * (self.k + 1)
@@ -254,7 +256,7 @@ class HERWriter(RoundRobinWriter):
         virtual = len(source)
         out = self._build(rows, real, source, self._relabel(rows, source, goal_source) if virtual else {})
         place[real] = torch.arange(written + virtual, written + len(out), device=place.device)
-        positive = self._positives(out.get(self._reward_key)[virtual:])
+        positive = self._positives(out.get(self._keys.reward)[virtual:])
         self._count(real=len(real), virtual=virtual, real_positive=positive)
         excess = max(0, len(out) - self._storage.max_size)
         self._cursor = (self._cursor + excess) % self._storage.max_size
@@ -295,8 +297,8 @@ class HERWriter(RoundRobinWriter):
     def _draw(self, rows: TensorDictBase, episodes: Episodes) -> tuple[Tensor, Tensor]:
         """Which rows [V] are written once more, and the rows [V] whose achieved goals they take."""
         return draw_goals(
-            rows.get(self._achieved_key),
-            rows.get(self._next_achieved_key),
+            rows.get(self._keys.achieved),
+            rows.get(self._keys.next_achieved),
             episodes,
             self.k,
             strategy=self.strategy,
@@ -307,27 +309,22 @@ class HERWriter(RoundRobinWriter):
 
     def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
         """The filter, [...]: False where a goal [..., g] was already achieved before the action."""
-        return self._reward_alone(before, goals).squeeze(-1) < self.achieved_reward
+        return reward_alone(self.reward, before, goals).squeeze(-1) < self.achieved_reward
 
     def _relabel(self, rows: TensorDictBase, source: Tensor, goal_source: Tensor) -> dict[NestedKey, Tensor]:
         """The entries of virtual rows that differ from those of the rows they are made of."""
-        achieved = rows.get(self._next_achieved_key)
+        achieved = rows.get(self._keys.next_achieved)
         goals = achieved.index_select(0, goal_source)
         reward, terminated = self.reward(achieved.index_select(0, source), goals)
         self._note(rows, source, goals, reward)
-        truncated = rows.get(self._truncated_key).index_select(0, source)
-        return {
-            **dict.fromkeys(self._goal_keys, goals),
-            self._reward_key: reward,
-            self._terminated_key: terminated,
-            self._done_key: terminated | truncated.view_as(terminated),
-        }
+        truncated = rows.get(self._keys.truncated).index_select(0, source)
+        return self._keys.changes(goals, reward, terminated, truncated)
 
     def _note(self, rows: TensorDictBase, source: Tensor, goals: Tensor, reward: Tensor) -> None:
         """Counts the rewards of virtual rows, and tells the weights of their goals."""
         useful = reward
         if not self.filter_achieved:  # all that the filter keeps is useful
-            before = self._reward_alone(rows.get(self._achieved_key).index_select(0, source), goals)
+            before = reward_alone(self.reward, rows.get(self._keys.achieved).index_select(0, source), goals)
             useful = reward[before < self.achieved_reward]
         self._count(virtual_positive=self._positives(reward), useful_virtual_positive=self._positives(useful))
         if self.weights is not None:
@@ -340,12 +337,6 @@ class HERWriter(RoundRobinWriter):
 
     def _positives(self, reward: Tensor) -> int:
         return int((reward >= self.achieved_reward).count_nonzero())
-
-    def _reward_alone(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """The reward without ``terminated``, which is half of the work, where they can be had apart."""
-        if isinstance(self.reward, EnvReward):
-            return self.reward.compute_reward(achieved_goal, desired_goal)
-        return self.reward(achieved_goal, desired_goal)[0]
 
 
 def _take(entry: Any, index: Tensor) -> Any:

@@ -6,6 +6,7 @@ import os
 import random
 import signal
 import sys
+import threading
 import time
 from dataclasses import replace
 from multiprocessing import get_context
@@ -16,6 +17,7 @@ import pandas as pd
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tqdm import tqdm
 
 from torchrl_her import load_checkpoint
 from torchrl_her_recipes import Parts, Recipe, cli, resume, run_state, running
@@ -75,6 +77,9 @@ def damage(path: Path) -> None:
 
 
 def go_on(recipe: Recipe, folder: Path) -> None:
+    tqdm.set_lock(
+        threading.RLock()
+    )  # its own is for all processes: one that is killed would never let go of it
     if (folder / "config.yaml").exists():
         sys.exit(cli.main(["train", "--resume", str(folder)]))
     recipe.build().run(folder, progress=False)
