@@ -6,6 +6,7 @@ import hashlib
 import os
 import pickle
 import warnings
+from collections import OrderedDict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,6 +22,9 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler
 _MAGIC = b"torchrl-her checkpoint 1\n"
 _PIECE = 1 << 26  # bytes that are written before they are put onto the disk
 _BODY = len(_MAGIC) + hashlib.sha256().digest_size  # where it begins
+
+
+_PLAIN = (bool, int, float, complex, str, bytes, type(None), torch.Size, torch.dtype, torch.device)
 
 
 class CheckpointError(ValueError):
@@ -64,8 +68,10 @@ def save_checkpoint(state: dict[str, Any], path: str | Path, *, keep: int = 1) -
             before it, and so on.
 
     Raises:
+        TypeError: something in it is neither a tensor nor plain data, and could not be read again.
         OSError: it cannot be written; what was there before is untouched.
     """
+    _check_plain(state, "the state")
     path = Path(path)
     part = path.with_name(path.name + ".part")
     try:
@@ -80,6 +86,18 @@ def save_checkpoint(state: dict[str, Any], path: str | Path, *, keep: int = 1) -
     finally:
         part.unlink(missing_ok=True)  # which it is if all went well; on a full disk it would be in the way
     _sync_folder(path.parent)
+
+
+def _check_plain(value: Any, name: str) -> None:
+    """Raises a TypeError that names what a safe load would refuse."""
+    if type(value) in (dict, OrderedDict):
+        for key, entry in value.items():
+            _check_plain(entry, f"{name}[{key!r}]")
+    elif type(value) in (list, tuple):
+        for index, entry in enumerate(value):
+            _check_plain(entry, f"{name}[{index}]")
+    elif not isinstance(value, Tensor) and type(value) not in _PLAIN:  # numpy's floats are floats, too
+        raise TypeError(f"{name} must be a tensor or plain data, got {type(value).__name__} {value!r}")
 
 
 def _write(state: dict[str, Any], file: BinaryIO) -> None:
@@ -213,10 +231,12 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> d
         copy: whether the rows are copied. Without it they are only good for being written at once.
     """
     n = len(buffer)
+    rows = buffer.storage[:] if n else None  # as stored, without what transforms add
     state: dict[str, Any] = {
-        # as stored, without what transforms add
-        "rows": buffer.storage[:n].apply(torch.clone if copy else _alone).to_dict() if n else None,
+        "rows": None if rows is None else rows.apply(torch.clone if copy else _alone).to_dict(),
+        "shape": [] if rows is None else list(rows.batch_size),
         "size": n,
+        "capacity": _capacity(buffer),
         "writer": buffer.writer.state_dict(),
         "sampler": None,
     }
@@ -233,6 +253,11 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> d
     return state
 
 
+def _capacity(buffer: TensorDictReplayBuffer) -> int:
+    """Rows that fit; 0 for storages of several dimensions, which round it up when they are first written."""
+    return buffer.storage.max_size if buffer.storage.ndim == 1 else 0
+
+
 def _alone(rows: Tensor) -> Tensor:
     """Rows of a longer tensor, in the same memory: torch.save would write the other rows, too."""
     if not rows.is_contiguous():
@@ -243,10 +268,22 @@ def _alone(rows: Tensor) -> Tensor:
 
 
 def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:
-    """Fills an empty buffer of the same make with what :func:`buffer_state_dict` gave."""
-    n = state["size"]
+    """Fills an empty buffer of the same make with what :func:`buffer_state_dict` gave.
+
+    Raises:
+        ValueError: the buffer holds rows already, has another capacity, or another kind of sampler.
+    """
+    n, capacity = state["size"], _capacity(buffer)
+    if len(buffer):
+        raise ValueError(f"the buffer must be empty, it holds {len(buffer):,} rows")
+    if capacity != state["capacity"]:
+        raise ValueError(f"the state is that of a buffer of {state['capacity']:,} rows, not of {capacity:,}")
+    if isinstance(buffer.sampler, PrioritizedSampler) != (state["sampler"] is not None):
+        whose = "without priorities" if state["sampler"] is None else "with priorities"
+        raise ValueError(f"the state is that of a sampler {whose}, not of a {type(buffer.sampler).__name__}")
     if n:
-        buffer.storage.set(torch.arange(n), TensorDict.from_dict(state["rows"], batch_size=[n]))
+        rows = TensorDict.from_dict(state["rows"], batch_size=state["shape"])
+        buffer.storage.set(torch.arange(len(rows)), rows)
     buffer.writer.load_state_dict(state["writer"])
     if state["sampler"] is not None:
         sampler = buffer.sampler.state_dict()

@@ -118,17 +118,30 @@ class Exploration(TensorDictModuleBase):
         self.epsilon.mul_(self.decay).clamp_(min=self.end)
 
     def restart(self, start: float | None = None, *, run: int | None = None) -> None:
-        """Sets epsilon back to a given start, or to its own; of one run, or of all."""
+        """Sets epsilon back to a given start, or to its own; of one run, or of all.
+
+        Raises:
+            ValueError: a start outside of [0, 1].
+        """
+        if start is not None and not 0.0 <= start <= 1.0:
+            raise ValueError(f"epsilon must be in [0, 1], got {start}")
         epsilon = self.epsilon if run is None else self.epsilon[run]
         epsilon.fill_(self.start if start is None else start)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Replaces the greedy action by an exploring one, where exploring is asked for."""
+        """Replaces the greedy action by an exploring one, where exploring is asked for.
+
+        Raises:
+            ValueError: rows that are not R equal blocks, or actions of another form.
+        """
         if exploration_type() not in (ExplorationType.RANDOM, None):
             return tensordict
         key = self.in_keys[0]
         greedy = tensordict.get(key)
-        blocks = greedy.chunk(len(self.generators))
+        runs = len(self.generators)
+        if len(greedy) % runs:
+            raise ValueError(f"{len(greedy)} rows cannot be shared out among {runs} runs")
+        blocks = greedy.chunk(runs)
         actions = [
             self._explore(block, epsilon, generator)
             for block, epsilon, generator in zip(blocks, self.epsilon, self.generators, strict=True)
@@ -204,4 +217,6 @@ class DecayingEpsilonGreedy(Exploration):
         self.actions = actions
 
     def _explore(self, greedy: Tensor, epsilon: Tensor, generator: torch.Generator | None) -> Tensor:
+        if greedy.is_floating_point() or greedy.dtype is torch.bool:
+            raise ValueError(f"actions must be whole numbers (categorical), got {greedy.dtype} (one-hot?)")
         return explore_actions(greedy, self.actions, epsilon.to(torch.float32), generator=generator)

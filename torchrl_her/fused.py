@@ -25,7 +25,7 @@ from torchrl_her.ddpg_step import (
     ddpg_gradients,
     ddpg_update_,
 )
-from torchrl_her.losses import ClampedTD0, PenalisedDDPGLoss, keep_runs
+from torchrl_her.losses import ClampedTD0, PenalisedDDPGLoss, check_steps, keep_runs
 from torchrl_her.networks import ActorNet, CriticNet
 
 
@@ -198,6 +198,7 @@ class FusedDDPGLearner:
 
     def _parts(self, rows: TensorDictBase, steps: int) -> list[Rows]:
         """The rows of each step."""
+        check_steps(rows, steps)
         entries = self._rows(rows)
         size = entries.action.shape[1] // steps
         split = [[None] * steps if entry is None else entry.split(size, 1) for entry in entries]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_her.episodes import Episodes
-from torchrl_her.goal_weights import GoalWeights
+from torchrl_her.goal_weights import GoalWeights, checked_weights
 from torchrl_her.virtual_goals import Strategy, between, combine, draw, draw_alike, draw_weighted, window
 
 # Likelihoods of goals [rows, T] that are held at once: see the writer's pieces.
@@ -64,7 +64,7 @@ def draw_goals(
     real = episodes.rows[episodes.inside]
     if k == 0:
         return real[:0], real[:0]
-    weight = None if weights is None or weights.alike else _checked(weights(after[episodes.rows]))
+    weight = None if weights is None or weights.alike else checked_weights(weights(after[episodes.rows]))
     episode, time = episodes.inside.nonzero(as_tuple=True)  # of each real row
     index = _propose(episodes, episode, time, k, strategy, weight, generator)
     valid = torch.ones_like(real, dtype=torch.bool)
@@ -84,20 +84,6 @@ def draw_goals(
         index[again], valid[again] = (torch.cat(part) for part in zip(*drawn, strict=True))
     source = real[valid].unsqueeze(-1).expand(-1, k).flatten()
     return source, episodes.rows.take(begin + index)[valid].flatten()
-
-
-def _checked(weight: Tensor) -> Tensor:
-    """Weights as floating numbers.
-
-    Raises:
-        ValueError: some are negative or not finite.
-    """
-    weight = weight if weight.is_floating_point() else weight.float()
-    if weight.numel() > 0:
-        least, most = weight.aminmax()
-        if not bool((least >= 0) & (most < torch.inf)):  # NaN fails both
-            raise ValueError(f"weights of goals must be finite and at least 0, got {least} to {most}")
-    return weight
 
 
 def _propose(

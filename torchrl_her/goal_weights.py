@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 
@@ -34,3 +35,17 @@ class GoalWeights:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Puts back what :meth:`state_dict` gave."""
+
+
+def checked_weights(weight: Tensor) -> Tensor:
+    """Weights as floating numbers.
+
+    Raises:
+        ValueError: some are negative or not finite.
+    """
+    weight = weight if weight.is_floating_point() else weight.float()
+    if weight.numel() > 0:
+        least, most = weight.aminmax()
+        if not bool((least >= 0) & (most < torch.inf)):  # NaN fails both
+            raise ValueError(f"weights of goals must be finite and at least 0, got {least} to {most}")
+    return weight

@@ -47,6 +47,8 @@ def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> T
     Returns:
         [...] of bool.
     """
+    if not achieved_goal.is_floating_point():  # squares of small whole numbers wrap around
+        achieved_goal, desired_goal = achieved_goal.float(), desired_goal.float()
     # One coordinate after the other: torch takes several times as long to sum over so short a dimension.
     pairs = zip(achieved_goal.unbind(-1), desired_goal.unbind(-1), strict=True)
     return reduce(torch.add, [(one - other).square() for one, other in pairs]) < threshold**2
@@ -75,7 +77,8 @@ class GoalReward:
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (reward, terminated), each [..., 1], for goals [..., g]."""
         terminated = achieved(achieved_goal, desired_goal, self.threshold).unsqueeze(-1)
-        return terminated.to(achieved_goal.dtype) - 1.0, terminated
+        dtype = achieved_goal.dtype if achieved_goal.is_floating_point() else torch.get_default_dtype()
+        return terminated.to(dtype) - 1.0, terminated
 
 
 class EnvReward:

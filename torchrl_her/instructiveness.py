@@ -142,7 +142,8 @@ class Instructiveness(GoalHistogram):
 
     def __call__(self, goals: Tensor) -> Tensor:
         cells = self.grid.cell(goals)
-        return self._weights.to(goals).index_select(0, cells.flatten()).view(cells.shape)
+        dtype = goals.dtype if goals.is_floating_point() else None  # weights are no whole numbers
+        return self._weights.to(goals.device, dtype).index_select(0, cells.flatten()).view(cells.shape)
 
     def update(self, goals: Tensor) -> None:
         super().update(goals)

@@ -123,7 +123,8 @@ def make_ddpg_loss(
         actor, critic, delay_actor=True, delay_value=True, action_penalty=action_penalty, reduction=reduction
     )
     estimator = clamped_td0(gamma, reward_range, loss.actor_critic)
-    estimator.set_keys(value="state_action_value")
+    loss.set_keys(state_action_value=critic.out_keys[0])
+    estimator.set_keys(value=critic.out_keys[0])
     loss.make_value_estimator(estimator)
     return loss
 
@@ -151,6 +152,12 @@ class Learner(Protocol):
             What it measured, [S, R] each.
         """
         ...
+
+
+def check_steps(rows: TensorDictBase, steps: int) -> None:
+    """Raises a ValueError if rows [R, n] are no whole number of batches."""
+    if steps < 1 or rows.shape[-1] % steps:
+        raise ValueError(f"{rows.shape[-1]} rows cannot be shared out among {steps} gradient steps")
 
 
 class LossLearner:
@@ -189,6 +196,7 @@ class LossLearner:
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
         """Gradient steps of each run; see :class:`Learner`."""
         last = rows.ndim - 1
+        check_steps(rows, steps)
         parts = rows.split(rows.shape[last] // steps, last)
         with keep_runs(self.loss, self.optimiser, idle, runs=self.runs):
             measured = [self._update(part) for part in parts]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 
@@ -72,8 +72,26 @@ class RowKeys:
 
 
 def in_root_and_next(keys: Sequence[NestedKey]) -> list[NestedKey]:
-    """Each key, and its twin under ``next``."""
+    """Each key, and its twin under ``next``.
+
+    Raises:
+        TypeError: one key in place of several.
+    """
+    if isinstance(keys, str):  # a sequence of letters
+        raise TypeError(f"keys must be given as a list, got {keys!r}: write [{keys!r}]")
     return [twin for key in keys for twin in (unravel_key(key), _next(key))]
+
+
+def entry_of(rows: TensorDictBase, key: NestedKey) -> Tensor:
+    """An entry that must be there.
+
+    Raises:
+        KeyError: it is not; says which ones are.
+    """
+    entry = rows.get(key, None)
+    if entry is None:
+        raise KeyError(f"relabelling needs the entry {key!r}, got {list(rows.keys(True, True))}")
+    return entry
 
 
 def _next(key: NestedKey) -> NestedKey:

@@ -25,9 +25,9 @@ from tensordict import NestedKey, TensorDictBase, is_tensor_collection
 from torch import Tensor
 from torchrl.data import SampleUnit, Storage
 
-from torchrl_her.goal_weights import GoalWeights
+from torchrl_her.goal_weights import GoalWeights, checked_weights
 from torchrl_her.goals import RewardFunction, reward_alone
-from torchrl_her.row_keys import RowKeys, in_root_and_next
+from torchrl_her.row_keys import RowKeys, entry_of, in_root_and_next
 from torchrl_her.virtual_goals import Strategy, check_strategy, combine, draw, draw_alike, window
 
 # Likelihoods of goals [rows, T] that are held at once.
@@ -170,7 +170,8 @@ class HERSampleUnit(SampleUnit):
             (Filtered-HER).
         achieved_reward: the reward of an achieved goal; anything below it is "not achieved".
         weights: prefers some goals to others, and is told of those that were lent; None for all alike. It is
-            not told when the buffer is emptied: call its ``clear``.
+            not told when the buffer is emptied: call its ``clear``. Nor is it part of the buffer's state: it
+            has a ``state_dict`` of its own.
         exclude: entries to leave out of batches, in the root and in ``next``: those that hold the real goal.
         generator: source of the random numbers; None for the buffer's (``buffer.set_rng``).
         achieved_goal, desired_goal, observed_reward, terminated, truncated, done, trajectory: keys.
@@ -308,11 +309,11 @@ class HERSampleUnit(SampleUnit):
             out.set(self._virtual_key, marks.index_fill_(0, rows, True))
         if len(rows) == 0:
             return out
-        achieved = self._get(data, self._keys.next_achieved)[rows]
+        achieved = entry_of(data, self._keys.next_achieved)[rows]
         reward, terminated = self.reward(achieved, chosen.goals)
-        truncated = self._get(data, self._keys.truncated)[rows]
+        truncated = entry_of(data, self._keys.truncated)[rows]
         for key, value in self._keys.changes(chosen.goals, reward, terminated, truncated).items():
-            entry = self._get(data, key)
+            entry = entry_of(data, key)
             value = value.to(entry.dtype).view(len(rows), *entry.shape[1:])
             out.set(key, entry.index_copy(0, rows, value))  # a copy: what was read might be the storage
         return out
@@ -338,22 +339,16 @@ class HERSampleUnit(SampleUnit):
             grid = shape if dims == 1 else torch.Size([shape[0], shape[1:].numel()])
             ids = rows.get(self._keys.trajectory, None)
             episodes = index_episodes(
-                self._get(rows, self._keys.done).reshape(grid),
+                entry_of(rows, self._keys.done).reshape(grid),
                 None if ids is None else ids.reshape(grid),
                 oldest=state[1],
             )
             before, after = (
-                self._get(rows, key).flatten(0, dims - 1)
+                entry_of(rows, key).flatten(0, dims - 1)
                 for key in (self._keys.achieved, self._keys.next_achieved)
             )
             self._stored = stored = _Stored(storage, state, before, after, episodes)
         return stored
-
-    def _get(self, rows: TensorDictBase, key: NestedKey) -> Tensor:
-        entry = rows.get(key, None)
-        if entry is None:
-            raise KeyError(f"HERSampleUnit needs the entry {key!r}, got {list(rows.keys(True, True))}")
-        return entry
 
     def _draw(
         self, stored: _Stored, row: Tensor, generator: torch.Generator | None
@@ -391,7 +386,7 @@ class HERSampleUnit(SampleUnit):
             goals = stored.after[candidate]
             weight = keep = None
             if self.weights is not None and not self.weights.alike:
-                weight = _checked(self.weights(goals))
+                weight = checked_weights(self.weights(goals))
             if self.filter_achieved:
                 keep = self._keep(stored.before[row[part]].unsqueeze(1), goals)
             drawn, valid[part] = draw(combine(steps < width, weight, keep), 1, generator=generator)
@@ -427,15 +422,3 @@ def _flat(index: Tensor | tuple[Tensor, ...], shape: torch.Size) -> Tensor:
     for size, coordinate in zip(shape[1:], index[1:], strict=True):
         row = row * size + coordinate
     return row
-
-
-def _checked(weight: Tensor) -> Tensor:
-    """Weights as floating numbers.
-
-    Raises:
-        ValueError: some are negative or not finite.
-    """
-    weight = weight if weight.is_floating_point() else weight.float()
-    if not bool(((weight >= 0) & (weight < torch.inf)).all()):
-        raise ValueError("weights of goals must be finite and at least 0")
-    return weight

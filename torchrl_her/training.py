@@ -26,7 +26,10 @@ class Schedule(Protocol):
         ...
 
 
-def check_finite(batch: TensorDictBase, keys: tuple[str, ...] = ("action", "observation")) -> None:
+_MUST_BE_FINITE = ("action", "observation", "achieved_goal", "desired_goal", "reward")
+
+
+def check_finite(batch: TensorDictBase, keys: tuple[str, ...] = _MUST_BE_FINITE) -> None:
     """Raises a ValueError that names the entry if a batch holds NaN or infinite numbers."""
     for key in keys:
         for name in (key, ("next", key)):
@@ -60,7 +63,8 @@ class Trainer:
             old as the call.
 
     Raises:
-        ValueError: when running, if what was collected is not finite or has no trajectory ids.
+        ValueError: a number that is too small; when running, if what was collected is not finite, has no
+            trajectory ids, or cannot be shared out among the runs.
 
     Attributes:
         frames: environment steps of each run so far.
@@ -82,6 +86,18 @@ class Trainer:
         batch_size: int = 256,
         updates_per_draw: int = 8,
     ) -> None:
+        counts = {
+            "epoch_frames": epoch_frames,
+            "batch_size": batch_size,
+            "updates_per_draw": updates_per_draw,
+        }
+        for name, count in counts.items():
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}")
+        if not frames_per_update > 0:
+            raise ValueError(f"frames_per_update must be positive, got {frames_per_update}")
+        if not buffers:
+            raise ValueError("there must be a buffer for each run, got none")
         self.collector, self.buffers, self.learner = collector, buffers, learner
         self.schedules = list(schedules)
         self.epoch_frames, self.frames_per_update = epoch_frames, frames_per_update
@@ -136,7 +152,10 @@ class Trainer:
 
     def _write(self, batch: TensorDictBase) -> int:
         """Gives each run its block of environments, and returns the frames of one run."""
-        blocks = batch.chunk(len(self.buffers))
+        runs = len(self.buffers)
+        if len(batch) % runs:
+            raise ValueError(f"{len(batch)} environments cannot be shared out among {runs} runs")
+        blocks = batch.chunk(runs)
         for buffer, block in zip(self.buffers, blocks, strict=True):
             buffer.extend(block)
         return blocks[0].numel()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -17,12 +18,13 @@ from torchrl_her.episodes import Episodes, find_episodes
 from torchrl_her.goal_drawing import draw_goals
 from torchrl_her.goal_weights import GoalWeights
 from torchrl_her.goals import RewardFunction, reward_alone
-from torchrl_her.row_keys import RowKeys, in_root_and_next
+from torchrl_her.row_keys import RowKeys, entry_of, in_root_and_next
 from torchrl_her.virtual_goals import Strategy, check_strategy
 
 # Work is done piece by piece: pieces that are too large touch fresh memory in every call, pieces that are too
 # small pay more for the calls. Rows written at once.
 _ROWS = 1 << 17
+_MASK = ("collector", "mask")  # TorchRL's mark of trajectories that it split and padded
 _STATE_FILE = "her_writer.pt"
 
 
@@ -48,6 +50,9 @@ class HERWriter(RoundRobinWriter):
     are still open at the end of a batch are held back until they close. A virtual row has a new
     desired goal in the root and in ``next``, reward, terminated and done recomputed for it, and
     everything else as it was. Rows never cross an episode or an environment.
+
+    Flat rows of an environment that is reset before its episode ends (``reset_at_each_iter``) wait for an end
+    that never comes: batches [N, T] with trajectory ids tell where such episodes stop.
 
     Works in any TorchRL replay buffer with a one-dimensional storage, under any sampler; the
     capacity counts real and virtual rows alike. Random numbers come from the buffer's generator
@@ -77,6 +82,7 @@ class HERWriter(RoundRobinWriter):
 
     Raises:
         ValueError: a negative ``k`` or an unknown strategy.
+        TypeError: ``exclude`` is one key, not a list.
         KeyError: a batch lacks an entry (when extending).
 
     Example:
@@ -154,6 +160,7 @@ class HERWriter(RoundRobinWriter):
         self._virtual_key = virtual
         self._held: TensorDictBase | None = None  # rows of open episodes, oldest first
         self._held_lanes: Tensor = torch.empty(0, dtype=torch.int64)
+        self._loaded = False  # whether the held rows came with a state, and nothing was written since
 
     @property
     def held_back(self) -> int:
@@ -176,18 +183,37 @@ class HERWriter(RoundRobinWriter):
         Returns:
             Where each incoming row went, in the incoming shape; -1 for rows that are held back, or
             that later rows of the same batch pushed out of a small buffer.
+
+        Raises:
+            ValueError: a storage of several dimensions, or trajectories that were split and padded.
+            KeyError: an entry is missing.
         """
+        if _MASK in data.keys(True):
+            raise ValueError(
+                "HERWriter takes batches as they are collected, not split and padded: split_trajs=False"
+            )
         if self._storage.ndim > 1:
             raise ValueError(f"HERWriter needs a storage of 1 dimension, got one of {self._storage.ndim}")
         held = self.held_back
         rows, lanes, ids = self._with_held(data)
-        episodes, left = find_episodes(lanes, rows.get(self._keys.done).reshape(-1), ids)
-        self._held, self._held_lanes = (rows[left] if len(left) else None), lanes[left]
+        ends = entry_of(rows, self._keys.done).reshape(-1)
+        if self._loaded and held:
+            ends = ends | self._broken(rows, lanes, held)
+        episodes, left = find_episodes(lanes, ends, ids)
         cursor, written = self._cursor, 0
         place = lanes.new_full((len(lanes),), -1)  # of each row, in the order of writing
         for piece in episodes.split(self._episodes_at_once(episodes)):
             written += self._write(rows, piece, place, written)
+        # Last of all: a batch that cannot be written costs no row that was there before.
+        self._held, self._held_lanes = (rows[left] if len(left) else None), lanes[left]
+        self._loaded = False
         capacity = self._storage.max_size
+        if self.held_back > capacity:
+            warnings.warn(
+                f"{self.held_back:,} rows of open episodes wait for their end, more than the buffer's "
+                f"{capacity:,}: do all episodes end, and do batches of several environments come as [N, T]?",
+                stacklevel=2,
+            )
         lost = place < max(0, written - capacity)  # -1 among them: not written at all
         index = ((cursor + place) % capacity).masked_fill_(lost, -1)
         return index[held:].reshape(data.shape)
@@ -202,8 +228,14 @@ class HERWriter(RoundRobinWriter):
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` gave.
+
+        Episodes that were held back go on if the collector goes on with them
+        (:func:`~torchrl_her.load_collector_state_dict`); where the next rows do not join onto them, they end.
+        """
         super().load_state_dict(state_dict)
         self._held_lanes = state_dict["held_lanes"].clone()
+        self._loaded = True
         held, shape = state_dict["held"], self._held_lanes.shape
         self._held = None if held is None else TensorDict.from_dict(held, batch_size=shape).clone()
         self.counts = WriterCounts(**state_dict["counts"])
@@ -245,6 +277,19 @@ class HERWriter(RoundRobinWriter):
             return rows, lanes, None
         return rows, lanes, rows.get(self._keys.trajectory).reshape(-1)
 
+    def _broken(self, rows: TensorDictBase, lanes: Tensor, held: int) -> Tensor:
+        """Which rows [n] are the last held ones of lanes that go on with something else."""
+        order = lanes.argsort(stable=True)
+        last, new = order[:-1], order[1:]
+        seam = (lanes[last] == lanes[new]) & (last < held) & (new >= held)
+        last, new = last[seam], new[seam]
+        joins = [(self._keys.next_achieved, self._keys.achieved), (self._keys.goals[1], self._keys.goals[0])]
+        differs = torch.zeros_like(last, dtype=torch.bool)
+        for after, before in joins:
+            pair = entry_of(rows, after)[last], entry_of(rows, before)[new]
+            differs |= (pair[0] != pair[1]).flatten(1).any(1)
+        return torch.zeros_like(lanes, dtype=torch.bool).index_fill_(0, last[differs], True)
+
     def _episodes_at_once(self, episodes: Episodes) -> int:
         rows_of_each = max(1, episodes.rows.shape[1]) * (self.k + 1)
         return max(1, min(_ROWS, self._storage.max_size) // rows_of_each)
@@ -256,7 +301,7 @@ class HERWriter(RoundRobinWriter):
         virtual = len(source)
         out = self._build(rows, real, source, self._relabel(rows, source, goal_source) if virtual else {})
         place[real] = torch.arange(written + virtual, written + len(out), device=place.device)
-        positive = self._positives(out.get(self._keys.reward)[virtual:])
+        positive = self._positives(entry_of(out, self._keys.reward)[virtual:])
         self._count(real=len(real), virtual=virtual, real_positive=positive)
         excess = max(0, len(out) - self._storage.max_size)
         self._cursor = (self._cursor + excess) % self._storage.max_size
@@ -274,7 +319,7 @@ class HERWriter(RoundRobinWriter):
         same = rows.exclude(*self._exclude, *changed)
         out = same.apply(partial(_take, index=order), batch_size=order.shape, is_leaf=is_leaf_nontensor)
         for key, value in changed.items():
-            entry = rows.get(key).index_select(0, real)
+            entry = entry_of(rows, key).index_select(0, real)
             out.set(key, torch.cat((value.to(entry.dtype).view(-1, *entry.shape[1:]), entry)))
         if self._virtual_key is not None:
             marks = torch.arange(len(order), device=order.device) < len(source)
@@ -296,9 +341,11 @@ class HERWriter(RoundRobinWriter):
 
     def _draw(self, rows: TensorDictBase, episodes: Episodes) -> tuple[Tensor, Tensor]:
         """Which rows [V] are written once more, and the rows [V] whose achieved goals they take."""
+        if self.k == 0:  # which needs no goals at all
+            return episodes.lengths[:0], episodes.lengths[:0]
         return draw_goals(
-            rows.get(self._keys.achieved),
-            rows.get(self._keys.next_achieved),
+            entry_of(rows, self._keys.achieved),
+            entry_of(rows, self._keys.next_achieved),
             episodes,
             self.k,
             strategy=self.strategy,
@@ -313,11 +360,11 @@ class HERWriter(RoundRobinWriter):
 
     def _relabel(self, rows: TensorDictBase, source: Tensor, goal_source: Tensor) -> dict[NestedKey, Tensor]:
         """The entries of virtual rows that differ from those of the rows they are made of."""
-        achieved = rows.get(self._keys.next_achieved)
+        achieved = entry_of(rows, self._keys.next_achieved)
         goals = achieved.index_select(0, goal_source)
         reward, terminated = self.reward(achieved.index_select(0, source), goals)
         self._note(rows, source, goals, reward)
-        truncated = rows.get(self._keys.truncated).index_select(0, source)
+        truncated = entry_of(rows, self._keys.truncated).index_select(0, source)
         return self._keys.changes(goals, reward, terminated, truncated)
 
     def _note(self, rows: TensorDictBase, source: Tensor, goals: Tensor, reward: Tensor) -> None:

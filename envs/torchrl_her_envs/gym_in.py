@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from functools import partial
-from numbers import Integral
 from typing import Any, cast
 
 import gymnasium
@@ -28,7 +27,7 @@ from torchrl_her_envs.gym_check import (
     shown_of,
     spec_of,
 )
-from torchrl_her_envs.seeding import block_keys
+from torchrl_her_envs.seeding import as_seeds, block_keys
 
 
 def make_gym_env(
@@ -101,7 +100,8 @@ class GymGoalEnv(GymWrapper):
         missed_reward: that of a goal that is far away; a sparse reward is one of the two.
 
     Raises:
-        ValueError: worlds cannot be shared out among the seeds.
+        ValueError: worlds cannot be shared out among the seeds, or goals that are met are worth no more than
+            others.
     """
 
     def __init__(
@@ -116,7 +116,12 @@ class GymGoalEnv(GymWrapper):
             GoalFunction(judge.get_wrapper_attr(name), *goals, name=f"{id}'s {name}") for name in METHODS
         )
         self.missed_reward, self.achieved_reward = (self._reward_of.tried[:2] + 0.0).tolist()  # never -0.0
-        self.set_seeds([int(seed)] if isinstance(seed, int | Integral) else list(seed))
+        if not self.missed_reward < self.achieved_reward:
+            raise ValueError(
+                f"{id}: a goal that is met gives {self.achieved_reward}, one far away {self.missed_reward}; "
+                f"that must be less (are all goals met from the start?)"
+            )
+        self.set_seeds(as_seeds(seed))
 
     @property
     def max_steps(self) -> int:

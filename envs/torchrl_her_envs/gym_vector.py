@@ -150,7 +150,11 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
             first = as_seed(self.np_random_seed)
             seeds: Sequence[int] = [as_seed(first + k) for k in range(self.num_envs)]
         else:
-            seeds = seed
+            seeds = [int(own) for own in seed]
+            if len(seeds) != self.num_envs:
+                raise ValueError(
+                    f"{len(seeds)} seeds for {self.num_envs} worlds: give one, or one for each world"
+                )
         self._worlds.set_seeds(seeds)
         self._seeded = True
 

@@ -7,6 +7,7 @@ others do. A stateful generator cannot give that; a hash of a counter can.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 
 import numpy as np
 import torch
@@ -60,6 +61,16 @@ def block_keys(seeds: Sequence[int], num_worlds: int) -> np.ndarray:
         if not 0 <= seed < 1 << 64:
             raise ValueError(f"a seed must be at least 0 and below 2**64, got {seed}")
     return np.concatenate([world_keys(seed, num_worlds // len(seeds)) for seed in seeds])
+
+
+def as_seeds(seed: int | Sequence[int]) -> list[int]:
+    """One seed, or several, as a list.
+
+    Example:
+        >>> as_seeds(3), as_seeds([3, 4])
+        ([3], [3, 4])
+    """
+    return [int(seed)] if isinstance(seed, int | Integral) else [int(own) for own in seed]
 
 
 def uniform(keys: np.ndarray, episodes: Tensor, count: int) -> Tensor:

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from torchrl_her_envs.seeded_worlds import SeededWorlds
-from torchrl_her_envs.seeding import uniform
+from torchrl_her_envs.seeding import as_seeds, uniform
 
 _MOST_STEPS = (1 << 20) - 1  # each episode has room for so many moments of random numbers
 _MOST_BITS = 127  # a start takes two numbers a bit and one more, and a moment has 256
@@ -145,7 +145,7 @@ class SmallWorld(SeededWorlds):
             *(torch.zeros(shape, dtype=torch.int64) for shape in ((num_envs, size),) * 2 + ((num_envs,),) * 2)
         )
         self._make_specs(size, len(goals.low))
-        self.set_seeds([int(seed)] if isinstance(seed, int | Integral) else list(seed))
+        self.set_seeds(as_seeds(seed))
 
     # What the outside asks for
 

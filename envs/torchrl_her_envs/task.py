@@ -3,9 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
+EffectorName = Literal["hand", "arm"]
 Start = Literal["held", "away", "mixed"]
+
+_POSITIVE = (
+    "size",
+    "pixels",
+    "ball_mass",
+    "time_step",
+    "substeps",
+    "max_steps",
+    "hand_speed",
+    "joint_speed",
+    "ball_radius",
+    "hole_radius",
+    "wall_thickness",
+    "arm_pixels",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,6 +31,9 @@ class WorldConfig:
     "screen" is a fraction of the side of the square screen, with (0, 0) at the bottom left.
     Positions are shown to the agent as ``2 * screen - 1``, so from -1 to 1, and speeds as a
     fraction of ``hand_speed`` (or ``joint_speed``).
+
+    Raises:
+        ValueError: a length, speed, mass or number that is not positive.
 
     Example:
         >>> world = WorldConfig()
@@ -48,6 +67,11 @@ class WorldConfig:
     arm_ball_angle: tuple[float, float] = (75.0, 105.0)  # degrees: thesis, appendix A
     arm_ball_radius: tuple[float, float] = (0.75, 1.0)  # share of the arm's length: thesis, appendix A
 
+    def __post_init__(self) -> None:
+        for name in _POSITIVE:
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
     @property
     def arm_length(self) -> float:
         """Total length of the arm in metres."""
@@ -71,14 +95,22 @@ class Task:
         throws: the goal is a black hole for the ball; otherwise it is the ball, for the effector.
         wall: whether a wall stands in the middle.
         summary: one line for people.
+
+    Raises:
+        ValueError: an unknown effector or start.
     """
 
     name: str
-    effector: Literal["hand", "arm"]
+    effector: EffectorName
     start: Start = "away"
     throws: bool = True
     wall: bool = False
     summary: str = ""
+
+    def __post_init__(self) -> None:
+        for name, known in (("effector", get_args(EffectorName)), ("start", get_args(Start))):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
 
 
 TASKS: dict[str, Task] = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Integral
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -18,7 +17,7 @@ from torchrl_her_envs.physics import BallPhysics
 from torchrl_her_envs.rendering import render
 from torchrl_her_envs.robot import Arm
 from torchrl_her_envs.seeded_worlds import SeededWorlds
-from torchrl_her_envs.seeding import uniform
+from torchrl_her_envs.seeding import as_seeds, uniform
 from torchrl_her_envs.task import Task, WorldConfig
 
 
@@ -123,11 +122,8 @@ class ThrowingEnv(SeededWorlds):
         self._goals: GoalDistribution = self._make_goals()
         self.worlds = WorldState.zeros(num_envs, self.effector.num_joints)
         self._make_specs()
-        seeds = [int(seed)] if isinstance(seed, int | Integral) else list(seed)
-        self.set_seeds(seeds)
-        # A space for each block: the last bits of a ball's path depend on where its world lies in its space.
-        size = num_envs // len(seeds)
-        self._physics = [BallPhysics(size, self.world, wall=task.wall) for _ in seeds]
+        self._physics: list[BallPhysics] = []
+        self.set_seeds(as_seeds(seed))
 
     # What the outside asks for
 
@@ -172,6 +168,13 @@ class ThrowingEnv(SeededWorlds):
         """
         return render(self, worlds, size=size)
 
+    def set_seeds(self, seeds: Sequence[int]) -> None:
+        super().set_seeds(seeds)
+        if len(self._physics) != len(seeds):
+            # A space for each block: the last bits of a ball's path depend on where its world lies in it.
+            size = self.batch_size[0] // len(seeds)
+            self._physics = [BallPhysics(size, self.world, wall=self.task.wall) for _ in seeds]
+
     # TorchRL's hooks
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
@@ -189,6 +192,9 @@ class ThrowingEnv(SeededWorlds):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
+        if action.shape != self.action_spec.shape:
+            expected = list(self.action_spec.shape)
+            raise ValueError(f"actions must be of shape {expected}, got {list(action.shape)}")
         if not bool(action.isfinite().all()):
             bad = (~action.isfinite()).any(-1).nonzero().flatten().tolist()
             raise ValueError(f"actions must be finite, got {action[bad[0]].tolist()} in world {bad[0]}")

@@ -403,3 +403,9 @@ def test_robots_repeat_and_do_the_same_in_every_batch() -> None:
         shown = two.step(shown.set("action", action.expand(2, 4)))["next"]
         alone = one.step(alone.set("action", action))["next"]
     assert not torch.equal(shown["desired_goal"][0], shown["desired_goal"][1])
+
+
+def test_goals_that_are_all_met_from_the_start_tell_nothing() -> None:
+    """What a goal that is far away gives is not known then."""
+    with pytest.raises(ValueError, match=r"is met gives 0.0, one far away 0.0; that must be less"):
+        make_gym_env("torchrl_her_envs:torchrl_her/HandReach-v0", threshold=10.0)

@@ -302,7 +302,7 @@ def test_a_vector_does_what_gymnasium_s_own_does(mode: AutoresetMode) -> None:
 
 def test_seeds_may_be_given_one_by_one() -> None:
     many = make_many(num_envs=3)
-    shown = many.reset(seed=[5, 9, 5])[0]["desired_goal"]
+    shown = many.reset(seed=np.array([5, 9, 5]))[0]["desired_goal"]
     for world, seed in enumerate((5, 9, 5)):
         assert np.array_equal(shown[world], make().reset(seed=seed)[0]["desired_goal"])
     again = many.reset()[0]["desired_goal"]
@@ -344,7 +344,8 @@ def test_a_vector_must_be_reset_first() -> None:
         ),
         ({"options": {"reset_mask": np.ones(3, np.bool_)}}, "must choose some of 2 worlds"),
         ({"seed": 1, "options": {"reset_mask": np.array([True, False])}}, "must not be given together"),
-        ({"seed": [1, 2, 3]}, "2 worlds cannot be shared out among 3 seeds"),
+        ({"seed": [1, 2, 3]}, "3 seeds for 2 worlds: give one, or one for each"),
+        ({"seed": [1]}, "1 seeds for 2 worlds"),
     ],
 )
 def test_resets_that_cannot_be(arguments: dict[str, Any], message: str) -> None:

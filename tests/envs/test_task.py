@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from torchrl_her_envs import TASKS, WorldConfig, get_task, make_env
+from torchrl_her_envs import TASKS, Task, WorldConfig, get_task, make_env
 
 TABLE = {
     # name: effector, start of the ball, throws, wall, entries of the observation, of the action
@@ -103,3 +103,37 @@ def test_options_reach_the_environment() -> None:
     assert env.action_spec.shape == (5, 4)
     assert env.action_spec.dtype == torch.float64
     assert env.threshold == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_steps": 0}, "max_steps must be positive, got 0"),
+        ({"hand_speed": -1.0}, "hand_speed must be positive, got -1.0"),
+        ({"time_step": 0.0}, "time_step must be positive, got 0.0"),
+        ({"size": float("nan")}, "size must be positive, got nan"),
+    ],
+)
+def test_constants_that_cannot_be(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        WorldConfig(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"effector": "foot"}, "effector must be one of hand, arm, got 'foot'"),
+        ({"effector": "arm", "start": "hold"}, "start must be one of held, away, mixed, got 'hold'"),
+    ],
+)
+def test_tasks_that_cannot_be(options: dict[str, str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Task(name="own", **options)
+
+
+@pytest.mark.parametrize("width", [1, 2, 4])
+def test_actions_of_another_width_are_refused(width: int) -> None:
+    env = make_env("hand_v1", num_envs=2)
+    shown = env.reset()
+    with pytest.raises(ValueError, match=rf"actions must be of shape \[2, 3\], got \[2, {width}\]"):
+        env.step(shown.set("action", torch.zeros(2, width)))

@@ -257,3 +257,12 @@ def test_a_worlds_episodes_do_not_depend_on_when_it_is_reset() -> None:
     plain.reset()
     plain.reset()
     assert all(equal(env.world_state_dict(), plain.world_state_dict()).values())
+
+
+def test_new_seeds_may_be_more_than_before() -> None:
+    """The last bits of a ball's path depend on where its world lies in its space: blocks have one each."""
+    alone, both = make("hand_v0", 4, seed=4), make("hand_v0", 8)
+    both.set_seeds([3, 4])
+    both.reset()
+    actions = random_actions(both, 40)
+    assert torch.equal(follow(both, actions)[:, 4:], follow(alone, actions[:, 4:]))

@@ -11,6 +11,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -23,6 +24,7 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampl
 from torchrl_her import (
     CheckpointError,
     GoalReward,
+    HERSampleUnit,
     HERWriter,
     buffer_state_dict,
     collector_state_dict,
@@ -36,6 +38,7 @@ from torchrl_her_envs import make_env
 
 from .her_data import make_batch
 
+MARK = b"torchrl-her checkpoint 1\n"
 STATE = {"epoch": 3, "name": "her", "rates": [0.5, None], "nested": {"weights": torch.arange(4.0)}}
 
 
@@ -49,6 +52,14 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
     assert torch.equal(loaded["nested"].pop("weights"), torch.arange(4.0))
     assert loaded == {"epoch": 3, "name": "her", "rates": [0.5, None], "nested": {}}
     assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+@pytest.mark.parametrize("value", [np.float64(1.0), np.int64(1), Path("a"), {1, 2}])
+def test_what_could_not_be_loaded_is_not_saved(value: Any, tmp_path: Path) -> None:
+    said = rf"the state\['own'\]\[1\] must be a tensor or plain data, got {type(value).__name__}"
+    with pytest.raises(TypeError, match=said):
+        save_checkpoint({"own": [1, value]}, tmp_path / "checkpoint.pt")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_checkpoint_is_replaced(tmp_path: Path) -> None:
@@ -95,7 +106,7 @@ def test_damage_in_the_body_is_called_damage(whole: Path) -> None:
 
 def test_anything_else_behind_a_right_checksum_is_refused(whole: Path) -> None:
     strange, body = whole.with_name("strange.pt"), b"not torch's"
-    strange.write_bytes(b"torchrl-her checkpoint 1\n" + hashlib.sha256(body).digest() + body)
+    strange.write_bytes(MARK + hashlib.sha256(body).digest() + body)
     with pytest.raises(CheckpointError, match=r"strange\.pt (cannot be read: \S|holds more than tensors)"):
         load_checkpoint(strange)
 
@@ -124,11 +135,11 @@ class Harmful:
 
 def test_objects_in_a_checkpoint_are_refused_and_not_run(tmp_path: Path) -> None:
     path, trace = tmp_path / "harmful.pt", tmp_path / "trace"
-    save_checkpoint({"innocent": 1, "harmful": Harmful(trace)}, path)
+    body = _saved({"innocent": 1, "harmful": Harmful(trace)})
+    path.write_bytes(MARK + hashlib.sha256(body).digest() + body)
     with pytest.raises(CheckpointError, match=r"harmful\.pt holds more than tensors and plain data"):
         load_checkpoint(path)
     assert not trace.exists()
-    body = path.read_bytes()[-len(_saved({"innocent": 1, "harmful": Harmful(trace)})) :]
     torch.load(io.BytesIO(body), weights_only=False)
     assert trace.exists()  # it would have been harmful
 
@@ -194,10 +205,10 @@ def test_the_old_checkpoint_is_whole_until_the_new_one_is_on_the_disk(
 
 
 def test_the_format_is_a_mark_a_checksum_and_torchs_file(whole: Path) -> None:
-    mark, data = b"torchrl-her checkpoint 1\n", whole.read_bytes()
-    assert data.startswith(mark)
-    body = data[len(mark) + 32 :]
-    assert data[len(mark) : len(mark) + 32] == hashlib.sha256(body).digest()
+    data = whole.read_bytes()
+    assert data.startswith(MARK)
+    body = data[len(MARK) + 32 :]
+    assert data[len(MARK) : len(MARK) + 32] == hashlib.sha256(body).digest()
     assert torch.load(io.BytesIO(body), weights_only=True)["epoch"] == 3
 
 
@@ -385,6 +396,51 @@ def test_a_state_without_a_copy_is_as_small(tmp_path: Path) -> None:
     assert same(rows, expected)
     buffer.storage[:]["observation"].fill_(9.0)
     assert (state["rows"]["observation"] == 9.0).all()
+
+
+@SAMPLERS
+def test_rows_of_two_dimensions_go_on(sampler: str, tmp_path: Path) -> None:
+    def make() -> TensorDictReplayBuffer:
+        hindsight = HERSampleUnit(GoalReward(0.5))
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(40, ndim=2),
+            sampler=RandomSampler() if sampler == "uniform" else PrioritizedSampler(40, 0.6, 0.4),
+            sample_unit=hindsight,
+            collate_fn=hindsight.relabel,
+            batch_size=16,
+            priority_key="td_error",
+        )
+        buffer.set_rng(torch.Generator().manual_seed(1))
+        return buffer
+
+    buffer, other = make(), make()
+    buffer.extend(make_batch([[5, 9], [9, 5]], steps=7))
+    save_checkpoint(buffer_state_dict(buffer), tmp_path / "buffer.pt")
+    load_buffer_state_dict(other, load_checkpoint(tmp_path / "buffer.pt"))
+    assert len(other) == len(buffer) == 14
+    assert same(other[:], buffer[:])
+    assert same(other.sample(), buffer.sample())
+    more = make_batch([[4], [4]])
+    for own in (buffer, other):
+        own.extend(more)
+    assert same(other[:], buffer[:])
+
+
+@pytest.mark.parametrize(
+    ("sampler", "capacity", "full", "message"),
+    [
+        ("uniform", 64, True, "the buffer must be empty, it holds 15 rows"),
+        ("uniform", 65, False, "that of a buffer of 64 rows, not of 65"),
+        ("prioritised", 64, False, "that of a sampler without priorities, not of a PrioritizedSampler"),
+    ],
+)
+def test_buffers_of_another_make_are_refused(sampler: str, capacity: int, full: bool, message: str) -> None:
+    buffer, other = make_buffer("uniform"), make_buffer(sampler, capacity)
+    buffer.extend(make_batch([[5]]))
+    if full:
+        other.extend(make_batch([[5]]))
+    with pytest.raises(ValueError, match=message):
+        load_buffer_state_dict(other, buffer_state_dict(buffer))
 
 
 # Collectors

@@ -254,3 +254,20 @@ def test_counted_actions_of_each_run_come_from_its_own_generator() -> None:
 def test_no_actions_are_refused() -> None:
     with pytest.raises(ValueError, match="actions must be at least 1, got 0"):
         DecayingEpsilonGreedy(0)
+
+
+@pytest.mark.parametrize("start", [5.0, -1.0, math.nan])
+def test_epsilon_cannot_start_outside_of_0_to_1(start: float) -> None:
+    with pytest.raises(ValueError, match=r"epsilon must be in \[0, 1\], got"):
+        DecayingEpsilonGreedy(2).restart(start)
+
+
+def test_rows_must_be_equal_blocks() -> None:
+    exploration = DecayingEpsilonGreedy(2, generators=[torch.Generator() for _ in range(2)])
+    with pytest.raises(ValueError, match="5 rows cannot be shared out among 2 runs"):
+        exploration(TensorDict({"action": torch.zeros(5, dtype=torch.int64)}, [5]))
+
+
+def test_one_hot_actions_are_refused() -> None:
+    with pytest.raises(ValueError, match="whole numbers .categorical., got torch.bool"):
+        DecayingEpsilonGreedy(4)(TensorDict({"action": torch.eye(4).bool()}, [4]))

@@ -101,3 +101,11 @@ def test_a_batch_is_what_its_rows_are(rows: list[tuple[list[float], list[float]]
     gap = torch.tensor([math.dist(one, other) for one, other in rows], dtype=torch.float64)
     clear = (gap - threshold).abs() > 1e-5  # elsewhere rounding decides
     assert torch.equal(terminated.squeeze(-1)[clear], (gap < threshold)[clear])
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int8, torch.int64, torch.bool])
+def test_whole_numbers_do_not_wrap_around(dtype: torch.dtype) -> None:
+    here, there = torch.tensor([[0], [0]]).to(dtype), torch.tensor([[16], [0]]).to(dtype)
+    assert achieved(here, there, 0.5).tolist() == [False, True]
+    reward, terminated = GoalReward(0.5)(here, there)
+    assert (reward.flatten().tolist(), terminated.flatten().tolist()) == ([-1.0, 0.0], [False, True])

@@ -16,6 +16,7 @@ from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import DDPGLoss, HardUpdate, LossModule, SACLoss, SoftUpdate, TD3Loss, ValueEstimators
 
 from torchrl_her import (
+    FusedDDPGLearner,
     LossLearner,
     PenalisedDDPGLoss,
     clip_by_run,
@@ -26,6 +27,8 @@ from torchrl_her import (
     stack_runs,
     take_run,
 )
+
+from .her_data import make_batch
 
 WEIGHT = "priority_weight"
 
@@ -451,3 +454,22 @@ def test_priorities_go_where_the_loss_puts_them() -> None:
     data = rows([-1.0, -1.0], terminated=[1, 0])
     LossLearner(loss, torch.optim.Adam(loss.parameters(), lr=0.1)).update(data)
     assert data["surprise"].tolist() == [9.0, 4.0]
+
+
+def test_a_critic_may_write_its_value_elsewhere() -> None:
+    losses = []
+    for key in ("state_action_value", "q"):
+        torch.manual_seed(0)
+        loss = make_ddpg_loss(make_actor((2, 2), 1), make_critic((2, 2), 1, value=key))
+        losses.append(loss(make_batch([[6]]).squeeze(0))["loss_value"])
+    assert torch.equal(*losses)
+
+
+@pytest.mark.parametrize("fused", [False, True])
+@pytest.mark.parametrize("steps", [0, 3])
+def test_rows_must_be_whole_batches(fused: bool, steps: int) -> None:
+    loss = make_ddpg_loss(make_actor((2, 2), 1), make_critic((2, 2), 1))
+    make = FusedDDPGLearner if fused else LossLearner
+    learner = make(loss, torch.optim.Adam(loss.parameters()), SoftUpdate(loss, tau=0.1))
+    with pytest.raises(ValueError, match=f"10 rows cannot be shared out among {steps} gradient steps"):
+        learner.update(make_batch([[10]]), steps)

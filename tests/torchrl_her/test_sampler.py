@@ -727,7 +727,7 @@ def test_bad_options_are_named() -> None:
 def test_a_missing_entry_is_named(key: Any) -> None:
     buffer = make_buffer(k=NEVER_REAL)
     buffer.extend(flat([[4]]).exclude(key))
-    with pytest.raises(KeyError, match=f"HERSampleUnit needs the entry {re.escape(repr(key))}"):
+    with pytest.raises(KeyError, match=f"relabelling needs the entry {re.escape(repr(key))}"):
         buffer.sample(4)
 
 

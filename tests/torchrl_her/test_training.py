@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
@@ -157,13 +158,15 @@ def test_seeds_make_training_repeat_bit_for_bit() -> None:
     assert not torch.equal(weights[0], weights[2])
 
 
-@pytest.mark.parametrize("key", ["action", "observation"])
-def test_nan_is_noticed_and_named(key: str) -> None:
+@pytest.mark.parametrize(
+    "key", ["action", "observation", "achieved_goal", ("next", "desired_goal"), ("next", "reward")]
+)
+def test_nan_is_noticed_and_named(key: str | tuple[str, str]) -> None:
     trainer, _ = make_trainer()
     batch = trainer.collector.next()
     batch[key][0, 0] = float("nan")
     trainer.collector.next = lambda: batch  # type: ignore[method-assign]
-    with pytest.raises(ValueError, match=f"{key}.*must be finite"):
+    with pytest.raises(ValueError, match=f"the collected {re.escape(repr(key))} must be finite"):
         trainer.epoch()
 
 
@@ -225,3 +228,32 @@ def test_a_run_whose_buffer_is_empty_waits_and_holds_no_other_back() -> None:
     alone._credit = 3.0
     assert alone._learn() == []
     assert alone._credit == 0.0  # these steps pass
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"epoch_frames": 0}, "epoch_frames must be at least 1, got 0"),
+        ({"updates_per_draw": 0}, "updates_per_draw must be at least 1, got 0"),
+        ({"batch_size": 0}, "batch_size must be at least 1, got 0"),
+        ({"frames_per_update": -1.0}, "frames_per_update must be positive, got -1.0"),
+    ],
+)
+def test_numbers_that_cannot_be(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_trainer(**options)
+
+
+def test_environments_must_be_equal_blocks() -> None:
+    trainer, _ = make_trainer()
+    trainer.buffers = trainer.buffers * 3
+    with pytest.raises(ValueError, match=f"{N} environments cannot be shared out among 3 runs"):
+        trainer.epoch()
+
+
+def test_trajectories_must_be_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer, _ = make_trainer()
+    collect = trainer.collector.next
+    monkeypatch.setattr(trainer.collector, "next", lambda: collect().exclude(("collector", "traj_ids")))
+    with pytest.raises(ValueError, match="must mark trajectories"):
+        trainer.epoch()

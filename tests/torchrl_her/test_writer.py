@@ -5,6 +5,7 @@ Goals are tagged with the environment, episode and state that they come from (se
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -316,6 +317,7 @@ def test_an_environment_reset_from_outside_leaks_nothing() -> None:
     assert pairs == {(0.0, 3.0), (1.0, 3.0), (2.0, 3.0), (100.0, 102.0), (101.0, 102.0)}
 
 
+@pytest.mark.filterwarnings("ignore:.*wait for their end")  # in buffers of 13 rows
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.lists(st.integers(1, 6), min_size=1, max_size=4), min_size=1, max_size=3),
@@ -469,12 +471,43 @@ def test_state_carries_held_back_episodes_counts_and_weights(by_file: bool, tmp_
     roundtrip(first, second, tmp_path if by_file else None)
     assert second.writer.held_back == 2
     assert second.writer.counts == first.writer.counts
+    assert second.writer.totals == first.writer.totals
     assert second.writer.weights.written == 12
     index = second.extend(make_batch([[3, 9]], steps=7, first=[(1, 2)]))
     assert second.writer.held_back == 0
     assert (index >= 15).all()  # behind the fifteen rows that the first one wrote
     held = second[:][15 + 36 :]["observation"]
     assert tags(held) == [tag(0, 1, t) for t in range(9)]
+
+
+def test_held_back_episodes_end_where_a_new_collector_begins_anew() -> None:
+    """Its trajectories are counted from 0 again, so ids do not tell."""
+    first, second = make_buffer(strategy="final"), make_buffer(strategy="final")
+    first.extend(make_batch([[9], [9]], steps=4))
+    second.writer.load_state_dict(first.writer.state_dict())
+    other = make_batch([[9], [9]], first=[(0, 0), (0, 4)])  # the second environment goes on
+    other["collector", "traj_ids"] = make_batch([[9], [9]])["collector", "traj_ids"]
+    second.extend(other[:, :5])
+    real, virtual = split(second)
+    assert (len(real), second.writer.held_back) == (4 + 9, 5)
+    assert set(tags(virtual["desired_goal"])) == {tag(0, 0, 4), tag(1, 0, 9)}
+
+
+def test_a_batch_that_cannot_be_written_costs_no_open_episode() -> None:
+    class Once(GoalWeights):
+        bad = True
+
+        def __call__(self, goals: Tensor) -> Tensor:
+            return torch.full(goals.shape[:-1], -1.0 if self.bad else 1.0)
+
+    buffer = make_buffer(weights=Once())
+    buffer.extend(make_batch([[9]], steps=4))
+    with pytest.raises(ValueError, match="at least 0"):
+        buffer.extend(make_batch([[9]], steps=5, first=[(0, 4)]))
+    assert buffer.writer.held_back == 4
+    buffer.writer.weights.bad = False
+    buffer.extend(make_batch([[9]], steps=5, first=[(0, 4)]))
+    assert tags(split(buffer)[0]["observation"]) == [float(t) for t in range(9)]
 
 
 def test_emptying_forgets_everything() -> None:
@@ -571,3 +604,37 @@ def test_a_storage_of_two_dimensions_is_refused() -> None:
     )
     with pytest.raises(ValueError, match="storage of 1 dimension, got one of 2"):
         buffer.extend(make_batch([[3]]))
+
+
+def test_one_key_is_no_list_of_keys() -> None:
+    with pytest.raises(TypeError, match=r"keys must be given as a list, got 'state': write \['state'\]"):
+        HERWriter(REWARD, exclude="state")
+
+
+NEXT = [("next", key) for key in ("achieved_goal", "desired_goal", "reward", "truncated", "done")]
+
+
+@pytest.mark.parametrize("key", ["achieved_goal", "desired_goal", *NEXT])
+def test_a_missing_entry_is_named(key: str | tuple[str, str]) -> None:
+    with pytest.raises(KeyError, match=f"relabelling needs the entry {re.escape(repr(key))}, got "):
+        make_buffer(filter_achieved=True).extend(make_batch([[3]]).exclude(key))
+
+
+def test_without_virtual_rows_no_goals_are_needed() -> None:
+    buffer = make_buffer(k=0)
+    goals = ("achieved_goal", "desired_goal")
+    buffer.extend(make_batch([[3]]).exclude(*goals, *(("next", key) for key in goals)))
+    assert len(buffer) == 3
+
+
+def test_padded_trajectories_are_refused() -> None:
+    batch = make_batch([[3], [2]])
+    batch["collector", "mask"] = torch.ones(2, 3, dtype=torch.bool)
+    with pytest.raises(ValueError, match="split_trajs=False"):
+        make_buffer().extend(batch)
+
+
+def test_rows_that_wait_in_vain_are_noticed() -> None:
+    buffer = make_buffer(capacity=5)
+    with pytest.warns(UserWarning, match="6 rows of open episodes wait .* than the buffer's 5"):
+        buffer.extend(make_batch([[9]], steps=6))
