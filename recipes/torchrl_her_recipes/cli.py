@@ -66,7 +66,7 @@ _HINTS = (
     "To append",
     "Set the environment",
 )  # Hydra's, for its users
-_BAD = (HydraException, OmegaConfBaseException, OSError, ValueError, ImportError)
+_BAD = (HydraException, OmegaConfBaseException, OSError, ValueError, ImportError, MemoryError)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -113,6 +113,8 @@ def _one_line(error: BaseException) -> str:
     """The message of an error, without the hints that other libraries put below it."""
     if isinstance(error, OSError) and error.strerror is not None:
         return f"cannot use {error.filename}: {error.strerror.lower()}"
+    if isinstance(error, MemoryError):
+        return "there is not enough memory: buffer_size, hidden or batch_size may be too large"
     cause = str(error.__cause__ or "") if isinstance(error, HydraException) else ""
     message = f"{error}\n{cause}".split("Config search path")[0].replace("In 'train': ", "")
     lines = [line.strip() for line in message.splitlines()]
@@ -132,6 +134,9 @@ def _train(arguments: list[str]) -> int:
         folder = parser.parse_args(arguments).resume
         _say_start(folder)
         return _say_end(resume(folder))
+    sweep = any(argument in ("-m", "--multirun") for argument in arguments)
+    if sweep and any(argument.lstrip("+").startswith("folder=") for argument in arguments):
+        return _fail("folder= is for a single run; a sweep's folder is hydra.sweep.dir=DIR")
     _store_recipe()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to main() as they are
     codes: list[int] = []
@@ -155,7 +160,10 @@ def _train(arguments: list[str]) -> int:
 def _train_one(config: DictConfig) -> int:
     values = OmegaConf.to_container(config, resolve=True)
     assert isinstance(values, dict)
-    folder = Path(str(values.pop("folder")))
+    chosen = str(values.pop("folder"))
+    if not chosen:
+        raise ValueError("folder must name a folder, got nothing")
+    folder = Path(chosen)
     recipe = Recipe.from_dict({str(key): value for key, value in values.items()})
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         folder = Path(HydraConfig.get().runtime.output_dir)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import traceback
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -66,8 +67,10 @@ def read_progress(folder: Path) -> Progress:
         lines = RunFolder(folder).metrics.read_text().splitlines()
     except OSError:  # there is none yet
         return Progress()
-    last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
-    return Progress(int(last["epoch"]), float(last["seconds"]))
+    with suppress(IndexError, ValueError, KeyError):  # of a table that lost its end when the power went
+        last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
+        return Progress(int(last["epoch"]), float(last["seconds"]))
+    return Progress()
 
 
 def kept_progress(job: Job) -> Progress:

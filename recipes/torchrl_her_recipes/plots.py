@@ -51,6 +51,11 @@ _AXES = {name: (label, limits) for name, label, limits in _PANELS} | {
 }
 
 
+def metric_names() -> list[str]:
+    """The metrics that can be drawn over environment steps."""
+    return list(_AXES)
+
+
 def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
     """Draws the curves of a run; of several ones the median, and the 33rd to 67th percentile.
 
@@ -160,6 +165,8 @@ def band(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
     """One metric as (frames [n], values [n, R])."""
+    if missing := [row for row in rows if name not in row]:
+        raise ValueError(f"these runs did not measure {name}; they have {', '.join(missing[0])}")
     groups: dict[float, list[float]] = {}
     for row in rows:
         groups.setdefault(row["frames"], []).append(row[name])

@@ -65,17 +65,7 @@ def load_trained(name: str | Path) -> TrainedPolicy:
     path = _SHIPPED / f"{name}.pt" if str(name) in policy_names() else Path(name)
     if not path.is_file():
         raise ValueError(f"there is no policy {str(name)!r}; there are {', '.join(policy_names())}")
-    state = load_checkpoint(path)
-    actor = make_actor(state["widths"], state["actions"], hidden=state["recipe"]["hidden"], in_keys=_KEYS)
-    actor.load_state_dict(state["actor"])
-    recipe = Recipe.from_dict(state["recipe"])
-    return TrainedPolicy(
-        task=state["task"],
-        actor=actor.requires_grad_(False),
-        recipe=recipe,
-        success=state["success"],
-        frames=state["frames"],
-    )
+    return _policy_of(load_checkpoint(path))
 
 
 def load_policy(name: str | Path) -> TensorDictModule:
@@ -105,8 +95,8 @@ def export_policy(
         What was written.
 
     Raises:
-        ValueError: this is no folder of a run, it has no such run, or its policy needs more than the
-            observation and the desired goal as they are.
+        ValueError: this is no folder of a run, it has no such run, its policy needs more than the
+            observation and the desired goal as they are, or the task is one that it cannot play.
         OSError: the run has not saved a policy yet.
     """
     home = RunFolder(folder)
@@ -116,19 +106,22 @@ def export_policy(
     chosen = median_run(rows) if run is None else run
     if chosen not in range(recipe.num_runs):
         raise ValueError(f"there is no run {chosen} in {folder}; it has runs 0 to {recipe.num_runs - 1}")
+    played = replace(recipe, task=task or recipe.task)
     state = {
-        "task": task or recipe.task,
+        "task": played.task,
         "widths": _widths(recipe),
-        "actions": make_worlds(recipe, 1, [0]).action_spec.shape[-1],
+        "actions": _needs(recipe)[1],
         "actor": take_run(load_checkpoint(home.policy)["actor"], chosen, recipe.num_runs),
         "recipe": asdict(replace(recipe, num_runs=1, seed=recipe.seed + chosen)),
         "success": math.nan,
         "frames": int(rows[-1]["frames"]),
     }
     _check_state(recipe, state)
+    if _needs(played) != (state["widths"], state["actions"]):
+        raise ValueError(f"a policy of {recipe.task} cannot play {played.task}: it has other widths")
+    state["success"] = measure_success(_policy_of(state))
     save_checkpoint(state, out)
-    save_checkpoint(state | {"success": measure_success(load_trained(out))}, out)
-    return load_trained(out)
+    return _policy_of(state)
 
 
 def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int = 1 << 41) -> float:
@@ -137,12 +130,23 @@ def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int =
     return float(success(evaluate(env, policy.actor, max_steps=goal_env(env).max_steps)).float().mean())
 
 
+def _policy_of(state: dict[str, Any]) -> TrainedPolicy:
+    actor = make_actor(state["widths"], state["actions"], hidden=state["recipe"]["hidden"], in_keys=_KEYS)
+    actor.load_state_dict(state["actor"])
+    recipe = Recipe.from_dict(state["recipe"])
+    return TrainedPolicy(
+        task=state["task"],
+        actor=actor.requires_grad_(False),
+        recipe=recipe,
+        success=state["success"],
+        frames=state["frames"],
+    )
+
+
 def _widths(recipe: Recipe) -> list[int]:
     """Of the observation and of the goal; a curriculum's last layer must see them as they are."""
-    env = make_worlds(recipe, 1, [0])
-    worlds = goal_env(env)
-    widths = [worlds.observation_spec[key].shape[-1] for key in _KEYS]
-    curriculum = make_curriculum(recipe, env)
+    widths, _ = _needs(recipe)
+    curriculum = make_curriculum(recipe, make_worlds(recipe, 1, [0]))
     if curriculum is not None:
         last, seen = curriculum.layers[-1], sum(widths)
         if (*last.observation, *last.desired_goal) != tuple(range(seen)):
@@ -151,6 +155,12 @@ def _widths(recipe: Recipe) -> list[int]:
                 "and the desired goal as they are, for its policy to be exported"
             )
     return widths
+
+
+def _needs(recipe: Recipe) -> tuple[list[int], int]:
+    """How wide a task's observation and goal are, and its actions."""
+    env = make_worlds(recipe, 1, [0])
+    return [goal_env(env).observation_spec[key].shape[-1] for key in _KEYS], env.action_spec.shape[-1]
 
 
 def _check_state(recipe: Recipe, state: dict[str, Any]) -> None:

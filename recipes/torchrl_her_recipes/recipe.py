@@ -171,8 +171,7 @@ class Recipe:
     def from_dict(cls, values: dict[str, object]) -> Recipe:
         """A recipe from plain values; a ValueError names the ones that no recipe has."""
         known = {field.name for field in fields(cls)}
-        unknown = [name for name in values if name not in known]
-        if unknown:
+        if unknown := [str(name) for name in values if name not in known]:
             raise ValueError(f"a recipe has no {', '.join(unknown)}; it has {', '.join(sorted(known))}")
         return cls(**values)  # type: ignore[arg-type]
 

@@ -106,11 +106,18 @@ class RunFolder:
         self._events.flush()  # what is behind a checkpoint must be on the disk when the run goes on from it
 
     def rows(self) -> list[dict[str, float]]:
-        """The table so far."""
+        """The table so far.
+
+        Raises:
+            ValueError: it is damaged.
+        """
         if not self.metrics.exists():
             return []
         with open(self.metrics, newline="") as file:
-            return [{name: _number(text) for name, text in row.items()} for row in csv.DictReader(file)]
+            try:
+                return [{name: _number(text) for name, text in row.items()} for row in csv.DictReader(file)]
+            except (AttributeError, TypeError, ValueError) as error:  # a line is cut short, or no numbers
+                raise ValueError(f"{self.metrics} is damaged: a line is no row of the table") from error
 
     def close(self) -> None:
         """Writes out what is still in memory."""

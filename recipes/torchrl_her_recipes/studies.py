@@ -14,7 +14,7 @@ from torchrl_her_recipes.batches import Batches, plan_batches
 from torchrl_her_recipes.chain_times import plot_times
 from torchrl_her_recipes.plain import read_mapping
 from torchrl_her_recipes.planning import Plan
-from torchrl_her_recipes.plots import plot_comparison
+from torchrl_her_recipes.plots import metric_names, plot_comparison
 from torchrl_her_recipes.recipe import Recipe
 from torchrl_her_recipes.scheduling import run_jobs
 from torchrl_her_recipes.workers import LocalWorkers, Workers
@@ -42,7 +42,7 @@ class Study:
         figure: metrics that are drawn over environment steps, or "times" until the chain is solved.
 
     Raises:
-        ValueError: nothing to compare, or values that are no lists.
+        ValueError: nothing to compare, values that are no lists, or a figure that there is not.
     """
 
     name: str
@@ -57,6 +57,13 @@ class Study:
         wrong = not isinstance(self.vary, Mapping) or not self.vary
         if wrong or not all(isinstance(values, list | tuple) and values for values in self.vary.values()):
             raise ValueError(f"vary of {self.name} must hold lists of values by option, got {self.vary!r}")
+        if strange := [name for name in (*self.recipe, *self.vary) if not isinstance(name, str)]:
+            raise ValueError(f"options of {self.name} must be names, got {strange[0]!r}")
+        drawn = [self.figure] if isinstance(self.figure, str) else list(self.figure)
+        if drawn != ["times"] and (not drawn or not set(drawn) <= set(metric_names())):
+            known = ", ".join(metric_names())
+            raise ValueError(f"figure of {self.name} must be times, or some of {known}; got {self.figure!r}")
+        object.__setattr__(self, "figure", "times" if drawn == ["times"] else drawn)
 
     def cells(self) -> Iterator[tuple[str, Recipe]]:
         """The combinations by name, each with all of its seeds.
@@ -72,7 +79,10 @@ class Study:
             if label in labels:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
             labels.add(label)
-            yield label, Recipe.from_dict({**self.recipe, **own})
+            recipe = Recipe.from_dict({**self.recipe, **own})
+            if self.figure == "times" and recipe.task != "chain":
+                raise ValueError(f"the figure times of {self.name} is for the task chain, not {recipe.task}")
+            yield label, recipe
 
 
 def curve_label(label: str, recipe: Recipe) -> str:
@@ -87,7 +97,7 @@ def curve_label(label: str, recipe: Recipe) -> str:
 
 def _word(name: str, value: Any, values: Sequence[Any]) -> str:
     """What sets a value apart from the other ``values`` of its option; of a mapping, the entries that do."""
-    if isinstance(value, Mapping):
+    if all(isinstance(each, Mapping) for each in values):
         entries = {key: [each.get(key) for each in values] for key in value}
         differing = {key: own for key, own in entries.items() if any(other != own[0] for other in own)}
         return "_".join(_word(key, value[key], own) for key, own in differing.items())

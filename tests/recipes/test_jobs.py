@@ -18,8 +18,11 @@ from torchrl_her_recipes.jobs import (
     run_job,
     unpack,
 )
+from torchrl_her_recipes.run_folder import RunFolder
 
 from .small import small
+
+HEAD = "run,epoch,seconds"
 
 
 @pytest.fixture
@@ -37,6 +40,18 @@ def test_a_job_without_a_checkpoint_begins_again(job: Job) -> None:
     assert read_progress(job.folder).epochs == 2
     assert can_resume(job.folder)
     assert not (job.folder / "error.txt").exists()
+
+
+@pytest.mark.parametrize(
+    "left", ["", "run,epoch,seconds\n", "run,epoch,seconds\n0,7", "run,epoch,seconds\n0,7,1.5,\0"]
+)
+def test_a_table_that_lost_its_end_holds_up_nobody(left: str, job: Job) -> None:
+    job.folder.mkdir()
+    (job.folder / "metrics.csv").write_text(left)
+    assert read_progress(job.folder).epochs == 0
+    if "7" in left:
+        with pytest.raises(ValueError, match=r"metrics\.csv is damaged: a line is no row of the table"):
+            RunFolder(job.folder).rows()
 
 
 def test_a_job_that_was_killed_before_its_configuration_was_written_begins_again(job: Job) -> None:

@@ -49,10 +49,17 @@ def test_export_takes_the_median_run(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     small(epochs=1, learner="sac").build().run(folder, progress=False)
+    other = tmp_path / "other"
+    small(task="hand_v0", epochs=1).build().run(other, progress=False)
+    with pytest.raises(ValueError, match="a policy of hand_v0 cannot play robot_v0: it has other widths"):
+        export_policy(other, tmp_path / "policy.pt", task="robot_v0")
+    with pytest.raises(ValueError, match="unknown task 'nope'"):
+        export_policy(other, tmp_path / "policy.pt", task="nope")
     with pytest.raises(ValueError, match="only policies of ddpg and td3 can be exported"):
         export_policy(folder, tmp_path / "policy.pt")
     with pytest.raises(ValueError, match="there is no run 4 in .*; it has runs 0 to 0"):
         export_policy(folder, tmp_path / "policy.pt", run=4)
+    assert not (tmp_path / "policy.pt").exists()
     with pytest.raises(ValueError, match="there is no policy 'hand_v9'; there are hand_reach"):
         load_policy("hand_v9")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from torchrl_her_recipes.batches import Batches
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.jobs import Job, Outcome, Progress, run_job
 from torchrl_her_recipes.run_folder import RunFolder
-from torchrl_her_recipes.studies import Study, StudyResult, load_study, run_study, study_names
+from torchrl_her_recipes.studies import Study, StudyResult, draw_study, load_study, run_study, study_names
 
 from .small import SMALL
 
@@ -120,6 +121,11 @@ def test_chains_are_compared_by_their_times_and_others_by_the_metrics_asked_for(
     run_study(metrics, tmp_path / "b", workers=Here(), progress=False)
     with Image.open(tmp_path / "b" / "metrics.png") as picture:
         assert picture.size[0] > 2 * picture.size[1]
+    draw_study(replace(metrics, figure="success"), tmp_path / "b")
+    with Image.open(tmp_path / "b" / "metrics.png") as picture:
+        assert picture.size[0] < 2 * picture.size[1]
+    with pytest.raises(ValueError, match="these runs did not measure useless_share; they have run, seed"):
+        draw_study(replace(metrics, figure="useless_share"), tmp_path / "b")
 
 
 def test_the_guide_s_study_is_planned_as_it_says(
@@ -189,6 +195,14 @@ def test_without_ray_its_name_and_the_remedy_are_given(
         (["vary: {algo: her}"], "vary of mine must hold lists of values by option, got {'algo': 'her'}"),
         (["vary: {algo: [her, her]}"], "the study mine has two combinations that are called her"),
         (["vary: {learning_rate: [1e-3, fast]}"], "learning_rate must be a number, got 'fast'"),
+        (["vary: {1: [2]}"], "options of mine must be names, got 1"),
+        (["vary: {algo: [her]}\nrecipe: {1: 2}"], "options of mine must be names, got 1"),
+        (["vary: {task_options: [{a: 1}, 3]}"], "task_options must"),
+        (["vary: {algo: [her]}\nfigure: [succes]"], "figure of mine must be times, or some of success, "),
+        (
+            ["vary: {algo: [her]}\nfigure: times"],
+            "times of mine is for the task chain, not hand_v0",
+        ),
     ],
 )
 def test_bad_input_is_one_clear_line(
