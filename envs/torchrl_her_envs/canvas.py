@@ -66,8 +66,7 @@ class Canvas:
 
     def finish(self) -> Tensor:
         """The picture as [size, size, 3] of uint8."""
-        small = self._image.resize((self.size, self.size), Image.Resampling.LANCZOS)
-        return torch.from_numpy(np.array(small))
+        return torch.from_numpy(np.array(self._image.reduce(OVERSAMPLING)))
 
     def pixels(self, length: float) -> int:
         """A length on the large picture, at least 1."""

@@ -67,7 +67,15 @@ def test_parts_of_the_chain_are_layers_that_end_at_the_next_one_s_start() -> Non
 
 def test_a_chain_is_climbed() -> None:
     options = {"length": 4, "layers": 2, "alternating": True}
-    recipe = small(task="chain", task_options=options, algo="cher", epochs=8, window=1, frames_per_update=4)
+    recipe = small(
+        task="chain",
+        task_options=options,
+        algo="cher",
+        epoch_frames=800,
+        epochs=8,
+        window=1,
+        frames_per_update=4,
+    )
     rows = recipe.build().run(progress=False).rows
     assert rows[0]["layer"] == 0
     assert rows[-1]["layer"] == 1

@@ -153,7 +153,7 @@ def test_an_environment_of_gymnasium_trains_by_its_id(algo: str, tmp_path: Path)
         curriculum=curriculum if algo == "cher" else None,
     )
     rows = recipe.build().run(tmp_path / "run", progress=False).rows
-    assert rows[-1]["rows_virtual"] > 0
+    assert rows[-1]["rows_virtual"] > 0, rows[-1]
     assert 0.0 <= rows[-1]["success"] <= 1.0
     assert ("kl" in rows[-1]) == (algo == "filtered_her_ibs")
 

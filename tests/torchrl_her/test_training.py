@@ -116,7 +116,7 @@ def make_trainer(seed: int = 0, **options: Any) -> tuple[Trainer, TensorDictSequ
 def test_it_learns_a_task_of_one_dimension() -> None:
     trainer, policy = make_trainer()
     before = success(evaluate(LineEnv(1), policy, max_steps=STEPS)).float().mean()
-    for _ in range(10):
+    for _ in range(5):
         trainer.epoch()
     after = torch.stack(
         [success(evaluate(LineEnv(seed), policy, max_steps=STEPS)).float().mean() for seed in range(10)]
