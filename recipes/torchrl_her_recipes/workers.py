@@ -24,7 +24,11 @@ class Workers(Protocol):
         """How many jobs they do at the same time."""
 
     def run(self, job: Job) -> Outcome:
-        """Waits for a place, does the job there, and returns when it has ended. Called from threads."""
+        """Waits for a place, does the job there, and returns when it has ended.
+
+        Called from threads. Jobs must not overlap within a process: TorchRL's exploration type, and torch's
+        random numbers, are those of all its threads.
+        """
 
     def progress(self) -> dict[str, Progress]:
         """How far the jobs are that are being done, by label."""

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
 
 import pytest
 import yaml
@@ -24,12 +25,16 @@ from .small import SMALL
 
 
 class Here:
-    """Does jobs in this process, one after the other."""
+    """Does jobs in this process, one after the other: TorchRL's exploration type is that of all threads."""
 
     at_once = 1
 
+    def __init__(self) -> None:
+        self._place = Lock()
+
     def run(self, job: Job) -> Outcome:
-        return run_job(job)
+        with self._place:
+            return run_job(job)
 
     def progress(self) -> dict[str, Progress]:
         return {}
