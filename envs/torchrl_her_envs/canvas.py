@@ -33,6 +33,12 @@ def to_pixel(point: Point, size: int) -> tuple[int, int]:
     return int((MARGIN + 1 - point[1]) * scale), int((MARGIN + point[0]) * scale)
 
 
+def check_size(size: int) -> None:
+    """Raises a ValueError for a picture on which nothing could be told apart."""
+    if size < SMALLEST:
+        raise ValueError(f"a picture needs a size of at least {SMALLEST} pixels, got {size}")
+
+
 class Canvas:
     """Shapes in fractions of the screen; colours with an opacity are blended with what lies below.
 
@@ -51,8 +57,7 @@ class Canvas:
     """
 
     def __init__(self, size: int, *, background: Colour) -> None:
-        if size < SMALLEST:
-            raise ValueError(f"a picture needs a size of at least {SMALLEST} pixels, got {size}")
+        check_size(size)
         self.size = size
         self._scale = size * OVERSAMPLING / (1 + 2 * MARGIN)
         self._use(Image.new("RGB", (size * OVERSAMPLING, size * OVERSAMPLING), background))

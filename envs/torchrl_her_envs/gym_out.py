@@ -12,6 +12,7 @@ from gymnasium import spaces
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_her_envs.canvas import check_size
 from torchrl_her_envs.registry import get_task
 from torchrl_her_envs.task import WorldConfig
 from torchrl_her_envs.throwing import ThrowingEnv
@@ -90,7 +91,7 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         num_links: int = 2,
         threshold: float | None = None,
     ) -> None:
-        check_render_mode(render_mode, self.metadata["render_modes"])
+        check_pictures(render_mode, self.metadata["render_modes"], size)
         self._worlds = make_worlds(task, 1, _NO_LIMIT, world=world, num_links=num_links, threshold=threshold)
         self.observation_space, self.action_space = spaces_of(self._worlds)
         self.render_mode = render_mode
@@ -166,8 +167,9 @@ def make_worlds(
     )
 
 
-def check_render_mode(mode: str | None, modes: list[str]) -> None:
-    """Raises a ValueError for a mode that there is not."""
+def check_pictures(mode: str | None, modes: list[str], size: int) -> None:
+    """Raises a ValueError for a render mode that there is not, or a size that is too small."""
+    check_size(size)
     if mode is not None and mode not in modes:
         raise ValueError(f"render_mode must be one of {', '.join(modes)}, or None, got {mode!r}")
 

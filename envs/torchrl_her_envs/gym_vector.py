@@ -18,7 +18,7 @@ from torchrl_her_envs.gym_out import (
     GoalRules,
     Observation,
     as_seed,
-    check_render_mode,
+    check_pictures,
     make_worlds,
     spaces_of,
 )
@@ -77,7 +77,7 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         num_links: int = 2,
         threshold: float | None = None,
     ) -> None:
-        check_render_mode(render_mode, self.metadata["render_modes"])
+        check_pictures(render_mode, self.metadata["render_modes"], size)
         options: dict[str, Any] = {"world": world, "num_links": num_links, "threshold": threshold}
         self._worlds = make_worlds(task, num_envs, max_episode_steps, **options)
         self.num_envs = num_envs

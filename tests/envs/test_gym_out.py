@@ -180,12 +180,20 @@ def test_arms_at_full_speed_stay_within_what_the_space_says(links: int) -> None:
     [
         ({"render_mode": "ansi"}, "render_mode must be one of human, rgb_array, or None, got 'ansi'"),
         ({"threshold": -1.0}, "threshold must be positive, got -1.0"),
+        ({"size": 0}, "a picture needs a size of at least 32 pixels, got 0"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*that is not in the possible render_modes")
 def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(**options)
+
+
+def test_a_vector_needs_steps_and_pictures_that_can_be_seen() -> None:
+    with pytest.raises(ValueError, match="max_steps must be positive, got 0"):
+        make_many(max_episode_steps=0)
+    with pytest.raises(ValueError, match="at least 32 pixels, got 8"):
+        make_many(size=8)
 
 
 def test_actions_that_are_no_numbers_are_refused() -> None:
