@@ -6,10 +6,9 @@ import os
 import random
 import signal
 import sys
-import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,12 @@ import pandas as pd
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tqdm import tqdm
 
 from torchrl_her import load_checkpoint
-from torchrl_her_recipes import Parts, Recipe, cli, resume, run_state, running
+from torchrl_her_recipes import Parts, Recipe, cli, resume, run_state
 from torchrl_her_recipes.run_folder import RunFolder
 
+from .killed import is_killed, no_pictures, server
 from .small import assert_same, small
 
 KILLS = 20
@@ -39,11 +38,10 @@ ALL: dict[str, Any] = {
 }
 
 
-@pytest.fixture
-def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most of the time of such short runs."""
-    for name in ("plot_curves", "plot_goals", "record_episodes", "write_video"):
-        monkeypatch.setattr(running, name, lambda *args, **options: None)
+@pytest.fixture(name="no_pictures")
+def _no_pictures() -> Iterator[None]:
+    with no_pictures():
+        yield
 
 
 def press_ctrl_c(parts: Parts, batch: int) -> Parts:
@@ -76,38 +74,21 @@ def damage(path: Path) -> None:
 # Killed
 
 
-def go_on(recipe: Recipe, folder: Path) -> None:
-    tqdm.set_lock(
-        threading.RLock()
-    )  # its own is for all processes: one that is killed would never let go of it
-    if (folder / "config.yaml").exists():
-        sys.exit(cli.main(["train", "--resume", str(folder)]))
-    recipe.build().run(folder, progress=False)
-
-
-def is_killed(recipe: Recipe, folder: Path, *, after: float) -> bool:
-    """Lets a process go on with a run; returns whether it was killed before it came to the end."""
-    process = get_context("fork").Process(target=go_on, args=(recipe, folder))
-    process.start()
-    process.join(after)
-    process.kill()
-    process.join()
-    assert process.exitcode in (0, -signal.SIGKILL)
-    return process.exitcode != 0
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="a fork that shares torch is for Linux")
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no fork server")
 def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not(
     no_pictures: None, tmp_path: Path
 ) -> None:
     recipe, draw = small(**ALL), random.Random(0)
-    began = time.perf_counter()
     recipe.build().run(tmp_path / "whole", progress=False)
+    server()
+    began = time.perf_counter()
+    assert not is_killed(recipe, tmp_path / "alone", after=300.0)
     seconds = time.perf_counter() - began
+    assert_same_runs(tmp_path / "whole", tmp_path / "alone")
     assert pd.read_csv(tmp_path / "whole" / "metrics.csv")["layer"].nunique() == 2
     kills, folder = 0, tmp_path / "0"
     while kills < KILLS:
-        if is_killed(recipe, folder, after=draw.uniform(0.0, seconds)):
+        if is_killed(recipe, folder, after=draw.uniform(0.0, 0.7 * seconds)):
             kills += 1
         else:
             assert_same_runs(tmp_path / "whole", folder)
