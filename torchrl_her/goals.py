@@ -109,8 +109,15 @@ class EnvReward:
         )
 
 
-def reward_alone(reward: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """The reward [..., 1] without ``terminated``, which is half of the work, where they can be had apart."""
+def missed(
+    reward: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor, achieved_reward: float
+) -> Tensor:
+    """Where a reward is below that of an achieved goal: [...] of bool, for goals [..., g].
+
+    Without ``terminated``, which is half of the work, where the two can be had apart.
+    """
     if isinstance(reward, EnvReward):
-        return reward.compute_reward(achieved_goal, desired_goal)
-    return reward(achieved_goal, desired_goal)[0]
+        value = reward.compute_reward(achieved_goal, desired_goal)
+    else:
+        value = reward(achieved_goal, desired_goal)[0]
+    return value.squeeze(-1) < achieved_reward

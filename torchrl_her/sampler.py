@@ -26,7 +26,7 @@ from torch import Tensor
 from torchrl.data import SampleUnit, Storage
 
 from torchrl_her.goal_weights import GoalWeights, checked_weights
-from torchrl_her.goals import RewardFunction, reward_alone
+from torchrl_her.goals import RewardFunction, missed
 from torchrl_her.row_keys import RowKeys, entry_of, in_root_and_next
 from torchrl_her.virtual_goals import Strategy, check_strategy, combine, draw, draw_alike, window
 
@@ -395,7 +395,7 @@ class HERSampleUnit(SampleUnit):
 
     def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
         """The filter, [...]: False where a goal [..., g] was already achieved before the action."""
-        return reward_alone(self.reward, before, goals).squeeze(-1) < self.achieved_reward
+        return missed(self.reward, before, goals, self.achieved_reward)
 
 
 def _oldest(storage: Storage) -> int:

@@ -17,7 +17,7 @@ from torchrl.data.replay_buffers.writers import RoundRobinWriter
 from torchrl_her.episodes import Episodes, find_episodes
 from torchrl_her.goal_drawing import draw_goals
 from torchrl_her.goal_weights import GoalWeights
-from torchrl_her.goals import RewardFunction, reward_alone
+from torchrl_her.goals import RewardFunction, missed
 from torchrl_her.row_keys import RowKeys, entry_of, in_root_and_next
 from torchrl_her.virtual_goals import Strategy, check_strategy
 
@@ -356,7 +356,7 @@ class HERWriter(RoundRobinWriter):
 
     def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
         """The filter, [...]: False where a goal [..., g] was already achieved before the action."""
-        return reward_alone(self.reward, before, goals).squeeze(-1) < self.achieved_reward
+        return missed(self.reward, before, goals, self.achieved_reward)
 
     def _relabel(self, rows: TensorDictBase, source: Tensor, goal_source: Tensor) -> dict[NestedKey, Tensor]:
         """The entries of virtual rows that differ from those of the rows they are made of."""
@@ -371,8 +371,8 @@ class HERWriter(RoundRobinWriter):
         """Counts the rewards of virtual rows, and tells the weights of their goals."""
         useful = reward
         if not self.filter_achieved:  # all that the filter keeps is useful
-            before = reward_alone(self.reward, rows.get(self._keys.achieved).index_select(0, source), goals)
-            useful = reward[before < self.achieved_reward]
+            before = rows.get(self._keys.achieved).index_select(0, source)
+            useful = reward[self._keep(before, goals)]
         self._count(virtual_positive=self._positives(reward), useful_virtual_positive=self._positives(useful))
         if self.weights is not None:
             self.weights.update(goals)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModule
+from torchrl.envs import EnvBase
 
 from torchrl_her import (
     ActorNet,
@@ -107,17 +108,20 @@ def export_policy(
     if chosen not in range(recipe.num_runs):
         raise ValueError(f"there is no run {chosen} in {folder}; it has runs 0 to {recipe.num_runs - 1}")
     played = replace(recipe, task=task or recipe.task)
+    env = make_worlds(recipe, 1, [0])
+    _check_seen(recipe, env)
+    widths, actions = _widths(env)
     state = {
         "task": played.task,
-        "widths": _widths(recipe),
-        "actions": _needs(recipe)[1],
+        "widths": widths,
+        "actions": actions,
         "actor": take_run(load_checkpoint(home.policy)["actor"], chosen, recipe.num_runs),
         "recipe": asdict(replace(recipe, num_runs=1, seed=recipe.seed + chosen)),
         "success": math.nan,
         "frames": int(rows[-1]["frames"]),
     }
     _check_state(recipe, state)
-    if _needs(played) != (state["widths"], state["actions"]):
+    if task is not None and _widths(make_worlds(played, 1, [0])) != (widths, actions):
         raise ValueError(f"a policy of {recipe.task} cannot play {played.task}: it has other widths")
     state["success"] = measure_success(_policy_of(state))
     save_checkpoint(state, out)
@@ -143,24 +147,22 @@ def _policy_of(state: dict[str, Any]) -> TrainedPolicy:
     )
 
 
-def _widths(recipe: Recipe) -> list[int]:
-    """Of the observation and of the goal; a curriculum's last layer must see them as they are."""
-    widths, _ = _needs(recipe)
-    curriculum = make_curriculum(recipe, make_worlds(recipe, 1, [0]))
-    if curriculum is not None:
-        last, seen = curriculum.layers[-1], sum(widths)
-        if (*last.observation, *last.desired_goal) != tuple(range(seen)):
-            raise ValueError(
-                f"the last layer of {recipe.task}'s curriculum must see the observation "
-                "and the desired goal as they are, for its policy to be exported"
-            )
-    return widths
-
-
-def _needs(recipe: Recipe) -> tuple[list[int], int]:
-    """How wide a task's observation and goal are, and its actions."""
-    env = make_worlds(recipe, 1, [0])
+def _widths(env: EnvBase) -> tuple[list[int], int]:
+    """How wide an environment's observation and goal are, and its actions."""
     return [goal_env(env).observation_spec[key].shape[-1] for key in _KEYS], env.action_spec.shape[-1]
+
+
+def _check_seen(recipe: Recipe, env: EnvBase) -> None:
+    """Raises a ValueError if a curriculum's last layer does not see observation and goal as they are."""
+    curriculum = make_curriculum(recipe, env)
+    if curriculum is None:
+        return
+    last, (widths, _) = curriculum.layers[-1], _widths(env)
+    if (*last.observation, *last.desired_goal) != tuple(range(sum(widths))):
+        raise ValueError(
+            f"the last layer of {recipe.task}'s curriculum must see the observation "
+            "and the desired goal as they are, for its policy to be exported"
+        )
 
 
 def _check_state(recipe: Recipe, state: dict[str, Any]) -> None:
