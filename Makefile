@@ -1,25 +1,35 @@
-# Each target makes the environment that it needs, from nothing but Python 3.11 or newer.
+# Each target makes the virtual environment that it needs, from nothing but Python 3.11 or newer.
 PYTHON ?= python3
 VENV ?= .venv
+WORKERS ?= logical
 BIN := $(VENV)/bin
+# Each worker computes in one thread: more of them only wait for each other.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal --durations=15
 
-.PHONY: demo test lint bench docs clean
+.PHONY: demo test test-full test-versions lint bench docs clean
 
 demo: $(VENV)/.ready  ## learn to pick up a ball and throw it, in two minutes; ends with a curve and a GIF
 	$(BIN)/torchrl-her train preset=demo
 
-test: $(VENV)/.ready-test  ## all tests and doctests
-	$(BIN)/python -m pytest $(TESTS)
+test: $(VENV)/.ready-test  ## tests and doctests; those of some files or folders only: make test TESTS=tests/envs
+	$(PYTEST) $(TESTS)
 
-lint: $(VENV)/.ready-test  ## style, formatting, types
+test-full: $(VENV)/.ready-test  ## the same, and the tests marked "full", which take much longer
+	$(PYTEST) -m "" $(TESTS)
+
+test-versions: $(VENV)/.ready-test  ## lowest and newest torch, tensordict and torchrl, and each Python, in environments of their own
+	$(BIN)/python .ci/try_versions.py $(TESTS)
+
+lint: $(VENV)/.ready-test  ## style, formatting, who imports whom, types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 	$(BIN)/mypy
 
 bench: $(VENV)/.ready-bench  ## all benchmarks, beside peers, in one report: runs/bench.md
 	$(BIN)/python benchmarks/run.py
 
-docs: $(VENV)/.ready-docs  ## the documentation as a site: build/docs/index.html
+docs: $(VENV)/.ready-docs  ## the documentation as a site, with the studies' pages: build/docs/index.html
 	$(BIN)/python -m sphinx -W --keep-going docs build/docs
 
 clean:
@@ -28,7 +38,7 @@ clean:
 $(VENV)/.ready: EXTRAS :=
 $(VENV)/.ready-test: EXTRAS := [test,lint,video]
 $(VENV)/.ready-bench: EXTRAS := [bench]
-$(VENV)/.ready-docs: EXTRAS := [docs]
+$(VENV)/.ready-docs: EXTRAS := [docs,report]
 $(VENV)/.ready $(VENV)/.ready-test $(VENV)/.ready-bench $(VENV)/.ready-docs: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; set PYTHON=") if sys.version_info < (3, 11) else None'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -11,34 +11,33 @@ import statistics
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
 from machine import describe, publish, table
 
 from torchrl_her import save_checkpoint
-from torchrl_her_recipes import Recipe
-from torchrl_her_recipes.run_state import run_state
+from torchrl_her_recipes import Recipe, build, make_recipe
+from torchrl_her_recipes.runs.state import run_state
 
 
 def measure(recipe: Recipe, folder: Path) -> list[str]:
     """Trains without evaluations, with the checkpoints of a run; a row of the table."""
-    parts = recipe.build()
-    trainer, path = parts.trainer(), folder / "checkpoint.pt"
+    components = build(recipe)
+    trainer, path = components.trainer(), folder / "checkpoint.pt"
     trained, saved = 0.0, []
-    while trainer.epochs < recipe.epochs:
+    while trainer.epochs < recipe.run.epochs:
         began = time.perf_counter()
         trainer.epoch()
         trained += time.perf_counter() - began
-        if trainer.epochs % recipe.checkpoint_interval == 0:
+        if trainer.epochs % recipe.run.checkpoint_interval == 0:
             began = time.perf_counter()
-            save_checkpoint(run_state(parts, trainer), path, keep=recipe.keep_checkpoints)
+            save_checkpoint(run_state(components, trainer), path, keep=recipe.run.keep_checkpoints)
             saved.append(time.perf_counter() - began)
     trained -= trainer.learner.compile_seconds  # once in the life of a machine
-    rows = statistics.mean(len(buffer) for buffer in parts.buffers)
+    rows = statistics.mean(len(buffer) for buffer in components.buffers)
     return [
-        str(recipe.num_runs),
+        str(recipe.run.num_runs),
         f"{rows:,.0f}",
         f"{path.stat().st_size / 1e6:,.0f}",
         f"{saved[-1]:.2f}",
@@ -50,16 +49,18 @@ def measure(recipe: Recipe, folder: Path) -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--runs", type=int, nargs="+", default=[1, 15], help="how many side by side")
-    parser.add_argument("--epochs", type=int, default=Recipe().epochs, help="of each run (%(default)s)")
+    parser.add_argument(
+        "--epochs", type=int, default=make_recipe().run.epochs, help="of each run (%(default)s)"
+    )
     parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
     options = parser.parse_args(arguments)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.set_num_threads(1)
-    recipe = Recipe(epochs=options.epochs)
+    recipe = make_recipe(epochs=options.epochs)
     rows = []
     for runs in options.runs:
         with tempfile.TemporaryDirectory(dir=".") as folder:  # not in a /tmp that may be memory
-            rows.append(measure(replace(recipe, num_runs=runs), Path(folder)))
+            rows.append(measure(recipe.replace(num_runs=runs), Path(folder)))
     header = ("runs", "rows of each", "MB", "seconds of the last", "all checkpoints", "share of the time")
     text = "\n\n".join((describe("torch", "torchrl"), table(header, rows)))
     publish(text, options.out)

@@ -10,8 +10,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from torchrl_her_envs import TASKS, get_task
+from torchrl_her_envs.registry import GYM
 from torchrl_her_recipes import Recipe
-from torchrl_her_recipes.worlds import GYM
 
 
 class SB3Env(PeerEnv):
@@ -25,7 +25,7 @@ class SB3Env(PeerEnv):
 def make_sb3(recipe: Recipe, *, gradient_steps: int | None = None, noise: float = 0.0) -> DDPG:
     """The same networks, batches, discount, target update and number of gradient steps.
 
-    It keeps real rows only, relabels while it samples, and has no prioritised replay.
+    It keeps real rows only, relabels while it samples, and has no prioritized replay.
 
     Args:
         recipe: what to be like.
@@ -34,27 +34,28 @@ def make_sb3(recipe: Recipe, *, gradient_steps: int | None = None, noise: float 
     """
 
     def make() -> gymnasium.Env:
-        if recipe.task in TASKS:
-            return SB3Env(get_task(recipe.task))
-        return gymnasium.make(recipe.task.removeprefix(GYM))
+        if recipe.task.name in TASKS:
+            return SB3Env(get_task(recipe.task.name))
+        return gymnasium.make(recipe.task.name.removeprefix(GYM))
 
-    worlds = DummyVecEnv([make] * recipe.num_envs)
+    worlds = DummyVecEnv([make] * recipe.collection.num_envs)
     actions = worlds.action_space.shape
     return DDPG(
         "MultiInputPolicy",
         worlds,
         replay_buffer_class=HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": recipe.k, "goal_selection_strategy": "future"},
-        policy_kwargs={"net_arch": [recipe.hidden] * 3},
-        gamma=recipe.gamma,
-        tau=recipe.tau,
-        learning_rate=recipe.learning_rate,
-        buffer_size=recipe.buffer_size // (recipe.k + 1),
-        batch_size=recipe.batch_size,
+        replay_buffer_kwargs={"n_sampled_goal": recipe.hindsight.k, "goal_selection_strategy": "future"},
+        policy_kwargs={"net_arch": [recipe.learner.hidden] * 3},
+        gamma=recipe.learner.gamma,
+        tau=recipe.learner.tau,
+        learning_rate=recipe.learner.learning_rate,
+        buffer_size=recipe.replay.buffer_size // (recipe.hindsight.k + 1),
+        batch_size=recipe.replay.batch_size,
         train_freq=(1, "step"),
-        gradient_steps=gradient_steps or int(recipe.num_envs / recipe.frames_per_update),
-        learning_starts=recipe.warmup_frames,
+        gradient_steps=gradient_steps
+        or int(recipe.collection.num_envs / recipe.collection.frames_per_update),
+        learning_starts=recipe.collection.warmup_frames,
         action_noise=NormalActionNoise(np.zeros(actions), np.full(actions, noise)) if noise else None,
-        seed=recipe.seed,  # of its environments, too
+        seed=recipe.run.seed,  # of its environments, too
         device="cpu",
     )

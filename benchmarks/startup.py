@@ -1,4 +1,4 @@
-"""Seconds until a new Python process is ready, beside what the libraries below need by themselves.
+"""Seconds and memory until a new Python process is ready, beside what the libraries below need by themselves.
 
 python benchmarks/startup.py --out startup.md
 """
@@ -6,12 +6,15 @@ python benchmarks/startup.py --out startup.md
 from __future__ import annotations
 
 import argparse
+import os
+import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
-from machine import describe, medians, publish, table
+from machine import describe, publish, table
 
 PROGRAMS = {
     "import torch": ["-c", "import torch"],
@@ -20,11 +23,16 @@ PROGRAMS = {
         "import torchrl.data, torchrl.collectors, torchrl.objectives",
     ],
     "import torchrl_her": ["-c", "import torchrl_her"],
-    "the parts of a recipe, ready to train": [
+    "the components of a recipe, ready to train": [
         "-c",
-        "from torchrl_her_recipes import Recipe; Recipe().build()",
+        "from torchrl_her_recipes import build, make_recipe; build(make_recipe())",
     ],
+    "torchrl-her --version": ["-m", "torchrl_her_recipes", "--version"],
+    "torchrl-her --help": ["-m", "torchrl_her_recipes", "--help"],
     "torchrl-her list": ["-m", "torchrl_her_recipes", "list"],
+    "torchrl-her train -h": ["-m", "torchrl_her_recipes", "train", "-h"],
+    "torchrl-her train task=hand_v9 (refused)": ["-m", "torchrl_her_recipes", "train", "task=hand_v9"],
+    "torchrl-her train epochs=many (refused)": ["-m", "torchrl_her_recipes", "train", "epochs=many"],
     "Stable-Baselines3's DDPG and HER, imported": [
         "-c",
         "from stable_baselines3 import DDPG, HerReplayBuffer",
@@ -32,26 +40,35 @@ PROGRAMS = {
 }
 
 
-def start(program: Sequence[str]) -> Callable[[], int]:
-    def work() -> int:
-        subprocess.run([sys.executable, *program], check=True, capture_output=True)
-        return 1
-
-    return work
+def start(command: Sequence[str]) -> tuple[float, float]:
+    """Seconds until a process has ended, and its greatest memory in MB."""
+    began = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    _, _, usage = os.wait4(process.pid, 0)
+    scale = 1e6 if sys.platform == "darwin" else 1e3  # bytes there, kilobytes elsewhere
+    return time.perf_counter() - began, usage.ru_maxrss / scale
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--repeats", type=int, default=3, help="starts of each")
+    parser.add_argument(
+        "--repeats", type=int, default=5, help="starts of each, behind one that is not counted"
+    )
+    parser.add_argument("--python", default=sys.executable, help="an interpreter of another environment")
+    parser.add_argument("--only", default="", help="those programs whose names begin so")
     parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
     options = parser.parse_args(arguments)
-    work = {name: start(program) for name, program in PROGRAMS.items()}
-    for first in work.values():
-        first()  # reads the files from disk
-    seconds = medians(work, repeats=options.repeats)
-    rows = [[name, f"{value:.1f}"] for name, value in seconds.items()]
-    text = "\n\n".join((describe("torch", "torchrl", "stable-baselines3"), table(("start", "seconds"), rows)))
-    publish(text, options.out)
+    rows = []
+    for name, program in PROGRAMS.items():
+        if name.startswith(options.only):
+            start([options.python, *program])  # reads the files from disk, and writes byte code
+            starts = [start([options.python, *program]) for _ in range(options.repeats)]
+            seconds, memory = (statistics.median(own) for own in zip(*starts, strict=True))
+            rows.append([name, f"{seconds:.2f}", f"{memory:,.0f}"])
+    header = ("start", "seconds", "MB")
+    publish(
+        "\n\n".join((describe("torch", "torchrl", "stable-baselines3"), table(header, rows))), options.out
+    )
 
 
 if __name__ == "__main__":

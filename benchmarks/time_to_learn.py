@@ -26,9 +26,9 @@ from tensordict import TensorDictBase
 
 from torchrl_her import evaluate, success
 from torchrl_her_envs import goal_env
-from torchrl_her_recipes import Recipe
-from torchrl_her_recipes.studies import load_preset
-from torchrl_her_recipes.worlds import make_worlds
+from torchrl_her_recipes import Recipe, build, make_recipe
+from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.config.shipped import load_preset
 
 HAND = {"task": "hand_v0", "algo": "her"}  # all else is the default
 
@@ -45,11 +45,11 @@ class Point(NamedTuple):
 
 def ours(recipe: Recipe, _noise: float) -> Iterator[Policy]:
     """Trains, and hands out the greedy policy after each epoch. Explores as the recipe says."""
-    parts = recipe.build()
-    trainer = parts.trainer()
+    components = build(recipe)
+    trainer = components.trainer()
     while True:
         trainer.epoch()
-        yield parts.policy
+        yield components.policy
 
 
 def peer(recipe: Recipe, noise: float) -> Iterator[Policy]:
@@ -62,7 +62,7 @@ def peer(recipe: Recipe, noise: float) -> Iterator[Policy]:
         return tensordict.set("action", torch.from_numpy(action))
 
     while True:
-        model.learn(recipe.epoch_frames, reset_num_timesteps=False)
+        model.learn(recipe.collection.epoch_frames, reset_num_timesteps=False)
         yield policy
 
 
@@ -73,16 +73,18 @@ CONTENDERS = {"this": ours, "Stable-Baselines3": peer}
 
 def race(name: str, recipe: Recipe, *, noise: float, aim: float) -> list[Point]:
     """The curve until the aim, or until the recipe's last epoch."""
-    test = make_worlds(recipe, recipe.eval_episodes, [recipe.seed + (1 << 32)])
+    test = make_task_envs(recipe, recipe.evaluation.episodes, [recipe.run.seed + (1 << 32)])
     curve: list[Point] = []
     training, seconds = CONTENDERS[name](recipe, noise), 0.0
-    for epoch in range(1, recipe.epochs + 1):
+    for epoch in range(1, recipe.run.epochs + 1):
         began = time.perf_counter()
         policy = next(training)
         seconds += time.perf_counter() - began
         rollout = evaluate(test, policy, max_steps=goal_env(test).max_steps)
-        curve.append(Point(epoch * recipe.epoch_frames, seconds, float(success(rollout).float().mean())))
-        print(f"{name}, seed {recipe.seed}: {curve[-1]}", flush=True)
+        curve.append(
+            Point(epoch * recipe.collection.epoch_frames, seconds, float(success(rollout).float().mean()))
+        )
+        print(f"{name}, seed {recipe.run.seed}: {curve[-1]}", flush=True)
         if curve[-1].success >= aim:
             break
     return curve
@@ -121,11 +123,11 @@ def draw_curves(curves: Curves, path: Path, *, title: str) -> None:
     figure = Figure(figsize=(9.4, 3.8), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, field in zip(panels, ("frames", "seconds"), strict=True):
-        for name, colour in zip(curves, ("#2b6cb0", "#dd6b20"), strict=False):
+        for name, color in zip(curves, ("#2b6cb0", "#dd6b20"), strict=False):
             for seed, curve in enumerate(curves[name]):
                 label = name if seed == 0 else None
                 places = [getattr(point, field) for point in curve]
-                axes.plot(places, [point.success for point in curve], color=colour, label=label)
+                axes.plot(places, [point.success for point in curve], color=color, label=label)
         axes.set(
             xlabel="environment steps" if field == "frames" else "seconds of training", ylim=(-0.02, 1.02)
         )
@@ -153,16 +155,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = [options.only] if options.only else list(CONTENDERS)
     curves: dict[str, list[list[Point]]] = {name: [] for name in names}
     for seed in range(options.repeats):
-        recipe = Recipe.from_dict({**values, "seed": seed})
+        recipe = make_recipe(values, seed=seed)
         for name in names:
             curves[name].append(race(name, recipe, noise=options.noise, aim=options.aim))
-    header = (recipe.task, f"reached {options.aim:.0%}", "seconds: median (each)", "frames", "last", "best")
+    header = (
+        recipe.task.name,
+        f"reached {options.aim:.0%}",
+        "seconds: median (each)",
+        "frames",
+        "last",
+        "best",
+    )
     rows = [line(name, curves[name], options.aim) for name in names]
     text = "\n\n".join((describe("torch", "torchrl", "stable-baselines3"), table(header, rows)))
     publish(text, options.out)
     if options.curves is not None:
         write_curves(curves, options.curves)
-        draw_curves(curves, options.curves.with_suffix(".png"), title=recipe.task)
+        draw_curves(curves, options.curves.with_suffix(".png"), title=recipe.task.name)
 
 
 if __name__ == "__main__":

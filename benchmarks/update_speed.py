@@ -2,8 +2,8 @@
 
     python benchmarks/update_speed.py --out update_speed.md
 
-An update counts everything: drawing rows, loss, backward, optimiser, target networks, priorities.
-Stable-Baselines3 (the extra `bench`) has no prioritised replay and relabels while it samples.
+An update counts everything: drawing rows, loss, backward, optimizer, target networks, priorities.
+Stable-Baselines3 (the extra `bench`) has no prioritized replay and relabels while it samples.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from peer_sb3 import make_sb3
 from stable_baselines3 import DDPG
 
 from torchrl_her import LossLearner, Trainer
-from torchrl_her_recipes import Recipe
+from torchrl_her_recipes import build, make_recipe
 
 TASK, ENVS, BATCH = "hand_v0", 64, 64
 FILL = 6_400  # frames in the buffers before anything is timed
@@ -35,24 +35,24 @@ def ours(
     compiled: str = "always",
 ) -> Trainer:
     """A trainer with filled buffers."""
-    recipe = Recipe(
+    recipe = make_recipe(
         task=TASK,
         algo="her",
         num_runs=runs,
         num_envs=ENVS,
         batch_size=batch,
         frames_per_update=frames_per_update,
-        updates_per_draw=per_draw,
+        batches_per_sample=per_draw,
         epoch_frames=FILL,
         warmup_frames=FILL,
         buffer_size=200_000,
-        eval_episodes=1,
+        episodes=1,
         compile=compiled,
     )
-    parts = recipe.build()
-    trainer = parts.trainer()
+    components = build(recipe)
+    trainer = components.trainer()
     if not fused:
-        trainer.learner = LossLearner(parts.loss, parts.optimiser, parts.target, runs=runs)
+        trainer.learner = LossLearner(components.loss, components.optimizer, components.target, runs=runs)
     trainer.epoch()
     return trainer
 
@@ -81,7 +81,7 @@ def frames_of(trainer: Trainer, frames: int) -> Callable[[], int]:
 
 def sb3(*, gradient_steps: int) -> DDPG:
     """Stable-Baselines3's model with its buffer filled."""
-    recipe = Recipe(task=TASK, num_envs=ENVS, batch_size=BATCH, warmup_frames=FILL)
+    recipe = make_recipe(task=TASK, num_envs=ENVS, batch_size=BATCH, warmup_frames=FILL)
     model = make_sb3(recipe, gradient_steps=gradient_steps)
     model.learn(FILL + ENVS)
     return model

@@ -28,12 +28,12 @@ from torchrl.data.replay_buffers.writers import RoundRobinWriter, Writer
 from torchrl_her import (
     EnvReward,
     GoalGrid,
-    GoalHistogram,
     GoalWeights,
     HERWriter,
     Instructiveness,
     box_target,
 )
+from torchrl_her.goals import GoalHistogram
 from torchrl_her_envs import ThrowingEnv, make_env
 
 EPISODES, STEPS, K = 800, 50, 4

@@ -5,7 +5,11 @@ from __future__ import annotations
 import inspect
 import re
 from importlib.metadata import version as version_of
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from torchrl_her_recipes.reports import page as report_page
+from torchrl_her_recipes.reports.tidy import is_results, read_results
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -15,17 +19,22 @@ author = "the authors of torchrl-her"
 version = release = version_of("torchrl-her")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-exclude_patterns = ["examples", "results"]  # a program, and the numbers behind the figures
+exclude_patterns = ["examples"]  # a program
 
 # Pages in Markdown. They are read in the repository, too, so links in them are those of the repository.
-myst_enable_extensions = ["colon_fence", "deflist"]
+myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 # What lies outside of this folder, and the page that shows it here.
 PAGES = {
     "../RESULTS.md": "results.md",
     "../CHANGELOG.md": "changelog.md",
+    "../results/README.md": "numbers.md",  # so it is called in pages of this folder
+    "results/README.md": "numbers.md",  # and in RESULTS.md
     "benchmarks/PROFILE.md": "profile.md",
 }
+# The numbers of studies: a link to such a folder is, on the site, one to the page that is made of them.
+RESULTS = Path(__file__).parent.parent / "results"
+REPORTS = sorted(folder.name for folder in RESULTS.iterdir() if is_results(folder))
 
 # Docstrings.
 autodoc_default_options = {"members": True, "member-order": "bysource"}
@@ -43,7 +52,11 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(collections|pathlib|torch|tensordict|torchrl|numpy|gymnasium)\..*"),
     ("py:class", r"[^.]*"),  # types that are written as text
-    ("py:class", r"torchrl_her_recipes\.curricula\.Climb"),  # not for others to use
+    # Types that appear in signatures and that nobody has to name.
+    ("py:class", r"torchrl_her\.replay_buffers\.keys\.TransitionKeys"),
+    ("py:class", r"torchrl_her_envs\.throwing\.rendering\.render\.Scene"),
+    ("py:class", r"torchrl_her_recipes\.components\.curricula\.CurriculumState"),
+    ("py:class", r"torchrl_her_recipes\.studies\.(workers_local\.Workers|study\.StudyResult|plan\.Plan)"),
 ]
 
 html_theme = "furo"
@@ -62,10 +75,28 @@ def link_to_pages(text: str) -> str:
     Example:
         >>> link_to_pages("see [results](../RESULTS.md#speed)")
         'see [results](results.md#speed)'
+        >>> link_to_pages("the study [ibs](results/ibs)")
+        'the study <a href="results/ibs/index.html">ibs</a>'
     """
     for file, page in PAGES.items():
         text = text.replace(f"]({file}", f"]({page}")
+    for name in REPORTS:
+        link = rf"\[([^\]]+)\]\((?:\.\./)?results/{re.escape(name)}\)"
+        text = re.sub(link, rf'<a href="results/{name}/index.html">\1</a>', text)
     return text
+
+
+def make_report_pages(app: Sphinx, error: Exception | None) -> None:
+    """Makes the page of each study out of its numbers, unless there is one that is newer than them."""
+    if error is not None or app.builder.format != "html":
+        return
+    code = Path(report_page.__file__).parent
+    for name in REPORTS:
+        out = Path(app.outdir) / "results" / name
+        made_of = [*(RESULTS / name).iterdir(), *code.glob("*.py"), *(code.parent / "templates").iterdir()]
+        page = out / "index.html"
+        if not page.exists() or page.stat().st_mtime < max(file.stat().st_mtime for file in made_of):
+            report_page.write_page(read_results(RESULTS / name), out)
 
 
 def on_read(*event: Any) -> None:
@@ -107,3 +138,4 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", on_read)
     app.connect("include-read", on_read)
     app.connect("autodoc-process-signature", on_signature)
+    app.connect("build-finished", make_report_pages)

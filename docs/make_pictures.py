@@ -13,11 +13,12 @@ from PIL import Image, ImageDraw, ImageFont
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_her_envs import TASKS, ThrowingEnv, make_env, palette, render, sprites, to_pixel
-from torchrl_her_envs.ballistics import fallen
-from torchrl_her_envs.canvas import Canvas, Point
-from torchrl_her_envs.inverse_kinematics import turn, two_link_angles
-from torchrl_her_envs.palette import Colour
+from torchrl_her_envs import TASKS, ThrowingEnv, make_env, render, to_pixel
+from torchrl_her_envs.throwing.experts.ballistics import fallen
+from torchrl_her_envs.throwing.experts.inverse_kinematics import turn, two_link_angles
+from torchrl_her_envs.throwing.rendering import palette, sprites
+from torchrl_her_envs.throwing.rendering.canvas import Canvas, Point
+from torchrl_her_envs.throwing.rendering.palette import Color
 
 IMAGES = Path(__file__).parent / "images"
 COLUMNS, SIDE, GAP, CAPTION = 4, 330, 16, 56  # pixels; 4 * 330 + 5 * 16 = 1400
@@ -147,9 +148,9 @@ def legend() -> Image.Image:
     return image
 
 
-def draw_swatch(canvas: Canvas, centre: Point, half: float, fill: Colour, edge: Colour) -> None:
-    """A piece of a region, on the colour of the screen."""
-    low, high = (centre[0] - half, centre[1] - half), (centre[0] + half, centre[1] + half)
+def draw_swatch(canvas: Canvas, center: Point, half: float, fill: Color, edge: Color) -> None:
+    """A piece of a region, on the color of the screen."""
+    low, high = (center[0] - half, center[1] - half), (center[0] + half, center[1] + half)
     canvas.box(low, high, fill=palette.PAPER)
     canvas.box(low, high, fill=fill, edge=edge, width=0.005)
 

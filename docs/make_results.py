@@ -1,69 +1,51 @@
-"""Makes the pictures, tables and data of RESULTS.md from finished runs.
+"""Makes the numbers, tables and pictures of RESULTS.md from finished runs.
 
-    python docs/make_results.py runs
+    python docs/make_results.py runs    # reads runs/STUDY, writes results/STUDY first
+    python docs/make_results.py         # tables and pictures of the numbers that are in results/
 
-Every study reads the folders STUDY/TASK_ALGORITHM in there, leaves out what is missing, prints a table,
-draws `images/STUDY.png`, and writes the curves behind it to `results/STUDY_TASK_ALGORITHM.csv`.
+For every study that there is, it prints a table and draws ``docs/images/STUDY.png``; for those of
+virtual goals, if their histograms are there, also ``docs/images/STUDY_goals.png``. The pages of the
+studies are made by ``make docs``.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from torchrl_her_envs import make_env
-from torchrl_her_recipes.batches import Batches
-from torchrl_her_recipes.plots import draw_goals, plot_comparison
-from torchrl_her_recipes.studies import draw_study, load_study
-from torchrl_her_recipes.study_results import at_the_end
+from torchrl_her_recipes.config.study import load_study
+from torchrl_her_recipes.reports.results import Combination, at_the_end
+from torchrl_her_recipes.reports.tidy import is_results, read_results, write_results
+from torchrl_her_recipes.runs.plots import draw_goals, plot_comparison
 
 HERE = Path(__file__).parent
-COLUMNS = (
-    "run",
-    "epoch",
-    "frames",
-    "updates",
-    "success",
-    "kl",
-    "layer",
-    "q_bias",
-    "rows_real_positive",
-    "rows_useful_virtual_positive",
-)
+RESULTS = HERE.parent / "results"
+STUDIES = {  # where they are described: in the package, or in a file beside this script
+    "v0": str(HERE / "studies" / "v0.yaml"),
+    "ibs": "ibs",
+    "bias": "bias",
+    "curriculum": "curriculum",
+    "climb": str(HERE / "studies" / "climb.yaml"),
+    "draws": str(HERE / "studies" / "draws.yaml"),
+    "window": "window",
+    "initialisation": "initialisation",
+}
+MAPS = ("ibs", "bias")  # studies whose maps of virtual goals are drawn
 
 Rows = list[dict[str, float]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Tasks beside each other, and the algorithms that are compared on them."""
-
-    tasks: Sequence[str]
-    algorithms: Sequence[str]
-    goals: bool = False  # whether to draw maps of virtual goals
-
-    @classmethod
-    def of_study(cls, name: str, *, goals: bool = False) -> Comparison:
-        vary = load_study(name).vary
-        return cls(tasks=vary["task"], algorithms=vary["algo"], goals=goals)
-
-
-COMPARISONS = {
-    "v0": Comparison(tasks=("hand_v0", "robot_v0", "hand_wall_v0"), algorithms=("her", "her_ibs")),
-    "ibs": Comparison.of_study("ibs", goals=True),
-    "bias": Comparison.of_study("bias", goals=True),
-    "curriculum": Comparison.of_study("curriculum"),
-    "climb": Comparison(tasks=("hand_v1", "hand_wall_v1", "robot_v1"), algorithms=("cher",)),
-    "draws": Comparison(tasks=("hand_v0_1", "hand_v0_8", "hand_v0_64"), algorithms=("her",)),
-}
-OPTIONS = ("window", "initialisation")
+def export(runs: Path) -> None:
+    """Writes the numbers of the studies that have runs in a folder."""
+    for name, described in STUDIES.items():
+        if (runs / name).is_dir():
+            command = f"torchrl-her study {described if described == name else f'docs/studies/{name}.yaml'}"
+            write_results(load_study(described), runs / name, RESULTS / name, command=command)
 
 
 def spread(values: Sequence[float], form: str) -> str:
@@ -72,50 +54,36 @@ def spread(values: Sequence[float], form: str) -> str:
     return f"**{middle:{form}}** ({low:{form}} to {high:{form}})"
 
 
-def read_study(study: Comparison, folder: Path) -> dict[tuple[str, str], Batches]:
-    """The runs that there are."""
-    found = {}
-    for task in study.tasks:
-        for algorithm in study.algorithms:
-            runs = Batches(folder / f"{task}_{algorithm}")
-            if runs.is_done:
-                found[task, algorithm] = runs
-    return found
-
-
-def print_table(runs: dict[tuple[str, str], Batches], heads: str = "task | algorithm") -> None:
-    print(f"| {heads} | runs | frames | success at the end | worst run | KL(q, q*) |")
+def print_table(cells: Sequence[Combination]) -> None:
+    print("| task | algorithm | runs | frames | success at the end | worst run | KL(q, q*) |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
-    for (task, algorithm), own in runs.items():
-        rows = own.rows()
-        success = at_the_end(rows, "success")
-        frames = f"{rows[-1]['frames']:,.0f}"
-        kl = spread([row["kl"] for row in rows if row["epoch"] == rows[-1]["epoch"]], ".2f")
+    for cell in cells:
+        success, kl = at_the_end(cell.rows, "success"), at_the_end(cell.rows, "kl", evaluations=1)
         print(
-            f"| `{task}` | `{algorithm}` | {len(success)} | {frames} | {spread(success, '.0%')} "
-            f"| {min(success):.0%} | {kl} |"
+            f"| `{cell.task}` | `{cell.algorithm}` | {cell.runs} | {cell.frames:,} "
+            f"| {spread(success, '.0%')} | {min(success):.0%} | {spread(kl, '.2f')} |"
         )
 
 
-def draw_success(runs: dict[tuple[str, str], Batches], path: Path) -> None:
+def draw_success(cells: Sequence[Combination], path: Path) -> None:
     panels: dict[str, dict[str, Rows]] = {}
-    for (task, algorithm), own in runs.items():
-        panels.setdefault(task, {})[algorithm] = own.rows()
+    for cell in cells:
+        panels.setdefault(cell.task, {})[cell.algorithm] = cell.rows
     plot_comparison(panels, path)
 
 
-def draw_maps(study: Comparison, runs: dict[tuple[str, str], Batches], path: Path) -> None:
+def draw_maps(cells: Sequence[Combination], path: Path) -> None:
     """Where virtual goals lie: a row for each task, q of each algorithm, and q* at the right."""
-    tasks = [task for task in study.tasks if any(task == own for own, _ in runs)]
-    names = [name for name in study.algorithms if any(name == own for _, own in runs)]
+    tasks = list(dict.fromkeys(cell.task for cell in cells))
+    names = list(dict.fromkeys(cell.algorithm for cell in cells))
+    found = {(cell.task, cell.algorithm): cell.goals for cell in cells}
     figure = Figure(figsize=(3 * (len(names) + 1), 3.1 * len(tasks)), layout="constrained")
     for line, task in zip(figure.subplots(len(tasks), len(names) + 1, squeeze=False), tasks, strict=True):
         env, target = make_env(task), None
         env.reset()
         for axes, name in zip(line, names, strict=False):
-            own = runs.get((task, name))
             axes.set_axis_off()
-            if own is not None and (goals := own.goal_map()) is not None:
+            if (goals := found.get((task, name))) is not None:
                 target = goals.target
                 axes.set_axis_on()
                 draw_goals(axes, goals.share, env, limit=float(target.max()))
@@ -126,46 +94,23 @@ def draw_maps(study: Comparison, runs: dict[tuple[str, str], Batches], path: Pat
     figure.savefig(path, dpi=80)
 
 
-def write_data(study: str, runs: dict[tuple[str, str], Batches]) -> None:
-    for (task, algorithm), own in runs.items():
-        rows = own.rows()
-        columns = [name for name in COLUMNS if name in rows[-1]]
-        stem = "_".join(dict.fromkeys((study, task, algorithm)))  # options have the study's name for the last
-        with open(HERE / "results" / f"{stem}.csv", "w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(columns)
-            for row in rows:
-                writer.writerow(f"{row.get(name, float('nan')):.5g}" for name in columns)
-
-
-def make_options(name: str, folder: Path) -> None:
-    """The same for a study of one option: one panel, a curve for each value."""
-    study = load_study(name)
-    runs = {(label, study.name): Batches(folder / label) for label, _ in study.cells()}
-    if all(own.is_done for own in runs.values()):
-        print(f"\n### {name}\n")
-        print_table(runs, "option | study")
-        shutil.copy(draw_study(study, folder), HERE / "images" / f"{name}.png")
-        write_data(name, runs)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("runs", type=Path, help="folder that the studies lie in")
-    folder = parser.parse_args().runs
-    for name, study in COMPARISONS.items():
-        runs = read_study(study, folder / name)
-        if runs:
+    parser.add_argument("runs", type=Path, nargs="?", help="folder with a folder of runs for each study")
+    parser.add_argument("--images", type=Path, default=HERE / "images", help="where the pictures go")
+    options = parser.parse_args()
+    if options.runs is not None:
+        export(options.runs)
+    for name in STUDIES:
+        if is_results(RESULTS / name):
+            cells = [cell for cell in read_results(RESULTS / name).cells if cell.done]
             print(f"\n### {name}\n")
-            print_table(runs)
-            draw_success(runs, HERE / "images" / f"{name}.png")
-            write_data(name, runs)
-            if study.goals:
-                draw_maps(study, runs, HERE / "images" / f"{name}_goals.png")
-    for name in OPTIONS:
-        make_options(name, folder / name)
+            print_table(cells)
+            draw_success(cells, options.images / f"{name}.png")
+            if name in MAPS and any(cell.goals is not None for cell in cells):
+                draw_maps(cells, options.images / f"{name}_goals.png")
 
 
 if __name__ == "__main__":

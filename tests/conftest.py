@@ -1,14 +1,18 @@
-"""What all tests share: one thread, which small tensors like best, a seed, and leaving nothing behind."""
+"""What all tests share: one thread, a seed, and leaving nothing behind."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
 import torch
 from torchrl.envs.utils import exploration_type
 
+# Small tensors are fastest in one thread, and the workers of pytest-xdist share the cores. The second line is
+# for the processes that tests start.
 torch.set_num_threads(1)
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 @pytest.fixture(autouse=True)

@@ -1,7 +1,7 @@
-"""A curriculum for an environment of somebody else's: gymnasium's mountain car fetches a parcel.
+"""A curriculum for an environment from elsewhere: gymnasium's mountain car fetches a parcel.
 
-Run it as ``python docs/examples/own_curriculum.py``; with ``--direct`` it goes without the first layer.
-The guide to it is ``docs/curriculum.md``.
+Run it with ``python docs/examples/own_curriculum.py``; ``--direct`` leaves out the first layer.
+``docs/curriculum.md`` explains it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from torchrl_her import (
     FusedDDPGLearner,
     GoalReward,
     HERWriter,
-    StackedLinear,
     StateToObs,
     Trainer,
     ZeroPad,
@@ -38,8 +37,9 @@ from torchrl_her import (
     make_ddpg_loss,
     make_target_updater,
     success,
-    zero_unused_inputs,
 )
+from torchrl_her.curriculum import zero_unused_inputs
+from torchrl_her.modules import StackedLinear
 
 STEPS = 75  # of an episode
 NAMES = {"car": [0, 1], "position": [0], "parcel": [2], "place": [3]}  # [position, speed | parcel | place]
@@ -52,7 +52,7 @@ DELIVER = CurriculumLayer(
 
 
 class FetchParcel(gymnasium.Wrapper):
-    """A parcel on the left slope is wanted on the right one; the car takes it along when it gets there."""
+    """The car picks up a parcel on the left slope and has to take it to a place on the right one."""
 
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
@@ -65,28 +65,28 @@ class FetchParcel(gymnasium.Wrapper):
         return self._state(car), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        for _ in range(2):  # steps of the car in one of ours, also behind its flag, where it would end
+        for _ in range(2):  # two steps of the car for one of ours; they ignore that it reached its flag
             car, _, _, _, info = self.env.step(action)
             state = self._state(car)
-        return state, 0.0, False, False, info  # StateToObs makes reward and ends, TimeLimit truncates
+        return state, 0.0, False, False, info  # StateToObs sets reward and terminated, TimeLimit truncated
 
     def _state(self, car: np.ndarray) -> np.ndarray:
-        position, speed = (car[0] + 0.3) / 0.9, car[1] / 0.07  # both within [-1, 1]
+        position, speed = (car[0] + 0.3) / 0.9, car[1] / 0.07  # both in [-1, 1]
         self.held = self.held or abs(position - self.parcel) < DRIVE.threshold
         self.parcel = position if self.held else self.parcel
         return np.array([position, speed, self.parcel, self.place], np.float32)
 
 
-def make_world() -> EnvBase:
-    """One environment; the time limit belongs around whatever steps it."""
+def make_single_env() -> EnvBase:
+    """One environment with its time limit."""
     car = gymnasium.make("MountainCarContinuous-v0").unwrapped
     return GymWrapper(gymnasium.wrappers.TimeLimit(FetchParcel(car), max_episode_steps=STEPS))
 
 
-def make_env(worlds: int, progress: CurriculumProgress, *, seed: int) -> EnvBase:
-    """``worlds`` for each run, run after run, as the layers of the runs see them."""
+def make_env(num_envs: int, progress: CurriculumProgress, *, seed: int) -> EnvBase:
+    """``num_envs`` environments for each run, one run after the other, each as its run's layer sees it."""
     layers = StateToObs(progress.curriculum, progress), ZeroPad(progress.curriculum, progress)
-    env = SerialEnv(worlds * progress.runs, make_world)
+    env = SerialEnv(num_envs * progress.runs, make_single_env)
     env = TransformedEnv(env, Compose(RenameTransform(["observation"], ["state"]), *layers))
     env.set_seed(seed)
     return env
@@ -95,7 +95,7 @@ def make_env(worlds: int, progress: CurriculumProgress, *, seed: int) -> EnvBase
 def make_network(
     make: Callable[..., TensorDictModule], curriculum: Curriculum, runs: int
 ) -> TensorDictModule:
-    """Of final width from the start; weights of inputs that the first layer does not use start at 0."""
+    """A network with all inputs; the weights of those that the first layer does not use start at 0."""
     network = make([curriculum.input_width], 1, runs=runs, in_keys=["input"])
     first = next(module for module in network.modules() if isinstance(module, StackedLinear))
     first.weight.data = zero_unused_inputs(first.weight.data, curriculum.first_inputs, alpha=0.0)
@@ -103,7 +103,7 @@ def make_network(
 
 
 def make_buffer(progress: CurriculumProgress, run: int, generator: torch.Generator) -> TensorDictReplayBuffer:
-    """The replay buffer of one run: relabels what is written, and makes the input of what is sampled."""
+    """The replay buffer of one run: it relabels when written to, and makes ``input`` when sampled."""
     reward = GoalReward(progress.layer_of(run).threshold)
     writer = HERWriter(reward, filter_achieved=True, exclude=("state", "input"))
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(300_000), writer=writer)
@@ -117,42 +117,42 @@ def train(
     *,
     epochs: int = 14,
     epoch_frames: int = 2_000,
-    worlds: int = 8,
+    num_envs: int = 8,
     runs: int = 1,
     window: int = 40,
     success_threshold: float = 0.9,
     seed: int = 0,
 ) -> Iterator[tuple[int, list[str], list[float]]]:
-    """Trains; yields after each epoch the frames, and the layer and the success of each run."""
+    """Trains, and yields after each epoch the frames so far, and the layer and the success of each run."""
     torch.manual_seed(seed)
     generators = [torch.Generator().manual_seed(seed + run) for run in range(runs)]
     curriculum = Curriculum(layers, 4, names=NAMES)
     progress = CurriculumProgress(curriculum, runs=runs, window=window, success_threshold=success_threshold)
-    env = make_env(worlds, progress, seed=seed)
-    eval_env = make_env(window, progress, seed=seed + 1_000_000)  # as many episodes as the window takes
+    env = make_env(num_envs, progress, seed=seed)
+    eval_env = make_env(window, progress, seed=seed + 1_000_000)  # as many episodes as the window holds
 
     actor, critic = (make_network(make, curriculum, runs) for make in (make_actor, make_critic))
     low, high = -torch.ones(1), torch.ones(1)
     exploration = DecayingEpsilon(low, high, decay=0.9, noise=0.15, generators=generators)
     policy = TensorDictSequential(actor, exploration)
     loss = make_ddpg_loss(actor, critic, action_penalty=0.03, reduction="none")
-    optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     target = make_target_updater(loss, tau=0.02, hard_interval=0)
     buffers = [make_buffer(progress, run, generator) for run, generator in enumerate(generators)]
     trainer = Trainer(
         collector=Collector(
             env,
             policy,
-            frames_per_batch=5 * runs * worlds,
+            frames_per_batch=5 * runs * num_envs,
             total_frames=-1,
             auto_register_policy_transforms=False,
         ),
         buffers=buffers,
-        learner=FusedDDPGLearner(loss, optimiser, target),
+        learner=FusedDDPGLearner(loss, optimizer, target),
         schedules=[exploration],
         epoch_frames=epoch_frames,
         frames_per_update=4.0,
-        warmup_frames=STEPS * worlds,  # an episode of each
+        warmup_frames=STEPS * num_envs,  # one episode of each environment
     )
     for _ in range(epochs):
         trainer.epoch()

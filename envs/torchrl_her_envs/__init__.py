@@ -1,60 +1,13 @@
-"""Throwing and reaching tasks with goals, batched, for TorchRL."""
+"""Throwing and reaching tasks with goals, toy environments and gymnasium's, batched, for TorchRL.
 
-from torchrl_her_envs.canvas import to_pixel
-from torchrl_her_envs.controllers import Controller, make_controller
-from torchrl_her_envs.effector import Effector
-from torchrl_her_envs.goal_env import GoalEnv, goal_env, reward_range
-from torchrl_her_envs.goals import BoxGoals, GoalDistribution, SectorGoals
-from torchrl_her_envs.gym_in import GymGoalEnv, make_gym_env
-from torchrl_her_envs.gym_registry import gym_id, register_tasks
-from torchrl_her_envs.hand import Hand
-from torchrl_her_envs.physics import BallPhysics
-from torchrl_her_envs.recording import base_env, record_episodes
-from torchrl_her_envs.registry import SMALL_WORLDS, get_task, make_env
-from torchrl_her_envs.rendering import render
-from torchrl_her_envs.robot import Arm
-from torchrl_her_envs.seeded_worlds import SeededWorlds
-from torchrl_her_envs.small_worlds import BitFlip, Chain, LatticeGoals, SmallWorld, TreasureHunt
-from torchrl_her_envs.task import TASKS, Task, WorldConfig
-from torchrl_her_envs.throwing import ThrowingEnv, WorldState
-from torchrl_her_envs.video import write_video
+Names are loaded when they are first used, since listing the tasks must not take the seconds in which
+torch is imported. They are listed in ``__init__.pyi``.
+"""
 
-__all__ = [
-    "SMALL_WORLDS",
-    "TASKS",
-    "Arm",
-    "BallPhysics",
-    "BitFlip",
-    "BoxGoals",
-    "Chain",
-    "Controller",
-    "Effector",
-    "GoalDistribution",
-    "GoalEnv",
-    "GymGoalEnv",
-    "Hand",
-    "LatticeGoals",
-    "SectorGoals",
-    "SeededWorlds",
-    "SmallWorld",
-    "Task",
-    "ThrowingEnv",
-    "TreasureHunt",
-    "WorldConfig",
-    "WorldState",
-    "base_env",
-    "get_task",
-    "goal_env",
-    "gym_id",
-    "make_controller",
-    "make_env",
-    "make_gym_env",
-    "record_episodes",
-    "register_tasks",
-    "render",
-    "reward_range",
-    "to_pixel",
-    "write_video",
-]
+import lazy_loader
 
-register_tasks()
+from torchrl_her_envs.gym.registration import register_gym_ids as _register_gym_ids
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+_register_gym_ids()  # gymnasium knows the throwing tasks from here on

@@ -1,72 +1,220 @@
-"""Environments by name."""
+"""All tasks by name. Importing this module loads no torch: only :func:`make_env` does, when it makes one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from difflib import SequenceMatcher
+from typing import TYPE_CHECKING, Any
 
-import torch
+from torchrl_her_envs.throwing.tasks import TASKS
 
-from torchrl_her_envs.small_worlds import BitFlip, Chain, SmallWorld, TreasureHunt
-from torchrl_her_envs.task import TASKS, Task, WorldConfig
-from torchrl_her_envs.throwing import ThrowingEnv
+if TYPE_CHECKING:  # loads torch
+    from torchrl.envs import EnvBase
 
-SMALL_WORLDS: dict[str, type[SmallWorld]] = {
-    "bit_flip": BitFlip,
-    "treasure_hunt": TreasureHunt,
-    "chain": Chain,
-}
-
-
-def get_task(name: str) -> Task:
-    """The task of a name.
-
-    Raises:
-        ValueError: there is none; the message lists those that there are.
-
-    Example:
-        >>> get_task("robot_v1").effector
-        'arm'
-    """
-    if name not in TASKS:
-        raise ValueError(f"unknown task {name!r}; the tasks are {', '.join(TASKS)}")
-    return TASKS[name]
+GYM = "gym:"  # before the id of an environment of gymnasium's
+_GYM_FAMILY = "gym"
+_ALIKE = 0.6  # the least similarity, from 0 to 1, at which another name is suggested
 
 
-def make_env(
-    name: str,
-    *,
-    num_envs: int = 1,
-    seed: int | Sequence[int] = 0,
-    world: WorldConfig | None = None,
-    num_links: int = 2,
-    threshold: float | None = None,
-    dtype: torch.dtype = torch.float32,
-) -> ThrowingEnv:
-    """Makes a batch of worlds of a task.
+@dataclass(frozen=True, kw_only=True)
+class TaskSpec:
+    """What is known of a task before its environment is made.
 
     Args:
-        name: one of :data:`~torchrl_her_envs.TASKS`.
-        num_envs: number of worlds.
-        seed: of all random starts and goals; R seeds for R equal blocks of worlds, each as if alone.
-        world: the constants of the world, to change them.
-        num_links: of the arm, for the robot's tasks.
-        threshold: how near to the goal is achieved, in shown coordinates; the task's if None.
-        dtype: of what the agent sees and does.
-
-    Raises:
-        ValueError: an unknown name, a number below 1, or a threshold that is not positive.
+        name: what :func:`make_env` calls it; without a colon.
+        summary: one line for people.
+        family: the tasks that it belongs to, such as ``"throwing"`` or ``"toy"``.
+        make: the function or class that makes the environment, as ``"module:name"``; it is imported when
+            it is first used. It takes ``num_envs``, ``seed``, the arguments and the options.
+        arguments: what it is always given, beyond the options.
+        options: all options that the task takes, with their defaults.
 
     Example:
-        >>> env = make_env("hand_v0", num_envs=2, seed=0)
-        >>> env.reset()["observation"].shape
-        torch.Size([2, 9])
+        >>> get_task_spec("bit_flip").options
+        {'bits': 15, 'useless_action': False, 'max_steps': None}
     """
-    return ThrowingEnv(
-        get_task(name),
-        num_envs=num_envs,
-        seed=seed,
-        world=world,
-        num_links=num_links,
-        threshold=threshold,
-        dtype=dtype,
+
+    name: str
+    summary: str
+    family: str
+    make: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+_SPECS: dict[str, TaskSpec] = {}
+
+
+def register_task(spec: TaskSpec) -> None:
+    """Adds a task, which :func:`make_env` makes from then on.
+
+    Args:
+        spec: its name, and how to make it.
+
+    Raises:
+        ValueError: the name is taken or has a colon, or ``make`` is not of the form ``"module:name"``.
+
+    Example:
+        >>> register_task(get_task_spec("chain"))
+        Traceback (most recent call last):
+        ValueError: the task 'chain' is registered already
+    """
+    if spec.name in _SPECS:
+        raise ValueError(f"the task {spec.name!r} is registered already")
+    if not spec.name or ":" in spec.name:
+        raise ValueError(f"a task's name must be some text without a colon, got {spec.name!r}")
+    module, _, function = spec.make.partition(":")
+    if not module or not function:
+        raise ValueError(f"make must be 'module:name', got {spec.make!r}")
+    _SPECS[spec.name] = spec
+
+
+def task_names() -> list[str]:
+    """The names of all tasks, in the order in which they were registered.
+
+    Example:
+        >>> task_names()[:2], task_names()[-1]
+        (['hand_reach', 'hand_v0'], 'chain')
+    """
+    return list(_SPECS)
+
+
+def get_task_spec(name: str) -> TaskSpec:
+    """What is known of a task.
+
+    Args:
+        name: one of :func:`task_names`, or ``gym:ID`` for an environment of gymnasium's.
+
+    Raises:
+        ValueError: there is no such task.
+
+    Example:
+        >>> get_task_spec("hand_v0").family, get_task_spec("gym:FetchReach-v4").family
+        ('throwing', 'gym')
+    """
+    check_task(name)
+    return _SPECS[name] if name in _SPECS else _gym_spec(name.removeprefix(GYM))
+
+
+def check_task(name: str) -> None:
+    """Raises a ValueError for a name that is no task's; it lists the tasks and suggests the nearest name.
+
+    Whether gymnasium knows the ID of ``gym:ID`` is only found out when the environment is made.
+
+    Example:
+        >>> check_task("gym:FetchReach-v4")
+        >>> check_task("hand_v9")
+        Traceback (most recent call last):
+        ValueError: unknown task 'hand_v9'; did you mean hand_v0? The tasks are ..., or gym:ID for one of
+        gymnasium's
+    """
+    if name in _SPECS or (name.startswith(GYM) and name != GYM):
+        return
+    likeness = {known: SequenceMatcher(None, name, known).ratio() for known in _SPECS}
+    nearest = max(_SPECS, key=likeness.__getitem__)
+    hint = f"did you mean {nearest}? The" if likeness[nearest] >= _ALIKE else "the"
+    raise ValueError(
+        f"unknown task {name!r}; {hint} tasks are {', '.join(_SPECS)}, or {GYM}ID for one of gymnasium's"
     )
+
+
+def make_env(name: str, *, num_envs: int = 1, seed: int | Sequence[int] = 0, **options: Any) -> EnvBase:
+    """Makes a batch of environments of a task.
+
+    Args:
+        name: one of :func:`task_names`, or ``gym:ID`` for an environment of gymnasium's.
+        num_envs: number of environments.
+        seed: of all that is random; R seeds for R equal blocks of environments, each as if alone.
+        options: of the task (see :class:`TaskSpec`), or for ``gym:ID`` those of
+            :func:`~torchrl_her_envs.make_gym_env`.
+
+    Raises:
+        ValueError: an unknown task, an option that it does not take, or a value out of its range.
+        ImportError: a package that the task needs is not installed.
+
+    Example:
+        >>> make_env("hand_v0", num_envs=2, seed=0).reset()["observation"].shape
+        torch.Size([2, 9])
+        >>> make_env("bit_flip", bits=4).reset()["observation"].shape
+        torch.Size([1, 4])
+    """
+    spec = get_task_spec(name)
+    if spec.family != _GYM_FAMILY:  # what those take depends on the environment, see make_gym_env
+        check_options(spec, options)
+    module, _, function = spec.make.partition(":")
+    maker = getattr(importlib.import_module(module), function)
+    return maker(num_envs=num_envs, seed=seed, **{**spec.options, **options, **spec.arguments})
+
+
+def check_options(spec: TaskSpec, options: Mapping[str, Any]) -> None:
+    """Raises a ValueError that names an option which a task does not take, and those that it takes.
+
+    Example:
+        >>> check_options(get_task_spec("treasure_hunt"), {"bits": 4})
+        Traceback (most recent call last):
+        ValueError: treasure_hunt takes no option 'bits'; its options are step, max_steps
+    """
+    for option in options:
+        if option not in spec.options:
+            allowed = f"its options are {', '.join(spec.options)}" if spec.options else "it has none"
+            raise ValueError(f"{spec.name} takes no option {option!r}; {allowed}")
+
+
+def _gym_spec(id: str) -> TaskSpec:
+    return TaskSpec(
+        name=GYM + id,
+        summary=f"gymnasium's {id}",
+        family=_GYM_FAMILY,
+        make="torchrl_her_envs.gym.from_gym:make_gym_env",
+        arguments={"id": id},
+        options={"max_steps": None, "parallel": False},
+    )
+
+
+# The tasks of this package.
+
+for _task in TASKS.values():
+    register_task(
+        TaskSpec(
+            name=_task.name,
+            summary=_task.summary,
+            family="throwing",
+            make="torchrl_her_envs.throwing.env:ThrowingEnv",
+            arguments={"task": _task},
+            options={"world": None, "num_links": 2, "threshold": None, "dtype": "float32"},
+        )
+    )
+
+for _spec in (
+    TaskSpec(
+        name="bit_flip",
+        summary="flip bits until they are the ones that are wanted",
+        family="toy",
+        make="torchrl_her_envs.toy.bit_flip:BitFlip",
+        options={"bits": 15, "useless_action": False, "max_steps": None},
+    ),
+    TaskSpec(
+        name="treasure_hunt",
+        summary="walk on a line from 0 to 100 to a treasure",
+        family="toy",
+        make="torchrl_her_envs.toy.treasure_hunt:TreasureHunt",
+        options={"step": 1, "max_steps": None},
+    ),
+    TaskSpec(
+        name="chain",
+        summary="walk a chain from its first place to its last",
+        family="toy",
+        make="torchrl_her_envs.toy.chain:Chain",
+        options={
+            "length": 10,
+            "forward_probability": 1.0,
+            "layers": 1,
+            "alternating": False,
+            "reset_state": False,
+            "max_steps": None,
+        },
+    ),
+):
+    register_task(_spec)

@@ -1,4 +1,4 @@
-"""What several of these files need: worlds put into a known state, and actions written as plain lists."""
+"""What several of these files need: environments put into a known state, and actions as plain lists."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _one_thread() -> None:
 
 @pytest.fixture
 def put() -> Put:
-    """``put(env, ball=[1.0, 2.0], held=True)`` writes over fields of all worlds; lengths are in metres.
+    """``put(env, ball=[1.0, 2.0], held=True)`` writes over fields of all environments; lengths are in meters.
 
     ``joints`` brings the grip along, as the effector would.
     """
@@ -39,9 +39,9 @@ def put() -> Put:
 
 @pytest.fixture
 def act() -> Act:
-    """``act(env, [1.0, 0.0, -1.0])`` takes one step with this action in all worlds, and returns ``next``.
+    """``act(env, [1.0, 0.0, -1.0])`` takes one step with this action everywhere, and returns ``next``.
 
-    With one action for each world, ``act(env, [...], [...])``, each takes its own.
+    With one action for each environment, ``act(env, [...], [...])``, each takes its own.
     """
 
     def step(env: ThrowingEnv, *actions: list[float]) -> TensorDictBase:

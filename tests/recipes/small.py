@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from torchrl_her_recipes import Recipe
+from torchrl_her_recipes import Recipe, make_recipe
 
 SMALL: dict[str, Any] = {
     "epochs": 2,
@@ -15,14 +15,14 @@ SMALL: dict[str, Any] = {
     "warmup_frames": 400,
     "batch_size": 32,
     "buffer_size": 20_000,
-    "eval_episodes": 4,
+    "episodes": 4,
     "checkpoint_interval": 1,
 }
 
 
 def small(**options: Any) -> Recipe:
     """A recipe that runs in about a second."""
-    return Recipe(**{**SMALL, **options})
+    return make_recipe(SMALL, **options)
 
 
 def overrides(**options: Any) -> list[str]:

@@ -1,0 +1,172 @@
+"""The base class of environments that are a batch of tensors: episodes, ends, rewards and resuming."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_her_envs.common.goal_env import TaskTraits
+from torchrl_her_envs.common.seeding import block_keys
+
+
+class BatchedEnv(TaskTraits, EnvBase):
+    """N environments whose state is a dataclass of tensors with N rows, and a random key for each of them.
+
+    Subclasses say how episodes start (:meth:`_start_episodes`), what an action does (:meth:`_advance`),
+    what the agent sees (:meth:`_show`) and when a goal is achieved (:meth:`compute_terminated`). All
+    random numbers come from the keys (see ``common.seeding``), so environment k
+    with a given seed does the same in every batch. The reward is 0 where the goal is achieved and -1
+    elsewhere; an achieved goal ends the episode.
+
+    Subclasses set ``max_steps`` and ``worlds``, then call :meth:`_make_specs` and
+    :meth:`set_seeds`.
+
+    Attributes:
+        worlds: the state of all environments, a dataclass of tensors with N rows. Two of them, [N] of
+            int64, are written here: ``step`` counts the steps of the episode, ``episode`` the resets.
+        max_steps: steps after which an episode is truncated.
+        dtype_shown: type of observations, goals and rewards.
+
+    Args:
+        num_envs: N, the number of environments.
+    """
+
+    worlds: Any
+    max_steps: int
+    dtype_shown: torch.dtype = torch.float32
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(device="cpu", batch_size=(num_envs,))
+
+    # What subclasses say
+
+    @abstractmethod
+    def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """Whether the goal is achieved, which ends an episode: [..., 1] of bool."""
+
+    @abstractmethod
+    def _start_episodes(self, which: Tensor) -> None:
+        """Draws the starts of new episodes in the given environments [M]; they are counted already."""
+
+    @abstractmethod
+    def _advance(self, action: Tensor) -> Tensor | None:
+        """Takes a step with checked actions; returns which episodes [N] it ends without success, if any."""
+
+    @abstractmethod
+    def _show(self) -> dict[str, Tensor]:
+        """What the agent sees: ``state``, ``observation``, ``achieved_goal`` and ``desired_goal``."""
+
+    @abstractmethod
+    def _check_action(self, action: Tensor) -> None:
+        """Raises a ValueError for actions that cannot be taken."""
+
+    def _is_achieved(self, shown: dict[str, Tensor]) -> Tensor:
+        """Whether each environment is at its goal: [N, 1] of bool."""
+        return self.compute_terminated(shown["achieved_goal"], shown["desired_goal"])
+
+    # What they get
+
+    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """The reward of having achieved one goal when another was desired.
+
+        Args:
+            achieved_goal: [..., g], as the agent sees it.
+            desired_goal: [..., g], broadcast against it.
+
+        Returns:
+            [..., 1]: 0 where the goal is achieved, -1 elsewhere.
+
+        Raises:
+            ValueError: goals of another width than g, where the task checks it.
+        """
+        return self.compute_terminated(achieved_goal, desired_goal).to(achieved_goal.dtype) - 1.0
+
+    def world_state_dict(self) -> dict[str, Tensor]:
+        """A copy of the whole state, row by row; loading it resumes exactly from here."""
+        state = {field.name: getattr(self.worlds, field.name).clone() for field in fields(self.worlds)}
+        return state | {"key": torch.from_numpy(self._keys.view(np.int64).copy())}
+
+    def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Puts the environments back to where :meth:`world_state_dict` was taken."""
+        entries = {field.name: state[field.name].clone() for field in fields(self.worlds)}
+        self.worlds = type(self.worlds)(**entries)
+        self._keys = state["key"].numpy().copy().view(np.uint64)
+
+    def set_seeds(self, seeds: Sequence[int]) -> None:
+        """Seeds R equal blocks of environments, each as if it were alone.
+
+        Args:
+            seeds: R of them.
+
+        Raises:
+            ValueError: the environments cannot be shared out among R blocks, or a seed is out of range.
+        """
+        self._keys = block_keys(seeds, self.batch_size[0])
+        self.worlds.episode.zero_()
+
+    # TorchRL's hooks
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.set_seeds([seed or 0])
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        which = torch.arange(self.batch_size[0]) if mask is None else mask.view(-1).nonzero().squeeze(-1)
+        self.worlds.episode[which] += 1
+        self.worlds.step[which] = 0
+        self._start_episodes(which)
+        shown = self._show()
+        off = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+        shown.update({"done": off, "terminated": off.clone(), "truncated": off.clone()})
+        # With the device that it has anyway: otherwise TorchRL copies every entry.
+        return TensorDict(shown, batch_size=self.batch_size, device=self.device)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action")
+        self._check_action(action)
+        self.worlds.step = self.worlds.step + 1
+        cut = self._advance(action)
+        shown = self._show()
+        terminated = self._is_achieved(shown)
+        truncated = (self.worlds.step >= self.max_steps).unsqueeze(-1)
+        if cut is not None:
+            truncated = truncated | cut.unsqueeze(-1)
+        shown["reward"] = terminated.to(self.dtype_shown) - 1.0
+        shown.update({"terminated": terminated, "truncated": truncated, "done": terminated | truncated})
+        return TensorDict(shown, batch_size=self.batch_size, device=self.device)
+
+    def _make_specs(
+        self, observed: int, goals: int, *, seen: Callable[[tuple[int, int]], TensorSpec], action: TensorSpec
+    ) -> None:
+        """Says what goes in and out.
+
+        Args:
+            observed: numbers in an observation.
+            goals: numbers in a goal.
+            seen: the spec of what the agent sees, from its shape.
+            action: the spec of actions.
+        """
+        (n,) = self.batch_size
+
+        def flag() -> Binary:
+            return Binary(n=1, shape=(n, 1), dtype=torch.bool)
+
+        self.observation_spec = Composite(
+            state=seen((n, observed + goals)),
+            observation=seen((n, observed)),
+            achieved_goal=seen((n, goals)),
+            desired_goal=seen((n, goals)),
+            shape=(n,),
+        )
+        self.action_spec = action
+        self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype_shown)
+        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))

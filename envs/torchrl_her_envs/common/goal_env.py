@@ -1,0 +1,234 @@
+"""What every environment with goals offers, whichever family it belongs to: throwing, toy or gymnasium's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, cast
+
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs import EnvBase
+
+Box = tuple[list[float], list[float]]  # the least and the greatest coordinates
+
+
+class GoalEnv(Protocol):
+    """N environments with goals in one batch, besides all that TorchRL's ``EnvBase`` has.
+
+    ``max_steps`` is the length of the longest episode. ``compute_reward`` and ``compute_terminated``
+    map achieved and desired goals [..., g] to [..., 1]. ``set_seeds`` takes R seeds for R equal blocks
+    of environments, and each block then does the same as if it were alone. The other members are those
+    of :class:`TaskTraits`, which gives all of them a default.
+    """
+
+    @property
+    def max_steps(self) -> int: ...
+
+    @property
+    def observation_spec(self) -> Composite: ...
+
+    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor: ...
+
+    def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor: ...
+
+    def set_seeds(self, seeds: Sequence[int]) -> None: ...
+
+    @property
+    def task_name(self) -> str: ...
+
+    @property
+    def goal_sigma(self) -> float: ...
+
+    @property
+    def starts_near_goals(self) -> bool: ...
+
+    @property
+    def can_render(self) -> bool: ...
+
+    def layers(self) -> list[dict[str, Any]]: ...
+
+    def goal_box(self) -> Box | None: ...
+
+    def regions(self) -> dict[str, Box]: ...
+
+    def trail_points(self) -> Tensor | None: ...
+
+    def render(
+        self,
+        worlds: int | Sequence[int] | None = None,
+        *,
+        size: int | None = None,
+        trail: Sequence[Tensor] = (),
+        caption: str = "",
+    ) -> Tensor: ...
+
+
+class TaskTraits:
+    """What an environment says about its task: a base class whose members are defaults to override."""
+
+    @property
+    def task_name(self) -> str:
+        """The name of the task, for messages."""
+        return type(self).__name__
+
+    @property
+    def goal_sigma(self) -> float:
+        """The final sigma of IBS, as a share of the width of the goals' box.
+
+        It says how far around the task's goals other goals are taken to be useful for learning them.
+        """
+        return 0.2
+
+    @property
+    def starts_near_goals(self) -> bool:
+        """Whether goals lie where episodes start.
+
+        Preferring virtual goals near the real ones, as IBS does, is then of no use: many of them are
+        achieved without doing anything.
+        """
+        return False
+
+    @property
+    def can_render(self) -> bool:
+        """Whether :meth:`render` gives pictures."""
+        return False
+
+    def layers(self) -> list[dict[str, Any]]:
+        """The layers of the task's curriculum, in the order of training; the last one is the full task.
+
+        Returns:
+            For each layer its ``name``; ``observation``, ``achieved_goal`` and ``desired_goal``, which are
+            lists of indices into the state; ``threshold``, how near to the goal is achieved; and
+            ``instructive``, whether IBS weights apply in it. The state is the observation with the desired
+            goal behind it.
+
+        Raises:
+            ValueError: the task has no curriculum.
+
+        Example:
+            >>> from torchrl_her_envs import make_env
+            >>> reach, throw = make_env("hand_v1").layers()
+            >>> reach["name"], reach["achieved_goal"], reach["desired_goal"]
+            ('reach', [0, 1], [5, 6])
+        """
+        raise ValueError(f"{self.task_name} has no curriculum: give its layers as curriculum=FILE.yaml")
+
+    def goal_box(self) -> Box | None:
+        """The least and greatest coordinates that achieved goals can have; None if the task does not say.
+
+        Example:
+            >>> from torchrl_her_envs import make_env
+            >>> make_env("hand_v1").goal_box(), make_env("chain").goal_box()
+            (([-1.0, -1.0], [1.0, 1.0]), None)
+        """
+        return None
+
+    def regions(self) -> dict[str, Box]:
+        """Boxes to draw over pictures, by name, in the coordinates that the agent sees.
+
+        Example:
+            >>> from torchrl_her_envs import make_env
+            >>> list(make_env("hand_v1").regions()), make_env("chain").regions()
+            (['goals', 'reach'], {})
+        """
+        return {}
+
+    def trail_points(self) -> Tensor | None:
+        """The present points [N, ...] of what leaves a trail in films; None if nothing does."""
+        return None
+
+    def render(
+        self,
+        worlds: int | Sequence[int] | None = None,
+        *,
+        size: int | None = None,
+        trail: Sequence[Tensor] = (),
+        caption: str = "",
+    ) -> Tensor:
+        """Draws environments as they are now.
+
+        Args:
+            worlds: an index, several, or None for all environments of the batch.
+            size: of the longer side of each picture in pixels; the environment's own choice if None.
+            trail: earlier values of :meth:`trail_points`, oldest first.
+            caption: a line of text in each picture.
+
+        Returns:
+            Pictures [len(worlds), height, width, 3] of uint8; without the first dimension for one index.
+
+        Raises:
+            ValueError: the environment gives no pictures.
+        """
+        raise ValueError(f"{self.task_name} gives no pictures")
+
+
+def goal_env(env: EnvBase) -> GoalEnv:
+    """The environment with goals below any transforms.
+
+    Raises:
+        TypeError: there is none.
+
+    Example:
+        >>> from torchrl.envs import StepCounter, TransformedEnv
+        >>> from torchrl_her_envs import make_env
+        >>> goal_env(TransformedEnv(make_env("hand_v1"), StepCounter())).max_steps
+        50
+    """
+    inner = first_below(env, _has_goals)
+    if inner is None:
+        raise TypeError(f"expected an environment with goals, got {type(env).__name__}")
+    return cast(GoalEnv, inner)
+
+
+def first_below(env: EnvBase, fits: Callable[[object], bool]) -> object | None:
+    """The environment, or the first one below its transforms, for which ``fits`` is true; or None.
+
+    Example:
+        >>> from torchrl.envs import StepCounter, TransformedEnv
+        >>> from torchrl_her_envs import BitFlip, make_env
+        >>> env = make_env("bit_flip")
+        >>> first_below(TransformedEnv(env, StepCounter()), lambda env: isinstance(env, BitFlip)) is env
+        True
+    """
+    inner: object | None = env
+    while inner is not None and not fits(inner):
+        inner = getattr(inner, "base_env", None)
+    return inner
+
+
+def choose_indices(count: int, worlds: int | Sequence[int] | None) -> list[int]:
+    """The indices of environments that are meant by what the user gave, checked.
+
+    Args:
+        count: number of environments in the batch.
+        worlds: an index, several, or None for all.
+
+    Raises:
+        ValueError: no index, or one that is out of range.
+
+    Example:
+        >>> choose_indices(3, None), choose_indices(3, 1)
+        ([0, 1, 2], [1])
+    """
+    if worlds is None:
+        return list(range(count))
+    chosen = [worlds] if isinstance(worlds, int) else list(worlds)
+    if not chosen or not all(0 <= world < count for world in chosen):
+        raise ValueError(f"worlds must be one or more indices from 0 to {count - 1}, got {worlds}")
+    return chosen
+
+
+def reward_range(env: GoalEnv) -> tuple[float, float]:
+    """The rewards of a missed and of an achieved goal; -1 and 0 unless the environment has others.
+
+    Example:
+        >>> from torchrl_her_envs import make_env
+        >>> reward_range(make_env("hand_v1"))
+        (-1.0, 0.0)
+    """
+    return getattr(env, "missed_reward", -1.0), getattr(env, "achieved_reward", 0.0)
+
+
+def _has_goals(env: object) -> bool:
+    """Whether the class itself has what makes a GoalEnv: TransformedEnv passes on attributes it lacks."""
+    return all(hasattr(type(env), name) for name in ("compute_reward", "compute_terminated", "set_seeds"))

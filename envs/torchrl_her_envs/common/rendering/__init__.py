@@ -1,0 +1,1 @@
+"""Films and windows of any environment that gives pictures."""

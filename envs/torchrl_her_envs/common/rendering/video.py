@@ -1,0 +1,110 @@
+"""Frames to files: GIF, and MP4 if the optional extra is there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+try:
+    import imageio.v2 as imageio_v2
+
+    imageio: Any = imageio_v2
+except ImportError:  # only MP4 needs it
+    imageio = None
+
+_COLORS = 255  # of a GIF: one place is left, with which unchanged pixels are made transparent
+_SAMPLES = 12  # frames that a GIF's colors are chosen from
+
+
+def write_video(frames: Sequence[Tensor], path: str | Path, *, fps: float = 25) -> Path:
+    """Writes frames to a file, as the suffix of its name says.
+
+    A GIF loops for ever and shares one palette. A run of equal frames in it is stored as one that
+    lasts longer, and its frames last a multiple of 0.01 s. An MP4 (H.264) needs
+    ``pip install ".[video]"``; a side of odd length grows by one pixel in it.
+
+    Args:
+        frames: pictures [height, width, 3] of uint8, all of one size.
+        path: file to write; ends in ``.gif`` or ``.mp4``. Missing folders are made.
+        fps: frames a second.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: no frames, frames of different shapes, ``fps`` not above 0, or another suffix.
+        ImportError: an MP4 without the extra.
+
+    Example:
+        >>> import tempfile
+        >>> frames = [torch.full((32, 32, 3), 50 * k, dtype=torch.uint8) for k in range(3)]
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_video(frames, Path(folder) / "gray.gif", fps=10).name
+        'gray.gif'
+    """
+    path, suffix = Path(path), Path(path).suffix.lower()
+    if suffix not in _WRITERS:
+        raise ValueError(f"cannot write {path.name!r}: its suffix must be one of {', '.join(_WRITERS)}")
+    shapes = {tuple(frame.shape) for frame in frames}
+    if len(shapes) != 1:
+        raise ValueError(
+            f"a video needs frames, all of one shape, got {len(frames)} of shapes {sorted(shapes)}"
+        )
+    if fps <= 0:
+        raise ValueError(f"fps must be above 0, got {fps}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _WRITERS[suffix](frames, path, fps)
+    return path
+
+
+def _write_gif(frames: Sequence[Tensor], path: Path, fps: float) -> None:
+    palette = _shared_palette(frames)
+    # Dithering would make still areas flicker, and the file large.
+    images = [_image(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    duration = max(20, 10 * round(100 / fps))  # milliseconds; many viewers slow down what is faster than 20
+    images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=True)
+
+
+def _write_mp4(frames: Sequence[Tensor], path: Path, fps: float) -> None:
+    try:
+        if imageio is None:
+            raise ImportError("no module named 'imageio'")
+        # Without a macro block size of 1 the plugin would stretch frames to multiples of 16.
+        writer = imageio.get_writer(
+            path, format="FFMPEG", fps=fps, codec="libx264", quality=8, macro_block_size=1
+        )
+    except ImportError as error:  # imageio, or its plugin, is missing
+        raise ImportError('writing an MP4 needs the extra "video": pip install ".[video]"') from error
+    with writer:
+        for frame in frames:
+            writer.append_data(_even(frame))
+
+
+_WRITERS = {".gif": _write_gif, ".mp4": _write_mp4}
+
+
+def _shared_palette(frames: Sequence[Tensor]) -> Image.Image:
+    """A palette for all frames, chosen from some that are evenly spread, the last one included."""
+    which = torch.linspace(0, len(frames) - 1, min(_SAMPLES, len(frames))).round().long().tolist()
+    sample = _image(torch.cat([frames[index] for index in which]))
+    counted = sample.getcolors(maxcolors=sample.width * sample.height) or []
+    # Each color counts with the root of its area: otherwise backgrounds take all, and balls turn gray.
+    weighted = [color for count, color in counted for _ in range(math.isqrt(count))]
+    return _image(torch.tensor([weighted], dtype=torch.uint8)).quantize(_COLORS, Image.Quantize.MEDIANCUT)
+
+
+def _image(frame: Tensor) -> Image.Image:
+    return Image.fromarray(frame.contiguous().numpy())
+
+
+def _even(frame: Tensor) -> np.ndarray:
+    """With even sides, as H.264 asks for, the last row and column repeated where needed."""
+    height, width, _ = frame.shape
+    return np.pad(frame.numpy(), ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -1,0 +1,1 @@
+"""From gymnasium to TorchRL, and back."""

@@ -1,0 +1,214 @@
+"""The throwing and reaching tasks as gymnasium environments."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_her_envs.throwing.env import ThrowingEnv
+from torchrl_her_envs.throwing.rendering.canvas import check_size
+from torchrl_her_envs.throwing.tasks import WorldConfig, get_task
+
+Observation = dict[str, Any]  # arrays
+
+KEYS = ("observation", "achieved_goal", "desired_goal")
+FPS = 25
+_NO_LIMIT = 1 << 60  # steps: gymnasium's TimeLimit truncates
+
+
+class GoalRules:
+    """The functions of goals that gymnasium's GoalEnv asks for, for one pair of goals or many."""
+
+    _env: ThrowingEnv
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
+        """The reward of having achieved one goal when another was desired.
+
+        Args:
+            achieved_goal: [..., 2].
+            desired_goal: [..., 2], broadcast against it.
+            info: not used.
+
+        Returns:
+            [...] of float: 0 where they are nearer than the task's threshold, -1 elsewhere.
+        """
+        return _plain(self._env.compute_reward(_tensor(achieved_goal), _tensor(desired_goal)))
+
+    def compute_terminated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
+        """Whether the goal is achieved, which ends an episode: [...] of bool."""
+        return _plain(self._env.compute_terminated(_tensor(achieved_goal), _tensor(desired_goal)))
+
+    def compute_truncated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
+        """Never, whatever the goals: the time limit alone cuts episodes off. [...] of bool."""
+        return np.zeros(np.shape(achieved_goal)[:-1], np.bool_)[()]
+
+
+class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
+    """One environment of a task.
+
+    Observations are a dict of ``observation``, ``achieved_goal`` and ``desired_goal`` (float32), actions
+    are in [-1, 1], the reward is 0 where the goal is achieved and -1 elsewhere: see
+    :class:`~torchrl_her_envs.ThrowingEnv`. ``info["is_success"]`` tells whether the goal is achieved,
+    which also ends the episode. The time limit is the one that ``gymnasium.make`` adds.
+
+    Args:
+        task: one of :data:`~torchrl_her_envs.TASKS`.
+
+    Keyword Args:
+        render_mode: ``"rgb_array"``, ``"human"`` (a window of matplotlib) or None.
+        size: side of a picture in pixels.
+        world: the constants of the physics; ``max_steps`` among them has no effect.
+        num_links: number of links of the arm, for the robot's tasks.
+        threshold: how near to the goal is achieved, in shown coordinates; the task's own if None.
+
+    Raises:
+        ValueError: an unknown task or render mode, a number below 1, or a threshold that is not positive.
+
+    Example:
+        >>> env = gymnasium.make("torchrl_her/HandThrow-v2")
+        >>> shown, _ = env.reset(seed=0)
+        >>> {key: value.shape for key, value in shown.items()}
+        {'observation': (9,), 'achieved_goal': (2,), 'desired_goal': (2,)}
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": FPS}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        render_mode: str | None = None,
+        size: int = 300,
+        world: WorldConfig | None = None,
+        num_links: int = 2,
+        threshold: float | None = None,
+    ) -> None:
+        check_pictures(render_mode, self.metadata["render_modes"], size)
+        self._env = make_batch(task, 1, _NO_LIMIT, world=world, num_links=num_links, threshold=threshold)
+        self.observation_space, self.action_space = spaces_of(self._env)
+        self.render_mode = render_mode
+        self._size = size
+        self._window: Any = None
+        self._seeded = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begins an episode.
+
+        Args:
+            seed: of this episode and the following ones; they go on from the last seed if None.
+            options: not used.
+        """
+        super().reset(seed=seed, options=options)
+        if seed is not None or not self._seeded:
+            self._env.set_seeds([as_seed(self.np_random_seed)])
+            self._seeded = True
+        shown = self._env.reset()
+        self._show()
+        return self._first(shown), {}
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One step of 0.04 s.
+
+        Raises:
+            ValueError: an action that is not finite.
+        """
+        taken = TensorDict({"action": _tensor(action).float().unsqueeze(0)}, batch_size=[1])
+        after = self._env.step(taken)["next"]
+        self._show()
+        terminated = bool(after["terminated"])
+        return self._first(after), float(after["reward"]), terminated, False, {"is_success": terminated}
+
+    def render(self) -> np.ndarray | None:
+        """A picture [size, size, 3] of uint8; None where a window shows it, or without a render mode."""
+        return self._picture() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Closes the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _first(self, shown: TensorDictBase) -> Observation:
+        return {key: shown[key][0].numpy() for key in KEYS}
+
+    def _picture(self) -> np.ndarray:
+        return self._env.render(0, size=self._size).numpy()
+
+    def _show(self) -> None:
+        """Shows the present picture in the window, if one was asked for."""
+        if self.render_mode != "human":
+            return
+        if self._window is None:
+            from torchrl_her_envs.common.rendering.window import (  # noqa: PLC0415  (matplotlib's windows load slowly)
+                Window,
+            )
+
+            self._window = Window(self._env.task.summary, fps=1 / self._env.world.time_step)
+        self._window.show(self._picture())
+
+
+def make_batch(
+    task: str, num_envs: int, max_steps: int, *, world: WorldConfig | None = None, **options: Any
+) -> ThrowingEnv:
+    """A batch of environments whose episodes have a given length."""
+    return ThrowingEnv(
+        get_task(task),
+        num_envs=num_envs,
+        world=replace(world or WorldConfig(), max_steps=max_steps),
+        **options,
+    )
+
+
+def check_pictures(mode: str | None, modes: list[str], size: int) -> None:
+    """Raises a ValueError for a render mode that there is not, or a size that is too small."""
+    check_size(size)
+    if mode is not None and mode not in modes:
+        raise ValueError(f"render_mode must be one of {', '.join(modes)}, or None, got {mode!r}")
+
+
+def as_seed(seed: int | None) -> int:
+    """A seed of gymnasium's, which may be any number, as one of ours, which is below 2**64.
+
+    Example:
+        >>> as_seed(7), as_seed((1 << 64) + 7)
+        (7, 7)
+    """
+    return (seed or 0) % (1 << 64)
+
+
+def spaces_of(env: ThrowingEnv) -> tuple[spaces.Dict, spaces.Box]:
+    """The spaces of observations and actions of a single environment."""
+    limit = _largest(env)
+    shown: dict[str, spaces.Space] = {
+        key: spaces.Box(-limit, limit, env.observation_spec[key].shape[1:], np.float32) for key in KEYS
+    }
+    return spaces.Dict(shown), spaces.Box(-1.0, 1.0, env.action_spec.shape[1:], np.float32)
+
+
+def _largest(env: ThrowingEnv) -> float:
+    """A bound on all numbers that are shown: positions are about [-1, 1], but falling balls are fast."""
+    world, effector = env.world, env.effector
+    fastest = 2**0.5 * world.hand_speed
+    if env.task.effector == "arm":  # each joint turns all links behind it
+        fastest = world.joint_speed * world.arm_length * (effector.num_joints + 1) / 2
+    falling = (fastest**2 + 2 * world.gravity * world.size) ** 0.5
+    places = max(abs(2 * side - 1) for side in (0.0, 1.0, *effector.reach))
+    return 1.01 * max(places, falling / world.hand_speed)
+
+
+def _tensor(values: Any) -> Tensor:
+    return torch.tensor(np.asarray(values))  # a copy: torch warns of arrays that must not be written
+
+
+def _plain(values: Tensor) -> Any:
+    """[..., 1] as an array [...], or as a number if that is all there is."""
+    return values.squeeze(-1).numpy()[()]

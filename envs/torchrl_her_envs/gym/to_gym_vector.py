@@ -1,0 +1,187 @@
+"""Many environments of a task as one of gymnasium's vectors, on our own batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_her_envs.gym.to_gym import (
+    FPS,
+    KEYS,
+    GoalRules,
+    Observation,
+    as_seed,
+    check_pictures,
+    make_batch,
+    spaces_of,
+)
+from torchrl_her_envs.throwing.tasks import WorldConfig
+
+_OUTCOME = ("reward", "terminated", "truncated")
+
+Step = tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
+
+
+class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
+    """N environments of a task that share one physics space.
+
+    Environment k does what a single ``GymTask`` (in :mod:`~torchrl_her_envs.gym.to_gym`) with seed
+    ``seed + k`` does.
+
+    Args:
+        task: one of :data:`~torchrl_her_envs.TASKS`.
+
+    Keyword Args:
+        num_envs: N, the number of environments.
+        max_episode_steps: steps after which an episode is truncated.
+        autoreset_mode: when an environment whose episode is over begins a new one: in place of its next step
+            (``NEXT_STEP``), at once (``SAME_STEP``; how the episode ended is in ``info["final_obs"]`` and
+            ``info["final_info"]``), or by ``reset(options={"reset_mask": ...})`` (``DISABLED``).
+        render_mode: ``"rgb_array"`` or None.
+        size: side of a picture in pixels.
+        options: ``world``, ``num_links`` and ``threshold``, as for ``GymTask``.
+
+    Raises:
+        ValueError: an unknown task or mode, a number below 1, or a threshold that is not positive.
+
+    Example:
+        >>> import gymnasium
+        >>> env = gymnasium.make_vec("torchrl_her/RobotReach-v0", num_envs=4)
+        >>> shown, _ = env.reset(seed=0)
+        >>> shown["observation"].shape
+        (4, 11)
+        >>> env.step(env.action_space.sample())[1].shape
+        (4,)
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        num_envs: int = 1,
+        max_episode_steps: int = WorldConfig.max_steps,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        size: int = 300,
+        **options: Any,
+    ) -> None:
+        check_pictures(render_mode, self.metadata["render_modes"], size)
+        self._env = make_batch(task, num_envs, max_episode_steps, **options)
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = spaces_of(self._env)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
+        self.render_mode = render_mode
+        self._size = size
+        self._over = np.zeros(num_envs, np.bool_)  # whose episode is over
+        self._shown: TensorDictBase | None = None  # by the last step or reset
+        self._seeded = False
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begins episodes.
+
+        Args:
+            seed: of the first environment (each further one has one more), or one for each environment.
+            options: ``{"reset_mask": [N] of bool}`` resets those environments alone.
+
+        Raises:
+            ValueError: a seed that is out of range, seeds for only some of the environments, or a mask that
+                chooses none.
+        """
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs)), np.bool_)
+        if mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(
+                f"reset_mask must choose some of {self.num_envs} environments, got {mask.tolist()}"
+            )
+        if seed is not None and not mask.all():
+            raise ValueError("seed and reset_mask must not be given together")
+        if seed is not None or not self._seeded:
+            self._set_seeds(seed)
+        return _arrays(self._begin(mask)), {}
+
+    def step(self, actions: np.ndarray) -> Step:
+        """One step of 0.04 s in all environments.
+
+        Raises:
+            ResetNeeded: an environment must be reset first.
+            ValueError: an action that is not finite.
+        """
+        before = self._over
+        if not self._seeded or (self.autoreset_mode is AutoresetMode.DISABLED and before.any()):
+            raise ResetNeeded("reset must be called before step, for each environment whose episode is over")
+        taken = torch.tensor(np.asarray(actions, np.float32))
+        after = self._env.step(TensorDict({"action": taken}, batch_size=[self.num_envs]))["next"]
+        self._shown = after
+        reward, terminated, truncated = (after[key].squeeze(-1).numpy() for key in _OUTCOME)
+        info = {"is_success": terminated, "_is_success": np.ones_like(terminated)}
+        self._over = terminated | truncated
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any():
+            after = self._begin(before)
+            for entry in (reward, terminated, truncated, info["_is_success"]):
+                entry[before] = 0
+        elif self.autoreset_mode is AutoresetMode.SAME_STEP and self._over.any():
+            info = _ended(_arrays(after), terminated, self._over)
+            after = self._begin(self._over)
+        return _arrays(after), reward, terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A picture [size, size, 3] of uint8 for each environment; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return tuple(self._env.render(None, size=self._size).numpy())
+
+    def _set_seeds(self, seed: int | Sequence[int] | None) -> None:
+        if seed is None or isinstance(seed, int | np.integer):
+            super().reset(seed=None if seed is None else int(seed))
+            first = as_seed(self.np_random_seed)
+            seeds: Sequence[int] = [as_seed(first + k) for k in range(self.num_envs)]
+        else:
+            seeds = [int(own) for own in seed]
+            if len(seeds) != self.num_envs:
+                raise ValueError(
+                    f"{len(seeds)} seeds for {self.num_envs} environments: give one, or one for each"
+                )
+        self._env.set_seeds(seeds)
+        self._seeded = True
+
+    def _begin(self, mask: np.ndarray) -> TensorDictBase:
+        """Begins new episodes in some environments, and gives what all of them show."""
+        self._over = self._over & ~mask
+        if self._shown is None or mask.all():
+            self._shown = self._env.reset()
+        else:  # TorchRL writes into what it is given, and that was handed out
+            chosen = torch.from_numpy(mask).unsqueeze(-1)
+            self._shown = self._env.reset(self._shown.select(*KEYS).clone().set("_reset", chosen))
+        return self._shown
+
+
+def _arrays(shown: TensorDictBase) -> Observation:
+    return {key: shown[key].numpy() for key in KEYS}
+
+
+def _ended(shown: Observation, terminated: np.ndarray, over: np.ndarray) -> dict[str, Any]:
+    """The info about episodes that are over, as gymnasium's own vectors give it."""
+    final = np.full(len(over), None, object)
+    for index in over.nonzero()[0]:
+        final[index] = {key: values[index] for key, values in shown.items()}
+    return {
+        "is_success": np.zeros_like(over),
+        "_is_success": ~over,
+        "final_obs": final,
+        "_final_obs": over,
+        "final_info": {"is_success": terminated, "_is_success": over},
+        "_final_info": over,
+    }

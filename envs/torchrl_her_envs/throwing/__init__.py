@@ -1,0 +1,1 @@
+"""The throwing and reaching tasks."""

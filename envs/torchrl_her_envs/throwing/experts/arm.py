@@ -1,0 +1,98 @@
+"""What a scripted controller knows of the arm: how to turn to a point, and how to throw."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchrl_her_envs.throwing.arm import Arm
+from torchrl_her_envs.throwing.effector import Effector
+from torchrl_her_envs.throwing.experts.ballistics import LONGEST_FLIGHT, fly, quickest
+from torchrl_her_envs.throwing.experts.clearance import clears_ceiling, is_free
+from torchrl_her_envs.throwing.experts.inverse_kinematics import nearest_turn, turn
+from torchrl_her_envs.throwing.tasks import WorldConfig
+
+_SPEEDS = 9  # of each joint, from full speed one way to full speed the other way
+_LONGEST_SWING = 16  # steps, in which a joint turns by up to 147 degrees
+_READY = (math.radians(120.0), 0.0)  # stretched up and back: from around here all goals can be thrown at
+
+
+class ArmSkill:
+    """The part of a controller of an arm of two links. See :class:`~.controller.Skill`.
+
+    Args:
+        world: the constants of the world.
+        num_links: of the arm.
+
+    Raises:
+        ValueError: the arm has not two links.
+    """
+
+    def __init__(self, world: WorldConfig, *, num_links: int = 2) -> None:
+        if num_links != 2:
+            raise ValueError(f"a controller can only solve an arm of 2 links, got num_links={num_links}")
+        self.effector: Effector = Arm(world, num_links=num_links)
+        self._world = world
+        self._base = torch.tensor(world.arm_base) * world.size
+
+    def joints(self, state: Tensor) -> Tensor:
+        return torch.atan2(state[:, 2:4], state[:, 0:2])
+
+    def reach(self, joints: Tensor, target: Tensor) -> Tensor:
+        return nearest_turn(joints, target, self._base, self._world.arm_length) / self._world.time_step
+
+    def throw(self, joints: Tensor, goal: Tensor, *, within: float) -> Tensor:
+        return arm_throw(joints, goal, self.effector, self._world, within=within)
+
+
+def arm_throw(joints: Tensor, goal: Tensor, arm: Effector, world: WorldConfig, *, within: float) -> Tensor:
+    """The next velocity of the joints of an arm that swings a ball at the goal, or gets ready to.
+
+    A throw is: turn each joint at a constant speed (one of a grid) for some steps, let go, fly. The
+    quickest is taken; where none works from here, the arm turns to where all goals can be thrown at. No
+    plan is kept: one step later the same throw is still there, a step shorter.
+
+    Args:
+        joints: [B, 2], the angles in radians.
+        goal: [B, 2], in meters.
+        arm: tells where its end is, and its speed.
+        world: the constants of the world.
+        within: how far beside the goal, in meters, the ball may come.
+
+    Returns:
+        [B, 2] in radians a second; more than the arm's speed where it has to turn farther than one step.
+
+    Example:
+        >>> world, joints, goal = WorldConfig(), torch.tensor([[1.6, 0.0]]), torch.tensor([[5.0, 4.0]])
+        >>> arm_throw(joints, goal, Arm(world), world, within=0.2)  # over the top, clockwise
+        tensor([[-4., -3.]])
+    """
+    speeds, launch, velocity = _swings(joints, arm, world)
+    flight = _steps_to_column(goal[:, None, None, 0] - launch[..., 0], velocity[..., 0], world)
+    points = fly(launch.unsqueeze(-2), velocity.unsqueeze(-2), flight * world.substeps, world)
+    hits = (points - goal[:, None, None, None]).square().sum(-1) < within**2  # [B, speeds, steps, 2]
+    clear = is_free(launch, world, wall=False) & clears_ceiling(launch, velocity, world)
+    works = hits & is_free(points, world, wall=False) & clear.unsqueeze(-1)
+    swing, *_ = quickest(torch.arange(1.0, _LONGEST_SWING + 1).unsqueeze(-1) + flight, works)
+    ready = turn(joints, torch.tensor(_READY)) / world.time_step
+    return torch.where(works.flatten(1).any(1, keepdim=True), speeds[swing], ready)
+
+
+def _swings(joints: Tensor, arm: Effector, world: WorldConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Constant speeds of the joints [speeds, 2], and where the ball is after 1, 2, ... steps at each of them.
+
+    That is its position and its velocity, each [B, speeds, steps, 2].
+    """
+    line = torch.linspace(-arm.action_speed, arm.action_speed, _SPEEDS)
+    speeds = torch.cartesian_prod(*[line] * arm.num_joints)
+    time = torch.arange(_LONGEST_SWING + 1) * world.time_step
+    path = arm.grip(joints[:, None, None] + speeds[:, None] * time[:, None])
+    return speeds, path[:, :, 1:], path.diff(dim=2) / world.time_step
+
+
+def _steps_to_column(gap: Tensor, speed: Tensor, world: WorldConfig) -> Tensor:
+    """The two numbers [..., 2] of whole steps between which a ball passes a horizontal gap in meters."""
+    steps = (gap / (speed.clamp(min=1e-3) * world.time_step)).floor()  # a ball that goes left never does
+    return torch.stack((steps, steps + 1), -1).clamp(1, LONGEST_FLIGHT)

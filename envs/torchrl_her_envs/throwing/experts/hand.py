@@ -1,0 +1,104 @@
+"""What a scripted controller knows of the hand: how to go to a point, and how to throw."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchrl_her_envs.throwing.effector import Effector
+from torchrl_her_envs.throwing.experts.ballistics import LONGEST_FLIGHT, quickest, throw_velocity
+from torchrl_her_envs.throwing.experts.clearance import clears_ceiling, clears_wall
+from torchrl_her_envs.throwing.hand import Hand
+from torchrl_her_envs.throwing.tasks import WorldConfig
+
+_PLACES = (11, 10)  # columns and rows of places to throw from; columns count for goals close behind the wall
+
+
+class HandSkill:
+    """The hand's part of a controller. See :class:`~.controller.Skill`.
+
+    Args:
+        world: the constants of the world.
+        wall: whether there is a wall to throw over.
+    """
+
+    def __init__(self, world: WorldConfig, *, wall: bool) -> None:
+        self.effector: Effector = Hand(world, wall=wall)
+        self._world, self._wall = world, wall
+
+    def joints(self, state: Tensor) -> Tensor:
+        return (state[:, :2] + 1.0) * (self._world.size / 2.0)
+
+    def reach(self, joints: Tensor, target: Tensor) -> Tensor:
+        return (target - joints) / self._world.time_step
+
+    def throw(self, joints: Tensor, goal: Tensor, *, within: float) -> Tensor:
+        return hand_throw(joints, goal, self.effector, self._world, wall=self._wall, within=within)
+
+
+def hand_throw(
+    grip: Tensor, goal: Tensor, hand: Effector, world: WorldConfig, *, wall: bool, within: float
+) -> Tensor:
+    """The next velocity of a hand that carries a ball to where it can be thrown, or throws it.
+
+    A throw is: move to a place (one of a grid, or just here), swing for one step with the velocity of
+    :func:`~.ballistics.throw_velocity`, let go, fly. The quickest is taken. No plan is
+    kept: one step later the same throw is still there, a step shorter.
+
+    Args:
+        grip: [B, 2], where hand and ball are, in meters.
+        goal: [B, 2], in meters.
+        hand: tells its reach and its speed.
+        world: the constants of the world.
+        wall: whether there is one.
+        within: how far beside the goal, in meters, the ball may come.
+
+    Returns:
+        [B, 2] in meters a second; more than the hand's speed where the place is farther than one step.
+        Where no throw works it means nothing.
+
+    Example:
+        >>> world, grip, goal = WorldConfig(), torch.tensor([[2.0, 3.0]]), torch.tensor([[4.0, 2.5]])
+        >>> hand_throw(grip, goal, Hand(world, wall=False), world, wall=False, within=0.2)  # at once, flatly
+        tensor([[ 7.1429, -0.8000]])
+    """
+    places = torch.cat((grip.unsqueeze(1), _grid(hand, world).expand(len(grip), -1, -1)), 1)
+    start, target = places[:, :, None, None], _aims(goal, world, within=within)[:, None, :, None]
+    steps = torch.arange(1.0, LONGEST_FLIGHT + 1)
+    velocity = throw_velocity(start, target, steps, world)  # [B, places, aims, steps, 2]
+    works = _can_throw(start, velocity, hand, world, wall=wall)
+    travel = _steps_to(places - grip.unsqueeze(1), hand.action_speed * world.time_step)
+    place, aim, flight = quickest(travel[:, :, None, None] + steps, works)
+    row = torch.arange(len(grip))
+    arrived = travel[row, place].unsqueeze(-1) == 0
+    go = (places[row, place] - grip) / world.time_step
+    return torch.where(arrived, velocity[row, place, aim, flight], go)
+
+
+def _grid(hand: Effector, world: WorldConfig) -> Tensor:
+    """Places [places, 2] all over the box that the hand reaches."""
+    left, bottom, right, top = (side * world.size for side in hand.reach)
+    columns, rows = _PLACES
+    return torch.cartesian_prod(torch.linspace(left, right, columns), torch.linspace(bottom, top, rows))
+
+
+def _aims(goal: Tensor, world: WorldConfig, *, within: float) -> Tensor:
+    """Points [B, 2, 2] to throw at: the goal's middle and, for goals close behind the wall, its far edge."""
+    aims = goal.unsqueeze(1) + torch.tensor([[0.0, 0.0], [within, 0.0]])
+    return aims.clamp(max=(1.0 - world.ball_radius) * world.size)
+
+
+def _steps_to(gap: Tensor, stride: float) -> Tensor:
+    """Steps that a hand needs for a way [..., 2], if it moves by up to a stride in each direction."""
+    return (gap.abs().amax(-1) / stride - 1e-3).ceil()  # rounding: a thousandth of a stride away is there
+
+
+def _can_throw(start: Tensor, velocity: Tensor, hand: Effector, world: WorldConfig, *, wall: bool) -> Tensor:
+    """Whether a swing of one step stays within the hand's speed and reach, and the flight touches nothing."""
+    launch = start + velocity * world.time_step
+    x, y = launch.unbind(-1)
+    left, bottom, right, top = (side * world.size for side in hand.reach)
+    works = (velocity.abs() <= hand.action_speed).all(-1)
+    works &= (x >= left) & (x <= right) & (y >= bottom) & (y <= top)
+    works &= clears_ceiling(launch, velocity, world)
+    return works & clears_wall(launch, velocity, world) if wall else works

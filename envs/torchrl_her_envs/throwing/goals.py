@@ -1,0 +1,109 @@
+"""Distributions that the goals of a task are drawn from."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+
+class GoalDistribution(Protocol):
+    """A distribution of points with a bounding box, all in one coordinate system.
+
+    ``low`` and ``high`` are the corners of the (smallest) box around it, ``is_box`` tells whether
+    the distribution is uniform over that box, ``from_uniform`` maps [..., 2] numbers in [0, 1) to
+    points, ``sample`` draws [n, 2] points, and ``scaled`` is the same distribution in coordinates
+    ``factor * x + shift``.
+    """
+
+    low: Tensor
+    high: Tensor
+    is_box: bool
+
+    def from_uniform(self, u: Tensor) -> Tensor: ...
+
+    def sample(self, n: int, *, generator: torch.Generator | None = None) -> Tensor: ...
+
+    def scaled(self, factor: float, shift: float) -> GoalDistribution: ...
+
+
+class _Sampled:
+    def from_uniform(self, u: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def sample(self, n: int, *, generator: torch.Generator | None = None) -> Tensor:
+        """Draws [n, 2] points (float64)."""
+        return self.from_uniform(torch.rand(n, 2, dtype=torch.float64, generator=generator))
+
+
+class BoxGoals(_Sampled):
+    """Uniform over an axis-aligned box.
+
+    Args:
+        low: left and bottom.
+        high: right and top; equal to ``low`` in a direction that has no extent.
+
+    Raises:
+        ValueError: ``high`` is below ``low``.
+
+    Example:
+        >>> goals = BoxGoals((0.0, 0.0), (1.0, 2.0))
+        >>> goals.from_uniform(torch.tensor([0.5, 0.5]))
+        tensor([0.5000, 1.0000], dtype=torch.float64)
+    """
+
+    is_box = True
+
+    def __init__(self, low: tuple[float, float], high: tuple[float, float]) -> None:
+        self.low = torch.tensor(low, dtype=torch.float64)
+        self.high = torch.tensor(high, dtype=torch.float64)
+        if (self.high < self.low).any():
+            raise ValueError(f"a box needs low <= high, got low={low}, high={high}")
+
+    def from_uniform(self, u: Tensor) -> Tensor:
+        return self.low + u * (self.high - self.low)
+
+    def scaled(self, factor: float, shift: float) -> BoxGoals:
+        low, high = (self.low * factor + shift).tolist(), (self.high * factor + shift).tolist()
+        return BoxGoals((low[0], low[1]), (high[0], high[1]))
+
+
+class SectorGoals(_Sampled):
+    """Angle and radius each uniform over a range, around a center (the robot's ball).
+
+    Args:
+        center: the point that angles are seen from.
+        angle: range in degrees, counter-clockwise from the x axis.
+        radius: range.
+    """
+
+    is_box = False
+
+    def __init__(
+        self, center: tuple[float, float], *, angle: tuple[float, float], radius: tuple[float, float]
+    ) -> None:
+        self.center = torch.tensor(center, dtype=torch.float64)
+        self.angle = angle
+        self.radius = radius
+        # A sector touches its box at its corners, or straight left, right, above or below the center.
+        straight = [90.0 * k for k in range(math.ceil(angle[0] / 90.0), math.floor(angle[1] / 90.0) + 1)]
+        touching = torch.tensor(list(product((*angle, *straight), radius)), dtype=torch.float64)
+        edge = self._point(touching[:, :1], touching[:, 1:])
+        self.low, self.high = edge.amin(0), edge.amax(0)
+
+    def from_uniform(self, u: Tensor) -> Tensor:
+        angle = self.angle[0] + u[..., :1] * (self.angle[1] - self.angle[0])
+        return self._point(angle, self.radius[0] + u[..., 1:] * (self.radius[1] - self.radius[0]))
+
+    def _point(self, angle: Tensor, radius: Tensor) -> Tensor:
+        turn = torch.deg2rad(angle)
+        return self.center + radius * torch.cat((turn.cos(), turn.sin()), -1)
+
+    def scaled(self, factor: float, shift: float) -> SectorGoals:
+        x, y = (self.center * factor + shift).tolist()
+        return SectorGoals(
+            (x, y), angle=self.angle, radius=(self.radius[0] * factor, self.radius[1] * factor)
+        )

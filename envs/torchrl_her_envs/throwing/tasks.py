@@ -1,0 +1,173 @@
+"""What a throwing or reaching task is, the constants of its physics, and the table of the eleven tasks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+EffectorName = Literal["hand", "arm"]
+Start = Literal["held", "away", "mixed"]
+
+_POSITIVE = (
+    "size",
+    "pixels",
+    "ball_mass",
+    "time_step",
+    "substeps",
+    "max_steps",
+    "hand_speed",
+    "joint_speed",
+    "ball_radius",
+    "hole_radius",
+    "wall_thickness",
+    "arm_pixels",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldConfig:
+    """The constants of the world, in SI units unless a comment says otherwise.
+
+    "screen" is a fraction of the side of the square screen, with (0, 0) at the bottom left.
+    Positions are shown to the agent as ``2 * screen - 1``, so from -1 to 1, and speeds as a
+    fraction of ``hand_speed`` (or ``joint_speed``).
+
+    Raises:
+        ValueError: a length, speed, mass or number that is not positive.
+
+    Example:
+        >>> world = WorldConfig()
+        >>> world.size, round(world.arm_length, 6)
+        (6.0, 2.0)
+        >>> world.shown(world.hole_radius)  # a length, in the coordinates that the agent sees
+        0.1
+    """
+
+    size: float = 6.0  # side of the square screen
+    pixels: int = 900  # ... and in pixels, which the thesis gives lengths in
+    gravity: float = 10.0  # thesis, appendix A
+    bounce: float = 0.7  # share of the normal speed that a bounce keeps: thesis, appendix A
+    friction: float = 0.1  # kinetic: thesis, appendix A
+    ball_mass: float = 3.0  # thesis, appendix A; only ratios of masses would matter
+    time_step: float = 0.04  # 25 actions a second
+    substeps: int = 4  # a ball at 12 m/s moves 0.12 m a substep, less than its radius
+    max_steps: int = 50  # an episode is 2 s
+    hand_speed: float = 8.0  # at most, in each direction: enough to throw across the screen
+    joint_speed: float = 4.0  # rad/s, at most
+    ball_radius: float = 0.03  # screen; also how near a hand must be to catch or to have reached
+    hole_radius: float = 0.05  # screen; how near to the goal a ball must be
+    hand_goals: tuple[float, float, float, float] = (0.55, 0.2, 0.95, 0.8)  # screen: left, bottom, right, top
+    arm_goals: tuple[float, float, float, float] = (0.72, 0.2, 0.95, 0.8)  # beyond the arm's reach
+    wall_x: float = 0.5  # screen
+    wall_height: float = 0.5  # screen
+    wall_thickness: float = 0.02  # screen
+    arm_base: tuple[float, float] = (0.33, 0.5)  # screen: thesis, appendix A
+    arm_pixels: float = 300.0  # total length: thesis, appendix A
+    arm_start: tuple[float, float] = (180.0, 360.0)  # degrees, each joint: thesis, appendix A
+    arm_ball_angle: tuple[float, float] = (75.0, 105.0)  # degrees: thesis, appendix A
+    arm_ball_radius: tuple[float, float] = (0.75, 1.0)  # share of the arm's length: thesis, appendix A
+
+    def __post_init__(self) -> None:
+        for name in _POSITIVE:
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+    @property
+    def arm_length(self) -> float:
+        """Total length of the arm in meters."""
+        return self.arm_pixels * self.size / self.pixels
+
+    @staticmethod
+    def shown(length: float) -> float:
+        """A length given as a fraction of the screen, in the coordinates that the agent sees."""
+        return 2.0 * length
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One task: who moves, where the ball starts, whether there is a wall, what the goal is.
+
+    Args:
+        name: the name that ``make_env`` takes.
+        effector: ``"hand"`` (moves freely in the left half) or ``"arm"``.
+        start: the ball is ``"held"`` from the first step, ``"away"`` (on the floor, or in the air
+            for the arm), or ``"mixed"``: held in half of the episodes.
+        throws: the goal is a black hole for the ball; otherwise it is the ball, for the effector.
+        wall: whether a wall stands in the middle.
+        goal_sigma: how far around a goal others teach it, as a share of the screen: the final sigma of IBS.
+        summary: one line for people.
+
+    Raises:
+        ValueError: an unknown effector or start.
+    """
+
+    name: str
+    effector: EffectorName
+    start: Start = "away"
+    throws: bool = True
+    wall: bool = False
+    goal_sigma: float = 0.2
+    summary: str = ""
+
+    def __post_init__(self) -> None:
+        for name, known in (("effector", get_args(EffectorName)), ("start", get_args(Start))):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+
+
+TASKS: dict[str, Task] = {
+    task.name: task
+    for task in (
+        Task(
+            name="hand_reach", effector="hand", throws=False, summary="bring the hand to a ball on the floor"
+        ),
+        Task(name="hand_v0", effector="hand", start="held", summary="throw a held ball into the black hole"),
+        Task(name="hand_v1", effector="hand", summary="pick the ball up from the floor and throw it"),
+        Task(name="hand_v2", effector="hand", start="mixed", summary="as v0 or v1, at even odds"),
+        Task(
+            name="hand_wall_v0",
+            effector="hand",
+            start="held",
+            wall=True,
+            goal_sigma=0.1,  # the wall leaves less around a goal that can be reached
+            summary="throw a held ball over a wall",
+        ),
+        Task(
+            name="hand_wall_v1",
+            effector="hand",
+            wall=True,
+            summary="pick the ball up and throw it over a wall",
+        ),
+        Task(
+            name="hand_wall_v2",
+            effector="hand",
+            start="mixed",
+            wall=True,
+            summary="as v0 or v1, at even odds",
+        ),
+        Task(
+            name="robot_reach",
+            effector="arm",
+            throws=False,
+            summary="bring the arm's end to a ball in the air",
+        ),
+        Task(name="robot_v0", effector="arm", start="held", summary="throw a held ball into the black hole"),
+        Task(name="robot_v1", effector="arm", summary="catch the ball in the air and throw it"),
+        Task(name="robot_v2", effector="arm", start="mixed", summary="as v0 or v1, at even odds"),
+    )
+}
+
+
+def get_task(name: str) -> Task:
+    """The throwing or reaching task of a name.
+
+    Raises:
+        ValueError: there is none; the message lists those that there are.
+
+    Example:
+        >>> get_task("robot_v1").effector
+        'arm'
+    """
+    if name not in TASKS:
+        raise ValueError(f"unknown task {name!r}; the tasks are {', '.join(TASKS)}")
+    return TASKS[name]

@@ -1,0 +1,1 @@
+"""Toy environments: bit flipping, treasure hunt, chain."""

@@ -1,0 +1,5 @@
+"""The command line. Commands and their arguments are checked before torch is imported."""
+
+from torchrl_her_recipes.cli.group import main
+
+__all__ = ["main"]

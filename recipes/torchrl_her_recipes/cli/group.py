@@ -1,0 +1,92 @@
+"""``torchrl-her``: the group of commands, and how each of them ends."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+
+import click
+
+from torchrl_her_recipes.cli.listing import listing
+from torchrl_her_recipes.cli.play import export, play
+from torchrl_her_recipes.cli.plot import plot
+from torchrl_her_recipes.cli.say import BAD_INPUT, BAD_INPUT_ERRORS, INTERRUPTED, fail, one_line, say_warning
+from torchrl_her_recipes.cli.study import report, study
+from torchrl_her_recipes.cli.train import train
+from torchrl_her_recipes.config.imports import import_modules
+from torchrl_her_recipes.config.options import what_there_is
+from torchrl_her_recipes.config.versions import own_version
+
+_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
+
+
+class _Commands(click.Group):
+    """Names the nearest command where there is none of the given name."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if self.get_command(ctx, args[0]) is None and not args[0].startswith("-"):
+            known = self.list_commands(ctx)
+            raise click.UsageError(f"unknown command {args[0]!r}{what_there_is(args[0], known, 'commands')}")
+        return super().resolve_command(ctx, args)
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)  # in the order in which people use them, not alphabetically
+
+
+def _import(context: click.Context, _parameter: click.Parameter, modules: tuple[str, ...]) -> None:
+    try:
+        import_modules(modules)
+    except ValueError:
+        if not context.resilient_parsing:  # a mistake must not end the completion of a command
+            raise
+
+
+@click.group(cls=_Commands, context_settings=_SETTINGS, invoke_without_command=True)
+@click.version_option(own_version(), prog_name="torchrl-her")
+@click.option(
+    "--import",
+    metavar="MODULE",
+    multiple=True,
+    expose_value=False,
+    callback=_import,
+    help="import a module of your own first: what it registers can be named; may be repeated",
+)
+@click.pass_context
+def group(context: click.Context) -> None:
+    """Train, compare and show policies that learn from sparse rewards with hindsight.
+
+    Shell completion: eval "$(_TORCHRL_HER_COMPLETE=bash_source torchrl-her)" (or zsh_source, fish_source).
+    """
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
+        context.exit(BAD_INPUT)
+
+
+for _command in (train, play, export, plot, study, report, listing):
+    group.add_command(_command)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns the exit code: 0, 2 for bad input, 130 for Ctrl-C."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # read by torchrl when it is imported
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)  # it warns of missing CUDA
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = say_warning
+            code = group.main(arguments, prog_name="torchrl-her", standalone_mode=False)
+            return code if isinstance(code, int) else 0
+    except click.exceptions.Exit as error:
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("torchrl-her: interrupted", err=True)
+        return INTERRUPTED
+    except click.ClickException as error:
+        return fail(error.format_message().rstrip("."))
+    except BAD_INPUT_ERRORS as error:
+        return fail(one_line(error))

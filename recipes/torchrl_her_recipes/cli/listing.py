@@ -1,0 +1,32 @@
+"""``torchrl-her list``: all names that the other commands take."""
+
+from __future__ import annotations
+
+import click
+
+from torchrl_her_envs.registry import GYM, get_task_spec, task_names
+from torchrl_her_recipes.config.algorithms import ALGORITHMS
+from torchrl_her_recipes.config.learners import LEARNERS
+from torchrl_her_recipes.config.shipped import policy_facts, preset_names, preset_summary
+from torchrl_her_recipes.config.study import load_study, study_names
+
+
+@click.command("list", short_help="tasks, algorithms, learners, studies, trained policies and presets")
+def listing() -> int:
+    """List what there is."""
+    sections = {
+        "tasks": {name: get_task_spec(name).summary for name in task_names()}
+        | {f"{GYM}ID": "any gymnasium environment with goals, by its id"},
+        "algorithms": {name: algorithm.summary for name, algorithm in ALGORITHMS.items()},
+        "learners": {name: spec.summary for name, spec in LEARNERS.items()},
+        "studies": {name: load_study(name).summary for name in study_names()},
+        "trained policies": {
+            name: f"{facts['success']:.0%} success" for name, facts in policy_facts().items()
+        },
+        "presets": {name: preset_summary(name) for name in preset_names()},
+    }
+    for title, entries in sections.items():
+        click.echo(f"{title}:")
+        for name, summary in entries.items():
+            click.echo(f"  {name:<20} {summary}")
+    return 0

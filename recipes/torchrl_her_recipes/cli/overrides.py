@@ -1,0 +1,141 @@
+"""``NAME=VALUE`` arguments of the command line: values as in YAML, and sweeps over several of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import product
+from typing import Any
+
+import yaml
+
+from torchrl_her_envs.registry import task_names
+from torchrl_her_recipes.config.algorithms import ALGORITHMS
+from torchrl_her_recipes.config.learners import LEARNERS
+from torchrl_her_recipes.config.shipped import preset_names
+from torchrl_her_recipes.config.shortcuts import GROUPS, locate
+
+_OPENING, _CLOSING = "[{(", "]})"
+
+
+def parse_override(text: str, also: Sequence[str] = ()) -> tuple[str, str]:
+    """The name and the text of the value of one argument; the name is checked.
+
+    Args:
+        text: ``NAME=VALUE``.
+        also: names besides those of options.
+
+    Raises:
+        ValueError: it has no ``=``, or no option has this name.
+
+    Example:
+        >>> parse_override("seed=3")
+        ('seed', '3')
+    """
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise ValueError(f"an option is written NAME=VALUE, got {text!r}{_meant(text)}")
+    if any(not part for part in split_sweep(value)):
+        raise ValueError(f"{name} needs a value, got {text!r}")
+    if name not in also:
+        _path(name, value)
+    return name, value
+
+
+def _path(name: str, value: str) -> tuple[str, ...]:
+    """The place of an option: group, name, and the entry of a mapping."""
+    if name in GROUPS and value.startswith("{"):  # a whole group
+        return (name,)
+    head = name.split(".", 2)
+    return (*locate(".".join(head[:2])), *head[2:])
+
+
+def check_once(arguments: Sequence[tuple[str, str]], also: Sequence[str] = ()) -> None:
+    """Refuses two values for one option, of which one would be ignored.
+
+    Args:
+        arguments: names and texts of values, as :func:`parse_override` gives them.
+        also: names besides those of options.
+
+    Raises:
+        ValueError: an option is given twice.
+
+    Example:
+        >>> check_once([("seed", "1"), ("run.seed", "2")])
+        Traceback (most recent call last):
+        ValueError: seed=1 and run.seed=2 set the same option: give one of them
+    """
+    before: list[tuple[tuple[str, ...], str]] = []
+    for name, value in arguments:
+        path = (name,) if name in also else _path(name, value)
+        for other, text in before:
+            shared = min(len(path), len(other))
+            if path[:shared] == other[:shared]:
+                raise ValueError(f"{text} and {name}={value} set the same option: give one of them")
+        before.append((path, f"{name}={value}"))
+
+
+def _meant(text: str) -> str:
+    """A hint for the name of a task or the like that lacks ``task=``; empty if there is none."""
+    for name, known in (
+        ("task", task_names()),
+        ("algo", ALGORITHMS),
+        ("learner", LEARNERS),
+        ("preset", preset_names()),
+    ):
+        if text in known:
+            return f"; did you mean {name}={text}?"
+    return ""
+
+
+def parse_value(text: str) -> Any:
+    """A value as YAML reads it; None is written ``null``, or as in Python.
+
+    Raises:
+        ValueError: it is not YAML.
+
+    Example:
+        >>> parse_value("3"), parse_value("{bits: 8}"), parse_value("gym:FetchReach-v4")
+        (3, {'bits': 8}, 'gym:FetchReach-v4')
+    """
+    if text == "None":
+        return None
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        why = getattr(error, "problem", None) or error
+        raise ValueError(f"{text} cannot be read as a value of YAML: {' '.join(str(why).split())}") from error
+
+
+def split_sweep(text: str) -> list[str]:
+    """The values of a sweep, which are separated by commas outside of brackets and quotes.
+
+    Example:
+        >>> split_sweep("her,filtered_her"), split_sweep("{bits: 8, useless_action: true}")
+        (['her', 'filtered_her'], ['{bits: 8, useless_action: true}'])
+    """
+    parts, depth, quote = [""], 0, ""
+    for letter in text:
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "'\"":
+            quote = letter
+        depth += (letter in _OPENING) - (letter in _CLOSING) if not quote else 0
+        if letter == "," and not depth and not quote:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
+
+
+def sweep(arguments: Sequence[tuple[str, str]]) -> Iterator[dict[str, Any]]:
+    """All combinations of the values of a sweep, the last option varying fastest.
+
+    Example:
+        >>> list(sweep([("algo", "her,cher"), ("seed", "0,1")]))[1]
+        {'algo': 'her', 'seed': 1}
+    """
+    names = [name for name, _ in arguments]
+    kept = ("preset",)  # a name, even if it reads as something else in YAML
+    for values in product(*(split_sweep(text) for _, text in arguments)):
+        pairs = zip(names, values, strict=True)
+        yield {name: value if name in kept else parse_value(value) for name, value in pairs}

@@ -1,0 +1,98 @@
+"""``torchrl-her study`` and ``report``: whole comparisons, and pages about them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from click.shell_completion import CompletionItem
+
+import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
+from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail
+from torchrl_her_recipes.config.study import load_study, study_names
+
+if TYPE_CHECKING:
+    from torchrl_her_recipes.studies.plan import Plan
+    from torchrl_her_recipes.studies.study import StudyResult
+
+_FOLDER = click.Path(path_type=Path)
+
+
+def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    names = [CompletionItem(name) for name in study_names() if name.startswith(incomplete)]
+    return [*names, CompletionItem(incomplete, type="file")]
+
+
+@click.command(short_help="run a whole comparison on all cores and draw its figure")
+@click.argument("name", shell_complete=_complete)
+@click.option("--seeds", type=click.IntRange(1), help="runs of each combination")
+@click.option("--frames", type=click.IntRange(1), help="environment steps of each run")
+@click.option("--quick", is_flag=True, help="a size that ends in minutes")
+@click.option("--folder", type=_FOLDER, help="where it goes (default: runs/NAME)")
+@click.option("--plan", is_flag=True, help="only say what is to do, and how long it takes")
+@click.option("--jobs", type=click.IntRange(1), help="batched runs at once (default: one for each core)")
+@click.option("--ray", metavar="ADDRESS", help="over a Ray cluster: auto, or HOST:PORT")
+def study(
+    name: str,
+    seeds: int | None,
+    frames: int | None,
+    quick: bool,
+    folder: Path | None,
+    plan: bool,
+    jobs: int | None,
+    ray: str | None,
+) -> int:
+    """Run the study NAME: one of torchrl-her list, or a .yaml file. The same command goes on with it."""
+    if jobs is not None and ray is not None:
+        raise click.UsageError("--jobs and --ray cannot be given together")
+    own = load_study(name, seeds=seeds, frames=frames, quick=quick)
+    list(own.cells())  # each combination is checked before torch is imported
+    home = folder or Path("runs") / (own.name + ("_quick" if quick else ""))
+    to_do = recipes.plan_study(own, home)
+    workers: Any = recipes.make_workers(jobs=jobs, ray=ray)
+    _say_plan(own.name, home, to_do, workers.at_once)
+    if plan:
+        workers.close()
+        return 0
+    return _say_study(recipes.run_study(own, home, workers=workers))
+
+
+def _say_plan(name: str, folder: Path, plan: Plan, at_once: int) -> None:
+    to_go = plan.to_go
+    steps = f"{plan.steps_to_go(to_go):,} environment steps in all"
+    click.echo(f"{name}: {len(to_go)} batched runs to go, {steps}: {folder}")
+    click.echo("\n".join(plan.table()))
+    if to_go:
+        together = min(at_once, len(to_go))
+        click.echo(f"about {recipes.duration(plan.wall_clock(to_go, at_once))}, {together} at once")
+
+
+def _say_study(result: StudyResult) -> int:
+    for label, reason in result.failed.items():
+        fail(f"{label} failed: {reason}")
+    if result.figure is not None:
+        click.echo(result.figure)
+        return 0
+    click.echo("interrupted: " * result.interrupted + "the same command goes on with it")
+    return INTERRUPTED if result.interrupted else FAILED
+
+
+@click.command(short_help="a page about a study: figures, intervals, the thesis's numbers beside ours")
+@click.argument("name", shell_complete=_complete)
+@click.option("--folder", type=_FOLDER, help="where its runs are (default: runs/NAME)")
+@click.option("--out", type=_FOLDER, help="where the page goes (default: FOLDER/report)")
+@click.option(
+    "--export", "tidy", type=_FOLDER, help="also write the numbers of all runs as tidy files into a folder"
+)
+def report(name: str, folder: Path | None, out: Path | None, tidy: Path | None) -> int:
+    """Write a page about what there is of the study NAME; trains nothing."""
+    own = load_study(name)
+    home = folder or Path("runs") / own.name
+    if not home.is_dir():
+        raise ValueError(f"there is no folder {home}; `torchrl-her study {own.name}` makes its runs")
+    if tidy is not None:
+        recipes.write_results(own, home, tidy)
+        click.echo(tidy)
+    click.echo(recipes.write_report(own, home, out or home / "report"))
+    return 0

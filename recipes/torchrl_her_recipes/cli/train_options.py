@@ -1,0 +1,126 @@
+"""The arguments of ``torchrl-her train``: their help and completion, and the runs they ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import click
+from click.shell_completion import CompletionItem
+
+from torchrl_her_envs.registry import task_names
+from torchrl_her_recipes.cli.overrides import check_once, parse_override, parse_value, split_sweep, sweep
+from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
+from torchrl_her_recipes.config.learners import LEARNERS, options_of
+from torchrl_her_recipes.config.options import default_of
+from torchrl_her_recipes.config.recipe import Recipe, make_recipe
+from torchrl_her_recipes.config.shipped import load_preset, preset_names
+from torchrl_her_recipes.config.shortcuts import GROUPS, option_names
+
+_ALSO = ("preset", "folder")  # arguments besides the options of a recipe
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """A run that was asked for, and its folder."""
+
+    recipe: Recipe
+    folder: Path
+
+
+def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest]:
+    """The runs that arguments ask for.
+
+    Args:
+        options: the arguments, ``NAME=VALUE`` each.
+        multirun: whether a comma separates the values of a sweep.
+
+    Raises:
+        ValueError: a mistake in an argument.
+    """
+    pairs = [parse_override(text, _ALSO) for text in options]
+    check_once(pairs, _ALSO)
+    given = dict(pairs)
+    folder = given.pop("folder", None)
+    now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
+    if not multirun:
+        recipe = _recipe({name: _single(name, text) for name, text in given.items()})
+        yield RunRequest(recipe, Path(folder or f"runs/{now}_{_label(recipe)}"))
+        return
+    root = Path(folder or f"runs/sweep_{now}")
+    for number, values in enumerate(sweep(list(given.items()))):
+        recipe = _recipe(values)
+        yield RunRequest(recipe, root / f"{_label(recipe)}_{number}")
+
+
+def _single(name: str, text: str) -> Any:
+    """The value of an option of a single run."""
+    if len(split_sweep(text)) > 1:
+        raise ValueError(f"{name} must be one value, got {text}; several are a sweep: torchrl-her train -m")
+    return text if name in _ALSO else parse_value(text)
+
+
+def _recipe(values: Mapping[str, Any]) -> Recipe:
+    own = dict(values)
+    preset = own.pop("preset", None)
+    return make_recipe(load_preset(preset) if preset else None, **own)
+
+
+def _label(recipe: Recipe) -> str:
+    """The name of a run's folder; its letters are allowed on every file system."""
+    task = recipe.task.name.replace("/", "_").replace(":", "_")
+    return f"{task}_{recipe.hindsight.algo}_s{recipe.run.seed}"
+
+
+class OptionsCommand(click.Command):
+    """A command whose help lists the options of a recipe, group by group."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        presets = f"start from the values of a preset: {', '.join(preset_names())}, or a YAML file"
+        folder = "where the run goes (default: a folder of its own in runs/)"
+        with formatter.section("Besides options"):
+            formatter.write_dl([("preset=NAME", presets), ("folder=DIR", folder)])
+        for group, kind in GROUPS.items():
+            kind = options_of("ddpg") if group == "learner" else kind
+            rows = [
+                (_written(group, own.name, default_of(own)), own.metadata["help"]) for own in fields(kind)
+            ]
+            doc = (GROUPS[group].__doc__ or "").splitlines()[0].rstrip(".")
+            with formatter.section(f"{group}: {doc[0].lower()}{doc[1:]}"):
+                formatter.write_dl(rows)
+
+
+def _written(group: str, name: str, default: Any) -> str:
+    """How an option is given on the command line, with its default."""
+    key = group if name == "name" else name
+    shown = str(default).lower() if isinstance(default, bool) else default
+    return key if default is None else f"{key}={shown}"
+
+
+def complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Completes the names of options, short or with their group, and values that are names."""
+    options = option_names()
+    name, equals, begun = incomplete.partition("=")
+    if equals:
+        return [CompletionItem(f"{name}={own}") for own in _values().get(name, []) if own.startswith(begun)]
+    known = [own for names in options.values() for own in names if own != "name"]
+    names = ["task", "algo", "learner", "curriculum", *_ALSO, *known]
+    if "." in name:
+        names = [f"{group}.{own}" for group, own_names in options.items() for own in own_names]
+    return [CompletionItem(f"{own}=") for own in dict.fromkeys(names) if own.startswith(name)]
+
+
+def _values() -> dict[str, list[str]]:
+    """The values of options that are names or one of a few choices."""
+    kinds = [options_of("ddpg") if group == "learner" else kind for group, kind in GROUPS.items()]
+    choices = {own.name: list(own.metadata["choices"]) for kind in kinds for own in fields(kind)}
+    return choices | {
+        "task": task_names(),
+        "algo": list(ALGORITHMS),
+        "learner": ["auto", *LEARNERS],
+        "preset": preset_names(),
+        "strategy": list(STRATEGIES),
+    }

@@ -1,0 +1,1 @@
+"""The components of a run, made from a recipe."""

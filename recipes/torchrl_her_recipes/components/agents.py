@@ -1,0 +1,116 @@
+"""The agent of a recipe, made by the builder of its learner."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+
+import torch
+from tensordict.nn import TensorDictSequential
+from torch import nn
+from torchrl.data import Categorical
+from torchrl.envs import EnvBase
+
+from torchrl_her.curriculum.layers import Curriculum, zero_unused_inputs
+from torchrl_her.modules.networks import StackedLinear, stack_runs
+from torchrl_her.objectives.targets import make_target_updater
+from torchrl_her_recipes.components.learner import Agent, LearnerBuilder, Networks
+from torchrl_her_recipes.config.learners import AUTO, LEARNERS, Actions, LearnerSpec
+from torchrl_her_recipes.config.options import default_of
+from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.values import load_name
+
+
+def make_agent(
+    recipe: Recipe,
+    env: EnvBase,
+    generators: Sequence[torch.Generator],
+    *,
+    rewards: tuple[float, float] = (-1.0, 0.0),
+    curriculum: Curriculum | None = None,
+) -> Agent:
+    """The agent that a recipe asks for.
+
+    Args:
+        recipe: of the run, or of several.
+        env: tells the widths of observations and actions.
+        generators: of the exploration of each run.
+        rewards: of a missed goal and of an achieved one.
+        curriculum: whose layers the networks see, or None.
+
+    Raises:
+        ValueError: the learner cannot choose such actions, or cannot train several runs.
+    """
+    builder = _builder(recipe, env, curriculum)
+    actor, critic = make_networks(recipe, env, curriculum=curriculum)
+    exploration, options = builder.exploration(generators), recipe.learner
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(recipe.run.seed)  # second critics are drawn anew
+        loss = builder.loss(actor, critic, rewards)
+    return Agent(
+        actor=actor,
+        critic=critic,
+        exploration=exploration,
+        policy=TensorDictSequential(actor, exploration),
+        loss=loss,
+        optimizer=torch.optim.Adam(loss.parameters(), lr=options.learning_rate, fused=True),
+        target=make_target_updater(loss, tau=options.tau, hard_interval=options.hard_update_interval),
+    )
+
+
+def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:
+    """The learner of a recipe; "auto" is DDPG where actions are continuous, and DQN where they are discrete.
+
+    Raises:
+        ValueError: it cannot choose such actions, cannot train several runs, or an option has no effect
+            with it.
+    """
+    actions: Actions = "discrete" if isinstance(env.action_spec, Categorical) else "continuous"
+    name = AUTO[actions] if recipe.learner.name == "auto" else recipe.learner.name
+    spec = LEARNERS[name]
+    if spec.actions != actions:
+        fitting = " or ".join(each.name for each in LEARNERS.values() if each.actions == actions)
+        raise ValueError(
+            f"learner={name} must not be used on {recipe.task.name}, which has {actions} actions: "
+            f"choose {fitting}"
+        )
+    if not spec.stacks and recipe.run.num_runs > 1:
+        raise ValueError(
+            f"num_runs must be 1 with learner={name}, which cannot train several runs side by side, "
+            f"got {recipe.run.num_runs}; sweep over seeds instead"
+        )
+    known = {own.name for own in fields(spec.options)}
+    for own in fields(recipe.learner):  # "auto" has the options of DDPG
+        value = getattr(recipe.learner, own.name)
+        if own.name not in known and value != default_of(own):
+            hint = f" or write learner={name}" if recipe.learner.name == "auto" else ""
+            raise ValueError(f"{own.name}={value} has no effect with learner={name}: leave it out{hint}")
+    return spec
+
+
+def make_networks(recipe: Recipe, env: EnvBase, *, curriculum: Curriculum | None = None) -> Networks:
+    """The actor and the critic; the weights of each run depend on its own seed alone."""
+    builder = _builder(recipe, env, curriculum)
+    with torch.random.fork_rng(devices=[]):
+        alone = []
+        for seed in recipe.seeds:
+            torch.manual_seed(seed)
+            alone.append(builder.networks(1))
+        networks = builder.networks(recipe.run.num_runs)
+    for network, own in zip(networks, zip(*alone, strict=True), strict=True):
+        network.load_state_dict(stack_runs([single.state_dict() for single in own]))
+    if curriculum is not None:
+        alphas = recipe.curriculum.alpha_actor, recipe.curriculum.alpha_critic
+        for network, alpha in zip(networks, alphas, strict=True):
+            weight = _first_layer(network).weight.data
+            weight.copy_(zero_unused_inputs(weight, curriculum.first_inputs, alpha=alpha))
+    return networks
+
+
+def _builder(recipe: Recipe, env: EnvBase, curriculum: Curriculum | None) -> LearnerBuilder:
+    in_keys = ("observation", "desired_goal") if curriculum is None else ("input",)
+    return load_name(find_learner(recipe, env).builder)(recipe, env, in_keys)
+
+
+def _first_layer(network: nn.Module) -> StackedLinear:
+    return next(module for module in network.modules() if isinstance(module, StackedLinear))

@@ -1,0 +1,69 @@
+"""Makes the components that a recipe asks for."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+
+from torchrl_her_envs.common.goal_env import goal_env, reward_range
+from torchrl_her_recipes.components.agents import make_agent
+from torchrl_her_recipes.components.buffers import make_buffer
+from torchrl_her_recipes.components.components import Components
+from torchrl_her_recipes.components.curricula import (
+    in_layers,
+    make_curriculum,
+    make_curriculum_state,
+    make_played_env,
+)
+from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.goal_space import goal_space
+from torchrl_her_recipes.config.recipe import Recipe
+
+# Evaluation has seeds of its own, far from those of training.
+_EVAL_SEED = 1 << 32
+
+
+def build(recipe: Recipe) -> Components:
+    """Makes the components that a recipe asks for."""
+    task = make_task_envs(recipe, recipe.collection.num_envs, recipe.seeds)
+    curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
+    state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
+    env = task if state is None else in_layers(task, state.progress)
+    generators = [torch.Generator().manual_seed(seed) for seed in recipe.seeds]
+    # A curriculum gives the rewards of its layers, whatever the environment's own are.
+    rewards = reward_range(goal_env(task)) if curriculum is None else (-1.0, 0.0)
+    agent = make_agent(recipe, env, generators, rewards=rewards, curriculum=curriculum)
+    return Components(
+        recipe=recipe,
+        env=env,
+        eval_env=make_played_env(recipe, recipe.evaluation.episodes, eval_seeds(recipe, 0)),
+        collector=make_collector(recipe, env, agent.policy),
+        buffers=[
+            make_buffer(recipe, task, generator, rewards=rewards, space=space, state=state, run=run)
+            for run, generator in enumerate(generators)
+        ],
+        goal_target=None if space is None else space.target,
+        generators=generators,
+        rewards=rewards,
+        curriculum=state,
+        **vars(agent),
+    )
+
+
+def make_collector(recipe: Recipe, env: EnvBase, policy: TensorDictModuleBase) -> Collector:
+    """Runs a policy in the training environments, a few steps of each at a time."""
+    return Collector(
+        env,
+        policy,
+        frames_per_batch=env.batch_size.numel() * recipe.collection.steps_per_batch,
+        total_frames=-1,
+        device=env.device,  # all of it: where the policy's is left open, every entry is copied at every step
+        auto_register_policy_transforms=False,
+    )
+
+
+def eval_seeds(recipe: Recipe, epoch: int) -> list[int]:
+    """The seeds of an evaluation: for each run and epoch its own, and never one of training."""
+    return [_EVAL_SEED + (seed << 20) + epoch for seed in recipe.seeds]

@@ -1,0 +1,128 @@
+"""The curriculum that a recipe asks for, and the layers that its runs are in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torchrl.envs import CatTensors, Compose, EnvBase, TransformedEnv
+
+from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
+from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
+from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
+from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.config.algorithms import get_algorithm
+from torchrl_her_recipes.config.recipe import Recipe
+
+_STATE = ["observation", "desired_goal"]  # what the state is made of, in this order
+
+
+@dataclass
+class CurriculumState:
+    """The curriculum of some runs, and the layer that each of them is in.
+
+    Attributes:
+        progress: the layer of each run.
+        layer_env: for evaluation at the layers' goals.
+    """
+
+    progress: CurriculumProgress
+    layer_env: EnvBase
+
+    @property
+    def curriculum(self) -> Curriculum:
+        """Its layers."""
+        return self.progress.curriculum
+
+    def at_the_top(self, run: int) -> bool:
+        """Whether a run is in the last layer, which is the full task."""
+        return self.progress.layers[run] == len(self.curriculum) - 1
+
+
+def make_curriculum(recipe: Recipe, env: EnvBase) -> Curriculum | None:
+    """The curriculum that the recipe asks for: its own layers, or those of its task.
+
+    Raises:
+        ValueError: the task has no curriculum of its own, or the recipe's layers cannot work.
+    """
+    if not get_algorithm(recipe.hindsight.algo).curriculum:
+        return None
+    task = goal_env(env)
+    return read_curriculum(
+        task.layers() if recipe.curriculum.layers is None else recipe.curriculum.layers, task
+    )
+
+
+def read_curriculum(layers: object, env: GoalEnv) -> Curriculum:
+    """A curriculum from plain values, for an environment whose state they index.
+
+    The state is the observation with the desired goal behind it.
+
+    Args:
+        layers: a list of mappings with the options of :class:`~torchrl_her.CurriculumLayer`.
+        env: tells how wide the state is.
+
+    Raises:
+        ValueError: it is no such list, or a layer that cannot work.
+
+    Example:
+        >>> from torchrl_her_envs import make_env
+        >>> env = make_env("hand_v1")
+        >>> [layer.name for layer in read_curriculum(env.layers(), env).layers]
+        ['reach', 'throw']
+    """
+    if not isinstance(layers, Sequence) or isinstance(layers, str):
+        raise ValueError(f"curriculum must be a list of layers, got {type(layers).__name__}")
+    width = sum(env.observation_spec[key].shape[-1] for key in _STATE)
+    return Curriculum([_read_layer(layer) for layer in layers], width)
+
+
+def _read_layer(options: Any) -> CurriculumLayer:
+    try:
+        return CurriculumLayer(**options)
+    except TypeError as error:  # missing or unknown options, or no options at all
+        raise ValueError(f"{options!r} is no layer of a curriculum: {error}") from error
+
+
+def make_curriculum_state(recipe: Recipe, curriculum: Curriculum, seeds: Sequence[int]) -> CurriculumState:
+    """The recipe's runs in a curriculum, all in its first layer.
+
+    Args:
+        recipe: of the runs.
+        curriculum: its curriculum.
+        seeds: of the evaluation of each run.
+    """
+    options = recipe.curriculum
+    progress = CurriculumProgress(
+        curriculum,
+        runs=recipe.run.num_runs,
+        window=options.window,
+        success_threshold=options.success_threshold,
+    )
+    layer_env = make_task_envs(recipe, recipe.evaluation.episodes, seeds)
+    return CurriculumState(progress, in_layers(layer_env, progress))
+
+
+def make_played_env(recipe: Recipe, num_envs: int, seeds: Sequence[int]) -> EnvBase:
+    """Environments as a trained policy sees them: at the top of the curriculum, if there is one."""
+    env = make_task_envs(recipe, num_envs, seeds)
+    curriculum = make_curriculum(recipe, env)
+    return env if curriculum is None else in_layers(env, at_the_top(curriculum, len(seeds)))
+
+
+def in_layers(env: EnvBase, progress: CurriculumProgress) -> TransformedEnv:
+    """An environment as the layers of its runs see it, with the networks' input."""
+    curriculum = progress.curriculum
+    transforms = [StateToObs(curriculum, progress), ZeroPad(curriculum, progress)]
+    if "state" not in env.observation_spec:
+        transforms.insert(0, CatTensors(_STATE, "state", del_keys=False, sort=False))
+    return TransformedEnv(env, Compose(*transforms))
+
+
+def at_the_top(curriculum: Curriculum, runs: int) -> CurriculumProgress:
+    """Progress of runs that are all in the last layer: the full task."""
+    progress = CurriculumProgress(curriculum, runs=runs)
+    for run in range(runs):
+        progress.set_layer(run, len(curriculum) - 1)
+    return progress

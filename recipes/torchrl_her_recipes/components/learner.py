@@ -1,0 +1,100 @@
+"""The base class of builders of learners: networks, exploration and a TorchRL loss."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
+from torchrl.objectives.utils import TargetNetUpdater
+
+from torchrl_her.modules.exploration import DecayingEpsilon, Exploration
+from torchrl_her_recipes.config.recipe import Recipe
+
+Networks = tuple[TensorDictModule, TensorDictModule]
+
+
+@dataclass(frozen=True)
+class Agent:
+    """The components of a run that act and learn.
+
+    Attributes:
+        actor: the greedy policy.
+        critic: values of (observation, goal, action).
+        exploration: turns greedy into exploring actions.
+        policy: actor, then exploration.
+        loss: of TorchRL.
+        optimizer: over the loss module's parameters.
+        target: moves the target networks.
+    """
+
+    actor: TensorDictModule
+    critic: TensorDictModule
+    exploration: Exploration
+    policy: TensorDictModuleBase
+    loss: LossModule
+    optimizer: torch.optim.Optimizer
+    target: TargetNetUpdater
+
+
+class LearnerBuilder(ABC):
+    """Builds a learner for a recipe and an environment; a subclass for each learner.
+
+    Args:
+        recipe: of the run, or of several.
+        env: tells the widths of observations, goals and actions.
+        in_keys: the entries that the networks see.
+
+    Attributes:
+        options: the recipe's group of the learner's own options.
+    """
+
+    def __init__(self, recipe: Recipe, env: EnvBase, in_keys: Sequence[str]) -> None:
+        self.recipe, self.env, self.in_keys = recipe, env, in_keys
+        self.options: Any = recipe.learner
+        self.dtype: torch.dtype = getattr(torch, recipe.run.dtype)
+
+    @property
+    def widths(self) -> list[int]:
+        """Widths of the entries that the networks see."""
+        return [self.env.observation_spec[key].shape[-1] for key in self.in_keys]
+
+    @property
+    def action_spec(self) -> Any:
+        """The actions of one environment."""
+        return self.env.action_spec_unbatched
+
+    @abstractmethod
+    def networks(self, runs: int) -> Networks:
+        """The actor and the critic of some runs side by side."""
+
+    @abstractmethod
+    def loss(
+        self, actor: TensorDictModule, critic: TensorDictModule, rewards: tuple[float, float]
+    ) -> LossModule:
+        """TorchRL's loss.
+
+        Args:
+            actor: from :meth:`networks`.
+            critic: likewise.
+            rewards: of a missed goal and of an achieved one.
+        """
+
+    def exploration(self, generators: Sequence[torch.Generator]) -> Exploration:
+        """Turns greedy into exploring actions; here for continuous ones.
+
+        Args:
+            generators: of each run's random numbers.
+        """
+        spec = self.action_spec
+        return DecayingEpsilon(spec.low, spec.high, generators=generators, **self.epsilon())
+
+    def epsilon(self) -> dict[str, float]:
+        """The schedule of epsilon."""
+        options = self.options
+        return {"start": options.epsilon_start, "decay": options.epsilon_decay, "end": options.epsilon_end}

@@ -1,0 +1,35 @@
+"""DQN."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import cast
+
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.modules import QValueActor
+from torchrl.objectives import LossModule
+
+from torchrl_her.modules.exploration import DecayingEpsilonGreedy, Exploration
+from torchrl_her.modules.q_actor import make_q_actor
+from torchrl_her.objectives.dqn import make_dqn_loss
+from torchrl_her_recipes.components.learner import LearnerBuilder, Networks
+
+
+class DQNBuilder(LearnerBuilder):
+    """See :func:`~torchrl_her.make_dqn_loss`."""
+
+    def networks(self, runs: int) -> Networks:
+        return make_q_actor(
+            self.widths, self.action_spec.n, hidden=self.options.hidden, runs=runs, in_keys=self.in_keys
+        )
+
+    def loss(
+        self, actor: TensorDictModule, critic: TensorDictModule, rewards: tuple[float, float]
+    ) -> LossModule:
+        return make_dqn_loss(
+            cast(QValueActor, actor), gamma=self.options.gamma, reward_range=rewards, reduction="none"
+        )
+
+    def exploration(self, generators: Sequence[torch.Generator]) -> Exploration:
+        return DecayingEpsilonGreedy(self.action_spec.n, generators=generators, **self.epsilon())

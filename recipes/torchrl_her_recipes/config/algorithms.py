@@ -1,0 +1,128 @@
+"""The algorithms by name, and the goal strategies: both are checked before torch is imported."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import Literal
+
+from torchrl_her_recipes.config.options import what_there_is
+
+STRATEGIES = ("future", "final", "episode")  # goal strategies that come with the library
+_STRATEGY_REGISTRY = "torchrl_her.goals.strategies"
+
+Instructive = Literal["simultaneous", "sequential"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Algorithm:
+    """One way to use hindsight on top of a learner.
+
+    Args:
+        name: the name that recipes take.
+        hindsight: whether virtual rows are written at all.
+        filter_achieved: whether virtual goals that were already achieved are left out.
+        instructive: how virtual goals are weighted by their instructiveness (IBS): "simultaneous" by
+            q* - q, so that a goal counts less the more often it was written; "sequential" by q* alone;
+            None for equal weights.
+        curriculum: whether runs learn the layers of a curriculum one after the other (CHER).
+        weights: a function that makes other weights, as ``module:function``. It gets the recipe and the
+            environment and returns new :class:`~torchrl_her.GoalWeights`; it is called once for each run.
+        summary: one line for people.
+    """
+
+    name: str
+    hindsight: bool = True
+    filter_achieved: bool = False
+    instructive: Instructive | None = None
+    curriculum: bool = False
+    weights: str = ""
+    summary: str = ""
+
+
+ALGORITHMS: dict[str, Algorithm] = {
+    algorithm.name: algorithm
+    for algorithm in (
+        Algorithm(name="no_hindsight", hindsight=False, summary="the learner alone"),
+        Algorithm(name="her", summary="hindsight experience replay"),
+        Algorithm(
+            name="filtered_her",
+            filter_achieved=True,
+            summary="HER without virtual goals that were achieved already",
+        ),
+        Algorithm(
+            name="her_ibs",
+            instructive="simultaneous",
+            summary="HER that prefers instructive goals: weights q* - q",
+        ),
+        Algorithm(
+            name="filtered_her_ibs",
+            filter_achieved=True,
+            instructive="simultaneous",
+            summary="Filtered-HER that prefers instructive goals",
+        ),
+        Algorithm(
+            name="her_ibs_sequential",
+            instructive="sequential",
+            summary="HER with weights q* alone; prioritized replay does the rest",
+        ),
+        Algorithm(
+            name="cher", curriculum=True, filter_achieved=True, summary="Filtered-HER with a curriculum: CHER"
+        ),
+        Algorithm(
+            name="cher_ibs",
+            curriculum=True,
+            filter_achieved=True,
+            instructive="simultaneous",
+            summary="CHER that prefers instructive goals in the layers that say so",
+        ),
+        Algorithm(name="unfiltered_cher", curriculum=True, summary="CHER without the filter"),
+        Algorithm(
+            name="unfiltered_cher_ibs",
+            curriculum=True,
+            instructive="simultaneous",
+            summary="CHER that prefers instructive goals, without the filter",
+        ),
+    )
+}
+
+
+def register_algorithm(algorithm: Algorithm) -> None:
+    """Makes an algorithm known by its name.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    if algorithm.name in ALGORITHMS:
+        raise ValueError(f"there is an algorithm {algorithm.name!r} already")
+    ALGORITHMS[algorithm.name] = algorithm
+
+
+def get_algorithm(name: str) -> Algorithm:
+    """The algorithm of a name.
+
+    Raises:
+        ValueError: there is none; the message lists those that there are.
+
+    Example:
+        >>> get_algorithm("her").filter_achieved
+        False
+    """
+    if name not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm {name!r}{what_there_is(name, ALGORITHMS, 'algorithms')}")
+    return ALGORITHMS[name]
+
+
+def check_strategy(name: str) -> None:
+    """Refuses a goal strategy that does not exist.
+
+    Other strategies exist only if the library was imported to register them. So if it was not imported,
+    the names that it comes with are all there are, and it need not be imported for the check.
+
+    Raises:
+        ValueError: it does not exist; the message lists those that do.
+    """
+    registry = sys.modules.get(_STRATEGY_REGISTRY)
+    known = list(STRATEGIES if registry is None else registry.STRATEGIES)
+    if name not in known:
+        raise ValueError(f"unknown goal strategy {name!r}{what_there_is(name, known, 'strategies')}")

@@ -1,0 +1,186 @@
+"""The groups of options that a recipe is made of; the learner's group is in :mod:`.learners`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl_her_envs.registry import GYM, check_task, get_task_spec
+from torchrl_her_envs.registry import check_options as check_task_options
+from torchrl_her_recipes.config.algorithms import check_strategy, get_algorithm
+from torchrl_her_recipes.config.options import check_options, option
+from torchrl_her_recipes.config.values import read_yaml
+
+
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """A group of options, which are checked when it is made."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig(Group):
+    """The task to learn."""
+
+    name: str = option(
+        "hand_v0",
+        "a task of `torchrl-her list`, or gym:ID for any gymnasium environment with goals",
+        shown_as="task",
+    )
+    options: Any = option(None, "options of the task or for gymnasium.make, as in task.options.bits=8")
+    threshold: float | None = option(
+        None, "distance to the goal that counts as achieved, in the coordinates that the agent sees", above=0
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_task(self.name)
+        if self.options is None:
+            return
+        if not isinstance(self.options, Mapping) or not all(isinstance(name, str) for name in self.options):
+            raise ValueError(f"task.options must be a mapping of options by name, got {self.options!r}")
+        object.__setattr__(self, "options", dict(self.options))
+        if not self.name.startswith(GYM):  # gymnasium.make tells which options an environment takes
+            check_task_options(get_task_spec(self.name), self.options)
+        if self.threshold is not None and "threshold" in self.options:
+            raise ValueError("threshold and task.options.threshold are the same option: give one of them")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectionConfig(Group):
+    """How experience is collected; numbers are for each run."""
+
+    epoch_frames: int = option(20_480, "environment steps in an epoch", at_least=1)
+    num_envs: int = option(64, "environments that are stepped together", at_least=1)
+    steps_per_batch: int = option(10, "steps of each environment between two rounds of updates", at_least=1)
+    frames_per_update: float = option(20.0, "environment steps for each gradient step", above=0)
+    warmup_frames: int = option(3_200, "environment steps before the first gradient step", at_least=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.epoch_frames < self.num_envs * self.steps_per_batch:
+            raise ValueError(
+                f"epoch_frames={self.epoch_frames} must be at least num_envs times steps_per_batch, "
+                f"{self.num_envs * self.steps_per_batch}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayConfig(Group):
+    """How transitions are stored and sampled."""
+
+    sampler: str = option(
+        "prioritized", "prioritized or uniform sampling", choices=("prioritized", "uniform")
+    )
+    priority_alpha: float = option(
+        0.6, "exponent of priorities, for absolute TD errors (Schaul et al.)", at_least=0
+    )
+    priority_beta: float = option(0.4, "exponent of importance weights (Schaul et al.)", at_least=0)
+    buffer_size: int = option(
+        1_000_000, "capacity in transitions, real and virtual ones together", at_least=1
+    )
+    batch_size: int = option(256, "transitions of a gradient step", at_least=1)
+    batches_per_sample: int = option(8, "batches that are sampled in one call", at_least=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.batch_size > self.buffer_size:
+            raise ValueError(f"batch_size={self.batch_size} must fit buffer_size={self.buffer_size}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HindsightConfig(Group):
+    """How transitions are relabeled with virtual goals."""
+
+    algo: str = option("filtered_her", "an algorithm of `torchrl-her list`")
+    k: int = option(4, "virtual transitions for each real one", at_least=0)
+    strategy: str = option(
+        "future", "where virtual goals come from: future, final, episode, or a registered name"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        get_algorithm(self.algo)
+        check_strategy(self.strategy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IBSConfig(Group):
+    """Goals weighted by how instructive they are (IBS)."""
+
+    sigma: float | None = option(
+        None, "width of the kernel around the real goals, as a share of the range of goals", above=0
+    )
+    start_factor: float = option(3.0, "sigma begins at this multiple of its final value", at_least=1)
+    decay: float = option(0.9, "the kernel's covariance is multiplied by this each epoch", above=0, at_most=1)
+    floor: float = option(0.002, "lowest weight of a goal, as a share of the largest q*", at_least=0)
+    cells: int = option(20, "cells along each dimension of the grid that goals are counted in", at_least=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurriculumConfig(Group):
+    """The layers that runs learn one after the other (Curriculum-HER)."""
+
+    name: str = option(
+        "task",
+        "task: the layers that the task itself has; or a YAML file with a list of layers",
+        shown_as="curriculum",
+    )
+    layers: Any = option(None, "the layers themselves, as a list of their options")
+    window: int = option(20, "a layer ends by the mean success of this many greedy episodes", at_least=1)
+    success_threshold: float = option(0.9, "mean success at which a layer ends", above=0, at_most=1)
+    layer_epsilon: float = option(1.0, "epsilon of exploration when a layer begins", at_least=0, at_most=1)
+    alpha_actor: float = option(
+        0.0, "scale of the actor's initial weights for inputs that the first layer hides", at_least=0
+    )
+    alpha_critic: float = option(0.0, "the same scale for the critic", at_least=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.name != "task" and self.layers is None:  # a recipe holds the layers, not just their file
+            object.__setattr__(self, "layers", _read_layers(Path(self.name)))
+        layers = self.layers
+        if layers is not None and not (
+            isinstance(layers, list | tuple) and layers and all(isinstance(own, Mapping) for own in layers)
+        ):
+            raise ValueError(
+                f"a curriculum must be a list of layers, each with its options by name, got {layers!r}"
+            )
+
+
+def _read_layers(path: Path) -> Any:
+    if not path.is_file():
+        raise ValueError(f"curriculum must be 'task' or a YAML file with a list of layers, got {str(path)!r}")
+    return read_yaml(path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig(Group):
+    """How runs are evaluated at the end of each epoch."""
+
+    episodes: int = option(100, "greedy episodes of each evaluation", at_least=1)
+
+
+_SEEDS = 1 << 31  # so that those of evaluations, which are made of it, have room
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Group):
+    """Seeds, length and checkpoints of the runs."""
+
+    seed: int = option(0, "seed of everything random", at_least=0)
+    num_runs: int = option(1, "independent runs side by side; run i has the seed `seed + i`", at_least=1)
+    epochs: int = option(30, "epochs; each ends with an evaluation", at_least=1)
+    checkpoint_interval: int = option(10, "epochs between two checkpoints", at_least=1)
+    keep_checkpoints: int = option(2, "how many of the newest checkpoints are kept", at_least=1)
+    threads: int = option(1, "threads of torch: small networks are fastest with one", at_least=1)
+    dtype: str = option("float32", "of observations and networks", choices=("float32", "float64"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.seed + self.num_runs > _SEEDS:
+            raise ValueError(f"seed must be below {_SEEDS - self.num_runs + 1}, got {self.seed}")

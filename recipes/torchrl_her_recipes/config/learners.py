@@ -1,0 +1,182 @@
+"""The learners by name: the options of each, and where its builder is found.
+
+A learner is one module with its options and its builder (see :mod:`torchrl_her_recipes.components.learners`),
+and a call of :func:`register_learner`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from torchrl_her_recipes.config.groups import Group
+from torchrl_her_recipes.config.options import option, what_there_is
+
+Actions = Literal["continuous", "discrete"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnerConfig(Group):
+    """The learner and its networks.
+
+    Attributes:
+        has_epsilon: whether a share epsilon of the actions explores.
+    """
+
+    has_epsilon: ClassVar[bool] = False
+
+    name: str = option(
+        "auto",
+        "auto: ddpg, or dqn where actions are discrete; or a learner of `torchrl-her list`",
+        shown_as="learner",
+    )
+    gamma: float = option(0.98, "discount factor", above=0, below=1)
+    learning_rate: float = option(1e-3, "learning rate of Adam", above=0)
+    max_grad_norm: float = option(3.0, "gradients of each network are clipped to this norm", above=0)
+    hidden: int = option(64, "width of the three hidden layers", at_least=1)
+    tau: float = option(0.02, "rate of the soft target update", at_least=0, at_most=1)
+    hard_update_interval: int = option(0, "gradient steps between hard target updates; 0: soft", at_least=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpsilonConfig(LearnerConfig):
+    """A learner with a deterministic policy: a share epsilon of its actions explores."""
+
+    has_epsilon: ClassVar[bool] = True
+
+    epsilon_start: float = option(1.0, "share of exploring actions in the first epoch", at_least=0, at_most=1)
+    epsilon_decay: float = option(0.9, "factor of epsilon each epoch", above=0, at_most=1)
+    epsilon_end: float = option(0.05, "lowest epsilon", at_least=0, at_most=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.epsilon_end > self.epsilon_start:
+            raise ValueError(
+                f"epsilon_end={self.epsilon_end} must not be above epsilon_start={self.epsilon_start}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DQNConfig(EpsilonConfig):
+    """DQN."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TD3Config(EpsilonConfig):
+    """TD3."""
+
+    batch_norm: bool = option(False, "batch normalization in the critic")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DDPGConfig(TD3Config):
+    """DDPG."""
+
+    action_penalty: float = option(
+        0.3, "action L2 penalty, which keeps actions off the ends of tanh", at_least=0
+    )
+    compile: str = option(
+        "auto",
+        "compile the gradient step; auto: if the run is long enough to gain by it",
+        choices=("auto", "always", "never"),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(LearnerConfig):
+    """SAC. Its policy is stochastic and explores by itself."""
+
+    batch_norm: bool = option(False, "batch normalization in the critics")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnerSpec:
+    """A learner that recipes can name.
+
+    Args:
+        name: the name.
+        summary: one line for people.
+        builder: where its :class:`~torchrl_her_recipes.components.learner.LearnerBuilder` is found, as
+            ``module:Class``; it is imported when the learner is first built.
+        options: its group of options, a subclass of :class:`LearnerConfig`.
+        actions: which actions it can choose among.
+        stacks: whether several runs can be trained side by side in one program.
+    """
+
+    name: str
+    summary: str
+    builder: str
+    options: type[LearnerConfig]
+    actions: Actions = "continuous"
+    stacks: bool = True
+
+
+_BUILDERS = "torchrl_her_recipes.components.learners"
+LEARNERS: dict[str, LearnerSpec] = {}
+
+
+def register_learner(spec: LearnerSpec) -> None:
+    """Makes a learner known by its name.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    if spec.name in LEARNERS or spec.name == "auto":
+        raise ValueError(f"there is a learner {spec.name!r} already")
+    LEARNERS[spec.name] = spec
+
+
+for _spec in (
+    LearnerSpec(
+        name="ddpg",
+        summary="deterministic policy gradients (Lillicrap et al., 2016)",
+        builder=f"{_BUILDERS}.ddpg:DDPGBuilder",
+        options=DDPGConfig,
+    ),
+    LearnerSpec(
+        name="td3",
+        summary="two critics and smoothed targets (Fujimoto et al., 2018)",
+        builder=f"{_BUILDERS}.td3:TD3Builder",
+        options=TD3Config,
+        stacks=False,  # runs would share the random numbers of the loss
+    ),
+    LearnerSpec(
+        name="sac",
+        summary="soft actor-critic with a learned temperature (Haarnoja et al., 2018)",
+        builder=f"{_BUILDERS}.sac:SACBuilder",
+        options=SACConfig,
+        stacks=False,
+    ),
+    LearnerSpec(
+        name="dqn",
+        summary="double DQN, for discrete actions (van Hasselt et al., 2016)",
+        builder=f"{_BUILDERS}.dqn:DQNBuilder",
+        options=DQNConfig,
+        actions="discrete",
+    ),
+):
+    register_learner(_spec)
+
+AUTO: dict[Actions, str] = {"continuous": "ddpg", "discrete": "dqn"}
+
+
+def check_learner(name: str) -> None:
+    """Refuses a learner that does not exist.
+
+    Raises:
+        ValueError: it does not exist; the message lists those that do.
+    """
+    if name != "auto" and name not in LEARNERS:
+        known = ["auto", *LEARNERS]
+        raise ValueError(f"unknown learner {name!r}{what_there_is(name, known, 'learners')}")
+
+
+def options_of(name: str) -> type[LearnerConfig]:
+    """The class of a learner's options; for ``auto`` that of DDPG, which it usually stands for.
+
+    Example:
+        >>> options_of("sac").__name__
+        'SACConfig'
+    """
+    check_learner(name)
+    return LEARNERS[AUTO["continuous"] if name == "auto" else name].options

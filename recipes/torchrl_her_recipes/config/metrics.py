@@ -1,0 +1,24 @@
+"""The metrics that can be drawn over environment steps, and the labels of their axes."""
+
+from __future__ import annotations
+
+PANELS = (
+    ("success", "success rate", (-0.02, 1.02)),
+    ("distance", "distance to goal at the end", None),
+    ("q_bias", "Q of the start minus return", None),
+    ("loss_value", "loss of the critic", None),
+    ("rows_real_positive", "positive rewards, real rows", None),
+    ("rows_useful_virtual_positive", "positive rewards, virtual rows that count", None),
+)
+AXES = {name: (label, limits) for name, label, limits in PANELS} | {
+    "q": ("Q of the start, return", None),
+    "rows_virtual_positive": ("positive rewards, virtual rows", None),
+    "useless_share": ("the useless action is best", None),
+    "useless_margin": ("useless action minus needed flip", None),
+    "right_way": ("pairs with the right way", None),
+}
+
+
+def metric_names() -> list[str]:
+    """The metrics that can be drawn over environment steps."""
+    return list(AXES)

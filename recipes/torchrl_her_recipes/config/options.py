@@ -1,0 +1,112 @@
+"""Options of a recipe: what each of them may be, said where it is defined, and checked in one place."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, Field, field, fields
+from difflib import get_close_matches
+from typing import Any
+
+from torchrl_her_recipes.config.values import as_kind
+
+_KINDS = {"str": str, "bool": bool, "int": int, "float": float}
+
+
+def option(
+    default: Any,
+    help: str,
+    *,
+    at_least: float | None = None,
+    above: float | None = None,
+    at_most: float | None = None,
+    below: float | None = None,
+    choices: tuple[str, ...] = (),
+    shown_as: str = "",
+) -> Any:
+    """A field of a group of options.
+
+    Args:
+        default: the value that works for most tasks; None where the task or the learner has its own.
+        help: a few words, shown by ``torchrl-her train -h``.
+        at_least, above, at_most, below: the range of a number.
+        choices: the values that are allowed.
+        shown_as: what messages call it, if not by the field's name.
+    """
+    limits = {"at_least": at_least, "above": above, "at_most": at_most, "below": below}
+    metadata = {"help": help, "choices": choices, "limits": limits, "shown_as": shown_as}
+    return field(default=default, metadata=metadata)
+
+
+def check_options(group: Any) -> None:
+    """Turns the values of a frozen group of options into their types, and checks their ranges.
+
+    Raises:
+        ValueError: a value of another type or out of its range; the message names both.
+    """
+    for own in fields(group):
+        value = getattr(group, own.name)
+        if value is None and own.default is None:
+            continue
+        kind = _KINDS.get(str(own.type).removesuffix(" | None"))
+        if kind is not None:
+            value = as_kind(_shown(own), value, kind)
+            object.__setattr__(group, own.name, value)
+        _check_value(own, value)
+
+
+def _shown(own: Field[Any]) -> str:
+    return own.metadata.get("shown_as") or own.name
+
+
+def _check_value(own: Field[Any], value: Any) -> None:
+    choices, limits = own.metadata.get("choices", ()), own.metadata.get("limits", {})
+    if choices and value not in choices:
+        raise ValueError(
+            f"{_shown(own)} must be one of {', '.join(choices)}, got {value!r}{nearest(value, choices)}"
+        )
+    tests = {
+        "at_least": lambda limit: value >= limit,
+        "above": lambda limit: value > limit,
+        "at_most": lambda limit: value <= limit,
+        "below": lambda limit: value < limit,
+    }
+    given = {name: limit for name, limit in limits.items() if limit is not None}
+    if not all(tests[name](limit) for name, limit in given.items()):  # NaN fails all of them
+        allowed = " and ".join(f"{name.replace('_', ' ')} {limit}" for name, limit in given.items())
+        raise ValueError(f"{_shown(own)} must be {allowed}, got {value}")
+
+
+def default_of(own: Field[Any]) -> Any:
+    """The default value of a field."""
+    if own.default is not MISSING:
+        return own.default
+    assert own.default_factory is not MISSING
+    return own.default_factory()
+
+
+def nearest(name: object, known: Any) -> str:
+    """A hint for a name that was probably mistyped; empty if nothing is near.
+
+    Example:
+        >>> nearest("lerning_rate", ["learning_rate", "gamma"])
+        '; did you mean learning_rate?'
+    """
+    found = get_close_matches(str(name), list(known), n=1)
+    return f"; did you mean {found[0]}?" if found else ""
+
+
+def what_there_is(name: object, known: Any, kind: str) -> str:
+    """The end of a message about an unknown name: the nearest known one, and all of them.
+
+    Args:
+        name: the unknown one.
+        known: the known ones.
+        kind: what they are, in the plural.
+
+    Example:
+        >>> what_there_is("cherr", ["her", "cher"], "algorithms")
+        '; did you mean cher? The algorithms are her, cher'
+        >>> what_there_is("sarsa", ["her", "cher"], "algorithms")
+        '; the algorithms are her, cher'
+    """
+    hint = nearest(name, known)
+    return f"{hint} The" * bool(hint) + "; the" * (not hint) + f" {kind} are {', '.join(known)}"

@@ -1,0 +1,189 @@
+"""A recipe: every choice of a training run, as groups of plain values that all have defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+from torchrl_her_envs.registry import get_task_spec
+from torchrl_her_recipes.config.groups import (
+    CollectionConfig,
+    CurriculumConfig,
+    EvaluationConfig,
+    Group,
+    HindsightConfig,
+    IBSConfig,
+    ReplayConfig,
+    RunConfig,
+    TaskConfig,
+)
+from torchrl_her_recipes.config.learners import DDPGConfig, LearnerConfig, options_of
+from torchrl_her_recipes.config.options import default_of, what_there_is
+from torchrl_her_recipes.config.shortcuts import GROUPS, Nested, over, place
+from torchrl_her_recipes.config.without_effect import without_effect
+
+# Compiling takes 15 s the first time and saves half a millisecond a step: from this many steps on it pays.
+_WORTH_COMPILING = 20_000
+_MOST_ROWS = 2_000  # transitions of a gradient step: with more, it is arithmetic that takes the time
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Every choice of a training run, as groups of options with plain values.
+
+    :func:`make_recipe` makes one from the short names of options. Lengths are environment steps ("frames").
+
+    Raises:
+        ValueError: a value that cannot work or that has no effect; the message names it and what is allowed.
+
+    Example:
+        >>> recipe = Recipe(hindsight=HindsightConfig(algo="her"), run=RunConfig(seed=3))
+        >>> recipe.learner.gamma, recipe.total_frames
+        (0.98, 614400)
+    """
+
+    task: TaskConfig = field(default_factory=TaskConfig)
+    hindsight: HindsightConfig = field(default_factory=HindsightConfig)
+    learner: LearnerConfig = field(default_factory=DDPGConfig)
+    collection: CollectionConfig = field(default_factory=CollectionConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    ibs: IBSConfig = field(default_factory=IBSConfig)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    run: RunConfig = field(default_factory=RunConfig)
+
+    def __post_init__(self) -> None:
+        wanted = options_of(self.learner.name)
+        if type(self.learner) is not wanted:
+            got = type(self.learner).__name__
+            raise ValueError(
+                f"learner={self.learner.name} takes a {wanted.__name__}, got a {got}: "
+                "name the learner in its options, as in SACConfig(name='sac')"
+            )
+        for (group, name), why in without_effect(self).items():
+            value = getattr(getattr(self, group), name)
+            if value != _default(getattr(self, group), name):
+                raise ValueError(f"{name}={value} has no effect {why}: leave it out")
+
+    @property
+    def total_frames(self) -> int:
+        """Environment steps of a whole run."""
+        return self.run.epochs * self.collection.epoch_frames
+
+    @property
+    def compiles(self) -> bool:
+        """Whether the gradient step is to be compiled."""
+        choice = getattr(self.learner, "compile", "never")
+        if choice == "auto":
+            long = self.total_frames / self.collection.frames_per_update >= _WORTH_COMPILING
+            return long and self.run.num_runs * self.replay.batch_size <= _MOST_ROWS
+        return choice == "always"
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seed of each run."""
+        return [self.run.seed + run for run in range(self.run.num_runs)]
+
+    def replace(self, **values: Any) -> Recipe:
+        """The same recipe with some other values, by their short names; see :func:`make_recipe`.
+
+        Example:
+            >>> Recipe().replace(seed=7).run.seed
+            7
+        """
+        return make_recipe(self.to_dict(), **values)
+
+    def to_dict(self) -> Nested:
+        """All values, by group and name."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
+        """A recipe from the values that :meth:`to_dict` gives, or some of them.
+
+        Raises:
+            ValueError: a group or an option that does not exist, or a value that cannot work.
+        """
+        return _assemble(place(values))
+
+
+def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Recipe:
+    """A recipe from options by their names: ``make_recipe(task="hand_v0", algo="her", seed=3)``.
+
+    An option is named by itself (``gamma``) or with its group (``{"learner.gamma": 0.95}``); ``task``,
+    ``learner`` and ``curriculum`` are the names of theirs.
+
+    Args:
+        base: values of a preset or of another recipe. Those that ``values`` leave without effect are
+            dropped, so that a preset of DDPG also serves TD3.
+        values: the options that are asked for. One that has no effect is an error.
+
+    Raises:
+        ValueError: an option that does not exist or that has no effect, or a value that cannot work.
+
+    Example:
+        >>> make_recipe(task="hand_v1", algo="cher", window=5).curriculum.window
+        5
+    """
+    given = place(values)
+    below = place(base or {})
+    name = given.get("learner", {}).get("name") or below.get("learner", {}).get("name") or "auto"
+    known = {own.name for own in fields(options_of(name))}
+    below["learner"] = {key: value for key, value in below.get("learner", {}).items() if key in known}
+    _drop_options_of_another_task(below, given)
+    _drop_another_curriculum(below, given)
+    for group, own in without_effect(_groups(over(below, given))):
+        if own not in given.get(group, {}) and own in below.get(group, {}):
+            del below[group][own]
+    return _assemble(over(below, given))
+
+
+def _drop_options_of_another_task(below: Nested, given: Nested) -> None:
+    """Leaves those options of the base's task that the task that is asked for takes as well."""
+    name, options = given.get("task", {}).get("name"), below.get("task", {}).get("options")
+    if name is None or not isinstance(options, Mapping) or name == below["task"].get("name"):
+        return
+    takes = get_task_spec(str(name)).options
+    below["task"]["options"] = {own: value for own, value in options.items() if own in takes} or None
+
+
+def _drop_another_curriculum(below: Nested, given: Nested) -> None:
+    asked = given.get("curriculum", {})
+    if asked.get("name", "task") != "task" and asked.get("layers") is not None:
+        raise ValueError(f"curriculum={asked['name']} and layers={asked['layers']!r}: give one of them")
+    if "name" in asked or "layers" in asked:
+        below.get("curriculum", {}).pop("layers", None)
+        below.get("curriculum", {}).pop("name", None)
+
+
+def _assemble(values: Nested) -> Recipe:
+    return Recipe(**vars(_groups(values)))
+
+
+class _Groups:
+    """The groups of a recipe, before they are checked against each other."""
+
+    task: TaskConfig
+    hindsight: HindsightConfig
+    learner: LearnerConfig
+    replay: ReplayConfig
+
+
+def _groups(values: Nested) -> Any:
+    groups = _Groups()
+    for group, kind in GROUPS.items():
+        own = dict(values.get(group, {}))
+        if group == "learner":
+            kind = options_of(str(own.get("name", "auto")))
+        known = [each.name for each in fields(kind)]
+        for name in own:
+            if name not in known:
+                of = f"learner={own.get('name', 'auto')}" if group == "learner" else f"the group {group}"
+                raise ValueError(f"{of} has no option {name}{what_there_is(name, known, 'options')}")
+        setattr(groups, group, kind(**own))
+    return groups
+
+
+def _default(group: Group, name: str) -> Any:
+    return next(default_of(own) for own in fields(group) if own.name == name)

@@ -1,0 +1,52 @@
+"""What comes with the package, by name: presets, and trained policies (:mod:`..runs.policies` loads them)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from torchrl_her_recipes.config.options import what_there_is
+from torchrl_her_recipes.config.values import read_mapping
+
+CONF = Path(__file__).parent.parent / "conf"
+TRAINED = Path(__file__).parent.parent / "trained"
+
+
+def preset_names() -> list[str]:
+    """All presets that come with the package."""
+    return sorted(path.stem for path in (CONF / "preset").glob("*.yaml"))
+
+
+def load_preset(name: str) -> dict[str, Any]:
+    """The values of a preset, by the names of options.
+
+    Args:
+        name: of ``preset_names()``, or the path of a YAML file.
+
+    Raises:
+        ValueError: there is no such preset.
+    """
+    return read_mapping(_path(name))
+
+
+def preset_summary(name: str) -> str:
+    """What a preset is for, in one line: the comment that its file begins with."""
+    first, *_ = [*_path(name).read_text().splitlines(), ""]
+    return first.lstrip("# ") if first.startswith("#") else ""
+
+
+def _path(name: str) -> Path:
+    path = Path(name) if str(name).endswith((".yaml", ".yml")) else CONF / "preset" / f"{name}.yaml"
+    if not path.is_file():
+        raise ValueError(f"there is no preset {name!r}{what_there_is(name, preset_names(), 'presets')}")
+    return path
+
+
+def policy_names() -> list[str]:
+    """The tasks whose policies come with the package."""
+    return sorted(path.stem for path in TRAINED.glob("*.pt"))
+
+
+def policy_facts() -> dict[str, dict[str, Any]]:
+    """Success and frames of each policy, copied from its file, so that listing them does not load torch."""
+    return read_mapping(TRAINED / "index.yaml")

@@ -1,0 +1,154 @@
+"""The names of options: short where they are unique, or with their group."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from torchrl_her_recipes.config.groups import (
+    CollectionConfig,
+    CurriculumConfig,
+    EvaluationConfig,
+    Group,
+    HindsightConfig,
+    IBSConfig,
+    ReplayConfig,
+    RunConfig,
+    TaskConfig,
+)
+from torchrl_her_recipes.config.learners import LEARNERS, LearnerConfig
+from torchrl_her_recipes.config.options import nearest, what_there_is
+
+Nested = dict[str, dict[str, Any]]
+
+GROUPS: dict[str, type[Group]] = {
+    "task": TaskConfig,
+    "hindsight": HindsightConfig,
+    "learner": LearnerConfig,  # of the learner that is chosen
+    "collection": CollectionConfig,
+    "replay": ReplayConfig,
+    "ibs": IBSConfig,
+    "curriculum": CurriculumConfig,
+    "evaluation": EvaluationConfig,
+    "run": RunConfig,
+}
+
+
+class Entries(dict[str, Any]):
+    """Some entries of a mapping, as ``task.options.bits=8`` gives them: the other entries stay."""
+
+
+def option_names() -> dict[str, list[str]]:
+    """The options of each group; of the learner's, those of all learners."""
+    names = {group: [own.name for own in fields(kind)] for group, kind in GROUPS.items()}
+    every = [own.name for spec in LEARNERS.values() for own in fields(spec.options)]
+    names["learner"] = list(dict.fromkeys([*names["learner"], *every]))
+    return names
+
+
+def locate(name: str) -> tuple[str, str]:
+    """The group and the name of an option.
+
+    Args:
+        name: short (``seed``), with its group (``run.seed``), or a group that has a name (``task``).
+
+    Raises:
+        ValueError: it does not exist, or is not unique; the message names the nearest one.
+
+    Example:
+        >>> locate("seed"), locate("learner"), locate("ibs.floor")
+        (('run', 'seed'), ('learner', 'name'), ('ibs', 'floor'))
+    """
+    names = option_names()
+    group, _, own = name.partition(".")
+    if own:
+        if group not in names:
+            home = next((each for each, known in names.items() if group in known and group != "name"), None)
+            if home is not None:
+                raise ValueError(f"{group} is an option of the group {home}: {name!r} has one name too many")
+            raise ValueError(f"no group {group!r}{what_there_is(group, names, 'groups')}")
+        if own not in names[group]:
+            raise ValueError(f"no option {name!r}{what_there_is(own, names[group], f'options of {group}')}")
+        return group, own
+    if "name" in names.get(name, []):
+        return name, "name"
+    if name in names:
+        raise ValueError(f"{name} is a group of options: write {name}.{names[name][0]}=..., for instance")
+    found = [group for group, known in names.items() if name in known]
+    if len(found) == 1:
+        return found[0], name
+    if found:
+        raise ValueError(
+            f"several groups have an option {name!r}: write {' or '.join(f'{g}.{name}' for g in found)}"
+        )
+    named = [each for each, known in names.items() if "name" in known]
+    every = [own for known in names.values() for own in known if own != "name"] + named
+    raise ValueError(f"no option {name!r}{nearest(name, every)}; `torchrl-her train -h` lists them")
+
+
+def place(values: Mapping[str, Any]) -> Nested:
+    """Values by short or long names, or whole groups as mappings, sorted into their groups.
+
+    Example:
+        >>> place({"task": "hand_v0", "seed": 3, "run": {"epochs": 2}, "task.options.bits": 8})
+        {'task': {'name': 'hand_v0', 'options': {'bits': 8}}, 'run': {'seed': 3, 'epochs': 2}}
+    """
+    placed: Nested = {}
+    names = option_names()
+    for name, value in values.items():
+        if not isinstance(name, str):
+            raise ValueError(f"options must be names, got {name!r}")
+        if name in GROUPS and isinstance(value, Mapping):
+            for own, each in value.items():
+                group, key = locate(f"{name}.{own}")
+                placed.setdefault(group, {})[key] = each
+            continue
+        if value is None and "name" in names.get(name, []):
+            continue  # task=null: the default
+        if name == "curriculum" and isinstance(value, list | tuple):
+            placed.setdefault("curriculum", {})["layers"] = list(value)
+            continue
+        head, *deeper = name.split(".", 2)[:2] + name.split(".")[2:]
+        group, own = locate(".".join([head, *deeper[:1]]))
+        if len(deeper) > 1:
+            before = placed.get(group, {}).get(own)
+            entry = {".".join(deeper[1:]): value}
+            value = Entries(entry) if not isinstance(before, Mapping) else _join(before, entry)
+        placed.setdefault(group, {})[own] = value
+    return placed
+
+
+def merge(*values: Mapping[str, Any]) -> Nested:
+    """Several sets of values as one, by group; later ones replace earlier ones.
+
+    Example:
+        >>> merge({"seed": 1, "epochs": 2}, {"run.seed": 3})
+        {'run': {'seed': 3, 'epochs': 2}}
+    """
+    merged: Nested = {}
+    for each in values:
+        merged = over(merged, place(each))
+    return merged
+
+
+def over(below: Nested, above: Nested) -> Nested:
+    """The values of ``above``, and those of ``below`` that it says nothing of.
+
+    Example:
+        >>> over({"task": {"options": {"bits": 8, "max_steps": 9}}}, place({"task.options.bits": 4}))
+        {'task': {'options': {'bits': 4, 'max_steps': 9}}}
+    """
+    both = {group: dict(own) for group, own in below.items()}
+    for group, own in above.items():
+        mine = both.setdefault(group, {})
+        for name, value in own.items():
+            before = mine.get(name)
+            keeps = isinstance(value, Entries) and isinstance(before, Mapping)
+            mine[name] = _join(before, value) if keeps else value
+    return both
+
+
+def _join(before: Any, entries: Mapping[str, Any]) -> dict[str, Any]:
+    joined = {**before, **entries}
+    return Entries(joined) if isinstance(before, Entries) else joined

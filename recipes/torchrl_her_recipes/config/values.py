@@ -1,0 +1,83 @@
+"""Plain values: reading YAML files, and turning values into the types of options."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from importlib import import_module
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+
+def read_yaml(path: Path) -> Any:
+    """The content of a YAML file.
+
+    Raises:
+        ValueError: it is not YAML.
+        OSError: it cannot be read.
+    """
+    try:
+        return yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """The names and values that a YAML file holds.
+
+    Raises:
+        ValueError: it is not YAML, or holds something else.
+        OSError: it cannot be read.
+    """
+    values = read_yaml(path)
+    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
+        raise ValueError(f"{path} cannot be read: it must hold names and values, got {values!r}")
+    return values
+
+
+def as_kind(name: str, value: object, kind: type) -> Any:
+    """A value as an option of a given type takes it.
+
+    YAML reads ``1e-3`` as text, so text that spells a number is accepted for one.
+
+    Args:
+        name: of the option, for messages.
+        value: the value.
+        kind: str, bool, int or float.
+
+    Raises:
+        ValueError: the value is of another type.
+
+    Example:
+        >>> as_kind("learning_rate", "1e-3", float), as_kind("epochs", 2.0, int)
+        (0.001, 2)
+    """
+    if kind in (str, bool):
+        if isinstance(value, kind):
+            return value
+    elif isinstance(value, str | Real) and not isinstance(value, bool):
+        with suppress(ValueError, OverflowError):
+            number = value if isinstance(value, Integral) else float(value)
+            if kind is float or number == int(number):
+                return kind(number)
+    words = {str: "text", bool: "true or false", int: "a whole number", float: "a number"}
+    raise ValueError(f"{name} must be {words[kind]}, got {value!r}")
+
+
+def load_name(path: str) -> Any:
+    """Imports a module and returns an attribute of it, named as ``module:attribute``.
+
+    Raises:
+        ValueError: there is no such module or attribute.
+
+    Example:
+        >>> load_name("math:floor")(2.5)
+        2
+    """
+    module, _, name = path.partition(":")
+    try:
+        return getattr(import_module(module), name)
+    except (AttributeError, ModuleNotFoundError) as error:
+        raise ValueError(f"{path!r} must name an attribute of a module, as module:name: {error}") from error

@@ -1,0 +1,52 @@
+"""Options that have no effect together with others. They are refused by name, so that nobody tunes them."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+from torchrl_her_envs.registry import GYM, get_task_spec
+from torchrl_her_recipes.config.algorithms import get_algorithm
+
+
+def without_effect(groups: Any) -> dict[tuple[str, str], str]:
+    """The options that have no effect, as (group, name), and with what they have none.
+
+    Args:
+        groups: a recipe, or any object with its groups as attributes.
+    """
+    algorithm = get_algorithm(groups.hindsight.algo)
+    idle: dict[tuple[str, str], str] = {}
+
+    def all_of(group: str, why: str, *, but: tuple[str, ...] = ()) -> None:
+        for own in fields(getattr(groups, group)):
+            if own.name not in but:
+                idle[group, own.name] = why
+
+    task = groups.task.name
+    for group, name in (("task", "threshold"), ("run", "dtype")):
+        if task.startswith(GYM) or name not in get_task_spec(task).options:
+            idle[group, name] = f"with task={task}"
+    with_algo = f"with algo={algorithm.name}"
+    if not algorithm.hindsight:
+        idle["hindsight", "k"] = idle["hindsight", "strategy"] = with_algo
+        all_of("ibs", with_algo)
+    elif groups.hindsight.k == 0:
+        idle["hindsight", "strategy"] = "with k=0"
+        all_of("ibs", "with k=0")
+    elif algorithm.weights:
+        pass  # the function that makes them may read any option of IBS
+    elif algorithm.instructive is None:
+        all_of("ibs", with_algo, but=("cells",))  # the goals of HER are counted in cells, too
+    elif algorithm.instructive == "sequential":
+        idle["ibs", "floor"] = with_algo
+    if not algorithm.curriculum:
+        all_of("curriculum", with_algo)
+    elif not groups.learner.has_epsilon:
+        idle["curriculum", "layer_epsilon"] = f"with learner={groups.learner.name}"
+    if groups.replay.sampler != "prioritized":
+        for name in ("priority_alpha", "priority_beta"):
+            idle["replay", name] = f"with sampler={groups.replay.sampler}"
+    if groups.learner.hard_update_interval > 0:
+        idle["learner", "tau"] = "with hard target updates"
+    return idle

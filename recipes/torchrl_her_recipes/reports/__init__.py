@@ -1,0 +1,1 @@
+"""Reports: what a study's runs say together."""

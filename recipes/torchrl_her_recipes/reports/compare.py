@@ -1,0 +1,213 @@
+"""What the combinations of a study reached, how they differ, and whether the orders of the thesis hold."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import combinations
+
+import numpy as np
+
+from torchrl_her_recipes.reports.bootstrap import Interval, bootstrap
+from torchrl_her_recipes.reports.results import LAST, Combination, at_the_end
+from torchrl_her_recipes.reports.thesis import Order, Thesis
+
+ALL_TASKS = "all tasks"
+_COUNTED = ("kl", "rows_")  # metrics that sum up all of a run: the last one stands for it
+
+
+@dataclass(frozen=True)
+class Final:
+    """What one algorithm reached on one task, or on all: a row of the table."""
+
+    measure: str
+    task: str
+    algorithm: str
+    finished: bool
+    runs: int
+    frames: int
+    iqm: float
+    low: float
+    high: float
+    median: float
+    percentile_33: float
+    percentile_67: float
+    least: float
+    most: float
+    thesis: float | None
+
+    @property
+    def interval(self) -> Interval:
+        """The interquartile mean."""
+        return Interval(self.iqm, self.low, self.high)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The interquartile mean of one algorithm minus that of another: a row of the table.
+
+    ``apart``: whether the intervals of the two have no point in common.
+    """
+
+    measure: str
+    task: str
+    first: str
+    second: str
+    difference: float
+    low: float
+    high: float
+    apart: bool
+
+
+class Verdict(StrEnum):
+    """What became of an order that the thesis states."""
+
+    APART = "holds, apart"  # the intervals of the two algorithms
+    HOLDS = "holds, overlap"
+    UNDECIDED = "undecided"
+    REVERSED = "reversed"
+    OPEN = "not known yet"
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An order of the thesis on one task: a row of the table."""
+
+    measure: str
+    task: str
+    order: str
+    verdict: Verdict
+    difference: float
+    low: float
+    high: float
+    why: str
+
+
+def values_of(cell: Combination, measure: str) -> list[float]:
+    """What each of its runs reached; those without a number are left out."""
+    if not cell.has(measure):
+        return []
+    last = 1 if measure.startswith(_COUNTED) else LAST
+    values = at_the_end(cell.rows, measure, evaluations=last)
+    return [value for value in values if not math.isnan(value)]
+
+
+def compare(
+    cells: Sequence[Combination], measure: str, thesis: Thesis
+) -> tuple[list[Final], list[Difference]]:
+    """What all combinations reached, and how each two algorithms differ on the same task.
+
+    Algorithms that are at their end on all tasks of the study are compared on all of them together, too.
+    Those that are not at their end have no part in differences.
+
+    Args:
+        cells: of a study.
+        measure: which metric.
+        thesis: what it says of the study.
+    """
+    shown = [cell for cell in cells if values_of(cell, measure)]
+    samples = [values_of(cell, measure) for cell in shown]
+    keys = [(cell.task, cell.algorithm) for cell in shown]
+    groups = [[index] for index in range(len(shown))]
+    for algorithm in _complete(cells, shown):
+        keys.append((ALL_TASKS, algorithm))
+        groups.append([index for index, cell in enumerate(shown) if cell.algorithm == algorithm])
+    final = [all(shown[index].done for index in group) for group in groups]
+    pairs = [
+        (first, second)  # the later one minus the earlier: plain HER comes first in most studies
+        for second, first in combinations(range(len(keys)), 2)
+        if keys[first][0] == keys[second][0] and final[first] and final[second]
+    ]
+    means, gaps = bootstrap(samples, groups, pairs)
+    finals = []
+    for key, group, mean, finished in zip(keys, groups, means, final, strict=True):
+        pooled = [value for index in group for value in samples[index]]
+        low, middle, high = (float(value) for value in np.percentile(pooled, [33, 50, 67]))
+        frames = max(shown[index].frames for index in group)
+        spread = (mean.value, mean.low, mean.high, middle, low, high, min(pooled), max(pooled))
+        said = thesis.number(measure, *key)
+        finals.append(Final(measure, *key, finished, len(pooled), frames, *spread, said))
+    differences = [
+        Difference(
+            measure,
+            *keys[first],
+            keys[second][1],
+            gap.value,
+            gap.low,
+            gap.high,
+            not means[first].overlaps(means[second]),
+        )
+        for (first, second), gap in zip(pairs, gaps, strict=True)
+    ]
+    return finals, differences
+
+
+def _complete(cells: Sequence[Combination], shown: Sequence[Combination]) -> list[str]:
+    """The algorithms that are at their end on all tasks, if there are several."""
+    tasks = {cell.task for cell in cells}
+    counts = Counter(cell.algorithm for cell in shown if cell.done)
+    return [name for name, count in counts.items() if count == len(tasks) > 1]
+
+
+def judge(cells: Sequence[Combination], orders: Sequence[Order], found: Sequence[Difference]) -> list[Judged]:
+    """Whether orders hold: on each task of a study, and the ones of success on all tasks together.
+
+    An order holds if the 95 % interval of the difference lies on its side of 0. That is less than asking
+    for intervals of the two algorithms that lie apart, which is said, too.
+
+    Args:
+        cells: of the study.
+        orders: of the thesis; the ones of algorithms that the study does not have are left out.
+        found: all differences.
+    """
+    tasks = list(dict.fromkeys(cell.task for cell in cells))
+    algorithms = {cell.algorithm for cell in cells}
+    judged = []
+    for order in orders:
+        if {order.more, order.less} <= algorithms:
+            everywhere = [ALL_TASKS] if order.measure == "success" and len(tasks) > 1 else []
+            judged += [_judge(cells, order, task, found) for task in tasks + everywhere]
+    return judged
+
+
+def _judge(cells: Sequence[Combination], order: Order, task: str, found: Sequence[Difference]) -> Judged:
+    for gap in found:
+        if (gap.measure, gap.task) == (order.measure, task) and {gap.first, gap.second} == {
+            order.more,
+            order.less,
+        }:
+            # as the order is written: a < b is about a minus b
+            written = order.text.split()[0]
+            ends = (gap.difference, gap.low, gap.high)
+            if gap.first != written:
+                ends = (-gap.difference, -gap.high, -gap.low)
+            verdict = _verdict(Interval(*ends), rising=written == order.more, apart=gap.apart)
+            why = "too few runs" if math.isnan(gap.low) else ""
+            return Judged(order.measure, task, order.text, verdict, *ends, why)
+    unknown = (math.nan, math.nan, math.nan)
+    return Judged(order.measure, task, order.text, Verdict.OPEN, *unknown, _why(cells, order, task))
+
+
+def _verdict(gap: Interval, *, rising: bool, apart: bool) -> Verdict:
+    """What an interval of a difference says of an order."""
+    if math.isnan(gap.low):
+        return Verdict.OPEN
+    above, below = gap.low > 0, gap.high < 0
+    if not (above or below):
+        return Verdict.UNDECIDED
+    if above != rising:
+        return Verdict.REVERSED
+    return Verdict.APART if apart else Verdict.HOLDS
+
+
+def _why(cells: Sequence[Combination], order: Order, task: str) -> str:
+    """What is lacking for an order to be judged."""
+    lacking = [
+        f"{cell.label} is {cell.state}"
+        for cell in cells
+        if cell.algorithm in (order.more, order.less) and task in (cell.task, ALL_TASKS) and not cell.done
+    ]
+    return ", ".join(lacking) or f"runs without {order.measure}"

@@ -1,0 +1,72 @@
+"""Measures and numbers as a reader of a report wants them."""
+
+from __future__ import annotations
+
+import math
+
+from torchrl_her_recipes.reports.compare import Difference, Final, Judged, Verdict
+
+MEASURES = {  # metric to its name on the page
+    "success": "success",
+    "distance": "distance to goal",
+    "kl": "KL(q, q*)",
+    "q_bias": "bias of Q",
+    "rows_real_positive": "positive rewards, real rows",
+    "rows_virtual_positive": "positive rewards, virtual rows",
+    "rows_useful_virtual_positive": "positive rewards, virtual rows that count",
+}
+
+SIGNS = {  # verdict to a sign for it, and a class of the page
+    Verdict.APART: ("✓", "good"),
+    Verdict.HOLDS: ("(✓)", "good"),
+    Verdict.UNDECIDED: ("?", "fair"),
+    Verdict.REVERSED: ("✗", "bad"),
+    Verdict.OPEN: ("…", "fair"),
+}
+
+
+def show(value: float | None, measure: str) -> str:
+    """A number of a measure as a reader wants it; a dash for none.
+
+    Example:
+        >>> show(0.614, "success"), show(1.0, "kl"), show(12345.6, "rows_real_positive"), show(None, "kl")
+        ('61 %', '1.00', '12,346', '—')
+    """
+    if value is None or math.isnan(value):
+        return "—"
+    if measure in ("success", "share"):
+        return f"{value:.0%}".replace("%", " %")
+    return f"{value:,.0f}" if measure.startswith("rows_") else f"{value:.2f}"
+
+
+def show_interval(row: Final, measure: str) -> str:
+    """An interquartile mean with its interval."""
+    return show(row.iqm, measure) + show_range(row.low, row.high, measure)
+
+
+def show_range(low: float, high: float, measure: str) -> str:
+    """Two ends in brackets, behind a number; nothing where they are not known.
+
+    Example:
+        >>> show_range(0.27, 0.45, "success")
+        ' (27 to 45 %)'
+    """
+    if math.isnan(low):
+        return ""
+    return f" ({show(low, measure).removesuffix(' %')} to {show(high, measure)})"
+
+
+def show_gap(row: Difference | Judged) -> str:
+    """A difference with its interval; of success in points.
+
+    Example:
+        >>> show_gap(Difference("success", "hand_v0", "her_ibs", "her", 0.0932, 0.01, 0.2, False))
+        '+9.3 (+1.0 to +20.0)'
+    """
+    if math.isnan(row.difference):
+        return "—"
+    scale, form = {"success": (100, "+.1f")}.get(row.measure, (1, "+.2f"))
+    if row.measure.startswith("rows_"):
+        form = "+,.0f"
+    value, low, high = (f"{scale * number:{form}}" for number in (row.difference, row.low, row.high))
+    return value if math.isnan(row.low) else f"{value} ({low} to {high})"

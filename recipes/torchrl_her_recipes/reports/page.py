@@ -1,0 +1,166 @@
+"""A page about a study, and the tables and pictures that it is made of."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from torchrl_her_recipes.config.study import Study
+from torchrl_her_recipes.reports.bootstrap import REPETITIONS
+from torchrl_her_recipes.reports.compare import ALL_TASKS, Difference, Final, Judged, Verdict, compare, judge
+from torchrl_her_recipes.reports.formatting import MEASURES, SIGNS, show, show_gap, show_interval, show_range
+from torchrl_her_recipes.reports.pictures import draw_pictures
+from torchrl_her_recipes.reports.results import LAST, Combination
+from torchrl_her_recipes.reports.thesis import load_thesis
+from torchrl_her_recipes.reports.tidy import Results, read_study
+from torchrl_her_recipes.runs.plots import band
+from torchrl_her_recipes.studies.plan import duration
+
+_AT_THE_END = ("success", "distance", "kl", "q_bias")  # whose last numbers are shown, with intervals
+
+
+def write_report(study: Study, folder: Path, out: Path) -> Path:
+    """Writes a page about what there is of a study; trains nothing.
+
+    Args:
+        study: which one.
+        folder: with a folder of each of its combinations, of which some may be missing or not at their end;
+            or with the files that :func:`~torchrl_her_recipes.write_results` made of them.
+        out: where the page goes, its tables, and its pictures into `figures`.
+
+    Returns:
+        The page.
+
+    Raises:
+        ValueError: the folder has none of the study's runs, or one cannot be read.
+        OSError: the page cannot be written.
+    """
+    return write_page(read_study(study, folder), out)
+
+
+def write_page(results: Results, out: Path) -> Path:
+    """Writes a page about results that were read before.
+
+    Args:
+        results: of a study.
+        out: where the page goes, its tables, and its pictures into `figures`.
+
+    Returns:
+        The page.
+
+    Raises:
+        OSError: the page cannot be written.
+    """
+    cells, thesis = results.cells, load_thesis(results.name)
+    measures = list(dict.fromkeys([*_AT_THE_END, *(order.measure for order in thesis.orders)]))
+    compared = [compare(cells, measure, thesis) for measure in measures]
+    finals = [row for rows, _ in compared for row in rows]
+    differences = [row for _, rows in compared for row in rows]
+    judged = judge(cells, thesis.orders, differences)
+    (out / "figures").mkdir(parents=True, exist_ok=True)
+    _write_tables(out, cells, finals, differences, judged)
+    page = _template().render(
+        study=results,
+        thesis=thesis,
+        cells=cells,
+        tasks=list(dict.fromkeys(cell.task for cell in cells)),
+        finals={measure: rows for measure, (rows, _) in zip(measures, compared, strict=True)},
+        differences=[row for row in differences if row.measure == "success"],
+        shares=_shares([row for row in finals if row.measure == "kl"]),
+        orders=_by_order(judged),
+        verdicts=Counter(row.verdict for row in judged),
+        failing=[row for row in judged if row.verdict is not Verdict.APART],
+        pictures=draw_pictures(cells, finals, out / "figures"),
+    )
+    path = out / "index.html"
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def _template() -> Any:
+    environment = Environment(
+        loader=PackageLoader("torchrl_her_recipes"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"show": show, "show_interval": show_interval, "show_gap": show_gap}
+    environment.filters["duration"] = _duration
+    environment.globals["show_range"] = show_range
+    environment.globals |= {"ALL_TASKS": ALL_TASKS, "LAST": LAST, "MEASURES": MEASURES}
+    environment.globals |= {"REPETITIONS": REPETITIONS, "SIGNS": SIGNS}
+    return environment.get_template("report.html")
+
+
+def _duration(seconds: float) -> str:
+    return "—" if math.isnan(seconds) else duration(seconds)
+
+
+def _shares(rows: Sequence[Final]) -> dict[tuple[str, str], tuple[float, float | None]]:
+    """What each algorithm leaves of HER's divergence on the same task: here, and in the thesis."""
+    her = {row.task: row for row in rows if row.algorithm == "her" and row.iqm > 0}
+    shares = {}
+    for row in rows:
+        base = her.get(row.task)
+        if base is not None and base is not row:
+            said = row.thesis / base.thesis if row.thesis is not None and base.thesis else None
+            shares[row.task, row.algorithm] = (row.iqm / base.iqm, said)
+    return shares
+
+
+def _by_order(judged: Sequence[Judged]) -> dict[tuple[str, str], dict[str, Judged]]:
+    """Measure and order to task to what became of it."""
+    table: dict[tuple[str, str], dict[str, Judged]] = {}
+    for row in judged:
+        table.setdefault((row.measure, row.order), {})[row.task] = row
+    return table
+
+
+def _write_tables(
+    out: Path,
+    cells: Sequence[Combination],
+    finals: Sequence[Final],
+    differences: Sequence[Difference],
+    judged: Sequence[Judged],
+) -> None:
+    tables: dict[str, list[dict[str, Any]]] = {
+        "runs": [_about(cell) for cell in cells],
+        "final": [asdict(row) for row in finals],
+        "differences": [asdict(row) for row in differences],
+        "orders": [asdict(row) for row in judged],
+        "curves": [point for cell in cells for point in _points(cell)],
+    }
+    for name, rows in tables.items():
+        with open(out / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerows([rows[0].keys()] if rows else [])
+            writer.writerows([_cell(value) for value in row.values()] for row in rows)
+
+
+def _cell(value: object) -> object:
+    return f"{value:.6g}" if isinstance(value, float) else value
+
+
+def _about(cell: Combination) -> dict[str, Any]:
+    columns = ("label", "task", "algorithm", "state", "runs", "epoch", "frames", "seconds", "differs")
+    return {name: getattr(cell, name) for name in columns}
+
+
+def _points(cell: Combination) -> list[dict[str, Any]]:
+    """What its curves are made of."""
+    names = ("frames", "percentile_33", "median", "percentile_67")
+    return [
+        {"task": cell.task, "algorithm": cell.algorithm, "measure": measure}
+        | dict(zip(names, map(float, point), strict=True))
+        for measure in (*MEASURES, "q", "return")
+        if cell.has(measure)
+        for point in zip(*band(cell.rows, measure), strict=True)
+    ]

@@ -1,0 +1,263 @@
+"""The numbers of a study as files to keep: one table of all its runs, and what is to be known about them."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import yaml
+
+from torchrl_her_recipes.config.study import Study
+from torchrl_her_recipes.config.values import read_mapping
+from torchrl_her_recipes.reports.results import Combination, read_combinations
+from torchrl_her_recipes.runs.goal_map import GoalMap
+
+_ABOUT, _RUNS, _GOALS = "about.yaml", "runs.csv", "goals.npz"
+_LARGE = 1_000_000  # bytes, from which on a table is compressed
+_KEYS = ("seed", "epoch", "frames")  # of a row, beside its combination
+_KEPT = ("task", "algorithm", "options", "done", "epochs", "planned", "seconds", "differs")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """What there is of a study.
+
+    Attributes:
+        name: of the study.
+        summary: one line for people.
+        cells: its combinations.
+    """
+
+    name: str
+    summary: str
+    cells: list[Combination]
+
+
+def is_results(folder: Path) -> bool:
+    """Whether a folder holds the files of :func:`write_results`, and not the folders of runs."""
+    return (folder / _ABOUT).is_file()
+
+
+def read_study(study: Study, folder: Path) -> Results:
+    """What there is of a study, from the folders of its runs or from the files made of them.
+
+    Args:
+        study: which one.
+        folder: with a folder of each combination, or with the files of :func:`write_results`.
+
+    Raises:
+        ValueError: the folder has none of the study's runs, or one cannot be read.
+    """
+    if not is_results(folder):
+        return Results(name=study.name, summary=study.summary, cells=read_combinations(study, folder))
+    results = read_results(folder)
+    if results.name != study.name:
+        raise ValueError(f"{folder} holds results of the study {results.name}, not of {study.name}")
+    return results
+
+
+def write_results(
+    study: Study, folder: Path, out: Path, *, command: str | Sequence[str] | None = None
+) -> Path:
+    """Writes the numbers of a study's runs as few small files, from which reports can be made again.
+
+    - ``runs.csv`` has a row for each run and evaluation: the combination (``label``, ``task``, ``algorithm``
+      and the other options that the study varies), ``seed``, ``epoch``, ``frames`` and all metrics, with six
+      significant digits. An empty place is a metric that the combination does not have. Above one
+      megabyte it is compressed: ``runs.csv.gz``.
+    - ``goals.npz`` has the histograms of virtual goals, ``LABEL.counts`` and ``LABEL.target`` for each
+      combination, if there are any.
+    - ``about.yaml`` has the command, the versions, the date, the study's recipe, and the state of each
+      combination.
+
+    Args:
+        study: which one.
+        folder: with a folder of each of its combinations; some may be missing or not at their end.
+        out: where the files go.
+        command: the command, or several, that made the runs; by default ``torchrl-her study NAME``.
+
+    Returns:
+        The folder of the files.
+
+    Raises:
+        ValueError: the folder has none of the study's runs, or one cannot be read.
+        OSError: the files cannot be written.
+    """
+    cells = read_combinations(study, folder)
+    about = {
+        "study": study.name,
+        "summary": study.summary,
+        "command": command or f"torchrl-her study {study.name}",
+        **_origin([folder / cell.label for cell in cells]),
+        "recipe": dict(study.recipe),
+        "vary": {name: list(values) for name, values in study.vary.items()},
+    }
+    return write_files(about, cells, out)
+
+
+def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Path) -> Path:
+    """The same for combinations that were read before.
+
+    Args:
+        about: the study's name and summary, and whatever else is to be known; the state of each
+            combination is added.
+        cells: the combinations.
+        out: where the files go.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    _write_table(cells, out)
+    _write_goals(cells, out / _GOALS)
+    states = {cell.label: {name: _plain(getattr(cell, name)) for name in _KEPT} for cell in cells}
+    text = yaml.safe_dump(
+        {**_plain(about), "combinations": states}, sort_keys=False, allow_unicode=True, width=110
+    )
+    (out / _ABOUT).write_text(text, encoding="utf-8")  # the last: with it the folder is one of results
+    return out
+
+
+def read_results(folder: Path) -> Results:
+    """What :func:`write_results` wrote.
+
+    Args:
+        folder: of one study.
+
+    Raises:
+        ValueError: there are no results in it, or they are damaged.
+    """
+    path = folder / _ABOUT
+    if not path.is_file():
+        raise ValueError(f"{folder} holds no results: it has no {_ABOUT}")
+    about, tables, maps = read_mapping(path), _read_table(folder), _read_goals(folder / _GOALS)
+    try:
+        cells = [
+            Combination(
+                label=label,
+                rows=tables.get(label, []),
+                goals=maps.get(label),
+                **{name: state[name] for name in _KEPT},
+            )
+            for label, state in about["combinations"].items()
+        ]
+        return Results(name=about["study"], summary=about["summary"], cells=cells)
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: {error} is missing or of the wrong kind") from error
+
+
+def _write_table(cells: Sequence[Combination], out: Path) -> None:
+    names = dict.fromkeys(name for cell in cells for name in cell.options)
+    # Tasks and algorithms that are varied are columns of their own already.
+    options = [
+        name
+        for name in names
+        if any(cell.options.get(name) not in (cell.task, cell.algorithm) for cell in cells)
+    ]
+    found = dict.fromkeys(name for cell in cells for row in cell.rows for name in row)
+    metrics = [name for name in found if name not in (*_KEYS, "run")]
+    plain, packed = out / _RUNS, out / f"{_RUNS}.gz"
+    with open(plain, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["label", "task", "algorithm", *options, *_KEYS, *metrics])
+        for cell in cells:
+            own = [cell.label, cell.task, cell.algorithm, *(cell.options.get(name) for name in options)]
+            for row in sorted(cell.rows, key=lambda row: (row["seed"], row["epoch"])):
+                writer.writerow([*own, *(_number(row.get(name)) for name in (*_KEYS, *metrics))])
+    packed.unlink(missing_ok=True)
+    if plain.stat().st_size > _LARGE:
+        packed.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))  # the same bytes every time
+        plain.unlink()
+
+
+def _number(value: float | None) -> str:
+    """Six significant digits; whole numbers have all of theirs."""
+    if value is None:
+        return ""
+    return str(int(value)) if float(value).is_integer() else f"{value:.6g}"
+
+
+def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
+    """Label to its rows in the order of epochs and runs."""
+    path, packed = folder / _RUNS, folder / f"{_RUNS}.gz"
+    if not path.is_file() and not packed.is_file():
+        raise ValueError(f"{folder} has no {_RUNS}")
+    read = path.read_bytes if path.is_file() else lambda: gzip.decompress(packed.read_bytes())
+    tables: dict[str, list[dict[str, float]]] = {}
+    try:
+        lines = csv.DictReader(read().decode().splitlines())
+        names = lines.fieldnames or []
+        if not {"label", *_KEYS} <= set(names):
+            raise ValueError(f"its columns are {', '.join(names)}")
+        numbers = names.index("seed")  # what comes before them says which combination
+        for line in lines:
+            row = {name: _parse(line[name]) for name in names[numbers:] if line[name] != ""}
+            tables.setdefault(line["label"], []).append(row)
+        return {label: _count(rows) for label, rows in tables.items()}
+    except (AttributeError, EOFError, KeyError, OSError, TypeError, ValueError) as error:
+        raise ValueError(f"the table of runs in {folder} is damaged: {error}") from error
+
+
+def _parse(text: str) -> float:
+    return int(text) if text.isdigit() else float(text)
+
+
+def _count(rows: list[dict[str, float]]) -> list[dict[str, float]]:
+    """Runs are counted in the order of their seeds, as when the folders of runs are read."""
+    places = {seed: run for run, seed in enumerate(sorted({row["seed"] for row in rows}))}
+    return sorted(
+        ({"run": places[row["seed"]], **row} for row in rows), key=lambda row: (row["epoch"], row["run"])
+    )
+
+
+def _write_goals(cells: Sequence[Combination], path: Path) -> None:
+    arrays: dict[str, Any] = {}
+    for cell in cells:
+        if cell.goals is not None:
+            counts = cell.goals.counts
+            if (counts == counts.astype(np.uint64)).all():
+                counts = counts.astype(np.min_scalar_type(int(counts.max(initial=0))))
+            arrays |= {f"{cell.label}.counts": counts, f"{cell.label}.target": cell.goals.target}
+    path.unlink(missing_ok=True)
+    if arrays:
+        np.savez_compressed(path, **arrays)
+
+
+def _read_goals(path: Path) -> dict[str, GoalMap]:
+    if not path.is_file():
+        return {}
+    try:
+        with open(path, "rb") as file, np.load(file) as arrays:
+            labels = [name.removesuffix(".counts") for name in arrays.files if name.endswith(".counts")]
+            return {label: GoalMap(arrays[f"{label}.counts"], arrays[f"{label}.target"]) for label in labels}
+    except (BadZipFile, EOFError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _origin(folders: Sequence[Path]) -> dict[str, Any]:
+    """The day of the last evaluation, and the versions that all runs had."""
+    homes = [home for folder in folders for home in (folder, *sorted(folder.glob("seeds_*")))]
+    versions: dict[str, set[str]] = {}
+    for path in (home / "run.json" for home in homes):
+        if path.is_file():
+            for name, version in json.loads(path.read_text()).get("versions", {}).items():
+                versions.setdefault(name, set()).add(version)
+    times = [path.stat().st_mtime for home in homes if (path := home / "metrics.csv").is_file()]
+    return {
+        "date": datetime.fromtimestamp(max(times), UTC).date().isoformat(),
+        "versions": {name: " or ".join(sorted(own)) for name, own in versions.items()},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Values that YAML has words for."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(own) for name, own in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(own) for own in value]
+    return value.item() if isinstance(value, np.generic) else value

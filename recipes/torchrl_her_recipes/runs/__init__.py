@@ -1,0 +1,1 @@
+"""Runs: training, evaluation, checkpoints, and what they leave behind."""

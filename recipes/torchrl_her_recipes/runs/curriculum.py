@@ -1,0 +1,56 @@
+"""Runs in a curriculum: how well they do in their layer, and when the next one begins."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_her.curriculum.switch import enter_layer
+from torchrl_her.trainers.metrics import success
+from torchrl_her.trainers.trainer import evaluate
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_recipes.components.assembly import eval_seeds
+from torchrl_her_recipes.components.components import Components
+from torchrl_her_recipes.components.curricula import CurriculumState
+
+
+def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDictBase:
+    """Greedy episodes of each run, with starts and goals of their own in each epoch."""
+    task = goal_env(env)
+    task.set_seeds(eval_seeds(components.recipe, epoch))
+    return evaluate(env, components.policy, max_steps=task.max_steps)
+
+
+def layer_success(
+    components: Components, state: CurriculumState, rollout: TensorDictBase, epoch: int
+) -> Tensor:
+    """Success [R, n] at the goals of the runs' layers; that of ``rollout`` where it is the full task."""
+    runs, last = components.recipe.run.num_runs, len(state.curriculum) - 1
+    full = success(rollout).float().view(runs, -1)
+    below = state.progress.layer < last
+    if not bool(below.any()):
+        return full
+    own = success(play_greedily(components, state.layer_env, epoch)).float().view(runs, -1)
+    return torch.where(below.unsqueeze(1), own, full)
+
+
+def move_on(components: Components, state: CurriculumState, samples: Tensor, frames: int) -> list[str]:
+    """Moves runs that have learned their layer to the next one, and returns a message for each of them."""
+    before = state.progress.layers
+    # As many as the window takes: more in one evaluation would give a lucky streak many chances.
+    moved = state.progress.record(samples[:, : state.progress.window])
+    learner, exploration, lines = components.recipe.learner, components.exploration, []
+    for run in moved.nonzero().flatten().tolist():
+        old, new = state.curriculum.layers[before[run]], state.progress.layer_of(run)
+        seed = components.recipe.seeds[run]
+        lines.append(f"seed {seed}: {old.name!r} learned after {frames:,} frames, {new.name!r} begins")
+        enter_layer(
+            components.buffers[run],
+            new,
+            exploration if learner.has_epsilon else None,
+            epsilon=components.recipe.curriculum.layer_epsilon,
+            run=run,
+        )
+    return lines

@@ -1,0 +1,65 @@
+"""Where a run's virtual goals lie, beside where they should: q and q* over a grid, as a file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from torchrl.data import TensorDictReplayBuffer
+
+from torchrl_her_recipes.components.goal_space import histograms
+
+
+@dataclass(frozen=True)
+class GoalMap:
+    """Histograms over a grid of goals: n x n cells of the screen, the first index goes right, the second up.
+
+    Attributes:
+        counts: [R, n, n] virtual goals of each run written since its buffer was last emptied; [R, n] or
+            [R, n, n, n] for goals of as many coordinates.
+        target: [n, n], q* at the final sigma.
+    """
+
+    counts: np.ndarray
+    target: np.ndarray
+
+    @property
+    def share(self) -> np.ndarray:
+        """q [n, n], the mean of the runs."""
+        totals = self.counts.sum(tuple(range(1, self.counts.ndim)), keepdims=True)
+        return (self.counts / np.maximum(totals, 1)).mean(0)
+
+    def save(self, path: Path) -> None:
+        """Writes it as a file of numpy arrays."""
+        part = path.with_suffix(".part.npz")
+        np.savez_compressed(part, counts=self.counts, target=self.target)
+        part.replace(path)  # whole or not at all
+
+    @classmethod
+    def load(cls, path: Path) -> GoalMap:
+        """Reads what :meth:`save` wrote.
+
+        Raises:
+            ValueError: there is no such file, as the run has written no virtual goals, or it is damaged.
+        """
+        if not path.is_file():
+            raise ValueError(f"{path.parent} has no {path.name}: the run has written no virtual goals")
+        try:
+            with open(path, "rb") as file, np.load(file) as arrays:
+                return cls(arrays["counts"], arrays["target"])
+        except (BadZipFile, EOFError, KeyError, ValueError) as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def goal_map(buffers: Sequence[TensorDictReplayBuffer], target: torch.Tensor | None) -> GoalMap | None:
+    """The map of a run's buffers and its q* [cells]; None where nothing counts virtual goals."""
+    counted = histograms(buffers)
+    if not counted or target is None:
+        return None
+    shape = counted[0].grid.shape
+    counts = torch.stack([own.counts.view(shape) for own in counted])
+    return GoalMap(counts.cpu().numpy(), target.view(shape).cpu().numpy())

@@ -1,0 +1,205 @@
+"""Pictures of a run: its curves, and where its virtual goals lie."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+from torchrl_her_envs.common.goal_env import GoalEnv
+from torchrl_her_recipes.config.metrics import AXES, PANELS
+from torchrl_her_recipes.runs.goal_map import GoalMap
+
+matplotlib.use("agg")
+
+Rows = Sequence[dict[str, float]]
+
+COLORS = {  # of algorithms, the same in every picture
+    "no_hindsight": "#1a202c",
+    "her": "#dd6b20",
+    "her_ibs": "#38a169",
+    "her_ibs_sequential": "#718096",
+    "filtered_her": "#805ad5",
+    "filtered_her_ibs": "#2b6cb0",
+    "cher": "#c53030",
+    "cher_ibs": "#0bc5ea",
+    "unfiltered_cher": "#d53f8c",
+    "unfiltered_cher_ibs": "#975a16",
+}
+_COLORS = ("#dd6b20", "#805ad5", "#2b6cb0", "#38a169", "#d53f8c", "#718096")
+_REGIONS = {"goals": "#63b3ed", "reach": "#fc8181"}
+_SCREEN = 300  # pixels of the picture behind a heat map
+
+
+def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
+    """Draws the curves of a run; of several ones the median, and the 33rd to 67th percentile.
+
+    Args:
+        rows: the table of metrics, one row an epoch and run.
+        path: of the picture.
+        title: above it.
+    """
+    figure = Figure(figsize=(14, 6), layout="constrained")
+    figure.suptitle(title)
+    for axes, (name, label, limits) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
+        if all(name in row for row in rows):
+            draw_curve(axes, rows, name)
+        for frames in layer_changes(rows):
+            axes.axvline(frames, color="#a0aec0", linewidth=0.8, linestyle=":")
+        axes.set(xlabel="environment steps", ylabel=label)
+        count_frames(axes)
+        axes.grid(alpha=0.3)
+        if limits is not None:
+            axes.set_ylim(*limits)
+    figure.savefig(path, dpi=110)
+
+
+def plot_comparison(
+    panels: Mapping[str, Mapping[str, Rows]], path: Path, *, metrics: Sequence[str] = ("success",)
+) -> None:
+    """Draws metrics over environment steps: medians, and the 33rd to 67th percentile of the runs.
+
+    Args:
+        panels: title of each panel to the curves in it, label to table of metrics.
+        path: of the picture.
+        metrics: what is drawn, one panel each.
+    """
+    columns = [(title, curves, name) for title, curves in panels.items() for name in metrics]
+    figure = Figure(figsize=(1.0 + 4.2 * len(columns), 3.8), layout="constrained")
+    grid = figure.subplots(1, len(columns), sharey=len(metrics) == 1, squeeze=False)[0]
+    for axes, (title, curves, name) in zip(grid, columns, strict=True):
+        draw_curves(axes, curves, name, colors(list(curves)))
+        axes.set(title=title, xlabel="environment steps of each run")
+        axes.legend(fontsize=8)
+        if axes is not grid[0] and len(metrics) == 1:
+            axes.set_ylabel("")
+    grid[0].set_ylabel(f"{grid[0].get_ylabel()} (median, 33rd to 67th percentile)")
+    figure.savefig(path, dpi=110)
+
+
+def colors(labels: Sequence[str]) -> dict[str, str]:
+    """A color for each label: algorithms have their own, others take their turn.
+
+    Example:
+        >>> colors(["her", "window=20"])
+        {'her': '#dd6b20', 'window=20': '#805ad5'}
+    """
+    return {label: COLORS.get(label, _COLORS[index % len(_COLORS)]) for index, label in enumerate(labels)}
+
+
+def draw_curves(axes: Axes, curves: Mapping[str, Rows], name: str, palette: Mapping[str, str]) -> None:
+    """One metric of several algorithms over environment steps, on given axes."""
+    for label, rows in curves.items():
+        draw_curve(axes, rows, name, color=palette[label], label=label)
+    label, limits = AXES[name]
+    axes.set_ylabel(label)
+    count_frames(axes)
+    axes.grid(alpha=0.3)
+    if limits is not None:
+        axes.set_ylim(*limits)
+
+
+def count_frames(axes: Axes) -> None:
+    """Environment steps along the x axis, with room between their numbers."""
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+
+
+def layer_changes(rows: Rows) -> list[float]:
+    """After how many frames runs went on to another layer of their curriculum: one entry each."""
+    last: dict[float, dict[str, float]] = {}
+    changes = []
+    for row in rows:
+        before = last.get(row["run"], row)
+        if row.get("layer") != before.get("layer"):
+            changes.append(before["frames"])
+        last[row["run"]] = row
+    return changes
+
+
+def draw_curve(
+    axes: Axes,
+    rows: Rows,
+    name: str,
+    *,
+    color: str = "#2b6cb0",
+    label: str | None = None,
+) -> None:
+    """One metric over environment steps, on given axes: median, and 33rd to 67th percentile."""
+    frames, low, middle, high = band(rows, name)
+    axes.plot(frames, middle, color=color, label=label)
+    axes.fill_between(frames, low, high, color=color, alpha=0.25, linewidth=0)
+
+
+def band(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Frames, and the 33rd, 50th and 67th percentile of one metric there, [n] each."""
+    frames, values = by_frames(rows, name)
+    low, middle, high = np.percentile(values, [33, 50, 67], axis=1)
+    return frames, low, middle, high
+
+
+def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """One metric as (frames [n], values [n, R])."""
+    if missing := [row for row in rows if name not in row]:
+        raise ValueError(f"these runs did not measure {name}; they have {', '.join(missing[0])}")
+    groups: dict[float, list[float]] = {}
+    for row in rows:
+        groups.setdefault(row["frames"], []).append(row[name])
+    return np.array(list(groups)), np.array(list(groups.values()))
+
+
+def plot_goals(goals: GoalMap, env: GoalEnv, path: Path, *, title: str = "") -> None:
+    """Draws where virtual goals lie beside the target q*, in the same colors.
+
+    Args:
+        goals: q and q*.
+        env: of the task.
+        path: of the picture.
+        title: above it.
+    """
+    figure = Figure(figsize=(9.6, 4.6), layout="constrained")
+    figure.suptitle(title)
+    limit = max(float(goals.target.max()), 1e-9)
+    panels = figure.subplots(1, 2)
+    for axes, share, name in zip(
+        panels, (goals.share, goals.target), ("written: q", "target: q*"), strict=True
+    ):
+        draw_goals(axes, share, env, limit=limit)
+        axes.set_title(name)
+    figure.colorbar(panels[0].images[-1], ax=panels, label="share of virtual goals in a cell", extend="max")
+    figure.savefig(path, dpi=110)
+
+
+def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> None:
+    """A heat map [n, n] over a picture of the environment, on given axes; its colors end at ``limit``.
+
+    The environment says in which box goals can lie, and which regions are worth drawing.
+
+    Raises:
+        ValueError: its goals do not lie in a box of two dimensions, or it cannot be drawn.
+    """
+    box = env.goal_box()
+    if box is None or len(box[0]) != 2 or not env.can_render:
+        raise ValueError(
+            f"goals of {env.task_name} cannot be drawn: they need a picture and a box in a plane"
+        )
+    (left, bottom), (right, top) = box
+    extent = (left, right, bottom, top)
+    axes.imshow(env.render(0, size=_SCREEN).numpy(), extent=extent)
+    heat = share.T
+    alpha = (
+        np.clip(heat / limit, 0.0, 1.0) ** 0.5
+    )  # what is hardly ever written leaves the picture to be seen
+    axes.imshow(heat, origin="lower", cmap="magma", vmin=0.0, vmax=limit, alpha=alpha, extent=extent)
+    for name, ((x, y), (x_end, y_end)) in env.regions().items():
+        color = _REGIONS.get(name, "#718096")
+        axes.add_patch(Rectangle((x, y), x_end - x, y_end - y, fill=False, edgecolor=color, linewidth=1.5))
+    middle = [(left + right) / 2, (bottom + top) / 2]
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    axes.set(xticks=[left, middle[0], right], yticks=[bottom, middle[1], top])

@@ -1,0 +1,170 @@
+"""Trained policies that come with the package, one for each throwing and reaching task."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tensordict.nn import TensorDictModule
+from torchrl.envs import EnvBase
+
+from torchrl_her.modules.networks import ActorNet, make_actor, take_run
+from torchrl_her.trainers.checkpoint import load_checkpoint, save_checkpoint
+from torchrl_her.trainers.metrics import success
+from torchrl_her.trainers.trainer import evaluate
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_recipes.components.curricula import make_curriculum
+from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.shipped import TRAINED, policy_names
+from torchrl_her_recipes.runs.folder import RunFolder
+from torchrl_her_recipes.runs.run import median_run
+
+_KEYS = ("observation", "desired_goal")
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A greedy policy, and what made it.
+
+    Attributes:
+        task: that it is for.
+        actor: reads ``observation`` and ``desired_goal``, writes ``action``.
+        recipe: of the run; its seed is that of this very policy. Its task may be a harder one.
+        success: in 1,000 episodes of its task, with starts and goals that no training has seen.
+        frames: environment steps that it was trained for.
+    """
+
+    task: str
+    actor: TensorDictModule
+    recipe: Recipe
+    success: float
+    frames: int
+
+
+def load_trained(name: str | Path) -> TrainedPolicy:
+    """A policy that comes with the package, or one that was exported, with what made it.
+
+    Args:
+        name: of a task, or the path of a .pt file.
+
+    Raises:
+        ValueError: there is no such policy, or the file is damaged.
+    """
+    path = TRAINED / f"{name}.pt" if str(name) in policy_names() else Path(name)
+    if not path.is_file():
+        raise ValueError(f"there is no policy {str(name)!r}; there are {', '.join(policy_names())}")
+    return _policy_of(load_checkpoint(path))
+
+
+def load_policy(name: str | Path) -> TensorDictModule:
+    """The greedy policy of a task, trained: reads ``observation`` and ``desired_goal``, writes ``action``.
+
+    Args:
+        name: of a task, or the path of a .pt file that :func:`export_policy` wrote.
+
+    Raises:
+        ValueError: there is no such policy, or the file is damaged.
+    """
+    return load_trained(name).actor
+
+
+def export_policy(
+    folder: str | Path, out: str | Path, *, run: int | None = None, task: str | None = None
+) -> TrainedPolicy:
+    """Writes the policy of a finished run as a small file of its own.
+
+    Args:
+        folder: of the run.
+        out: the .pt file.
+        run: which one, of several side by side; the median of them if None.
+        task: that the policy is for, if not the run's own: one that shows and wants the same.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ValueError: this is no folder of a run, it has no such run, its policy needs more than the
+            observation and the desired goal as they are, or the task is one that it cannot play.
+        OSError: the run has not saved a policy yet.
+    """
+    home = RunFolder(folder)
+    recipe, rows = home.recipe(), home.rows()
+    if not rows:
+        raise ValueError(f"the run in {folder} has not been evaluated yet")
+    chosen = median_run(rows) if run is None else run
+    if chosen not in range(recipe.run.num_runs):
+        raise ValueError(f"there is no run {chosen} in {folder}; it has runs 0 to {recipe.run.num_runs - 1}")
+    played = recipe.replace(task=task or recipe.task.name)
+    env = make_task_envs(recipe, 1, [0])
+    _check_seen(recipe, env)
+    widths, actions = _widths(env)
+    state = {
+        "task": played.task.name,
+        "widths": widths,
+        "actions": actions,
+        "actor": take_run(load_checkpoint(home.policy)["actor"], chosen, recipe.run.num_runs),
+        "recipe": recipe.replace(num_runs=1, seed=recipe.run.seed + chosen).to_dict(),
+        "success": math.nan,
+        "frames": int(rows[-1]["frames"]),
+    }
+    _check_state(recipe, state)
+    if task is not None and _widths(make_task_envs(played, 1, [0])) != (widths, actions):
+        raise ValueError(
+            f"a policy of {recipe.task.name} cannot play {played.task.name}: it has other widths"
+        )
+    state["success"] = measure_success(_policy_of(state))
+    save_checkpoint(state, out)
+    return _policy_of(state)
+
+
+def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int = 1 << 41) -> float:
+    """The share of greedy episodes in which a policy achieves its goal."""
+    env = make_task_envs(policy.recipe.replace(task=policy.task), episodes, [seed])
+    return float(success(evaluate(env, policy.actor, max_steps=goal_env(env).max_steps)).float().mean())
+
+
+def _policy_of(state: dict[str, Any]) -> TrainedPolicy:
+    actor = make_actor(
+        state["widths"], state["actions"], hidden=state["recipe"]["learner"]["hidden"], in_keys=_KEYS
+    )
+    actor.load_state_dict(state["actor"])
+    recipe = Recipe.from_dict(state["recipe"])
+    return TrainedPolicy(
+        task=state["task"],
+        actor=actor.requires_grad_(False),
+        recipe=recipe,
+        success=state["success"],
+        frames=state["frames"],
+    )
+
+
+def _widths(env: EnvBase) -> tuple[list[int], int]:
+    """How wide an environment's observation and goal are, and its actions."""
+    return [goal_env(env).observation_spec[key].shape[-1] for key in _KEYS], env.action_spec.shape[-1]
+
+
+def _check_seen(recipe: Recipe, env: EnvBase) -> None:
+    """Raises a ValueError if a curriculum's last layer does not see observation and goal as they are."""
+    curriculum = make_curriculum(recipe, env)
+    if curriculum is None:
+        return
+    last, (widths, _) = curriculum.layers[-1], _widths(env)
+    if (*last.observation, *last.desired_goal) != tuple(range(sum(widths))):
+        raise ValueError(
+            f"the last layer of {recipe.task.name}'s curriculum must see the observation "
+            "and the desired goal as they are, for its policy to be exported"
+        )
+
+
+def _check_state(recipe: Recipe, state: dict[str, Any]) -> None:
+    """Raises a ValueError if these are not the weights of :func:`~torchrl_her.make_actor`."""
+    wanted = ActorNet(sum(state["widths"]), state["actions"], hidden=recipe.learner.hidden).state_dict()
+    shapes = {f"module.{name}": value.shape for name, value in wanted.items()}
+    if {name: value.shape for name, value in state["actor"].items()} != shapes:
+        raise ValueError(
+            f"a policy of learner={recipe.learner.name} cannot be exported: its network is not one of "
+            "make_actor, as those of ddpg and td3 are"
+        )

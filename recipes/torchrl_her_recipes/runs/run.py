@@ -1,0 +1,268 @@
+"""One run from beginning to end: train, evaluate, record, checkpoint, and go on from there."""
+
+from __future__ import annotations
+
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from torchrl_her.trainers.checkpoint import load_newest_checkpoint, save_checkpoint
+from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner
+from torchrl_her.trainers.trainer import Trainer
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_envs.common.rendering.recording import record_episodes
+from torchrl_her_envs.common.rendering.video import write_video
+from torchrl_her_recipes.components.assembly import build
+from torchrl_her_recipes.components.components import Components
+from torchrl_her_recipes.runs.curriculum import layer_success, move_on, play_greedily
+from torchrl_her_recipes.runs.evaluation import measure, written
+from torchrl_her_recipes.runs.folder import RunFolder
+from torchrl_her_recipes.runs.goal_map import GoalMap, goal_map
+from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
+from torchrl_her_recipes.runs.plots import plot_curves, plot_goals
+from torchrl_her_recipes.runs.state import load_run_state, run_state
+
+FPS = 12  # of films: half the true speed, as a throw takes half a second
+_FILMED = 6  # environments in the GIF at the end of a run
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """The result of a run, or of several side by side.
+
+    Attributes:
+        rows: the table of metrics, with a row for each epoch and run.
+        folder: the folder with all files of the run, or None.
+        interrupted: whether it was stopped by Ctrl-C or a signal.
+    """
+
+    rows: list[dict[str, float]]
+    folder: Path | None
+    interrupted: bool = False
+
+    @property
+    def success(self) -> float:
+        """Success rate in the last evaluation, the median of the runs; 0 if there was none."""
+        return statistics.median(last_success(self.rows)) if self.rows else 0.0
+
+
+def last_success(rows: list[dict[str, float]]) -> list[float]:
+    """Success of each run in the last evaluation."""
+    return [row["success"] for row in rows if row["epoch"] == rows[-1]["epoch"]]
+
+
+def run(components: Components, folder: str | Path | None = None, *, progress: bool = True) -> RunResult:
+    """Trains for as many epochs as the recipe says.
+
+    Args:
+        components: from :func:`~torchrl_her_recipes.build`; you may have replaced some of them.
+        folder: where the run writes its files; None writes nothing.
+        progress: whether to show a progress bar.
+
+    Raises:
+        ValueError: the folder holds a run already.
+    """
+    home, trainer = None if folder is None else RunFolder(folder), components.trainer()
+    with torch.random.fork_rng(devices=[]):
+        # Losses and policies of TorchRL draw from torch's own generator.
+        torch.manual_seed(components.recipe.run.seed)
+        if home is not None:
+            home.create()
+            _save(components, trainer, home)  # before config.yaml: a folder that has one can be resumed
+            home.describe(components.recipe)
+        return _run(components, trainer, home, [], progress=progress)
+
+
+def resume(folder: str | Path, *, components: Components | None = None, progress: bool = True) -> RunResult:
+    """Continues a run from its newest complete checkpoint.
+
+    With the tasks of this library the result is bit for bit that of a run that never stopped. So it is with
+    an environment of your own if it keeps no state from one epoch to the next; after a stop in the middle
+    of an epoch, however, the rest of that epoch consists of new episodes.
+
+    Args:
+        folder: of the run.
+        components: newly made ones, if those of the run were not the ones of its recipe.
+        progress: whether to show a progress bar.
+
+    Raises:
+        ValueError: there is no run in the folder, no checkpoint is complete, or the components differ
+            from those of the run.
+        OSError: there is no checkpoint.
+    """
+    home = RunFolder(folder)
+    components = components or build(home.recipe())
+    trainer = components.trainer()
+    state = load_newest_checkpoint(home.checkpoint, keep=components.recipe.run.keep_checkpoints)
+    with torch.random.fork_rng(devices=[]):
+        load_run_state(components, trainer, state)
+        home.policy.unlink(missing_ok=True)  # of an earlier stop: it comes last, when the run has ended
+        rows = home.rows()[
+            : trainer.epochs * components.recipe.run.num_runs
+        ]  # without those that are newer than the checkpoint
+        return _run(components, trainer, home, rows, progress=progress)
+
+
+def _run(
+    components: Components,
+    trainer: Trainer,
+    home: RunFolder | None,
+    rows: list[dict[str, float]],
+    *,
+    progress: bool,
+) -> RunResult:
+    recipe = components.recipe
+    threads = torch.get_num_threads()
+    torch.set_num_threads(recipe.run.threads)
+    torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
+    bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
+    interrupted = compiled = saved = False
+    unlogged = 0  # rows that are not on the disk yet
+    if isinstance(trainer.learner, FusedDDPGLearner):
+        trainer.learner.before_compiling = lambda: _say(bar, "Compiling the gradient step, once: about 30 s")
+    with soft_interrupt() as check:  # also while things are saved at the end
+        try:
+            while trainer.epochs < recipe.run.epochs:
+                new = _epoch(components, trainer, bar, check, rows[-1]["seconds"] if rows else 0.0)
+                rows += new
+                compiled = compiled or _say_compiled(trainer, bar)
+                if home is not None:
+                    unlogged += len(new)
+                    with _despite_a_full_disk("table", trainer):
+                        home.log(rows, unlogged)
+                        unlogged = 0
+                    saved = trainer.epochs % recipe.run.checkpoint_interval == 0 and _save(
+                        components, trainer, home
+                    )
+                    if saved:
+                        with _despite_a_full_disk("map of goals", trainer):
+                            _save_goals(components, home)
+        except Interrupted:
+            interrupted, saved = True, False
+        finally:
+            bar.close()
+            torch.set_num_threads(threads)
+            torch.set_flush_denormal(False)
+        if home is not None:
+            if not saved:
+                _save(components, trainer, home)
+            _finish(components, rows, home)
+    return RunResult(rows=rows, folder=None if home is None else home.path, interrupted=interrupted)
+
+
+def _epoch(
+    components: Components, trainer: Trainer, bar: tqdm, check: Callable[[], None], seconds: float
+) -> list[dict[str, float]]:
+    """One epoch and its evaluation, as rows of the table: one for each run."""
+
+    def on_batch(trainer: Trainer) -> None:
+        bar.set_description_str(f"{trainer.updates} updates", refresh=False)
+        bar.update(trainer.frames - bar.n)
+        check()
+
+    began = time.perf_counter()
+    measured = trainer.epoch(on_batch)
+    rollout = play_greedily(components, components.eval_env, trainer.epochs)
+    measured |= measure(components, rollout)
+    samples = (
+        None
+        if components.curriculum is None
+        else layer_success(components, components.curriculum, rollout, trainer.epochs)
+    )
+    if samples is not None:
+        measured["layer_success"] = samples.mean(1)
+    seconds += time.perf_counter() - began
+    rows = []
+    for run, seed in enumerate(components.recipe.seeds):
+        counters = {"run": run, "seed": seed, "epoch": trainer.epochs, "frames": trainer.frames}
+        times = {"updates": trainer.updates, "seconds": seconds}
+        values = {name: float(value[run]) for name, value in measured.items()}
+        if components.curriculum is not None:
+            values["layer"] = components.curriculum.progress.layers[run]
+        rows.append({**counters, **times, **values, **written(components, run)})
+    if components.curriculum is not None and samples is not None:
+        for line in move_on(components, components.curriculum, samples, trainer.frames):
+            _say(bar, line)
+    bar.set_postfix(success=f"{statistics.median(last_success(rows)):.2f}")
+    return rows
+
+
+def _say(bar: tqdm, line: str) -> None:
+    """A line above the progress bar, if there is one."""
+    if not bar.disable:
+        bar.write(line)
+
+
+def _say_compiled(trainer: Trainer, bar: tqdm) -> bool:
+    """A line when the gradient step has been compiled; returns whether it was."""
+    learner = trainer.learner
+    if not (isinstance(learner, FusedDDPGLearner) and learner.is_compiled):
+        return False
+    bar.start_t += learner.compile_seconds  # which would make the bar guess hours
+    _say(bar, f"gradient step compiled in {learner.compile_seconds:.0f} s (kept for later runs)")
+    return True
+
+
+def _save(components: Components, trainer: Trainer, home: RunFolder) -> bool:
+    """Writes a checkpoint; returns whether it could."""
+    with _despite_a_full_disk("checkpoint", trainer):
+        save_checkpoint(
+            run_state(components, trainer), home.checkpoint, keep=components.recipe.run.keep_checkpoints
+        )
+        return True
+    return False
+
+
+@contextmanager
+def _despite_a_full_disk(what: str, trainer: Trainer) -> Iterator[None]:
+    """Turns a failure to write a file into a warning: the run goes on, and the next epoch tries again."""
+    try:
+        yield
+    except OSError as error:
+        warnings.warn(f"no {what} after {trainer.frames:,} frames, the run goes on: {error}", stacklevel=4)
+
+
+def _finish(components: Components, rows: list[dict[str, float]], home: RunFolder) -> None:
+    """Draws the pictures and then writes the policy, whose file tells that the run has ended."""
+    _draw(components, rows, home)
+    save_checkpoint({"actor": dict(components.actor.state_dict())}, home.policy)
+
+
+def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder) -> None:
+    recipe = components.recipe
+    home.close()
+    title = f"{recipe.task.name}, {recipe.hindsight.algo}, " + (
+        f"seed {recipe.run.seed}" if recipe.run.num_runs == 1 else f"{recipe.run.num_runs} runs"
+    )
+    if rows:
+        plot_curves(rows, home.curves, title=title)
+    goals = _save_goals(components, home)
+    task = goal_env(components.env)
+    if not task.can_render:
+        return
+    if goals is not None and goals.target.ndim == 2:
+        plot_goals(goals, task, home.goals, title=f"virtual goals: {title}")
+    first = recipe.evaluation.episodes * (median_run(rows) if rows else 0)
+    worlds = range(first, first + min(_FILMED, recipe.evaluation.episodes))
+    write_video(record_episodes(components.eval_env, components.policy, worlds=worlds), home.video, fps=FPS)
+
+
+def median_run(rows: list[dict[str, float]]) -> int:
+    """The index of the run with the median success in the last evaluation."""
+    values = last_success(rows)
+    return sorted(range(len(values)), key=values.__getitem__)[len(values) // 2]
+
+
+def _save_goals(components: Components, home: RunFolder) -> GoalMap | None:
+    """Writes the histogram of virtual goals, if there is one."""
+    goals = goal_map(components.buffers, components.goal_target)
+    if goals is not None:
+        goals.save(home.goal_map)
+    return goals

@@ -1,0 +1,100 @@
+"""All that a run is, as tensors and plain data, so that it can go on from there bit for bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from torchrl_her.curriculum.switch import set_layer_goals
+from torchrl_her.replay_buffers.writer import HERWriter
+from torchrl_her.trainers.checkpoint import (
+    buffer_state_dict,
+    collector_state_dict,
+    load_buffer_state_dict,
+    load_collector_state_dict,
+)
+from torchrl_her.trainers.trainer import Trainer
+from torchrl_her_envs.common.batched_env import BatchedEnv
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_recipes.components.components import Components
+
+
+def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
+    """All that a run is, as tensors and plain data. Rows are the buffers' own: save it at once."""
+    return {
+        "recipe": components.recipe.to_dict(),
+        "made_of": _made_of(components),
+        "trainer": trainer.state_dict(),
+        "loss": dict(components.loss.state_dict()),
+        "optimizer": components.optimizer.state_dict(),
+        "target": None if components.target is None else components.target.state_dict(),
+        "exploration": dict(components.exploration.state_dict()),
+        "buffers": [buffer_state_dict(buffer, copy=False) for buffer in components.buffers],
+        "generators": [generator.get_state() for generator in components.generators],
+        "torch_generator": torch.get_rng_state(),  # for losses that draw, as SAC's
+        "worlds": None if (worlds := _worlds(components)) is None else worlds.world_state_dict(),
+        "progress": None if components.curriculum is None else components.curriculum.progress.state_dict(),
+        "collector": collector_state_dict(components.collector),
+    }
+
+
+def load_run_state(components: Components, trainer: Trainer, state: dict[str, Any]) -> None:
+    """Puts freshly built components where :func:`run_state` was taken.
+
+    Raises:
+        ValueError: the components are of other types or have other settings than those of the run.
+    """
+    for name, value in _made_of(components).items():
+        if value != state["made_of"][name]:
+            was = state["made_of"][name]
+            raise ValueError(
+                f"the run's {name} was {was}, not {value}: give resume() components made as its were"
+            )
+    components.loss.load_state_dict(state["loss"])
+    components.optimizer.load_state_dict(state["optimizer"])
+    if components.target is not None:
+        components.target.load_state_dict(state["target"])
+    components.exploration.load_state_dict(state["exploration"])
+    for buffer, own in zip(components.buffers, state["buffers"], strict=True):
+        load_buffer_state_dict(buffer, own)
+    for generator, own in zip(components.generators, state["generators"], strict=True):
+        generator.set_state(own)
+    torch.set_rng_state(state["torch_generator"])
+    if components.curriculum is not None:
+        components.curriculum.progress.load_state_dict(state["progress"])
+        for run, buffer in enumerate(components.buffers):
+            set_layer_goals(buffer.writer, components.curriculum.progress.layer_of(run))
+    load_collector_state_dict(components.collector, state["collector"])
+    trainer.load_state_dict(state["trainer"])
+    if (worlds := _worlds(components)) is not None:
+        worlds.load_world_state_dict(state["worlds"])
+    elif trainer.in_epoch:
+        components.collector.reset()  # such an environment cannot go on with its episodes
+
+
+def _worlds(components: Components) -> BatchedEnv | None:
+    """The environment below all transforms, if it is one of ours."""
+    worlds = goal_env(components.env)
+    return worlds if isinstance(worlds, BatchedEnv) else None
+
+
+def _made_of(components: Components) -> dict[str, str]:
+    """What must be the same for a run to go on."""
+    writer = components.buffer.writer
+    hindsight: list[object] = []
+    if isinstance(writer, HERWriter):
+        hindsight = [
+            writer.k,
+            getattr(writer.strategy, "__name__", writer.strategy),
+            writer.filter_achieved,
+            type(writer.weights).__name__,
+        ]
+    names = {
+        name: type(getattr(components, name)).__name__
+        for name in ("actor", "critic", "loss", "optimizer", "target")
+    }
+    return names | {
+        "writer": " ".join(map(str, [type(writer).__name__, *hindsight])),
+        "sampler": type(components.buffer.sampler).__name__,
+    }

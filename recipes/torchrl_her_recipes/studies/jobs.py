@@ -1,0 +1,170 @@
+"""Jobs of a study: one is a batched run and the folder that it leaves behind, wherever it is worked on."""
+
+from __future__ import annotations
+
+import shutil
+import traceback
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchrl_her_recipes.components.assembly import build
+from torchrl_her_recipes.config.imports import import_modules, imported_modules
+from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.runs.folder import RunFolder
+from torchrl_her_recipes.runs.run import RunResult, resume, run
+
+_CHECKPOINTS = "checkpoint*.pt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One batched run of a study.
+
+    Args:
+        label: names it within the study.
+        recipe: what to run.
+        folder: where to.
+    """
+
+    label: str
+    recipe: Recipe
+    folder: Path
+
+    def to_plain(self) -> dict[str, Any]:
+        """The job as plain values for another process, with the modules that it must import first.
+
+        They register the tasks and learners that the recipe may name.
+        """
+        recipe, modules = self.recipe.to_dict(), imported_modules()
+        return {"label": self.label, "recipe": recipe, "folder": str(self.folder), "modules": modules}
+
+    @classmethod
+    def from_plain(cls, values: dict[str, Any]) -> Job:
+        """The job that :meth:`to_plain` was asked of; its modules are imported.
+
+        Raises:
+            ValueError: a module cannot be imported here, or the recipe names something that is not known.
+        """
+        import_modules(values["modules"])
+        recipe = Recipe.from_dict(values["recipe"])
+        return cls(label=values["label"], recipe=recipe, folder=Path(values["folder"]))
+
+
+class Progress(NamedTuple):
+    """How far a run is: epochs, and the seconds that they took."""
+
+    epochs: int = 0
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What came of a job.
+
+    Attributes:
+        interrupted: whether it was stopped; it can go on.
+        error: why it failed, in one line; empty if it did not.
+    """
+
+    interrupted: bool = False
+    error: str = ""
+
+
+def can_resume(folder: Path) -> bool:
+    """Whether a run's folder has a checkpoint to go on from, and says of which run."""
+    return RunFolder(folder).config.exists() and any(folder.glob(_CHECKPOINTS))
+
+
+def read_progress(folder: Path) -> Progress:
+    """How far the table of a run's folder goes. Cheap: only its last line is looked at.
+
+    Example:
+        >>> read_progress(Path("nowhere"))
+        Progress(epochs=0, seconds=0.0)
+    """
+    try:
+        lines = RunFolder(folder).metrics.read_text().splitlines()
+    except OSError:  # there is none yet
+        return Progress()
+    with suppress(IndexError, ValueError, KeyError):  # of a table that lost its end when the power went
+        last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
+        return Progress(int(last["epoch"]), float(last["seconds"]))
+    return Progress()
+
+
+def kept_progress(job: Job) -> Progress:
+    """How far a job is that nobody is at work on: what was done behind its last checkpoint may be lost.
+
+    One that was killed between its last epoch and its pictures is an epoch short of its end.
+    """
+    done, home = read_progress(job.folder), RunFolder(job.folder)
+    if done.epochs >= job.recipe.run.epochs and home.is_done:
+        return done
+    short = done._replace(epochs=min(done.epochs, job.recipe.run.epochs - 1))
+    return short if can_resume(job.folder) else Progress()
+
+
+def run_job(job: Job) -> Outcome:
+    """Does a job, or goes on with it from its checkpoint. Ctrl-C ends it at the next good moment.
+
+    Whatever goes wrong is an outcome; the whole story of it is left in ``error.txt``.
+    """
+    story = job.folder / "error.txt"
+    try:
+        story.unlink(missing_ok=True)
+        return Outcome(interrupted=_train(job).interrupted)
+    except KeyboardInterrupt:
+        return Outcome(interrupted=True)
+    except Exception as error:
+        if job.folder.is_dir():
+            story.write_text(traceback.format_exc())
+        return Outcome(error=" ".join(f"{type(error).__name__}: {error}".split()))
+
+
+def _train(job: Job) -> RunResult:
+    if can_resume(job.folder):
+        return resume(job.folder, progress=False)
+    home = RunFolder(job.folder)
+    for left in (home.config, home.metrics):  # by a run that ended before its first checkpoint
+        left.unlink(missing_ok=True)
+    return run(build(job.recipe), job.folder, progress=False)
+
+
+def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:
+    """The files of a run's folder, to be sent to another machine.
+
+    Args:
+        folder: of the run; there may be none yet.
+        checkpoints: whether to take them along. They hold the replay buffers: gigabytes, for many runs.
+
+    Returns:
+        Contents by path within the folder.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for name in ("config.yaml", "checkpoint.pt"):
+        ...         _ = (Path(folder) / name).write_text("...")
+        ...     pack(Path(folder), checkpoints=False)
+        {'config.yaml': b'...'}
+    """
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    kept = [path for path in paths if checkpoints or not path.match(_CHECKPOINTS)]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in kept}
+
+
+def unpack(files: dict[str, bytes], folder: Path) -> None:
+    """Makes a folder of what :func:`pack` gave, in place of the one that may be there.
+
+    It appears as a whole: written beside it, and then renamed.
+    """
+    part = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    for name, content in files.items():
+        path = part / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    shutil.rmtree(folder, ignore_errors=True)
+    part.replace(folder)

@@ -1,0 +1,156 @@
+"""The runs of one combination of a study: its seeds, in batches that are run side by side."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.runs.folder import RunFolder
+from torchrl_her_recipes.runs.goal_map import GoalMap
+from torchrl_her_recipes.studies.jobs import Job, read_progress
+
+_ROWS = 1_280  # of a batch's gradient step: more runs side by side are no faster, and fill no second core
+
+
+class Batches:
+    """What a folder holds of one combination: its folders ``seeds_*``, or itself if it is that of a run.
+
+    What is read are the batches that have come to their end; as long as none has, those that are under
+    way, up to the last epoch that all of them have reached.
+
+    Args:
+        path: of the folder; there may be none yet.
+
+    Attributes:
+        path: likewise.
+        homes: the batches that were begun, in the order of their seeds.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        found = [RunFolder(path)]
+        if not found[0].config.exists():
+            found = [RunFolder(folder) for folder in sorted(path.glob("seeds_*"), key=_seeds_of)]
+        self.homes = [home for home in found if home.config.exists()]
+
+    @cached_property
+    def _done(self) -> list[RunFolder]:
+        return [home for home in self.homes if home.is_done]
+
+    @cached_property
+    def shown(self) -> list[RunFolder]:
+        """Those of them that are read."""
+        return self._done or [home for home in self.homes if home.rows()]
+
+    @property
+    def is_done(self) -> bool:
+        """Whether those that are read have come to their end."""
+        return bool(self._done)
+
+    @property
+    def recipe(self) -> Recipe | None:
+        """What was run, with all seeds together; None if there is nothing to read.
+
+        Raises:
+            ValueError: a configuration cannot be read.
+        """
+        recipes = [home.recipe() for home in self.shown]
+        return recipes[0].replace(num_runs=sum(own.run.num_runs for own in recipes)) if recipes else None
+
+    @property
+    def seconds(self) -> float:
+        """How long the runs took, one core for each batch, without their pictures."""
+        return sum(read_progress(home.path).seconds for home in self.shown)
+
+    def rows(self) -> list[dict[str, float]]:
+        """The tables of the runs as one: a row an epoch and run, in this order; runs are counted anew."""
+        tables = [home.rows() for home in self.shown]
+        if not tables:
+            return []
+        seeds = sorted({row["seed"] for table in tables for row in table})
+        shared = min(table[-1]["epoch"] for table in tables)
+        rows = [
+            {**row, "run": seeds.index(row["seed"])}
+            for table in tables
+            for row in table
+            if row["epoch"] <= shared
+        ]
+        return sorted(rows, key=lambda row: (row["epoch"], row["run"]))
+
+    def goal_map(self) -> GoalMap | None:
+        """Where the virtual goals of the runs lie; None where no run has written its map."""
+        maps = [GoalMap.load(home.goal_map) for home in self.shown if home.goal_map.is_file()]
+        return GoalMap(np.concatenate([own.counts for own in maps]), maps[0].target) if maps else None
+
+
+def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
+    """The jobs of one combination: the batches that there are, and those of the seeds that are missing.
+
+    Args:
+        label: of the combination.
+        recipe: of all its seeds together.
+        folder: of the study.
+
+    Raises:
+        ValueError: the folder has a run of other options under the same name, or one that is no batch.
+    """
+    home = folder / label
+    if (home / "config.yaml").exists():
+        raise ValueError(f"{home} is the folder of a single run; choose another folder for the study")
+    recipes = {own.path: _begun(recipe, own.path) for own in Batches(home).homes}
+    there = {seed for own in recipes.values() for seed in own.seeds}
+    missing = [seed for seed in recipe.seeds if seed not in there]
+    for seeds in share_out(missing, most=max(_ROWS // recipe.replay.batch_size, 1)):
+        recipes[home / _name(seeds)] = recipe.replace(seed=seeds[0], num_runs=len(seeds))
+    return [
+        Job(label=path.relative_to(folder).as_posix(), recipe=own, folder=path)
+        for path, own in recipes.items()
+    ]
+
+
+def _begun(recipe: Recipe, path: Path) -> Recipe:
+    """What a batch runs that was begun. One whose configuration was torn by a power failure is as planned."""
+    first, last = _seeds_of(path)
+    planned = recipe.replace(seed=first, num_runs=last - first + 1)
+    try:
+        own = RunFolder(path).recipe()
+    except ValueError:
+        own = planned
+    if own != planned:
+        raise ValueError(f"{path} holds a run with other options; choose another folder")
+    return own
+
+
+def _name(seeds: Sequence[int]) -> str:
+    ends = dict.fromkeys((seeds[0], seeds[-1]))
+    return f"seeds_{'-'.join(map(str, ends))}"
+
+
+def _seeds_of(path: Path) -> tuple[int, int]:
+    """The first and the last seed of a batch, by the name of its folder."""
+    match = re.fullmatch(r"seeds_(\d+)(?:-(\d+))?", path.name)
+    if match is None:
+        raise ValueError(f"{path} is not the name of a batch, which is for instance seeds_0-4")
+    return int(match[1]), int(match[2] or match[1])
+
+
+def share_out(seeds: Sequence[int], *, most: int) -> list[list[int]]:
+    """Neighboring seeds in batches, as few and as equal as can be.
+
+    Args:
+        seeds: in rising order, not all of them neighbours.
+        most: seeds of a batch.
+
+    Example:
+        >>> share_out([0, 1, 2, 3, 4, 5, 9], most=5)
+        [[0, 1, 2], [3, 4, 5], [9]]
+    """
+    ends = [place + 1 for place, (one, other) in enumerate(pairwise(seeds)) if other != one + 1]
+    runs = (seeds[start:end] for start, end in pairwise([0, *ends, len(seeds)]) if start < end)
+    return [part.tolist() for run in runs for part in np.array_split(run, -(-len(run) // most))]

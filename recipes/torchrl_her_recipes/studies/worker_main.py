@@ -1,0 +1,61 @@
+"""A worker process: does the jobs that come in on its input, one after the other, until that ends.
+
+The end of its input is also how it is told to stop in the middle of a job, so it does so as well if
+whoever started it is gone: what it has is saved, and nothing goes on unseen.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+import pickle
+import signal
+import sys
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, BinaryIO
+
+from torchrl_her_recipes.studies.jobs import Job, Outcome, run_job
+
+
+def main() -> None:
+    """Runs the process."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
+    try:
+        with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as answers:
+            os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # nothing that is printed gets among them
+            _serve(answers)
+    except (KeyboardInterrupt, BrokenPipeError):
+        pass  # told to stop between two jobs, or nobody is there to hear
+
+
+def _serve(answers: BinaryIO) -> None:
+    jobs: SimpleQueue[dict[str, Any] | None] = SimpleQueue()
+    Thread(target=_listen, args=(jobs,), daemon=True).start()
+    for values in iter(jobs.get, None):
+        pickle.dump(_run(values), answers)
+        answers.flush()
+        gc.collect()  # the buffers of a run are gigabytes, and its components refer to each other
+
+
+def _run(values: dict[str, Any]) -> Outcome:
+    try:
+        job = Job.from_plain(values)
+    except Exception as error:  # whatever a user's module raises
+        return Outcome(error=" ".join(f"{type(error).__name__}: {error}".split()))
+    return run_job(job)
+
+
+def _listen(jobs: SimpleQueue[dict[str, Any] | None]) -> None:
+    try:
+        while True:
+            jobs.put(pickle.load(sys.stdin.buffer))
+    except (EOFError, pickle.UnpicklingError):
+        os.kill(os.getpid(), signal.SIGINT)  # runs know how to stop at a good moment
+        jobs.put(None)
+
+
+if __name__ == "__main__":
+    main()

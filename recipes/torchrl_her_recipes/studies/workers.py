@@ -1,0 +1,27 @@
+"""Who does the jobs of a study: chosen by what the user asks for."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
+
+
+def make_workers(*, jobs: int | None = None, ray: str | None = None) -> Workers:
+    """Worker processes on this machine, or the nodes of a Ray cluster.
+
+    Args:
+        jobs: how many at once on this machine; one for each core if None.
+        ray: address of a cluster, ``auto`` or ``HOST:PORT``; None for this machine.
+
+    Raises:
+        ImportError: Ray is not installed.
+        ConnectionError: there is no cluster at the address.
+    """
+    if ray is None:
+        return LocalWorkers(jobs)
+    try:
+        module = import_module("torchrl_her_recipes.studies.workers_ray")  # needs an extra
+    except ModuleNotFoundError as error:
+        raise ImportError("--ray needs Ray: pip install '.[cluster]'") from error
+    return module.RayWorkers(ray)

@@ -1,0 +1,146 @@
+"""Who does the jobs of a study: worker processes on this machine, or anything with the same few methods."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from queue import LifoQueue
+from typing import Protocol
+
+from torchrl_her_recipes.studies.jobs import Job, Outcome, Progress, read_progress
+
+_COMMAND = [sys.executable, "-P", "-m", "torchrl_her_recipes.studies.worker_main"]
+
+
+class Workers(Protocol):
+    """What :func:`torchrl_her_recipes.studies.schedule.run_jobs` asks of those who do the jobs."""
+
+    @property
+    def at_once(self) -> int:
+        """How many jobs they do at the same time."""
+
+    def run(self, job: Job) -> Outcome:
+        """Waits for a place, does the job there, and returns when it has ended.
+
+        Called from threads. Jobs must not overlap within a process: TorchRL's exploration type, and torch's
+        random numbers, are those of all its threads.
+        """
+
+    def progress(self) -> dict[str, Progress]:
+        """How far the jobs are that are being done, by label."""
+
+    def stop(self) -> None:
+        """Tells all to save what they have and to stop; returns at once."""
+
+    def close(self) -> None:
+        """Ends what is still going on, the hard way, and gives everything back."""
+
+
+class LocalWorkers:
+    """Worker processes on this machine, each of which does one job at a time.
+
+    They are in sessions of their own: Ctrl-C reaches them by :meth:`stop` only, never in a bad moment.
+
+    Args:
+        at_once: how many; by default one for each core.
+
+    Raises:
+        ValueError: a number below 1.
+    """
+
+    def __init__(self, at_once: int | None = None) -> None:
+        if at_once is not None and at_once < 1:
+            raise ValueError(f"jobs must be at least 1, got {at_once}")
+        self.at_once = at_once or _cores()
+        self._places: LifoQueue[_Worker | None] = LifoQueue()  # with the process that waits there, if any
+        for _ in range(self.at_once):
+            self._places.put(None)
+        self._busy: dict[str, tuple[Job, _Worker]] = {}
+        self._stopped = False
+
+    def run(self, job: Job) -> Outcome:
+        """Waits for a place, does the job there, and returns when it has ended."""
+        worker = self._places.get()
+        try:
+            if self._stopped:
+                return Outcome(interrupted=True)
+            worker = worker or _Worker()
+            self._busy[job.label] = job, worker  # from here on, stop() tells it
+            if self._stopped:
+                worker.stop()
+            outcome = worker.run(job)
+            return Outcome(interrupted=True) if outcome.error and self._stopped else outcome
+        finally:
+            self._busy.pop(job.label, None)
+            self._places.put(worker if worker and not worker.ended else None)
+
+    def progress(self) -> dict[str, Progress]:
+        """How far the jobs are that are being done, by label."""
+        return {label: read_progress(job.folder) for label, (job, _) in list(self._busy.items())}
+
+    def stop(self) -> None:
+        """Tells all to save what they have and to stop; returns at once."""
+        self._stopped = True
+        for _, worker in list(self._busy.values()):
+            worker.stop()
+
+    def close(self) -> None:
+        """Ends what is still going on, the hard way."""
+        self._stopped = True
+        for _, worker in list(self._busy.values()):
+            worker.kill()
+        for place in [self._places.get() for _ in range(self.at_once)]:
+            if place is not None:
+                place.end()
+            self._places.put(None)
+
+
+def _cores() -> int:
+    """How many cores this process may use: fewer than there are, under taskset or a scheduler of jobs."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+class _Worker:
+    """A worker process, seen from outside; see :mod:`torchrl_her_recipes.studies.worker_main`."""
+
+    def __init__(self) -> None:
+        environment = {"OMP_NUM_THREADS": "1", **os.environ}  # each has a core for itself, and no more
+        self._process = subprocess.Popen(
+            _COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._jobs, self._answers = self._process.stdin, self._process.stdout
+        self.ended = False
+
+    def run(self, job: Job) -> Outcome:
+        try:
+            pickle.dump(job.to_plain(), self._jobs)
+            self._jobs.flush()
+            return pickle.load(self._answers)
+        except (OSError, EOFError, ValueError, pickle.UnpicklingError):  # its pipes are broken, or closed
+            return Outcome(error=self.end())
+
+    def stop(self) -> None:
+        with suppress(BrokenPipeError):  # it has ended already
+            self._jobs.close()
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def end(self) -> str:
+        """Waits for its end, and says how it came."""
+        self.stop()
+        code = self._process.wait()
+        self._answers.close()
+        self.ended = True
+        if code >= 0:
+            return f"its process ended with code {code}"
+        hint = ", perhaps for want of memory" if code == -signal.SIGKILL else ""
+        return f"its process was ended by {signal.Signals(-code).name}{hint}"

@@ -1,0 +1,169 @@
+"""Who does the jobs of a study: the nodes of a Ray cluster. Needs the extra `cluster`.
+
+Nothing is asked of the nodes but this package: no shared disk. A job is done in a temporary folder of
+whichever node has a core free, and its files come home when it ends.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import ray
+from ray.exceptions import RayError, RayTaskError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from torchrl_her_recipes.studies.jobs import (
+    Job,
+    Outcome,
+    Progress,
+    can_resume,
+    pack,
+    read_progress,
+    run_job,
+    unpack,
+)
+
+_PATIENCE = 5.0  # seconds until an address that does not answer is given up
+_RETRIES = 3  # of a job whose node died
+_REPORT = 0.5  # seconds between two looks at how far a run is
+
+
+class RayWorkers:
+    """The nodes of a Ray cluster, one job for each core.
+
+    Ray does a job again, up to three times, if its node or process dies.
+
+    Args:
+        address: of the cluster, HOST:PORT, or ``auto`` for the one that this machine is a node of.
+
+    Raises:
+        ConnectionError: there is none.
+    """
+
+    def __init__(self, address: str = "auto") -> None:
+        try:
+            if ":" in address:  # Ray itself would try for minutes
+                host, port = address.rsplit(":", 1)
+                socket.create_connection((host, int(port)), timeout=_PATIENCE).close()
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise ConnectionError(f"no Ray cluster at {address} lets us in: {_one_line(error)}") from error
+        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+        board = ray.remote(num_cpus=0, scheduling_strategy=here)(Board)
+        self._board = board.remote()
+        self._tasks: dict[str, ray.ObjectRef] = {}
+        self._stopped = False
+
+    @property
+    def at_once(self) -> int:
+        """How many cores the cluster has just now."""
+        return int(ray.cluster_resources().get("CPU", 0))
+
+    def run(self, job: Job) -> Outcome:
+        """Has a job done where there is a core free, and fetches its files."""
+        task = _work.options(num_cpus=job.recipe.run.threads).remote(job.to_plain(), _begun(job), self._board)
+        self._tasks[job.label] = task  # from here on, stop() cancels it
+        if self._stopped:
+            ray.cancel(task)
+        try:
+            outcome, files = ray.get(task)
+        except RayError as error:
+            return Outcome(interrupted=True) if self._stopped else Outcome(error=_one_line(error))
+        finally:
+            del self._tasks[job.label]
+        if files:
+            unpack(files, job.folder)
+        return outcome
+
+    def progress(self) -> dict[str, Progress]:
+        """How far the jobs are that are being done, by label."""
+        try:
+            board = ray.get(self._board.read.remote())
+        except RayError:  # this machine's node is gone, which run() gets to hear, too
+            board = {}
+        return {label: board[label] for label in list(self._tasks) if label in board}
+
+    def stop(self) -> None:
+        """Tells all to save what they have and to stop; returns at once."""
+        self._stopped = True
+        for task in list(self._tasks.values()):
+            ray.cancel(task)  # which is a Ctrl-C to those that have begun
+
+    def close(self) -> None:
+        """Ends what is still going on, the hard way, and leaves the cluster."""
+        self._stopped = True
+        while self._tasks:
+            for task in list(self._tasks.values()):
+                ray.cancel(task, force=True)
+            time.sleep(0.1)  # until run() has heard of it
+        ray.shutdown()
+
+
+class Board:
+    """Where the nodes write how far their jobs are."""
+
+    def __init__(self) -> None:
+        self._progress: dict[str, Progress] = {}
+
+    def write(self, label: str, progress: Progress) -> None:
+        """Takes down how far a job is."""
+        self._progress[label] = progress
+
+    def read(self) -> dict[str, Progress]:
+        """All there is, by label."""
+        return self._progress
+
+
+@ray.remote(max_retries=_RETRIES)
+def _work(values: dict[str, Any], files: dict[str, bytes], board: Any) -> tuple[Outcome, dict[str, bytes]]:
+    """Does a job on a node, from the files of an earlier attempt if there are any."""
+    job = Job.from_plain(values)
+    with TemporaryDirectory(prefix="torchrl-her-") as place:
+        own = replace(job, folder=Path(place) / job.label)
+        if files:
+            unpack(files, own.folder)
+        with _reporting(own, board):
+            outcome = run_job(own)
+        return outcome, pack(own.folder, checkpoints=outcome != Outcome())
+
+
+@contextmanager
+def _reporting(job: Job, board: Any) -> Iterator[None]:
+    """Keeps the board up to date."""
+    ended = threading.Event()
+
+    def report() -> None:
+        before = None
+        while not ended.wait(_REPORT):
+            progress = read_progress(job.folder)
+            if progress != before:
+                board.write.remote(job.label, progress)
+                before = progress
+
+    thread = threading.Thread(target=report)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _begun(job: Job) -> dict[str, bytes]:
+    """The files that a job goes on from, if there are any."""
+    return pack(job.folder, checkpoints=True) if can_resume(job.folder) else {}
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, RayTaskError):
+        return f"{type(error.cause).__name__}: {error.cause}"
+    return next(iter(str(error).splitlines()), type(error).__name__)

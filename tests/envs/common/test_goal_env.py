@@ -1,0 +1,120 @@
+"""What all environments with goals offer, and how they are found below transforms."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torchrl.envs import StepCounter, TransformedEnv
+from torchrl.envs.libs.gym import GymEnv
+
+from torchrl_her_envs import TaskTraits, goal_env, make_env, reward_range, task_names
+from torchrl_her_envs.common.goal_env import choose_indices, first_below
+
+from ..gym.walk import WALK, walk
+
+EVERY = [*task_names(), f"gym:{WALK}"]
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_it_is_found_below_transforms(name: str) -> None:
+    env = make_env(name)
+    once = TransformedEnv(env, StepCounter())
+    twice = TransformedEnv(once, StepCounter(step_count_key="other"), auto_unwrap=False)
+    assert all(goal_env(outer) is env for outer in (env, once, twice))
+
+
+def test_an_environment_without_goals_is_refused() -> None:
+    with pytest.raises(TypeError, match="expected an environment with goals, got GymEnv"):
+        goal_env(GymEnv("CartPole-v1"))
+    assert first_below(make_env("chain"), lambda env: False) is None
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_environment_says_all_of_its_task(name: str) -> None:
+    env = make_env(name, num_envs=2)
+    assert env.task_name == name
+    assert 0 < env.goal_sigma < 1
+    assert isinstance(env.starts_near_goals, bool)
+    width = env.observation_spec["desired_goal"].shape[-1]
+    boxes = [*env.regions().values(), *([] if env.goal_box() is None else [env.goal_box()])]
+    for low, high in boxes:
+        assert (len(low), len(high)) == (width, width)
+    assert (
+        bool(boxes) == env.can_render == (name not in {"bit_flip", "treasure_hunt", "chain", f"gym:{WALK}"})
+    )
+    points = env.trail_points()
+    assert points is None or len(points) == 2
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_pictures_are_given_or_refused_in_one_line(name: str) -> None:
+    env = make_env(name, num_envs=2)
+    env.reset()
+    if env.can_render:
+        assert env.render([1, 0], size=32).shape == (2, 32, 32, 3)
+        assert env.render(1, size=32).dtype == torch.uint8
+        return
+    with pytest.raises(ValueError, match=r"pictures") as raised:
+        env.render([1, 0], size=32)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["bit_flip", "treasure_hunt", f"gym:{WALK}"])
+def test_tasks_without_a_curriculum_say_so(name: str) -> None:
+    with pytest.raises(
+        ValueError, match=f"^{name} has no curriculum: give its layers as curriculum=FILE.yaml$"
+    ):
+        make_env(name).layers()
+
+
+KEYS = {"name", "observation", "achieved_goal", "desired_goal", "threshold", "instructive"}
+
+
+@pytest.mark.parametrize(("name", "options"), [("hand_v1", {}), ("robot_v2", {}), ("chain", {"layers": 5})])
+def test_layers_are_plain_data_that_index_the_state(name: str, options: dict[str, int]) -> None:
+    env = make_env(name, **options)
+    width = env.observation_spec["state"].shape[-1]
+    for layer in env.layers():
+        assert set(layer) == KEYS
+        assert isinstance(layer["name"], str)
+        assert isinstance(layer["threshold"], float)
+        assert isinstance(layer["instructive"], bool)
+        for key in ("observation", "achieved_goal", "desired_goal"):
+            assert all(type(index) is int and 0 <= index < width for index in layer[key])
+        assert len(layer["achieved_goal"]) == len(layer["desired_goal"])
+
+
+def test_defaults_of_an_environment_that_says_nothing() -> None:
+    class Silent(TaskTraits):
+        pass
+
+    silent = Silent()
+    assert (silent.task_name, silent.goal_sigma, silent.starts_near_goals) == ("Silent", 0.2, False)
+    assert (silent.can_render, silent.goal_box(), silent.regions(), silent.trail_points()) == (
+        False,
+        None,
+        {},
+        None,
+    )
+    with pytest.raises(ValueError, match="Silent has no curriculum"):
+        silent.layers()
+    with pytest.raises(ValueError, match="Silent gives no pictures"):
+        silent.render()
+
+
+def test_rewards_of_missed_and_achieved_goals() -> None:
+    assert reward_range(make_env("chain")) == (-1.0, 0.0)
+    assert reward_range(walk()) in {(-1.0, 0.0), (-2.0, 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("worlds", "chosen"), [(None, [0, 1, 2]), (2, [2]), ((2, 0), [2, 0]), (range(2), [0, 1])]
+)
+def test_indices(worlds: object, chosen: list[int]) -> None:
+    assert choose_indices(3, worlds) == chosen
+
+
+@pytest.mark.parametrize("worlds", [3, -1, [0, 3], []])
+def test_indices_that_there_are_not(worlds: object) -> None:
+    with pytest.raises(ValueError, match="worlds must be one or more indices from 0 to 2, got"):
+        choose_indices(3, worlds)

@@ -1,0 +1,81 @@
+"""What is said of gymnasium environments that cannot be used."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from torchrl_her_envs import make_gym_env
+
+from .walk import WALK, walk
+
+TO_TARGET = spaces.Box(-1.0, 1.0, (2,), np.float64)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"without": "desired_goal"}, "lacks 'desired_goal' in what it shows: .*achieved_goal, observation"),
+        ({"without": "compute_reward"}, "lacks the method 'compute_reward'"),
+        ({"without": "compute_terminated"}, "lacks the method 'compute_terminated'"),
+        ({"shown": TO_TARGET}, "shows no dict of observation, achieved_goal, desired_goal, but a Box"),
+        ({"shown": {"desired_goal": TO_TARGET}}, r"must have one shape, got \(1,\) and \(2,\)"),
+        ({"shown": {"achieved_goal": spaces.Discrete(5)}}, "must show 'achieved_goal' as a row of numbers"),
+        ({"actions": spaces.MultiBinary(2)}, r"must be a Box or Discrete, got MultiBinary\(2\)"),
+        ({"actions": spaces.Box(-np.inf, np.inf, (2,))}, "actions must have bounds"),
+    ],
+)
+def test_what_an_environment_lacks_is_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{WALK}.* ?{message}") as raised:
+        walk(**options)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("id", "message"),
+    [
+        ("tests/Wlak-v0", "cannot make .* 'tests/Wlak-v0': .*Walk"),
+        ("tests/Walk-v9", "cannot make .* 'tests/Walk-v9': .*version"),
+        ("nowhere/Walk-v0", "cannot make .* 'nowhere/Walk-v0': .*nowhere"),
+    ],
+)
+def test_ids_that_there_are_not(id: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as raised:
+        make_gym_env(id)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_module_that_is_not_there_is_named() -> None:
+    with pytest.raises(ImportError, match="cannot make .* 'no_such_module:Env-v0': .*no_such_module"):
+        make_gym_env("no_such_module:Env-v0")
+
+
+def test_what_to_install_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise ModuleNotFoundError(f"No module named {name!r}")
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    with pytest.raises(ValueError, match=r"pip install '.\[robotics\]'"):
+        make_gym_env("FetchStand-v4")
+
+
+def test_an_option_that_an_environment_does_not_take_is_named() -> None:
+    allowed = "max_steps, parallel, ends, form, without, actions, shown, render_mode"
+    with pytest.raises(ValueError, match=f"^{WALK} takes no option 'color'; its options are {allowed}$"):
+        walk(color="red")
+    with pytest.raises(
+        ValueError, match="torchrl_her/HandReach-v0 takes no option 'task_name'; .* threshold$"
+    ):
+        make_gym_env("torchrl_her/HandReach-v0", task_name="hand_v0")
+
+
+def test_environments_that_take_any_option_and_fail_do_so_in_one_line() -> None:
+    gymnasium.register("tests/Wrong-v0", lambda **options: len(3), max_episode_steps=3)
+    with pytest.raises(ValueError, match=r"cannot make .* 'tests/Wrong-v0': object of type 'int'") as raised:
+        make_gym_env("tests/Wrong-v0", size=3)
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,354 @@
+"""Gymnasium environments with goals as batched TorchRL environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import Bounded, Categorical, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs.utils import RandomPolicy, check_env_specs
+
+from torchrl_her import EnvReward, HERWriter
+from torchrl_her_envs import GymGoalEnv, goal_env, make_gym_env
+
+from .walk import LAST, WALK, walk
+
+KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+def rollout(env: GymGoalEnv, steps: int = 40) -> TensorDict:
+    torch.manual_seed(0)
+    return env.rollout(steps, break_when_any_done=False)
+
+
+def same(one: TensorDict, other: TensorDict) -> bool:
+    return bool((one == other).all())
+
+
+# What comes out
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_specs(num_envs: int) -> None:
+    env = walk(num_envs)
+    check_env_specs(env, seed=0)
+    steps = rollout(env, 3)
+    for seen in (steps, steps["next"]):
+        for key in KEYS:
+            assert seen[key].shape == (num_envs, 3, 1)
+            assert seen[key].dtype == torch.float32
+    assert steps["next", "reward"].dtype == torch.float32
+    assert set(steps["next"].keys()) == {*KEYS, "reward", "terminated", "truncated", "done"}
+    assert (goal_env(env), env.max_steps) == (env, 6)
+
+
+def test_counted_actions_are_whole_numbers_one_for_each_environment() -> None:
+    env = walk(3, actions=spaces.Discrete(2, start=5))  # the environment asserts that it gets 5 or 6
+    assert isinstance(env.action_spec, Categorical)
+    assert (env.action_spec.shape, env.action_spec.n) == ((3,), 2)
+    before = env.reset()["observation"]
+    after = env.step(TensorDict({"action": torch.tensor([0, 1, 1])}, [3]))["next", "observation"]
+    assert torch.equal(after, (before + torch.tensor([[-1.0], [1.0], [1.0]])).clamp(0, LAST))
+
+
+def test_continuous_actions_keep_their_bounds() -> None:
+    env = walk(3, actions=spaces.Box(np.float32([-2.0, 0.0]), np.float32([3.0, 0.5])))
+    assert isinstance(env.action_spec, Bounded)
+    assert env.action_spec_unbatched.low.tolist() == [-2.0, 0.0]
+    assert env.action_spec_unbatched.high.tolist() == [3.0, 0.5]
+    assert rollout(env)["action"].shape == (3, 40, 2)
+
+
+def test_further_keys_are_left_out_and_goals_may_be_bits() -> None:
+    bit = spaces.MultiBinary(1)
+
+    class Bits(gymnasium.ObservationWrapper):
+        def observation(self, shown: dict[str, np.ndarray]) -> dict[str, Any]:
+            goals = {key: (shown[key] > 2).astype(np.int8) for key in KEYS[1:]}
+            return {"observation": shown["observation"], **goals, "words": "some"}
+
+    shown = {"achieved_goal": bit, "desired_goal": bit, "words": spaces.Text(9)}
+    gymnasium.register(
+        "tests/Bits-v0",
+        lambda **options: Bits(gymnasium.make(WALK, shown=shown, **options).unwrapped),
+        max_episode_steps=6,
+    )
+    env = make_gym_env("tests/Bits-v0", num_envs=2)
+    goals = rollout(env)["achieved_goal"]
+    assert goals.dtype == torch.float32
+    assert set(goals.flatten().tolist()) == {0.0, 1.0}
+    assert env.compute_reward(goals[0, 0], goals[0, 0]).tolist() == [0.0]
+
+
+# Ends
+
+
+def test_an_end_at_the_goal_is_terminated_and_one_out_of_time_is_truncated() -> None:
+    steps = rollout(walk(4), 60)
+    after, step = steps["next"], torch.zeros(4, dtype=torch.int64)
+    for t in range(60):
+        step += 1
+        now = after[:, t]
+        met = now["achieved_goal"] == now["desired_goal"]
+        assert torch.equal(now["terminated"], met)
+        assert torch.equal(now["truncated"], (step == 6).unsqueeze(-1))
+        assert torch.equal(now["done"], now["terminated"] | now["truncated"])
+        step[now["done"].squeeze(-1)] = 0
+    assert after["terminated"].any()
+    assert (after["truncated"] & ~after["terminated"]).any()
+
+
+def test_environments_that_never_terminate_run_into_their_time_limit() -> None:
+    after = rollout(walk(3, ends=False), 12)["next"]
+    assert not after["terminated"].any()
+    assert after["truncated"].nonzero()[:, 1].tolist() == [5, 11] * 3
+    assert (after["reward"] == 0).any()
+
+
+def test_only_environments_that_are_done_begin_anew() -> None:
+    steps = rollout(walk(4), 60)
+    goes_on = ~steps["next", "done"].squeeze(-1)[:, :-1]
+    for key in KEYS:
+        assert torch.equal(steps[key][:, 1:][goes_on], steps["next", key][:, :-1][goes_on])
+    new = (steps["achieved_goal"] != steps["desired_goal"]).squeeze(-1)[:, 1:]
+    assert new[~goes_on].all()  # no episode starts at its goal, where many ended
+
+
+def test_an_environment_without_a_time_limit_is_given_one() -> None:
+    with pytest.raises(ValueError, match="tests/Endless-v0 has no time limit: give max_steps"):
+        make_gym_env("tests/Endless-v0")
+    env = make_gym_env("tests/Endless-v0", max_steps=3, ends=False)
+    assert env.max_steps == 3
+    assert rollout(env, 9)["next", "truncated"].flatten().tolist() == [False, False, True] * 3
+
+
+# Seeds
+
+
+def test_the_same_seed_gives_the_same_run_and_another_one_another() -> None:
+    runs = [rollout(walk(3, seed=seed)) for seed in (5, 5, 6)]
+    assert same(runs[0], runs[1])
+    assert not same(runs[0], runs[2])
+
+
+def test_a_environment_does_the_same_in_every_batch() -> None:
+    many, few, one = (walk(n, seed=3) for n in (5, 2, 1))
+    starts = [torch.stack([env.reset()["desired_goal"] for _ in range(20)], 1) for env in (many, few, one)]
+    assert torch.equal(starts[0][:2], starts[1])
+    assert torch.equal(starts[0][:1], starts[2])
+    assert len({tuple(row.flatten().tolist()) for row in starts[0]}) == 5
+
+
+def test_blocks_of_environments_are_each_as_if_alone() -> None:
+    both, alone = walk(4, seed=[7, 8]), walk(2, seed=8)
+    for _ in range(10):
+        assert torch.equal(both.reset()["observation"][2:], alone.reset()["observation"])
+    with pytest.raises(ValueError, match="4 environments cannot be shared out among 3 seeds"):
+        both.set_seeds([1, 2, 3])
+
+
+def test_seeding_again_starts_over_at_the_next_reset_of_each_environment() -> None:
+    env = walk(3, seed=1)
+    first = rollout(env)
+    env.set_seeds([1])
+    assert same(rollout(env), first)
+    env.set_seed(1)
+    shown = first[:, -1].clone()
+    shown = env.reset(shown.set("_reset", torch.tensor([[True], [False], [True]])))
+    assert torch.equal(shown["desired_goal"][[0, 2]], first["desired_goal"][[0, 2], 0])
+    shown = env.reset(shown.set("_reset", torch.tensor([[False], [True], [False]])))
+    assert torch.equal(shown["desired_goal"], first["desired_goal"][:, 0])
+
+
+# The environment's own functions
+
+
+@pytest.mark.parametrize("form", ["batch", "single"])
+@pytest.mark.parametrize("ends", [True, False])
+def test_rewards_and_ends_are_the_environment_s_own(form: str, ends: bool) -> None:
+    env = walk(4, form=form, ends=ends)
+    after = rollout(env)["next"]
+    goals = after["achieved_goal"], after["desired_goal"]
+    assert torch.equal(env.compute_reward(*goals), after["reward"])
+    assert torch.equal(env.compute_terminated(*goals), after["terminated"])
+    assert set(after["reward"].flatten().tolist()) == {-2.0, -1.0, 0.0}
+    assert (env.missed_reward, env.achieved_reward) in {(-1.0, 0.0), (-2.0, 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("options", "answers"),
+    [
+        ({"form": "batch"}, ("batch", "batch")),
+        ({"form": "single"}, ("loop", "loop")),
+        ({"form": "batch", "ends": False}, ("batch", "one")),
+    ],
+)
+def test_functions_are_called_with_batches_where_they_take_them(
+    options: dict[str, Any], answers: tuple[str, str]
+) -> None:
+    env = walk(2, **options)
+    assert (env._reward_of.answers, env._terminated_of.answers) == answers
+    asked = env._reference_env.unwrapped.asked
+    asked.clear()
+    env.compute_reward(torch.zeros(3, 5, 1), torch.ones(3, 5, 1))
+    assert asked == ([(15, 1)] if answers[0] == "batch" else [(1,)] * 15)
+
+
+@pytest.mark.parametrize("form", ["batch", "single"])
+def test_goals_keep_their_order_and_broadcast(form: str) -> None:
+    env = walk(form=form)
+    low, high = torch.zeros(1), torch.full((1,), 4.0)
+    assert env.compute_reward(high, low).tolist() == [-2.0]
+    assert env.compute_reward(low, high).tolist() == [-1.0]
+    table = env.compute_reward(torch.tensor([[[0.0]], [[4.0]]]), torch.tensor([[0.0], [4.0], [2.0]]))
+    assert table.squeeze(-1).tolist() == [[0.0, -1.0, -1.0], [-2.0, 0.0, -1.0]]
+    met = env.compute_terminated(torch.tensor([[0.0], [4.0]]), high)
+    assert met.tolist() == [[False], [True]]
+    assert (met.dtype, table.dtype) == (torch.bool, torch.float32)
+    assert env.compute_reward(torch.zeros(0, 1), torch.zeros(0, 1)).shape == (0, 1)
+
+
+def test_goals_are_not_written_over_whatever_a_function_does() -> None:
+    env = walk()
+    reward = env._reference_env.unwrapped.compute_reward
+
+    def spoil(achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        answer = reward(achieved, desired, info)
+        achieved += 1.0
+        return answer
+
+    env._reward_of._function = spoil
+    goals = torch.zeros(3, 1, dtype=torch.float64)
+    env.compute_reward(goals, goals)
+    assert goals.tolist() == [[0.0]] * 3
+
+
+def test_virtual_rows_are_judged_by_the_environment() -> None:
+    env = walk(4, form="single")
+    writer = HERWriter(EnvReward(env.compute_reward, env.compute_terminated), k=4)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(5_000), writer=writer, batch_size=8)
+    for batch in Collector(env, RandomPolicy(env.full_action_spec), frames_per_batch=80, total_frames=400):
+        buffer.extend(batch)
+    rows = buffer[:]
+    virtual = rows[rows["virtual"].flatten()]
+    gap = virtual["next", "achieved_goal"] - virtual["next", "desired_goal"]
+    assert len(virtual) > 800
+    assert torch.equal(virtual["next", "reward"], -(gap != 0).float() - (gap > 2).float())
+    assert torch.equal(virtual["next", "terminated"], gap == 0)
+
+
+def test_there_is_at_least_one_environment() -> None:
+    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
+        walk(0)
+
+
+# The rest
+
+
+def test_processes_do_what_one_does() -> None:
+    pytest.importorskip("gymnasium_robotics")
+    options: dict[str, Any] = {"num_envs": 2, "seed": 4, "max_steps": 5}
+    runs = []
+    for parallel in (True, False):
+        env = make_gym_env("PointMaze_UMaze-v3", parallel=parallel, **options)
+        runs.append(rollout(env, 12))
+        env.close()
+    assert same(*runs)
+
+
+def test_pictures() -> None:
+    env = walk(3, render_mode="rgb_array")
+    places = env.reset()["observation"]
+    frames = env.render()
+    assert (frames.shape, frames.dtype) == ((3, 4, 6, 3), torch.uint8)
+    assert torch.equal(frames[:, 0, 0, 0], places.flatten().to(torch.uint8))
+    assert env.can_render
+    assert torch.equal(env.render([2, 0]), frames[[2, 0]])
+    assert torch.equal(env.render(1), frames[1])
+    assert env.render([1], size=3).shape == (1, 2, 3, 3)
+    assert not torch.equal(env.render(0, size=96, caption="epoch 3"), env.render(0, size=96))
+    with pytest.raises(ValueError, match=r"worlds must be one or more indices from 0 to 2, got \[3\]"):
+        env.render([3])
+    with pytest.raises(ValueError, match="a picture needs a size of at least 1 pixel, got 0"):
+        env.render(size=0)
+
+
+def test_environments_made_without_pictures_give_none() -> None:
+    assert not walk().can_render
+    with pytest.raises(ValueError, match='pictures need render_mode="rgb_array", got None'):
+        walk().render()
+
+
+def test_pictures_of_other_processes() -> None:
+    env, same = (walk(3, render_mode="rgb_array", parallel=parallel) for parallel in (True, False))
+    env.reset()
+    same.reset()
+    assert torch.equal(env.render([2, 0]), same.render([2, 0]))
+    env.close()
+
+
+def test_what_it_says_of_its_task() -> None:
+    env = walk()
+    assert (env.task_name, env.goal_box(), env.regions(), env.starts_near_goals) == (
+        f"gym:{WALK}",
+        None,
+        {},
+        False,
+    )
+    assert env.goal_sigma == 0.2
+    with pytest.raises(ValueError, match=f"gym:{WALK} has no curriculum: give its layers"):
+        env.layers()
+
+
+# gymnasium-robotics
+
+
+@pytest.mark.parametrize(
+    ("id", "options", "answers"),
+    [
+        ("FetchReach-v4", {}, ("batch", "one")),
+        ("FetchPush-v4", {}, ("batch", "one")),
+        ("gymnasium_robotics:PointMaze_UMaze-v3", {"max_steps": 50}, ("batch", "one")),
+        ("PointMaze_UMaze-v3", {"max_steps": 50, "continuing_task": False}, ("batch", "loop")),
+    ],
+)
+def test_robots(id: str, options: dict[str, Any], answers: tuple[str, str]) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    env = make_gym_env(id, num_envs=2, seed=0, **options)
+    check_env_specs(env, seed=0)
+    assert (env._reward_of.answers, env._terminated_of.answers) == answers
+    assert (env.missed_reward, env.achieved_reward) == ((0.0, 1.0) if "Maze" in id else (-1.0, 0.0))
+    steps = rollout(env, 52)
+    after = steps["next"]
+    assert after["truncated"].nonzero()[:, 1].tolist() == [49, 49]
+    assert not after["terminated"].any()
+    goals = after["achieved_goal"], after["desired_goal"]
+    assert torch.equal(env.compute_reward(*goals), after["reward"])
+    assert torch.equal(env.compute_terminated(*goals), after["terminated"])
+    met = env.compute_terminated(goals[0], goals[0])
+    assert bool(met.all()) is bool(met.any()) is (answers[1] == "loop")
+    env.close()
+
+
+def test_robots_repeat_and_do_the_same_in_every_batch() -> None:
+    pytest.importorskip("gymnasium_robotics")
+    two, one = (make_gym_env("FetchPush-v4", num_envs=n, seed=9) for n in (2, 1))
+    action = torch.tensor([[1.0, -0.5, -1.0, 0.3]])
+    shown, alone = two.reset(), one.reset()
+    for _ in range(10):
+        assert torch.equal(shown["observation"][:1], alone["observation"])
+        shown = two.step(shown.set("action", action.expand(2, 4)))["next"]
+        alone = one.step(alone.set("action", action))["next"]
+    assert not torch.equal(shown["desired_goal"][0], shown["desired_goal"][1])
+
+
+def test_goals_that_are_all_met_from_the_start_tell_nothing() -> None:
+    """What a goal that is far away gives is not known then."""
+    with pytest.raises(ValueError, match=r"is met gives 0.0, one far away 0.0; that must be less"):
+        make_gym_env("torchrl_her_envs:torchrl_her/HandReach-v0", threshold=10.0)

@@ -1,0 +1,92 @@
+"""A small gymnasium environment with goals, in all the forms that such environments take."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from torchrl_her_envs import GymGoalEnv, make_gym_env
+
+WALK = "tests/Walk-v0"  # episodes of 6 steps
+LAST = 4  # places 0 to 4
+ROW = spaces.Box(-10.0, 10.0, (1,), np.float64)
+
+
+class Walk(gymnasium.Env):
+    """A walk on a line, one place left (action 0) or right (1) a step, to another place.
+
+    Args:
+        ends: whether an episode ends at the goal.
+        form: how the functions take goals: ``"batch"``, or ``"single"``, which sum over all that they get.
+        without: a key or method that it lacks.
+        actions: the space of actions, whose first entry says where to.
+        shown: spaces instead of its own.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(
+        self,
+        *,
+        ends: bool = True,
+        form: str = "batch",
+        without: str = "",
+        actions: spaces.Space | None = None,
+        shown: dict[str, spaces.Space] | spaces.Box | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        keys = ("observation", "achieved_goal", "desired_goal")
+        own = {key: ROW for key in keys if key != without}
+        whole = isinstance(shown, spaces.Box)
+        self.observation_space = shown if whole else spaces.Dict(own | (shown or {}))
+        self.action_space = actions or spaces.Discrete(2)
+        self.ends, self.form, self.without, self.render_mode = ends, form, without, render_mode
+        self.asked: list[tuple[int, ...]] = []  # shapes of goals
+
+    def __getattribute__(self, name: str) -> Any:
+        if name.startswith("compute_") and name == self.without:
+            raise AttributeError(name)
+        return super().__getattribute__(name)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        super().reset(seed=seed)
+        self.place, self.goal = (float(x) for x in self.np_random.choice(LAST + 1, 2, replace=False))
+        return self._show(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert self.action_space.contains(action)
+        right = np.ravel(action)[0] > getattr(self.action_space, "start", 0)
+        self.place = float(np.clip(self.place + (1 if right else -1), 0, LAST))
+        goals = np.array([self.place]), np.array([self.goal])
+        reward = float(self.compute_reward(*goals, {}))
+        return self._show(), reward, bool(self.compute_terminated(*goals, {})), False, {}
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        self.asked.append(achieved.shape)
+        axis = -1 if self.form == "batch" else None
+        gap = np.abs(achieved - desired).sum(axis)
+        far = np.maximum(achieved - desired, 0).sum(axis) > 2  # not the same from the other side
+        return -(gap > 0).astype(np.float64) - far
+
+    def compute_terminated(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        if not self.ends:
+            return False
+        return self.compute_reward(achieved, desired, info) == 0
+
+    def render(self) -> np.ndarray:
+        return np.full((4, 6, 3), int(self.place), np.uint8)
+
+    def _show(self) -> dict[str, np.ndarray]:
+        places = {"observation": self.place, "achieved_goal": self.place, "desired_goal": self.goal}
+        return {key: np.array([place]) for key, place in places.items()}
+
+
+gymnasium.register(WALK, Walk, max_episode_steps=6)
+gymnasium.register("tests/Endless-v0", Walk)
+
+
+def walk(num_envs: int = 1, **options: Any) -> GymGoalEnv:
+    return make_gym_env(WALK, num_envs=num_envs, **options)

@@ -1,0 +1,42 @@
+"""Throws of an arm of two links."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchrl_her_envs import Arm, WorldConfig
+from torchrl_her_envs.throwing.experts.arm import ArmSkill, arm_throw
+
+WORLD = WorldConfig()
+
+
+def test_speeds_of_a_throw_are_within_the_arm_s() -> None:
+    joints, goal = torch.tensor([[1.6, 0.0]]), torch.tensor([[5.0, 4.0]])
+    velocity = arm_throw(joints, goal, Arm(WORLD), WORLD, within=0.2)
+    assert velocity.abs().max() <= WORLD.joint_speed
+    assert velocity[0, 0] < 0  # clockwise, to the right
+
+
+def test_an_arm_that_cannot_throw_gets_ready() -> None:
+    hanging, goal = torch.tensor([[-math.pi / 2, 0.0]]), torch.tensor([[5.0, 4.9]])
+    impossible = arm_throw(hanging, goal, Arm(WORLD), WORLD, within=1e-6)
+    ready = hanging + impossible * WORLD.time_step
+    torch.testing.assert_close(ready.cos(), torch.tensor([[math.cos(math.radians(120)), 1.0]]))
+
+
+def test_a_skill_reads_its_angles_and_reaches_in_one_step() -> None:
+    skill = ArmSkill(WORLD)
+    angles = torch.tensor([[0.5, -2.0]])
+    torch.testing.assert_close(skill.joints(torch.cat((angles.cos(), angles.sin()), -1)), angles)
+    arm = Arm(WORLD)
+    near = arm.grip(torch.tensor([[0.6, -1.9]]))
+    velocity = skill.reach(angles, near)
+    torch.testing.assert_close(arm.grip(angles + velocity * WORLD.time_step), near, atol=1e-4, rtol=0)
+
+
+def test_it_needs_two_links() -> None:
+    with pytest.raises(ValueError, match="an arm of 2 links, got num_links=3"):
+        ArmSkill(WORLD, num_links=3)

@@ -1,0 +1,279 @@
+"""Flight, bounces and friction of a free ball, against numbers worked out on paper.
+
+A time step is four substeps of h = 0.01 s. Each moves the ball by v h, finds what it then touches, and
+changes v: by gravity, and so that a bounce leaves 0.7 of the normal speed that it met the surface with. The
+world is 6 m wide and high, the ball's radius 0.18 m; the wall stands from x = 2.94 to 3.06 and up to y = 3.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from torchrl_her_envs import BallPhysics, WorldConfig
+
+RADIUS = 0.18
+
+
+def points(*rows: list[float]) -> Tensor:
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def fly(position: Tensor, velocity: Tensor, *, steps: int, wall: bool = False) -> tuple[Tensor, Tensor]:
+    physics = BallPhysics(len(position), WorldConfig(), wall=wall)
+    for _ in range(steps):
+        position, velocity = physics.step(position, velocity)
+    return position, velocity
+
+
+def thrown_balls(n: int, *, seed: int = 0, speed: float = 6.0) -> tuple[Tensor, Tensor]:
+    """Balls anywhere that is free, with any velocity."""
+    generator = torch.Generator().manual_seed(seed)
+    position = 0.2 + 5.6 * torch.rand(n, 2, dtype=torch.float64, generator=generator)
+    in_wall = ((position[:, 0] - 3.0).abs() < 0.25) & (position[:, 1] < 3.2)
+    position[in_wall, 0] -= 1.0
+    return position, speed * torch.randn(n, 2, dtype=torch.float64, generator=generator)
+
+
+def assert_close(value: Tensor, expected: Tensor, *, atol: float = 1e-12) -> None:
+    torch.testing.assert_close(value, expected, rtol=0, atol=atol)
+
+
+# Flight
+
+
+@pytest.mark.parametrize(
+    ("velocity", "to", "then"),
+    [
+        ([0.0, 0.0], [2.0, 3.994], [0.0, -0.4]),  # 0 + 0.001 + 0.002 + 0.003 m down
+        ([1.0, 2.0], [2.04, 4.074], [1.0, 1.6]),
+        ([-3.0, -1.0], [1.88, 3.954], [-3.0, -1.4]),
+    ],
+)
+def test_free_flight_over_one_step(velocity: list[float], to: list[float], then: list[float]) -> None:
+    position, velocity_ = fly(points([2.0, 4.0]), points(velocity), steps=1)
+    assert_close(position, points(to))
+    assert_close(velocity_, points(then))
+
+
+def test_free_flight_over_half_a_second() -> None:
+    # 48 substeps up at first: 4 * 0.48 - g h^2 (0 + 1 + ... + 47) = 1.92 - 1.128 m
+    position, velocity = fly(points([1.0, 1.0]), points([2.0, 4.0]), steps=12)
+    assert_close(position, points([1.96, 1.792]))
+    assert_close(velocity, points([2.0, -0.8]))
+
+
+# Bounces. In each case the ball meets the surface in the first substep and flies freely for three more.
+
+
+@pytest.mark.parametrize(
+    ("where", "start", "velocity", "then"),
+    [
+        # 0.7 * 2 = 1.4 m/s back. Gravity then takes 0.1 m/s in each of three substeps.
+        ("floor", [1.0, 0.19], [0.0, -2.0], [0.0, 1.1]),
+        ("ceiling", [1.0, 5.81], [0.0, 2.0], [0.0, -1.7]),
+        # Against a side friction is 0.1 * (2 + 1.4) = 0.34 m/s: it eats the first substep's gravity, 0.1 m/s,
+        ("left side", [0.19, 4.0], [-2.0, 0.0], [1.4, -0.3]),
+        ("right side", [5.81, 4.0], [2.0, 0.0], [-1.4, -0.3]),
+        # or slows a ball that slides along: 5 - 0.1 - 0.34 - 0.3.
+        ("right side, sliding", [5.81, 4.0], [2.0, 5.0], [-1.4, 4.26]),
+        ("wall, from the left", [2.75, 1.0], [2.0, 0.0], [-1.4, -0.3]),
+        ("wall, from the right", [3.25, 1.0], [-2.0, 0.0], [1.4, -0.3]),
+        ("wall, its top", [3.0, 3.19], [0.0, -2.0], [0.0, 1.1]),
+    ],
+)
+def test_a_bounce_keeps_70_percent(
+    where: str, start: list[float], velocity: list[float], then: list[float]
+) -> None:
+    _, after = fly(points(start), points(velocity), steps=1, wall=where.startswith("wall"))
+    assert_close(after, points(then))
+
+
+def test_a_wall_is_only_there_when_asked_for() -> None:
+    position, velocity = fly(points([2.75, 1.0]), points([2.0, 0.0]), steps=1)
+    assert_close(position, points([2.83, 0.994]))
+    assert_close(velocity, points([2.0, -0.4]))
+
+
+@pytest.mark.parametrize("down", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("along", [0.01, 0.3, 2.0, -5.0])
+def test_friction_of_a_bounce_is_a_tenth_of_its_push(down: float, along: float) -> None:
+    # The push turns -v into 0.7 v and carries the ball's weight for a substep, 0.1 m/s.
+    _, velocity = fly(points([3.0, RADIUS + 0.005 * down]), points([along, -down]), steps=1)
+    lost = 0.1 * (1.7 * down + 0.1)
+    sign = 1.0 if along > 0 else -1.0
+    expected = sign * max(abs(along) - lost, 0.0)  # friction stops a ball and never turns it round
+    assert velocity[0, 0].item() == pytest.approx(expected, abs=1e-12)
+
+
+def test_bounces_die_away() -> None:
+    position, velocity = fly(points([3.0, 2.0]), points([0.0, 0.0]), steps=300)
+    assert_close(position, points([3.0, RADIUS]), atol=1e-3)
+    assert_close(velocity, points([0.0, 0.0]), atol=1e-9)
+
+
+# Sliding and resting
+
+
+def test_a_sliding_ball_slows_by_one_meter_a_second_each_second() -> None:
+    start = points([1.0, RADIUS]), points([2.0, 0.0])
+    for steps, speed in ((1, 1.96), (25, 1.0), (49, 0.04)):
+        position, velocity = fly(*start, steps=steps)
+        assert_close(velocity, points([speed, 0.0]), atol=1e-9)
+        assert position[0, 1].item() == pytest.approx(RADIUS, abs=1e-9)
+
+
+def test_a_sliding_ball_stops_where_it_should() -> None:
+    # 200 substeps at 2.00, 1.99, ..., 0.01 m/s make 2.01 m; after that nothing moves any more
+    position, velocity = fly(points([1.0, RADIUS]), points([2.0, 0.0]), steps=60)
+    assert_close(position, points([3.01, RADIUS]), atol=1e-9)
+    assert_close(velocity, points([0.0, 0.0]), atol=1e-12)
+
+
+def test_a_ball_at_rest_stays_at_rest() -> None:
+    position, velocity = fly(points([1.0, RADIUS], [5.82, RADIUS]), points([0.0, 0.0], [0.0, 0.0]), steps=50)
+    assert_close(position, points([1.0, RADIUS], [5.82, RADIUS]))
+    assert_close(velocity, torch.zeros(2, 2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("start", "velocity", "then"),
+    [
+        ([1.0, RADIUS], [0.0, 0.0], [0.0, 0.0]),
+        ([RADIUS, 4.0], [-1.0, 0.0], [0.7, -0.3]),
+        ([2.76, 1.0], [1.0, 0.0], [-0.7, -0.3]),
+        ([3.0, 3.18], [0.0, 0.0], [0.0, 0.0]),
+    ],
+)
+def test_a_ball_put_against_a_surface_touches_it_in_every_world(
+    start: list[float], velocity: list[float], then: list[float]
+) -> None:
+    # Worlds stand at different places, where sums are rounded differently: no contact may hang on that.
+    position, after = fly(points(start).repeat(1024, 1), points(velocity).repeat(1024, 1), steps=1, wall=True)
+    assert_close(after, points(then).repeat(1024, 1))
+    assert_close(position, position[:1].repeat(1024, 1))
+
+
+# Nothing gets out or through
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(0.2, 2.7), st.floats(0.2, 5.8), st.booleans(), st.floats(0.0, 15.0), st.floats(0.0, 6.3)
+        ),
+        min_size=1,
+        max_size=16,
+    )
+)
+def test_no_ball_leaves_the_screen_or_enters_the_wall(
+    balls: list[tuple[float, float, bool, float, float]],
+) -> None:
+    position = points(*([6.0 - x if right else x, y] for x, y, right, _, _ in balls))
+    velocity = torch.stack([torch.polar(torch.tensor(s), torch.tensor(a)) for *_, s, a in balls])
+    velocity = torch.view_as_real(velocity).double()
+    physics = BallPhysics(len(balls), WorldConfig(), wall=True)
+    for _ in range(60):
+        position, velocity = physics.step(position, velocity)
+        # Thrown down at 15 m/s it lands at 18.4 m/s at most, so sinks in by 0.184 m: its center by 4 mm.
+        assert ((position > -0.005) & (position < 6.005)).all()
+        assert not (((position[:, 0] - 3.0).abs() < 0.06) & (position[:, 1] < 3.0)).any()
+
+
+# Many worlds in one space
+
+
+def test_256_worlds_equal_256_times_one_world() -> None:
+    start, velocity = thrown_balls(256)
+    together = BallPhysics(256, WorldConfig(), wall=True)
+    path, position, speed = [], start, velocity
+    for _ in range(200):
+        position, speed = together.step(position, speed)
+        path.append(torch.cat((position, speed), -1))
+    alone = BallPhysics(
+        1, WorldConfig(), wall=True
+    )  # one for all of them: it must keep nothing of the ball before
+    worst = 0.0
+    for k in range(256):
+        position, speed = start[k : k + 1], velocity[k : k + 1]
+        for seen in path:
+            position, speed = alone.step(position, speed)
+            worst = max(worst, (torch.cat((position, speed), -1) - seen[k]).abs().max().item())
+    assert worst < 1e-9
+
+
+@pytest.mark.parametrize("more", [257, 1024])
+def test_worlds_do_not_depend_on_how_many_stand_beside_them(more: int) -> None:
+    few, many = thrown_balls(256), thrown_balls(more, seed=1)
+    for ours, theirs in zip(few, many, strict=True):
+        theirs[:256] = ours
+    small, big = BallPhysics(256, WorldConfig(), wall=True), BallPhysics(more, WorldConfig(), wall=True)
+    for _ in range(200):
+        few, many = small.step(*few), big.step(*many)
+        for ours, theirs in zip(few, many, strict=True):
+            assert_close(theirs[:256], ours, atol=1e-9)
+
+
+def test_position_and_velocity_are_the_whole_state() -> None:
+    # A ball in the middle of a bounce is still being pushed out of the floor: that must not outlive a step.
+    used, state = BallPhysics(64, WorldConfig(), wall=True), thrown_balls(64, speed=10.0)
+    for _ in range(100):
+        fresh = BallPhysics(64, WorldConfig(), wall=True)
+        again, state = fresh.step(*state), used.step(*state)
+        for one, other in zip(again, state, strict=True):
+            assert torch.equal(one, other)
+
+
+def test_a_step_leaves_its_arguments_and_earlier_results_alone() -> None:
+    physics = BallPhysics(8, WorldConfig(), wall=False)
+    start = thrown_balls(8)
+    first = physics.step(*start)
+    kept = [tensor.clone() for tensor in (*start, *first)]
+    physics.step(*first)
+    assert all(torch.equal(a, b) for a, b in zip(kept, (*start, *first), strict=True))
+
+
+# Other worlds
+
+
+def test_constants_are_used() -> None:
+    world = WorldConfig(
+        gravity=0.0, bounce=0.5, friction=0.2, size=3.0, ball_radius=0.1, time_step=0.02, substeps=1
+    )
+    physics = BallPhysics(1, world, wall=False)
+    # the floor is met at y = 0.3: 0.5 * 2 = 1 m/s up, and 0.2 * (2 + 1) = 0.6 m/s lost along it
+    _, velocity = physics.step(points([1.0, 0.33]), points([2.0, -2.0]))
+    assert_close(velocity, points([1.4, 1.0]))
+
+
+def test_a_ball_that_has_come_to_rest_is_as_if_it_were_still_simulated() -> None:
+    resting, simulated = (BallPhysics(2, WorldConfig(), wall=False) for _ in range(2))
+    state = (torch.tensor([[1.0, 0.5], [2.0, 0.3]], dtype=torch.float64), torch.zeros(2, 2).double())
+    other = tuple(entry.clone() for entry in state)
+    skipped = 0
+    for _ in range(400):
+        before = state
+        state = resting.step(*state)
+        skipped += int(torch.equal(state[0], before[0]) and torch.equal(state[1], before[1]))
+        simulated._settled[:] = np.nan  # forgets that a ball rests
+        other = simulated.step(*other)
+        assert torch.equal(state[0], other[0])
+        assert torch.equal(state[1], other[1])
+    assert skipped > 50
+    pushed = resting.step(state[0], state[1] + torch.tensor([1.0, 0.0]))
+    assert (pushed[0][:, 0] > state[0][:, 0]).all()
+
+
+def test_balls_that_are_not_free_stay_and_the_others_do_not_care() -> None:
+    position = torch.tensor([[1.0, 3.0], [2.0, 3.0]], dtype=torch.float64)
+    velocity = torch.tensor([[1.0, 0.0], [0.0, 2.0]], dtype=torch.float64)
+    all_moved = BallPhysics(2, WorldConfig(), wall=False).step(position, velocity)
+    moved = BallPhysics(2, WorldConfig(), wall=False).step(position, velocity, torch.tensor([True, False]))
+    for before, both, one in zip((position, velocity), all_moved, moved, strict=True):
+        assert torch.equal(one[0], both[0])
+        assert torch.equal(one[1], before[1])

@@ -1,0 +1,138 @@
+"""The table of tasks, the constants of the world, and environments by name."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from torchrl_her_envs import TASKS, Task, WorldConfig, get_task, make_env
+
+TABLE = {
+    # name: effector, start of the ball, throws, wall, entries of the observation, of the action
+    "hand_reach": ("hand", "away", False, False, 5, 3),
+    "hand_v0": ("hand", "held", True, False, 9, 3),
+    "hand_v1": ("hand", "away", True, False, 9, 3),
+    "hand_v2": ("hand", "mixed", True, False, 9, 3),
+    "hand_wall_v0": ("hand", "held", True, True, 9, 3),
+    "hand_wall_v1": ("hand", "away", True, True, 9, 3),
+    "hand_wall_v2": ("hand", "mixed", True, True, 9, 3),
+    "robot_reach": ("arm", "away", False, False, 11, 3),
+    "robot_v0": ("arm", "held", True, False, 15, 3),
+    "robot_v1": ("arm", "away", True, False, 15, 3),
+    "robot_v2": ("arm", "mixed", True, False, 15, 3),
+}
+
+
+def test_there_are_eleven_tasks() -> None:
+    assert list(TASKS) == list(TABLE)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_task(name: str) -> None:
+    task = get_task(name)
+    assert (task.effector, task.start, task.throws, task.wall) == TABLE[name][:4]
+    assert task.name == name
+    assert task.summary
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_sizes(name: str) -> None:
+    env = make_env(name, num_envs=2)
+    seen, done = TABLE[name][4:]
+    assert env.observation_spec["observation"].shape == (2, seen)
+    assert env.observation_spec["state"].shape == (2, seen + 2)
+    assert env.observation_spec["achieved_goal"].shape == (2, 2)
+    assert env.observation_spec["desired_goal"].shape == (2, 2)
+    assert env.action_spec.shape == (2, done)
+    assert env.task is TASKS[name]
+
+
+@pytest.mark.parametrize(("name", "threshold"), [("hand_reach", 0.06), ("hand_v1", 0.1), ("robot_v1", 0.1)])
+def test_thresholds_are_the_radii_of_ball_and_black_hole(name: str, threshold: float) -> None:
+    assert make_env(name).threshold == pytest.approx(threshold)
+
+
+def test_constants_of_the_thesis() -> None:
+    world = WorldConfig()
+    assert (world.gravity, world.bounce, world.friction, world.ball_mass) == (10.0, 0.7, 0.1, 3.0)
+    assert world.arm_base == (0.33, 0.5)
+    assert world.arm_length == pytest.approx(2.0)  # 300 px of 900 px that are 6 m
+    assert (world.arm_start, world.arm_ball_angle) == ((180.0, 360.0), (75.0, 105.0))
+    assert world.arm_ball_radius == (0.75, 1.0)
+
+
+def test_constants_do_not_change_under_an_environment() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        WorldConfig().gravity = 9.81  # type: ignore[misc]
+
+
+def test_unknown_task_lists_those_that_there_are() -> None:
+    with pytest.raises(ValueError, match=r"unknown task 'hand_v9'; the tasks are hand_reach, .*, robot_v2$"):
+        get_task("hand_v9")
+
+
+@pytest.mark.parametrize("num_envs", [0, -3])
+def test_no_environment_is_refused(num_envs: int) -> None:
+    with pytest.raises(ValueError, match=f"num_envs must be at least 1, got {num_envs}"):
+        make_env("hand_v0", num_envs=num_envs)
+
+
+def test_no_link_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least 1 link, got num_links=0"):
+        make_env("robot_v0", num_links=0)
+
+
+@pytest.mark.parametrize("threshold", [0.0, -0.1, float("nan")])
+def test_a_threshold_that_nothing_meets_is_refused(threshold: float) -> None:
+    with pytest.raises(ValueError, match=f"threshold must be positive, got {threshold}"):
+        make_env("hand_v0", threshold=threshold)
+
+
+def test_a_threshold_may_be_chosen() -> None:
+    env = make_env("hand_v0", threshold=0.5)
+    assert env.compute_reward(torch.zeros(2), torch.tensor([0.4, 0.0])).item() == 0.0
+    assert env.compute_reward(torch.zeros(2), torch.tensor([0.6, 0.0])).item() == -1.0
+
+
+def test_options_reach_the_environment() -> None:
+    world = WorldConfig(gravity=0.0, max_steps=7, hole_radius=0.1)
+    env = make_env("robot_v1", num_envs=5, world=world, num_links=3, dtype=torch.float64)
+    assert env.world is world
+    assert env.batch_size == (5,)
+    assert env.action_spec.shape == (5, 4)
+    assert env.action_spec.dtype == torch.float64
+    assert env.threshold == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_steps": 0}, "max_steps must be positive, got 0"),
+        ({"hand_speed": -1.0}, "hand_speed must be positive, got -1.0"),
+        ({"time_step": 0.0}, "time_step must be positive, got 0.0"),
+        ({"size": float("nan")}, "size must be positive, got nan"),
+    ],
+)
+def test_constants_that_cannot_be(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        WorldConfig(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"effector": "foot"}, "effector must be one of hand, arm, got 'foot'"),
+        ({"effector": "arm", "start": "hold"}, "start must be one of held, away, mixed, got 'hold'"),
+    ],
+)
+def test_tasks_that_cannot_be(options: dict[str, str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Task(name="own", **options)
+
+
+@pytest.mark.parametrize("width", [1, 2, 4])
+def test_actions_of_another_width_are_refused(width: int) -> None:
+    env = make_env("hand_v1", num_envs=2)
+    shown = env.reset()
+    with pytest.raises(ValueError, match=rf"actions must be of shape \[2, 3\], got \[2, {width}\]"):
+        env.step(shown.set("action", torch.zeros(2, width)))

@@ -1,0 +1,59 @@
+"""Commands that the documentation gives: each names options, presets, tasks and studies that there are."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import torchrl_her_recipes
+from torchrl_her_recipes import cli
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "RESULTS.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def commands(name: str) -> list[str]:
+    """Those of one command: lines of their own, and what stands in running text."""
+    text = "\n".join(page.read_text() for page in PAGES)
+    lines = re.findall(rf"^(?:\$ )?torchrl-her ({name} [^#\n]*)", text, re.MULTILINE)
+    inline = re.findall(rf"`torchrl-her ({name} [^`]*)`", text)
+    found = {" ".join(command.split()) for command in lines + inline}
+    return sorted(command for command in found if "..." not in command and "NAME" not in command)
+
+
+class Reached(Exception):
+    """A recipe was made of a command."""
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def build(job: object) -> None:
+        raise Reached
+
+    monkeypatch.setattr(torchrl_her_recipes, "build", build)
+    monkeypatch.chdir(tmp_path)
+    Path("docs").symlink_to(ROOT / "docs")
+
+
+@pytest.mark.parametrize("command", [own for own in commands("train") if own != "train -h"])
+def test_train(command: str) -> None:
+    with pytest.raises(Reached):
+        cli.main(shlex.split(command))
+
+
+@pytest.mark.parametrize("command", [own for own in commands("study") if "--ray" not in own])
+def test_study(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for page in PAGES:
+        for name, text in re.findall(r"```yaml\n# (\S+\.yaml)\n(.*?)```", page.read_text(), re.DOTALL):
+            Path(name).write_text(text)
+    arguments = shlex.split(command)
+    assert cli.main([*arguments, *([] if "--plan" in arguments else ["--plan"])]) == 0
+    assert " batched runs to go, " in capsys.readouterr().out
+
+
+def test_there_are_commands_to_try() -> None:
+    assert len(commands("train")) > 15
+    assert len(commands("study")) > 8

@@ -1,0 +1,185 @@
+"""The guide to curricula: its Python runs, the messages it quotes are real, its example works."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
+from torchrl.envs import SerialEnv, TransformedEnv
+
+from torchrl_her import Curriculum, CurriculumLayer, CurriculumProgress, StateToObs, ZeroPad, make_actor
+
+DOCS = Path(__file__).parents[2] / "docs"
+GUIDE = (DOCS / "curriculum.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def example() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("own_curriculum", DOCS / "examples" / "own_curriculum.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_guide_s_python_runs_from_top_to_bottom() -> None:
+    blocks = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
+    assert len(blocks) == 5
+    names: dict[str, object] = {}
+    for block in blocks:
+        exec(compile(block, "curriculum.md", "exec"), names)
+
+
+def test_the_guide_s_layers_are_the_example_s(example: ModuleType) -> None:
+    names: dict[str, object] = {}
+    exec(re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)[0], names)
+    assert (names["drive"], names["deliver"]) == (example.DRIVE, example.DELIVER)
+    assert names["names"] == example.NAMES
+
+
+def test_the_example_s_episodes_end_at_the_layer_s_goal_and_at_the_time_limit_only(
+    example: ModuleType,
+) -> None:
+    progress = CurriculumProgress(Curriculum([example.DRIVE, example.DELIVER], 4, names=example.NAMES))
+    env = example.make_env(2, progress, seed=0)
+
+    # Without acceleration the car rolls back and forth in the valley, where there is no parcel.
+    roll = TensorDictModule(lambda state: torch.zeros(len(state), 1), in_keys=["state"], out_keys=["action"])
+    rolled = env.rollout(example.STEPS, roll)["next"]
+    assert rolled["truncated"][:, -1].all()
+    assert rolled["truncated"].sum() == 2
+    assert not rolled["terminated"].any()
+    assert torch.equal(rolled["desired_goal"], rolled["state"][..., 2:3])
+
+    swing = TensorDictModule(  # accelerate in the direction of motion
+        lambda state: torch.where(state[:, 1:2] > 0, 1.0, -1.0), in_keys=["state"], out_keys=["action"]
+    )
+    there = env.rollout(example.STEPS, swing, break_when_any_done=False)["next"]
+    first = there["terminated"].int().argmax(1).flatten()
+    for lane, step in enumerate(first.tolist()):
+        assert there["terminated"][lane, step]
+        assert not there["truncated"][lane, step]
+        assert there["reward"][lane, : step + 1].flatten().tolist() == [-1.0] * step + [0.0]
+    progress.set_layer(0, 1)
+    carried = env.rollout(example.STEPS, swing)["next"]
+    assert torch.equal(carried["desired_goal"], carried["state"][..., 3:4])
+    assert torch.equal(carried["achieved_goal"], carried["state"][..., 2:3])
+    assert carried["terminated"][:, -1].any()  # the car carried the parcel to its place
+
+
+def test_the_example_trains_each_run_in_its_layer_and_moves_on(
+    example: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended: list[tuple[TensorDict, CurriculumLayer]] = []  # stored transitions, and the next layer
+    buffers: list[ReplayBuffer] = []
+    enter_layer = example.enter_layer
+
+    def spy(buffer: ReplayBuffer, layer: CurriculumLayer, *args: object, **kwargs: object) -> None:
+        ended.append((buffer[:].clone(), layer))
+        enter_layer(buffer, layer, *args, **kwargs)
+        buffers.append(buffer)
+
+    monkeypatch.setattr(example, "enter_layer", spy)
+    easy = replace(example.DRIVE, threshold=0.6)  # the parcel is 0.27 to 0.84 away
+    small = {"epochs": 3, "epoch_frames": 300, "num_envs": 2, "runs": 2, "window": 2}
+    rows = list(example.train([easy, example.DELIVER], success_threshold=0.5, **small))
+    assert [frames for frames, _, _ in rows] == [300, 600, 900]
+    assert all(0.0 <= share <= 1.0 for _, _, shares in rows for share in shares)
+    first = {run: [names[run] for _, names, _ in rows] for run in range(2)}
+    assert [names[0] for names in first.values()] == ["drive", "drive"]
+    assert "deliver" in [names[-1] for names in first.values()]
+    assert len(ended) == len(buffers) >= 1
+    for stored, layer in ended:
+        assert layer.name == "deliver"
+        check_rows(stored, easy.threshold, low=-0.95, high=-0.6)
+    begun = [buffer for buffer in buffers if len(buffer) > 0]  # the others changed layer after the last epoch
+    assert begun
+    for buffer in begun:
+        check_rows(buffer[:], example.DELIVER.threshold, low=0.4, high=0.8)
+
+
+def check_rows(rows: TensorDict, threshold: float, *, low: float, high: float) -> None:
+    """Real rows want the layer's goals, virtual ones what was achieved; rewards fit its threshold."""
+    assert "state" not in rows.keys()
+    virtual = rows["virtual"].squeeze(-1)
+    wanted, got = rows["next", "desired_goal"], rows["next", "achieved_goal"]
+    assert torch.equal(wanted, rows["desired_goal"])
+    assert wanted[~virtual].numel() > 0
+    assert wanted[~virtual].min() >= low - 1e-6
+    assert wanted[~virtual].max() <= high + 1e-6
+    near: Tensor = (wanted - got).square() < threshold**2
+    assert torch.equal(rows["next", "reward"], near.float() - 1.0)
+    assert torch.equal(rows["next", "terminated"], near)
+    assert torch.isin(wanted[virtual], got).all()
+
+
+def stored_without_input() -> ReplayBuffer:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), batch_size=5)
+    rows = {"observation": torch.zeros(5, 3), "desired_goal": torch.zeros(5, 1)}
+    buffer.extend(TensorDict(rows, [5]))
+    return buffer
+
+
+MISTAKES: dict[str, tuple[type[Exception], Callable[[ModuleType, Curriculum], object]]] = {
+    "desired_goal must share no index": (
+        ValueError,
+        lambda own, _: CurriculumLayer(
+            name="drive", observation=[0, 1, 2], achieved_goal=[0], desired_goal=[2], threshold=0.1
+        ),
+    ),
+    "the goal has 2 entries": (
+        ValueError,
+        lambda own, _: Curriculum(
+            [replace(own.DRIVE, achieved_goal=[0, 1], desired_goal=[2, 3]), own.DELIVER], 4, names=own.NAMES
+        ),
+    ),
+    "StateToObs needs the observation": (
+        KeyError,
+        lambda own, curriculum: (
+            TransformedEnv(
+                SerialEnv(2, own.make_single_env), StateToObs(curriculum, CurriculumProgress(curriculum))
+            ).specs
+        ),
+    ),
+    "the first dimension of a batch": (
+        ValueError,
+        lambda own, curriculum: (
+            stored_without_input()
+            .append_transform(ZeroPad(curriculum, CurriculumProgress(curriculum, runs=2)))
+            .sample()
+        ),
+    ),
+    "StateToObs is for environments": (
+        RuntimeError,
+        lambda own, curriculum: (
+            stored_without_input()
+            .append_transform(StateToObs(curriculum, CurriculumProgress(curriculum)))
+            .sample()
+        ),
+    ),
+    "the following inputs are None": (
+        KeyError,
+        lambda own, _: make_actor([4], 1, in_keys=["input"])(stored_without_input().sample()),
+    ),
+}
+
+
+@pytest.mark.parametrize("start", MISTAKES)
+def test_the_guide_quotes_messages_as_they_are(example: ModuleType, start: str) -> None:
+    quoted = [message for message in re.findall(r"^\| `(.*?)` ", GUIDE, re.MULTILINE) if start in message]
+    assert len(quoted) == 1
+    error, mistake = MISTAKES[start]
+    curriculum = Curriculum([example.DRIVE, example.DELIVER], 4, names=example.NAMES)
+    with pytest.raises(error, match=re.escape(quoted[0])):
+        mistake(example, curriculum)

@@ -1,0 +1,49 @@
+"""The arguments of ``train``: help, completion, and what ``--show`` prints."""
+
+from __future__ import annotations
+
+import click
+import pytest
+import yaml
+
+from torchrl_her_recipes import Recipe, cli, make_recipe
+from torchrl_her_recipes.cli.train import train
+from torchrl_her_recipes.cli.train_options import complete, requests
+from torchrl_her_recipes.config.shortcuts import option_names
+
+
+def completed(text: str) -> list[str]:
+    return [item.value for item in complete(click.Context(train), train.params[-1], text)]
+
+
+def test_completion_of_names_and_values() -> None:
+    assert completed("se") == ["seed="]
+    assert completed("run.s") == ["run.seed="]
+    assert completed("learner=d") == ["learner=ddpg", "learner=dqn"]
+    assert completed("sampler=") == ["sampler=prioritized", "sampler=uniform"]
+    assert completed("strategy=f") == ["strategy=future", "strategy=final"]
+    assert completed("seed=") == []
+
+
+def test_help_explains_every_option_of_the_default_learner(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["train", "-h"]) == 0
+    words = {word.partition("=")[0] for word in capsys.readouterr().out.split()}
+    assert {name for names in option_names().values() for name in names} - {"name"} <= words
+
+
+def test_show_prints_documents_that_are_recipes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["train", "-m", "--show", "preset=demo", "seed=0,1"]) == 0
+    shown = [Recipe.from_dict(each) for each in yaml.safe_load_all(capsys.readouterr().out)]
+    assert [recipe.run.seed for recipe in shown] == [0, 1]
+    assert {recipe.task.name for recipe in shown} == {"hand_v1"}
+
+
+def test_requests_and_their_folders() -> None:
+    (one,) = requests(("task=gym:FetchReach-v4", "algo=her"), multirun=False)
+    assert one.recipe == make_recipe(task="gym:FetchReach-v4", algo="her")
+    assert one.folder.name.endswith("_gym_FetchReach-v4_her_s0")
+    several = list(requests(("seed=3,4", "folder=a,b"), multirun=True))
+    assert [str(each.folder) for each in several] == [
+        "a,b/hand_v0_filtered_her_s3_0",
+        "a,b/hand_v0_filtered_her_s4_1",
+    ]

@@ -1,0 +1,127 @@
+"""Runs that prefer instructive goals, and what every run tells of its virtual goals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from PIL import Image
+
+from torchrl_her import Instructiveness
+from torchrl_her.goals import GoalHistogram
+from torchrl_her_envs import TASKS, make_env
+from torchrl_her_recipes import build, run
+from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.components.goal_space import goal_space, make_goal_weights
+from torchrl_her_recipes.runs.goal_map import GoalMap
+
+from ..small import small
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    run(build(small(algo="filtered_her_ibs", num_runs=2, epochs=3)), folder, progress=False)
+    return folder
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_has_a_target(task: str) -> None:
+    target = goal_space(small(task=task), make_env(task)).target
+    assert target.shape == (400,)
+    assert float(target.sum()) == pytest.approx(1.0)
+    greatest = int(target.argmax())
+    goals = make_env(task).goal_distribution
+    center = torch.tensor([greatest // 20, greatest % 20]) * 0.1 - 0.95  # of the cell with most of it
+    assert (center >= goals.low - 0.1).all()
+    assert (center <= goals.high + 0.1).all()
+
+
+@pytest.mark.parametrize(
+    ("algo", "kind", "subtract"),
+    [
+        ("her", GoalHistogram, None),
+        ("her_ibs", Instructiveness, True),
+        ("her_ibs_sequential", Instructiveness, False),
+    ],
+)
+def test_each_algorithm_has_its_weights(algo: str, kind: type, subtract: bool | None) -> None:
+    recipe, env = small(algo=algo), make_env("hand_v0")
+    weights = make_goal_weights(recipe, env, goal_space(recipe, env))
+    assert type(weights) is kind
+    assert getattr(weights, "subtract", None) is subtract
+
+
+def test_sigma_is_a_share_of_the_screen_and_smaller_beside_the_wall() -> None:
+    for task, options, sigma in (
+        ("hand_v0", {}, 0.4),
+        ("hand_wall_v0", {}, 0.2),
+        ("hand_wall_v0", {"sigma": 0.3}, 0.6),
+    ):
+        recipe, env = small(task=task, algo="her_ibs", **options), make_env(task)
+        weights = make_goal_weights(recipe, env, goal_space(recipe, env))
+        assert isinstance(weights, Instructiveness)
+        assert weights.final_sigma == pytest.approx(sigma)
+        assert weights.sigma == pytest.approx(3 * sigma)
+
+
+@pytest.mark.parametrize("task", ["hand_reach", "robot_reach"])
+def test_goals_around_the_start_states_are_refused_by_name(task: str) -> None:
+    with pytest.raises(ValueError, match=f"her_ibs must not be used on {task}"):
+        build(small(task=task, algo="her_ibs"))
+    build(small(task=task, algo="her"))  # counting them is fine
+
+
+def test_a_damaged_map_is_named(finished: Path, tmp_path: Path) -> None:
+    whole = (finished / "goal_map.npz").read_bytes()
+    path = tmp_path / "goal_map.npz"
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="goal_map.npz is damaged"):
+        GoalMap.load(path)
+
+
+def test_sigma_shrinks_each_epoch_and_divergence_is_logged(finished: Path) -> None:
+    rows = pd.read_csv(finished / "metrics.csv")
+    assert rows["kl"].between(0.0, 20.0).all()
+    components = build(small(algo="her_ibs"))
+    run(components, progress=False)
+    weights = components.buffer.writer.weights
+    assert weights.sigma == pytest.approx(3 * 0.4 * 0.9)  # two epochs, each a root of 0.9
+
+
+def test_without_hindsight_there_is_nothing_to_tell(tmp_path: Path) -> None:
+    run(build(small(algo="no_hindsight")), tmp_path / "run", progress=False)
+    assert "kl" not in pd.read_csv(tmp_path / "run" / "metrics.csv").columns
+    assert not (tmp_path / "run" / "virtual_goals.png").exists()
+
+
+def test_the_map_holds_all_virtual_goals_of_each_run(finished: Path) -> None:
+    goals = GoalMap.load(finished / "goal_map.npz")
+    rows = pd.read_csv(finished / "metrics.csv")
+    assert goals.counts.shape == (2, 20, 20)
+    assert goals.counts.sum((1, 2)).tolist() == rows[rows["epoch"] == 3]["rows_virtual"].tolist()
+    assert goals.share.sum() == pytest.approx(1.0)
+    assert np.allclose(goals.target.sum(), 1.0)
+
+
+def test_plot_goals_draws_them_again(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "goals.png"
+    assert main(["plot", "goals", str(finished), "--out", str(out)]) == 0
+    assert capsys.readouterr().out.strip() == str(out)
+    with Image.open(out) as picture:
+        assert picture.size[0] > picture.size[1] > 300
+
+
+def test_a_run_without_a_map_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(build(small(algo="no_hindsight", epochs=1)), tmp_path / "run", progress=False)
+    assert main(["plot", "goals", str(tmp_path / "run")]) == 2
+    assert (
+        capsys.readouterr()
+        .err.strip()
+        .endswith("has no map of goals: its runs have written no virtual goals")
+    )

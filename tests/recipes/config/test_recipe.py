@@ -1,0 +1,196 @@
+"""Recipes: defaults that work, and one clear line for what cannot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
+
+from torchrl_her import make_actor, make_critic
+from torchrl_her.modules import CriticNet
+from torchrl_her_recipes import ALGORITHMS, Recipe, build, make_recipe, run
+from torchrl_her_recipes.components.assembly import make_collector
+
+from ..small import small
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"task": "hand_v9"},
+            "unknown task 'hand_v9'; did you mean hand_v0. The tasks are hand_reach, hand_v0",
+        ),
+        ({"algo": "sarsa"}, "unknown algorithm 'sarsa'; the algorithms are no_hindsight, her, filtered_her"),
+        ({"strategy": "past"}, "unknown goal strategy 'past'; the strategies are future, final, episode"),
+        ({"sampler": "best"}, "sampler must be one of prioritized, uniform, got 'best'"),
+        ({"threshold": -0.1}, "threshold must be above 0, got -0.1"),
+        ({"batch_size": 256, "buffer_size": 100}, "batch_size=256 must fit buffer_size=100"),
+        ({"epoch_frames": 100}, "epoch_frames=100 must be at least num_envs times steps_per_batch, 640"),
+        ({"seed": 2**40}, "seed must be below 2147483648, got 1099511627776"),
+        ({"k": -1}, "k must be at least 0, got -1"),
+        ({"seed": -1}, "seed must be at least 0, got -1"),
+        ({"num_runs": 0}, "num_runs must be at least 1, got 0"),
+        ({"gamma": 1.0}, "gamma must be above 0 and below 1, got 1.0"),
+        ({"tau": 1.5}, "tau must be at least 0 and at most 1, got 1.5"),
+        ({"learning_rate": float("nan")}, "learning_rate must be above 0, got nan"),
+        ({"epsilon_start": 0.1, "epsilon_end": 0.5}, "epsilon_end=0.5 must not be above epsilon_start=0.1"),
+    ],
+)
+def test_what_cannot_work_is_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_recipe(**options)
+
+
+def test_values_that_no_recipe_has_are_named() -> None:
+    with pytest.raises(ValueError, match="no option 'speed'"):
+        Recipe.from_dict({"speed": 3})
+    with pytest.raises(ValueError, match="no option 'run.sed'; did you mean seed. The options of run"):
+        Recipe.from_dict({"run": {"sed": 3}})
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("sampler", ["prioritized", "uniform"])
+def test_every_algorithm_runs_with_every_sampler(algo: str, sampler: str) -> None:
+    components = build(small(algo=algo, sampler=sampler))
+    result = run(components, progress=False)
+    assert isinstance(
+        components.buffer.sampler, PrioritizedSampler if sampler == "prioritized" else RandomSampler
+    )
+    assert len(result.rows) == 2
+    assert (result.rows[-1]["rows_virtual"] > 0) == (algo != "no_hindsight")
+    filtered = {"filtered_her", "filtered_her_ibs", "cher", "cher_ibs"}
+    assert components.buffer.writer.filter_achieved == (algo in filtered)
+
+
+@pytest.mark.parametrize("strategy", ["future", "final", "episode"])
+def test_every_goal_strategy_runs(strategy: str) -> None:
+    assert run(build(small(strategy=strategy, epochs=1)), progress=False).rows
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"batch_norm": True},
+        {"batch_norm": True, "num_runs": 2},
+        {"hard_update_interval": 50},
+        {"dtype": "float64"},
+        {"k": 0},
+    ],
+)
+def test_other_options_run(options: dict[str, Any]) -> None:
+    rows = run(build(small(epochs=1, **options)), progress=False).rows
+    # without virtual goals there is no distribution of them
+    values = [value for row in rows for name, value in row.items() if name != "kl" or options.get("k", 4)]
+    assert torch.tensor(values).isfinite().all()
+
+
+def test_schaul_s_alpha_is_halved_because_errors_come_squared() -> None:
+    assert build(small(priority_alpha=0.6)).buffer.sampler.alpha == pytest.approx(0.3)
+
+
+def test_stored_rows_hold_nothing_of_the_real_goal() -> None:
+    components = build(small(epochs=1))
+    run(components, progress=False)
+    rows = components.buffer[:]
+    assert "state" not in rows.keys()
+    assert torch.equal(rows["desired_goal"], rows["next", "desired_goal"])
+
+
+def test_the_stored_reward_is_the_environment_s() -> None:
+    components = build(small(epochs=1, task="hand_v2"))
+    run(components, progress=False)
+    after = components.buffer[:]["next"]
+    ball = after["observation"][:, 5:7]
+    reward = components.env.compute_reward(ball, after["desired_goal"])
+    assert torch.equal(after["reward"], reward)
+    assert torch.equal(after["terminated"], reward == 0)
+
+
+# Swapping components
+
+
+def test_td3_may_take_the_place_of_ddpg() -> None:
+    components = build(small())
+    actor = components.actor
+    loss = TD3Loss(
+        actor,
+        make_critic((9, 2), 3),
+        bounds=(-1.0, 1.0),
+        num_qvalue_nets=2,
+    )
+    loss.make_value_estimator(gamma=0.98)
+    components.loss, components.critic = loss, None
+    components.optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    components.target = SoftUpdate(loss, tau=0.01)
+    before = torch.cat([p.detach().flatten().clone() for p in actor.parameters()])
+    rows = run(components, progress=False).rows
+    after = torch.cat([p.detach().flatten() for p in actor.parameters()])
+    assert not torch.equal(before, after)
+    assert rows[-1]["loss_qvalue"] > 0
+
+
+class TwoHeads(nn.Module):
+    """Location and scale of an action."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.body = nn.Sequential(nn.Linear(11, 32), nn.ReLU(), nn.Linear(32, 6))
+
+    def forward(self, observation: torch.Tensor, goal: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        location, scale = self.body(torch.cat((observation, goal), -1)).chunk(2, -1)
+        return location, nn.functional.softplus(scale) + 0.01
+
+
+def test_sac_may_take_the_place_of_ddpg() -> None:
+    components = build(small())
+    keys = ["observation", "desired_goal"]
+    actor = ProbabilisticActor(
+        TensorDictModule(TwoHeads(), in_keys=keys, out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=False,
+    )
+    critic = ValueOperator(CriticNet(11, 3), in_keys=[*keys, "action"])
+    loss = SACLoss(actor, critic, action_spec=components.env.action_spec_unbatched)
+    loss.make_value_estimator(gamma=0.98)
+    components.actor = components.policy = actor
+    components.critic, components.loss, components.target = None, loss, SoftUpdate(loss, tau=0.01)
+    components.optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    components.collector = make_collector(components.recipe, components.env, actor)
+    rows = run(components, progress=False).rows
+    assert rows[-1]["loss_qvalue"] > 0
+    assert rows[-1]["loss_alpha"] != rows[0]["loss_alpha"]
+
+
+def test_actor_of_ones_own_keys() -> None:
+    assert make_actor((3,), 2, in_keys=["seen"], action_key=("deep", "action")).out_keys == [
+        ("deep", "action")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "compiles"),
+    [
+        ({"epochs": 30}, True),  # 30,720 gradient steps
+        ({"epochs": 10}, False),
+        ({"epochs": 10, "compile": "always"}, True),
+        ({"epochs": 30, "compile": "never"}, False),
+        ({"epochs": 30, "num_runs": 15}, False),  # 3,840 rows: nothing to win
+        ({"epochs": 30, "num_runs": 15, "batch_size": 64}, True),
+    ],
+)
+def test_long_runs_of_few_rows_are_compiled(options: dict[str, Any], compiles: bool) -> None:
+    assert make_recipe(**options).compiles is compiles
+
+
+def test_compiling_what_cannot_be_is_said() -> None:
+    components = build(small(compile="always", batch_norm=True))
+    with pytest.warns(UserWarning, match="compile=always has no effect"):
+        components.learner()

@@ -1,0 +1,28 @@
+"""Presets, and YAML files of one's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from torchrl_her_recipes import load_preset, make_recipe
+from torchrl_her_recipes.config.shipped import preset_names, preset_summary
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_makes_a_recipe_and_says_what_it_is_for(name: str) -> None:
+    values = load_preset(name)
+    recipe = make_recipe(values).to_dict()
+    for group, own in values.items():
+        assert own == {key: recipe[group][key] for key in own}
+    assert 10 < len(preset_summary(name)) < 90
+
+
+def test_a_file_of_ones_own(tmp_path: Path) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text("seed: 3\ntask: {name: hand_v1}\n")
+    assert make_recipe(load_preset(str(file))).run.seed == 3
+    assert preset_summary(str(file)) == ""
+    with pytest.raises(ValueError, match="there is no preset 'demoo'; did you mean demo. The presets are"):
+        load_preset("demoo")

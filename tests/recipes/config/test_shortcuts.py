@@ -1,0 +1,56 @@
+"""Names of options: short, with their group, or as whole groups."""
+
+from __future__ import annotations
+
+import pytest
+
+from torchrl_her_recipes import make_recipe
+from torchrl_her_recipes.config.shortcuts import locate, merge, option_names, place
+
+
+def test_every_option_is_found_by_its_long_name() -> None:
+    for group, names in option_names().items():
+        for name in names:
+            assert locate(f"{group}.{name}") == (group, name)
+
+
+def test_short_names_are_unique_except_for_the_names_of_groups() -> None:
+    every = [name for names in option_names().values() for name in names if name != "name"]
+    assert sorted(every) == sorted(set(every))
+    assert [locate(name)[1] for name in every] == every
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("sed", "no option 'sed'; did you mean seed"),
+        ("runs.seed", "no group 'runs'; did you mean run. The groups are task"),
+        ("seed.x", "seed is an option of the group run: 'seed.x' has one name too many"),
+        ("run", "run is a group of options: write run.seed="),
+        ("name", "several groups have an option 'name': write task.name or learner.name or curriculum.name"),
+    ],
+)
+def test_unknown_names_get_a_hint(name: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        locate(name)
+
+
+def test_one_entry_of_a_mapping_leaves_the_others() -> None:
+    base = {"task": {"name": "bit_flip", "options": {"bits": 8, "max_steps": 9}}}
+    recipe = make_recipe(base, **{"task.options.bits": 4})
+    assert recipe.task.options == {"bits": 4, "max_steps": 9}
+    assert type(recipe.task.options) is dict  # as YAML can write it
+    assert make_recipe(base, **{"task.options": {"bits": 4}}).task.options == {"bits": 4}
+    both = place({"task.options": {"bits": 4}, "task.options.max_steps": 3})
+    assert both == {"task": {"options": {"bits": 4, "max_steps": 3}}}
+
+
+def test_later_values_replace_earlier_ones() -> None:
+    merged = merge(
+        {"seed": 1, "task": "hand_v0"}, {"run.seed": 2}, {"task": None, "curriculum": [{"name": "a"}]}
+    )
+    assert merged == {
+        "run": {"seed": 2},
+        "task": {"name": "hand_v0"},
+        "curriculum": {"layers": [{"name": "a"}]},
+    }

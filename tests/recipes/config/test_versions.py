@@ -1,0 +1,75 @@
+"""Versions of torch, tensordict and torchrl: refused outside of their ranges, before anything is imported."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+
+from torchrl_her_recipes.config.versions import TRIED, check_versions
+
+INSTALLED = {"torch": "2.14.1", "tensordict": "0.14.3", "torchrl": "0.14.1"}
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"torch": "2.13.0+cpu"}, {"torch": "2.15.0"}, {"torch": "2.15.0.dev20260801"}, {"torch": "3.0"}],
+)
+def test_a_version_outside_of_its_range_is_named_with_the_remedy(given: dict[str, str]) -> None:
+    shown = given["torch"].split("+")[0]
+    with pytest.raises(ImportError) as error:
+        check_versions({**INSTALLED, **given}.__getitem__)
+    assert str(error.value) == (
+        f"torch {shown} does not fit this version of torchrl-her; "
+        "install 'torch>=2.14,<2.15' 'tensordict>=0.14,<0.15' 'torchrl>=0.14,<0.15'"
+    )
+
+
+def test_all_versions_that_do_not_fit_are_named() -> None:
+    installed = {"torch": "2.14.1", "tensordict": "0.13.0", "torchrl": "0.15.0"}
+    with pytest.raises(ImportError, match=r"^tensordict 0\.13\.0, torchrl 0\.15\.0 do not fit"):
+        check_versions(installed.__getitem__)
+
+
+@pytest.mark.parametrize("version", ["2.14.1+cu130", "2.14.0", "2.14.1+cpu"])
+def test_a_version_that_was_tried_is_taken_in_silence(version: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_versions({**INSTALLED, "torch": version}.__getitem__)
+
+
+@pytest.mark.parametrize("version", ["2.14.7", "2.14.2rc1"])
+def test_a_patch_release_never_tried_only_warns_in_one_line(version: str) -> None:
+    with pytest.warns(UserWarning, match="never tried") as warned:
+        check_versions({**INSTALLED, "torch": version}.__getitem__)
+    assert [str(warning.message) for warning in warned] == [
+        f"torch {version} was never tried with this version of torchrl-her; "
+        "the tests were run with 2.14.0 and 2.14.1"
+    ]
+
+
+@pytest.mark.parametrize("name", TRIED)
+def test_what_was_tried_lies_in_the_ranges(name: str) -> None:
+    for version in TRIED[name]:
+        check_versions({**INSTALLED, name: version}.__getitem__)
+
+
+def test_versions_are_checked_before_anything_is_imported(tmp_path: Path) -> None:
+    """A torchrl that cannot even be imported beside this torch is still named in one line."""
+    for name, version in {**INSTALLED, "torch": "2.13.0"}.items():
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('not to be imported')")
+        about = tmp_path / f"{name}-{version}.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-m", "torchrl_her_recipes", "list"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith(
+        "torchrl-her: torch 2.13.0 does not fit this version of torchrl-her; install "
+    )
+    assert done.stderr.count("\n") == 1

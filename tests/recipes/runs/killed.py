@@ -1,0 +1,70 @@
+"""Runs in processes that may be killed at any moment."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from multiprocessing import get_context
+from multiprocessing.context import ForkServerContext
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from torchrl_her_recipes import Recipe, build, cli
+from torchrl_her_recipes.runs import run as running
+
+_PICTURES = ("plot_curves", "plot_goals", "record_episodes", "write_video")
+_ROOT = Path(__file__).parents[3]
+
+
+@contextmanager
+def no_pictures() -> Iterator[None]:
+    """Most of the time of such short runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in _PICTURES:
+            patch.setattr(running, name, mock.Mock())
+        yield
+
+
+def is_killed(recipe: Recipe, folder: Path, *, after: float) -> bool:
+    """Lets a process go on with a run; returns whether it was killed before it came to the end.
+
+    Not a fork of the tests' process: it would be born with the locks that other threads there hold (Ray's,
+    progress bars'), and share some with all other forks, which a killed one never gives back.
+    """
+    process = server().Process(target=_go_on, args=(recipe, folder))
+    process.start()
+    process.join(after)
+    process.kill()
+    process.join()
+    assert process.exitcode in (0, -signal.SIGKILL)
+    return process.exitcode != 0
+
+
+@cache
+def server() -> ForkServerContext:
+    """Forks processes that have imported all there is, and nothing else; it is up when this returns."""
+    context = get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(_ROOT)
+        first = context.Process(target=_nothing)
+        first.start()
+        first.join()
+    assert first.exitcode == 0
+    return context
+
+
+def _nothing() -> None:
+    """Runs when all is imported."""
+
+
+def _go_on(recipe: Recipe, folder: Path) -> None:
+    with no_pictures():
+        if (folder / "config.yaml").exists():
+            sys.exit(cli.main(["train", "--resume", str(folder)]))
+        running.run(build(recipe), folder, progress=False)

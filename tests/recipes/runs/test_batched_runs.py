@@ -1,0 +1,95 @@
+"""Runs side by side are the runs that they would be alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_her.modules import take_run
+from torchrl_her_recipes import Components, Recipe, build, run
+
+from ..small import small
+
+RUNS = 3
+
+
+def train(recipe: Recipe) -> Components:
+    components = build(recipe)
+    run(components, progress=False)
+    return components
+
+
+def weights(components: Components, run: int) -> Tensor:
+    state = {
+        **components.actor.state_dict(),
+        **{f"critic {k}": v for k, v in components.critic.state_dict().items()},
+    }
+    return torch.cat(
+        [value.flatten() for value in take_run(state, run, components.recipe.run.num_runs).values()]
+    )
+
+
+def priorities(components: Components, run: int) -> Tensor:
+    buffer = components.buffers[run]
+    return torch.as_tensor(buffer.sampler.state_dict()["_sum_tree"][torch.arange(len(buffer))])
+
+
+@pytest.fixture(scope="module", params=["her", "filtered_her_ibs", "cher"])
+def runs(request: pytest.FixtureRequest) -> tuple[Components, list[Components]]:
+    options: dict[str, Any] = {
+        "algo": request.param,
+        "dtype": "float64",
+        "frames_per_update": 16.0,
+        "seed": 5,
+    }
+    return (
+        train(small(num_runs=RUNS, **options)),
+        [train(small(**{**options, "seed": 5 + run})) for run in range(RUNS)],
+    )
+
+
+def test_at_least_two_hundred_updates_were_made(runs: tuple[Components, list[Components]]) -> None:
+    recipe = runs[0].recipe
+    assert recipe.total_frames / recipe.collection.frames_per_update >= 200
+
+
+@pytest.mark.parametrize("run", range(RUNS))
+def test_each_run_follows_the_single_run_with_its_seed(
+    runs: tuple[Components, list[Components]], run: int
+) -> None:
+    together, alone = runs[0], runs[1][run]
+    torch.testing.assert_close(weights(together, run), weights(alone, 0), rtol=1e-7, atol=1e-9)
+    assert len(together.buffers[run]) == len(alone.buffer)
+    for key in ("desired_goal", "action", ("next", "reward")):
+        torch.testing.assert_close(together.buffers[run][:][key], alone.buffer[:][key], rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(priorities(together, run), priorities(alone, 0), rtol=1e-6, atol=1e-9)
+
+
+def test_runs_differ_from_each_other(runs: tuple[Components, list[Components]]) -> None:
+    assert not torch.allclose(weights(runs[0], 0), weights(runs[0], 1))
+
+
+def test_nothing_of_a_run_reaches_another() -> None:
+    spoiled, whole = build(small(num_runs=2)), build(small(num_runs=2))
+    with torch.no_grad():
+        for parameter in spoiled.actor.parameters():
+            parameter[1].mul_(-3.0)
+        for parameter in spoiled.critic.parameters():
+            parameter[1].mul_(100.0)
+    for components in (spoiled, whole):
+        run(components, progress=False)
+    assert torch.equal(weights(spoiled, 0), weights(whole, 0))
+    assert not torch.equal(weights(spoiled, 1), weights(whole, 1))
+
+
+def test_the_table_has_a_row_for_each_run_and_epoch() -> None:
+    result = run(build(small(num_runs=2, seed=7)), progress=False)
+    assert [(row["epoch"], row["run"], row["seed"]) for row in result.rows] == [
+        (1, 0, 7),
+        (1, 1, 8),
+        (2, 0, 7),
+        (2, 1, 8),
+    ]

@@ -1,0 +1,208 @@
+"""Runs that climb a curriculum: what changes with a layer, and what goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from torchrl_her import Instructiveness, enter_layer
+from torchrl_her_envs import TASKS, Chain, base_env, make_env
+from torchrl_her_recipes import Components, Recipe, build, load_actor, play, resume, run
+from torchrl_her_recipes.components.curricula import read_curriculum
+from torchrl_her_recipes.runs.curriculum import move_on
+
+from ..small import small
+
+THROWS = [name for name, task in TASKS.items() if task.throws]
+
+
+def climbing(**options: object) -> Recipe:
+    return small(**{"task": "hand_v1", "algo": "cher_ibs", "window": 4, **options})
+
+
+def move(components: Components, *, run: int) -> list[str]:
+    """Lets one run learn its layer."""
+    samples = torch.zeros(components.recipe.run.num_runs, 4)
+    samples[run] = 1.0
+    assert components.curriculum is not None
+    return move_on(components, components.curriculum, samples, 1_600)
+
+
+def weights(components: Components) -> Tensor:
+    return torch.cat([value.flatten() for value in components.actor.state_dict().values()])
+
+
+@pytest.mark.parametrize("task", THROWS)
+def test_every_throwing_task_has_a_curriculum_that_hands_over(task: str) -> None:
+    env = make_env(task, num_envs=2)
+    curriculum = read_curriculum(env.layers(), env)
+    shown = env.reset()
+    state = shown["state"]
+    reach, throw = curriculum.layers
+    assert state[:, list(reach.achieved_goal)].tolist() == env._scale(env.worlds.grip).float().tolist()
+    assert state[:, list(reach.desired_goal)].tolist() == env._scale(env.worlds.ball).float().tolist()
+    assert state[:, list(throw.achieved_goal)].tolist() == shown["achieved_goal"].tolist()
+    assert state[:, list(throw.desired_goal)].tolist() == env.worlds.goal.float().tolist()
+    # What the throw sees first is all that the reach sees, its goal included.
+    assert [*reach.observation, *reach.desired_goal] == list(throw.observation[: curriculum.first_inputs])
+
+
+def test_parts_of_the_chain_are_layers_that_end_at_the_next_one_s_start() -> None:
+    env = Chain(6, 1.0, layers=3)
+    state = env.reset()["state"][0]
+    first, second, third = read_curriculum(env.layers(), env).layers
+    assert (first.observation, first.achieved_goal) == ((0, 1), (0, 1))
+    assert (second.observation, second.achieved_goal) == ((0, 1, 2, 3), (2, 3))
+    assert (third.observation, third.achieved_goal) == ((0, 1, 2, 3, 4, 5), (4, 5))
+    for layer in (first, second, third):
+        assert state[list(layer.desired_goal)].tolist() == [1.0, 1.0]
+        assert layer.threshold < 2.0  # what a single open link is away
+
+
+def test_a_chain_is_climbed() -> None:
+    options = {"length": 4, "layers": 2, "alternating": True}
+    recipe = small(
+        task="chain",
+        options=options,
+        algo="cher",
+        epoch_frames=800,
+        epochs=8,
+        window=1,
+        frames_per_update=4,
+    )
+    rows = run(build(recipe), progress=False).rows
+    assert rows[0]["layer"] == 0
+    assert rows[-1]["layer"] == 1
+
+
+def test_a_task_of_one_layer_has_none() -> None:
+    with pytest.raises(ValueError, match="hand_reach has no curriculum"):
+        build(small(task="hand_reach", algo="cher"))
+
+
+def test_a_run_begins_with_the_reach_and_is_measured_at_the_full_task_too(tmp_path: Path) -> None:
+    recipe = climbing(success_threshold=1.0)
+    components = build(recipe)
+    run(components, tmp_path / "run", progress=False)
+    rows = pd.read_csv(tmp_path / "run" / "metrics.csv")
+    assert rows["layer"].tolist() == [0, 0]
+    assert {"success", "layer_success"} <= set(rows.columns)
+    assert rows["kl"].isna().all()  # q* is that of the throw
+    stored = components.buffer[:]
+    assert (stored["observation"][:, 5:] == 0).all()  # of a reach: no ball is seen
+    goals = stored["desired_goal"][~stored["virtual"].squeeze(-1)]
+    assert (goals[:, 1] == goals[0, 1]).all()  # balls on the floor
+    assert "state" not in stored
+    assert torch.equal(
+        stored["input"][:, :7], torch.cat((stored["observation"][:, :5], stored["desired_goal"]), -1)
+    )
+
+
+def test_inputs_that_the_reach_does_not_use_keep_their_weights() -> None:
+    components = build(climbing(alpha_actor=0.1))
+    before = [next(net.parameters()).clone() for net in (components.actor, components.critic)]
+    run(components, progress=False)
+    after = [next(net.parameters()) for net in (components.actor, components.critic)]
+    for was, now in zip(before, after, strict=True):
+        assert torch.equal(was[:, 7:], now[:, 7:])
+        assert not torch.equal(was[:, :7], now[:, :7])
+    assert (before[0][:, 7:] != 0).all()
+    assert (before[1][:, 7:] == 0).all()
+
+
+def test_a_change_of_layer_empties_and_restarts_one_run_alone() -> None:
+    components = build(climbing(num_runs=2, success_threshold=1.0))
+    run(components, progress=False)
+    networks = weights(components)
+    steps = [float(state["step"]) for state in components.optimizer.state.values()]
+    lines = move(components, run=1)
+    assert lines == ["seed 1: 'reach' learned after 1,600 frames, 'throw' begins"]
+    assert [len(buffer) > 0 for buffer in components.buffers] == [True, False]
+    assert components.exploration.epsilon.tolist() == pytest.approx([0.81, 1.0])
+    first, second = (buffer.writer for buffer in components.buffers)
+    assert first.counts.real > 0
+    assert second.counts.real == second.held_back == 0
+    assert isinstance(second.weights, Instructiveness)
+    assert (first.weights.alike, second.weights.alike) == (True, False)
+    assert second.weights.sigma == pytest.approx(3 * 0.4)
+    assert first.weights.sigma < second.weights.sigma
+    assert second.reward_fn.threshold == pytest.approx(0.1)
+    assert first.reward_fn.threshold == pytest.approx(0.06)
+    assert torch.equal(weights(components), networks)
+    assert [float(state["step"]) for state in components.optimizer.state.values()] == steps
+
+
+def test_training_goes_on_in_two_layers_at_once() -> None:
+    components = build(climbing(num_runs=2, success_threshold=1.0))
+    trainer = components.trainer()
+    trainer.epoch()
+    move(components, run=1)
+    trainer.epoch()
+    reach, throw = (buffer[:] for buffer in components.buffers)
+    assert (reach["observation"][:, 5:] == 0).all()
+    assert (throw["observation"][:, 5:7] != 0).any()
+    assert torch.equal(throw["input"], torch.cat((throw["observation"], throw["desired_goal"]), -1))
+    assert torch.isfinite(weights(components)).all()
+
+
+def test_a_run_that_was_stopped_after_a_change_goes_on_as_if_it_had_not(tmp_path: Path) -> None:
+    # a threshold that any success meets: the reach ends after the first epoch
+    recipe = climbing(success_threshold=0.01, episodes=30, window=30, epochs=4, seed=1)
+    whole = build(recipe)
+    run(whole, tmp_path / "whole", progress=False)
+    layers = pd.read_csv(tmp_path / "whole" / "metrics.csv")["layer"].tolist()
+    assert layers[0] == 0
+    assert layers[-1] == 1
+    changed = layers.index(1)
+    run(build(recipe.replace(epochs=changed + 1)), tmp_path / "part", progress=False)
+    config = (tmp_path / "part" / "config.yaml").read_text()
+    (tmp_path / "part" / "config.yaml").write_text(config.replace(f"epochs: {changed + 1}", "epochs: 4"))
+    part = build(recipe)
+    resume(tmp_path / "part", components=part, progress=False)
+    assert torch.equal(weights(part), weights(whole))
+    assert part.curriculum is not None
+    assert part.curriculum.progress.layers == (1,)
+
+
+def test_its_policy_plays_the_full_task(tmp_path: Path) -> None:
+    run(build(climbing()), tmp_path / "run", progress=False)
+    actor = load_actor(tmp_path / "run")
+    assert actor.in_keys == ["input"]
+    assert 0 <= play(tmp_path / "run", tmp_path / "play.gif", goals=2, size=64) <= 2
+
+
+def test_environments_for_evaluation_show_the_full_task() -> None:
+    components = build(climbing())
+    shown = components.eval_env.reset()
+    assert torch.equal(shown["desired_goal"], base_env(components.eval_env).worlds.goal.float())
+    assert (shown["observation"][:, 5:7] != 0).any()
+
+
+def test_checkpoints_hold_no_inputs(tmp_path: Path) -> None:
+    components = build(climbing(epochs=1))
+    run(components, tmp_path / "run", progress=False)
+    stored = {str(key) for key in components.buffer.storage[:4].keys(True, True)}
+    again = build(climbing(epochs=1))
+    resume(tmp_path / "run", components=again, progress=False)
+    assert {str(key) for key in again.buffer.storage[:4].keys(True, True)} == stored
+    assert not any("input" in key for key in stored)
+
+
+def test_a_buffer_that_does_not_relabel_is_refused() -> None:
+    components = build(climbing())
+    with pytest.raises(
+        TypeError, match="a curriculum needs a buffer with a HERWriter, got a TensorDictRoundRobinWriter"
+    ):
+        enter_layer(
+            TensorDictReplayBuffer(storage=LazyTensorStorage(4)), components.curriculum.progress.layer_of(0)
+        )
+
+
+def test_nothing_is_said_without_a_progress_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    run(build(climbing(success_threshold=0.01, episodes=30, window=30, compile="never")), progress=False)
+    assert capsys.readouterr().out == ""

@@ -1,0 +1,88 @@
+"""Policies as files: exported from runs, and those that come with the package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrl_her import evaluate, success
+from torchrl_her_envs import TASKS, make_env
+from torchrl_her_recipes import build, export_policy, load_actor, load_policy, load_trained, run
+from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.components.curricula import make_played_env
+from torchrl_her_recipes.config.shipped import policy_names
+
+from ..small import small
+
+
+@pytest.mark.parametrize("algo", ["filtered_her", "cher"])
+def test_an_exported_policy_acts_as_its_run_does(algo: str, tmp_path: Path) -> None:
+    recipe = small(task="hand_v1", algo=algo, num_runs=2, epochs=1)
+    run(build(recipe), tmp_path / "run", progress=False)
+    written = export_policy(tmp_path / "run", tmp_path / "policy.pt", run=1)
+    assert written.recipe.run.seed == 1
+    assert written.frames == 1_600
+    seen = make_env("hand_v1", num_envs=4, seed=7).reset()
+    shown = make_played_env(recipe, 4, [7]).reset()
+    own = load_actor(tmp_path / "run", run=1)(shown)["action"]
+    torch.testing.assert_close(load_policy(tmp_path / "policy.pt")(seen)["action"], own)
+
+
+def test_export_takes_the_median_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    run(build(small(num_runs=3, epochs=1)), folder, progress=False)
+    lines = (folder / "metrics.csv").read_text().splitlines()
+    place = lines[0].split(",").index("success")
+    for index, value in enumerate(("0.5", "0.9", "0.1")):
+        cells = lines[index + 1].split(",")
+        cells[place] = value
+        lines[index + 1] = ",".join(cells)
+    (folder / "metrics.csv").write_text("\n".join(lines) + "\n")
+    assert main(["export", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("seed 0, success ")
+    assert said.endswith(f" on hand_v0: {folder / 'hand_v0.pt'}\n")
+
+
+def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    run(build(small(epochs=1, learner="sac")), folder, progress=False)
+    other = tmp_path / "other"
+    run(build(small(task="hand_v0", epochs=1)), other, progress=False)
+    with pytest.raises(ValueError, match="a policy of hand_v0 cannot play robot_v0: it has other widths"):
+        export_policy(other, tmp_path / "policy.pt", task="robot_v0")
+    with pytest.raises(ValueError, match="unknown task 'nope'"):
+        export_policy(other, tmp_path / "policy.pt", task="nope")
+    with pytest.raises(ValueError, match="cannot be exported: its network is not one of"):
+        export_policy(folder, tmp_path / "policy.pt")
+    with pytest.raises(ValueError, match="there is no run 4 in .*; it has runs 0 to 0"):
+        export_policy(folder, tmp_path / "policy.pt", run=4)
+    assert not (tmp_path / "policy.pt").exists()
+    with pytest.raises(ValueError, match="there is no policy 'hand_v9'; there are hand_reach"):
+        load_policy("hand_v9")
+
+
+def test_every_task_has_a_trained_policy() -> None:
+    assert policy_names() == sorted(TASKS)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_trained_policies_are_as_good_as_they_say(task: str) -> None:
+    """300 other episodes; five standard deviations of room."""
+    trained = load_trained(task)
+    assert trained.task == task
+    env = make_env(task, num_envs=300, seed=99)
+    measured = float(success(evaluate(env, trained.actor, max_steps=env.max_steps)).float().mean())
+    assert measured > trained.success - 5 * 0.029
+    assert measured > 0.3
+
+
+def test_a_task_is_played_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "hand_v1.gif"
+    assert main(["play", "hand_v1", "--out", str(out), "--goals", "2", "--size", "64"]) == 0
+    assert out.stat().st_size > 1_000
+    assert "of 2 goals achieved" in capsys.readouterr().out
+    assert main(["play", "hand_v9"]) == 2
+    assert "neither the folder of a run nor one of the trained policies" in capsys.readouterr().err

@@ -1,0 +1,265 @@
+"""A run that was stopped goes on from its checkpoint bit for bit as if it had not been."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from torchrl_her import load_checkpoint
+from torchrl_her_recipes import Components, Recipe, build, cli, resume, run
+from torchrl_her_recipes.runs import state as run_state
+from torchrl_her_recipes.runs.folder import RunFolder
+
+from ..small import assert_same, small
+from .killed import is_killed, no_pictures, server
+
+KILLS = 20
+# Everything there is to save: a curriculum whose layer changes on the way, q, priorities, held-back episodes.
+ALL: dict[str, Any] = {
+    "task": "hand_v1",
+    "algo": "cher_ibs",
+    "seed": 1,
+    "epochs": 5,
+    "epoch_frames": 480,
+    "episodes": 10,
+    "window": 10,
+    "success_threshold": 0.01,
+}
+
+
+@pytest.fixture(name="no_pictures")
+def _no_pictures() -> Iterator[None]:
+    with no_pictures():
+        yield
+
+
+def press_ctrl_c(components: Components, batch: int) -> Components:
+    """Components whose run is interrupted after a number of batches."""
+    collect, count = components.collector.next, iter(range(10**6))
+
+    def next_batch() -> Any:
+        if next(count) == batch:
+            os.kill(os.getpid(), signal.SIGINT)
+        return collect()
+
+    components.collector.next = next_batch  # type: ignore[method-assign]
+    return components
+
+
+def assert_same_runs(first: Path, second: Path) -> None:
+    """Two folders: all weights, buffers and generators, and the tables but for the time."""
+    for name in ("checkpoint.pt", "policy.pt"):
+        assert_same(load_checkpoint(first / name), load_checkpoint(second / name))
+    tables = [pd.read_csv(folder / "metrics.csv").drop(columns="seconds") for folder in (first, second)]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+
+
+def damage(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+# Killed
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a fork server that shares torch is for Linux")
+@pytest.mark.parametrize("most", [3, pytest.param(KILLS, marks=pytest.mark.full)])
+def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not(
+    most: int, no_pictures: None, tmp_path: Path
+) -> None:
+    recipe, draw = small(**ALL), random.Random(0)
+    run(build(recipe), tmp_path / "whole", progress=False)
+    server()
+    began = time.perf_counter()
+    assert not is_killed(recipe, tmp_path / "alone", after=300.0)
+    seconds = time.perf_counter() - began
+    assert_same_runs(tmp_path / "whole", tmp_path / "alone")
+    assert pd.read_csv(tmp_path / "whole" / "metrics.csv")["layer"].nunique() == 2
+    kills, folder = 0, tmp_path / "0"
+    while kills < most:
+        if is_killed(recipe, folder, after=draw.uniform(0.0, seconds)):
+            kills += 1
+        else:
+            assert_same_runs(tmp_path / "whole", folder)
+            folder = tmp_path / str(kills)
+    assert not is_killed(recipe, folder, after=300.0)
+    assert_same_runs(tmp_path / "whole", folder)
+    assert not list(folder.glob("*.part"))
+    events = EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("success/run_0")] == [480, 960, 1_440, 1_920, 2_400]
+
+
+# Interrupted
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param(ALL, id="curriculum"),
+        pytest.param({"task": "robot_v2", "num_runs": 2, "algo": "filtered_her_ibs"}, id="two runs"),
+        pytest.param(
+            {"sampler": "uniform", "hard_update_interval": 7, "batch_norm": True}, id="hard updates"
+        ),
+    ],
+)
+def test_ctrl_c_at_any_batch_changes_nothing(
+    options: dict[str, Any], no_pictures: None, tmp_path: Path
+) -> None:
+    recipe, draw = small(**{**options, "epochs": 3}), random.Random(1)
+    run(build(recipe), tmp_path / "whole", progress=False)
+    left = recipe.total_frames // (recipe.collection.num_envs * recipe.collection.steps_per_batch)
+    batch = draw.randrange(left // 2)
+    assert run(press_ctrl_c(build(recipe), batch), tmp_path / "part", progress=False).interrupted
+    for _ in range(3):
+        left -= batch + 1
+        batch = draw.randrange(left // 2)
+        components = press_ctrl_c(build(recipe), batch)
+        assert resume(tmp_path / "part", components=components, progress=False).interrupted
+    assert not resume(tmp_path / "part", progress=False).interrupted
+    assert_same_runs(tmp_path / "whole", tmp_path / "part")
+
+
+def test_ctrl_c_saves_what_there_is(tmp_path: Path) -> None:
+    components = press_ctrl_c(build(small(epochs=3)), 50)  # in the middle of the third epoch
+    result = run(components, tmp_path / "run", progress=False)
+    assert result.interrupted
+    assert [row["frames"] for row in result.rows] == [1_600, 3_200]
+    saved = load_checkpoint(tmp_path / "run" / "checkpoint.pt")
+    assert saved["trainer"]["frames"] == 51 * 80
+    assert saved["trainer"]["measured"]["loss_value"].shape == (44, 1)
+    assert (tmp_path / "run" / "curves.png").exists()
+
+
+def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
+    no_pictures: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_state, "_worlds", lambda components: None)
+    recipe = small(epochs=2)
+    run(press_ctrl_c(build(recipe), 25), tmp_path / "run", progress=False)
+    held = load_checkpoint(tmp_path / "run" / "checkpoint.pt")["buffers"][0]["writer"]["held"]
+    components = build(recipe)
+    result = resume(tmp_path / "run", components=components, progress=False)
+    assert [row["frames"] for row in result.rows] == [1_600, 3_200]
+    assert result.rows[-1]["rows_real"] + components.buffer.writer.held_back == 3_200
+    assert held["collector"]["traj_ids"].max() < components.collector._carrier["collector", "traj_ids"].min()
+
+
+# Between epochs
+
+
+@pytest.mark.parametrize(
+    "options", [{"task": "hand_wall_v2"}, {"task": "robot_v2", "num_runs": 2}, {"sampler": "uniform"}]
+)
+def test_a_finished_run_that_is_given_more_epochs(
+    options: dict[str, Any], no_pictures: None, tmp_path: Path
+) -> None:
+    recipe = small(epochs=4, checkpoint_interval=2, **options)
+    run(build(recipe), tmp_path / "whole", progress=False)
+    run(build(recipe.replace(epochs=2)), tmp_path / "part", progress=False)
+    (tmp_path / "part" / "config.yaml").write_text((tmp_path / "whole" / "config.yaml").read_text())
+    assert len(resume(tmp_path / "part", progress=False).rows) == 4 * recipe.run.num_runs
+    assert_same_runs(tmp_path / "whole", tmp_path / "part")
+
+
+def test_the_last_checkpoints_are_kept(no_pictures: None, tmp_path: Path) -> None:
+    run(build(small(epochs=4, epoch_frames=400, keep_checkpoints=3)), tmp_path, progress=False)
+    epochs = {path.name: load_checkpoint(path)["trainer"]["epochs"] for path in tmp_path.glob("checkpoint*")}
+    assert epochs == {"checkpoint.pt": 4, "checkpoint.1.pt": 3, "checkpoint.2.pt": 2}
+
+
+@pytest.mark.filterwarnings("always")
+def test_on_the_command_line_a_warning_is_one_line(
+    no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(build(small(epochs=2, epoch_frames=800)), tmp_path, progress=False)
+    damage(tmp_path / "checkpoint.pt")
+    assert cli.main(["train", "--resume", str(tmp_path)]) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "damaged" in line]
+    assert line.strip().startswith(f"torchrl-her: warning: {tmp_path / 'checkpoint.pt'} is damaged: ")
+
+
+def test_the_one_before_a_damaged_checkpoint_is_used(no_pictures: None, tmp_path: Path) -> None:
+    recipe = small(epochs=3, epoch_frames=800)
+    for name in ("whole", "part"):
+        run(build(recipe), tmp_path / name, progress=False)
+    damage(tmp_path / "part" / "checkpoint.pt")
+    said = (
+        r"part/checkpoint\.pt is damaged: its checksum does not match; checkpoint\.1\.pt, the one before, is"
+    )
+    with pytest.warns(UserWarning, match=said):
+        assert len(resume(tmp_path / "part", progress=False).rows) == 3
+    assert_same_runs(tmp_path / "whole", tmp_path / "part")
+
+
+def test_damaged_checkpoints_alone_are_refused(no_pictures: None, tmp_path: Path) -> None:
+    run(build(small(epochs=1)), tmp_path, progress=False)
+    for path in tmp_path.glob("checkpoint*.pt"):
+        damage(path)
+    with pytest.raises(
+        ValueError, match=r"^[^\n]*checkpoint\.pt is damaged[^\n]*checkpoint\.1\.pt is damaged"
+    ):
+        resume(tmp_path, progress=False)
+
+
+def test_a_run_before_its_first_epoch_can_be_resumed(no_pictures: None, tmp_path: Path) -> None:
+    recipe = small(epochs=1)
+    run(build(recipe), tmp_path / "whole", progress=False)
+    assert run(press_ctrl_c(build(recipe), 0), tmp_path / "part", progress=False).interrupted
+    (tmp_path / "part" / "checkpoint.1.pt").replace(tmp_path / "part" / "checkpoint.pt")
+    resume(tmp_path / "part", progress=False)
+    assert_same_runs(tmp_path / "whole", tmp_path / "part")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no disk that is always full")
+def test_a_full_disk_does_not_end_a_run(no_pictures: None, tmp_path: Path) -> None:
+    (tmp_path / "checkpoint.pt.part").symlink_to("/dev/full")
+    said = "no checkpoint after 0 frames, the run goes on: .*No space left on device"
+    with pytest.warns(UserWarning, match=said):
+        run(build(small(epochs=2)), tmp_path, progress=False)
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["trainer"]["epochs"] == 2
+
+
+def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(
+    no_pictures: None, tmp_path: Path
+) -> None:
+    (tmp_path / "metrics.csv.part").symlink_to("/dev/full")
+    with pytest.warns(UserWarning, match=r"no table after 800 frames, the run goes on: .*No space left"):
+        result = run(build(small(epochs=2, epoch_frames=800)), tmp_path, progress=False)
+    assert len(result.rows) == len(RunFolder(tmp_path).rows()) == 2
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [event.step for event in events.Scalars("success/run_0")] == [800, 1600]
+
+
+def test_parts_that_were_swapped_must_be_given_to_resume(no_pictures: None, tmp_path: Path) -> None:
+    def swapped(recipe: Recipe) -> Components:
+        components = build(recipe)
+        components.optimizer = torch.optim.AdamW(components.loss.parameters(), lr=1e-3)
+        components.critic = None
+        return components
+
+    recipe = small(epochs=2, checkpoint_interval=1)
+    run(swapped(recipe.replace(epochs=1)), tmp_path / "run", progress=False)
+    with pytest.raises(ValueError, match="the run's critic was NoneType, not TensorDictModule"):
+        resume(tmp_path / "run", progress=False)
+    assert (tmp_path / "run" / "policy.pt").exists()
+    assert resume(tmp_path / "run", components=swapped(recipe), progress=False).rows[-1]["epoch"] == 2
+
+
+@pytest.mark.parametrize("text", ["epochs: [", "epochs: many", ""])
+def test_a_spoilt_configuration_is_named(text: str, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(ValueError, match="config.yaml cannot be read"):
+        resume(tmp_path)

@@ -1,0 +1,109 @@
+"""A run leaves behind what it promises, and comes out the same from the same seed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+import yaml
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from torchrl_her import load_checkpoint
+from torchrl_her_recipes import Components, Recipe, build, load_actor, play, resume, run
+
+from ..small import assert_same, small
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    run(build(small(seed=3)), folder, progress=False)
+    return folder
+
+
+def test_configuration_versions_and_seed(finished: Path) -> None:
+    assert Recipe.from_dict(yaml.safe_load((finished / "config.yaml").read_text())) == small(seed=3)
+    about = json.loads((finished / "run.json").read_text())
+    assert about["seed"] == 3
+    assert about["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
+
+
+def test_pandas_reads_the_metrics_at_once(finished: Path) -> None:
+    table = pd.read_csv(finished / "metrics.csv")
+    assert table["frames"].tolist() == [1_600, 3_200]
+    assert table["updates"].tolist() == [80, 160]
+    assert table["epsilon"].tolist() == pytest.approx([0.9, 0.81])
+    assert {"success", "distance", "return", "q", "q_bias", "loss_actor", "loss_value"} <= set(table.columns)
+    assert (table["rows_virtual"] > 0).all()
+    assert (table["rows_virtual"] <= 4 * table["rows_real"]).all()
+
+
+def test_tensorboard_reads_the_events(finished: Path) -> None:
+    events = EventAccumulator(str(finished / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("success/run_0")] == [1_600, 3_200]
+
+
+def test_pictures_open(finished: Path) -> None:
+    for name in ("curves.png", "virtual_goals.png", "policy.gif"):
+        with Image.open(finished / name) as picture:
+            assert min(picture.size) > 100, name
+            assert picture.convert("L").getextrema()[0] < picture.convert("L").getextrema()[1], name
+
+
+def test_play_shows_the_policy_that_the_run_ended_with(finished: Path, tmp_path: Path) -> None:
+    achieved = play(finished, tmp_path / "play.gif", goals=2, size=64)
+    assert 0 <= achieved <= 2
+    with Image.open(tmp_path / "play.gif") as film:
+        assert film.n_frames > 10
+    state = load_checkpoint(finished / "policy.pt")["actor"]
+    for name, value in load_actor(finished).state_dict().items():
+        assert torch.equal(value, state[name])
+
+
+def test_a_folder_that_holds_a_run_is_not_written_over(finished: Path) -> None:
+    with pytest.raises(ValueError, match="holds a run already"):
+        run(build(small()), finished, progress=False)
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="is no folder of a run"):
+        resume(tmp_path)
+    folder = tmp_path / "run"
+    run(build(small(epochs=1)), folder, progress=False)
+    with pytest.raises(ValueError, match="there is no run 4 in"):
+        load_actor(folder, run=4)
+
+
+# The same again
+
+
+def everything(components: Components) -> dict[str, Any]:
+    """Weights, targets and optimizer, as one flat dict."""
+    state = dict(components.loss.state_dict())
+    for index, own in components.optimizer.state_dict()["state"].items():
+        state |= {f"optimizer {index} {name}": value for name, value in own.items()}
+    return {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
+
+
+def test_the_same_seed_gives_the_same_run() -> None:
+    runs = [build(small(epochs=1, seed=seed)) for seed in (1, 1, 2)]
+    for components in runs:
+        run(components, progress=False)
+    first, second, other = (everything(components) for components in runs)
+    assert_same(first, second)
+    assert not all(torch.equal(first[name], other[name]) for name in first)
+
+
+def test_epochs_without_an_update_leave_a_table_that_fits(tmp_path: Path) -> None:
+    recipe = small(epochs=3, epoch_frames=400, warmup_frames=900, checkpoint_interval=1)
+    run(build(recipe), tmp_path / "run", progress=False)
+    table = pd.read_csv(tmp_path / "run" / "metrics.csv")
+    assert table["loss_value"].isna().tolist() == [True, True, False]
+    assert table["success"].between(0, 1).all()
+    assert (tmp_path / "run" / "policy.gif").exists()

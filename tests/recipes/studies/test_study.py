@@ -1,0 +1,227 @@
+"""Studies: what they run, that they go on where they stopped, and what they refuse."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from threading import Lock
+
+import pytest
+import yaml
+from filelock import FileLock
+from PIL import Image
+
+import torchrl_her_recipes
+from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.config.study import Study, load_study, study_names
+from torchrl_her_recipes.runs.folder import RunFolder
+from torchrl_her_recipes.studies.jobs import Job, Outcome, Progress, run_job
+from torchrl_her_recipes.studies.seed_batches import Batches
+from torchrl_her_recipes.studies.study import StudyResult, draw_study, run_study
+
+from ..small import SMALL, small
+
+
+class Here:
+    """Does jobs in this process, one after the other: TorchRL's exploration type is that of all threads."""
+
+    at_once = 1
+
+    def __init__(self) -> None:
+        self._place = Lock()
+
+    def run(self, job: Job) -> Outcome:
+        with self._place:
+            return run_job(job)
+
+    def progress(self) -> dict[str, Progress]:
+        return {}
+
+    def stop(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("name", study_names())
+def test_every_study_is_made_of_recipes_that_work_and_can_be_shrunk(name: str) -> None:
+    cells = dict(load_study(name).cells())
+    assert len(cells) >= 2
+    assert all(recipe.run.num_runs >= 3 for recipe in cells.values())
+    quick = dict(load_study(name, quick=True).cells())
+    assert quick.keys() == cells.keys()
+    assert sum(recipe.total_frames * recipe.run.num_runs for recipe in quick.values()) < 300_000
+
+
+def test_seeds_and_frames_take_the_place_of_the_study_s() -> None:
+    recipe = next(recipe for _, recipe in load_study("ibs", seeds=3, frames=20_000).cells())
+    assert recipe.run.num_runs == 3
+    assert recipe.total_frames == 24_000  # whole epochs of 8,000
+
+
+def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draws(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, folder = tmp_path / "mine.yaml", tmp_path / "runs"
+    vary = {"algo": ["her", "filtered_her"]}
+    path.write_text(yaml.safe_dump({"recipe": {**SMALL, "task": "hand_v0"}, "vary": vary}))
+    command = ["study", str(path), "--folder", str(folder), "--jobs", "1"]
+    assert main([*command, "--plan"]) == 0
+    said = capsys.readouterr().out
+    assert "2 batched runs to go, 6,400 environment steps in all" in said
+    assert "her/seeds_0           to do                      3,200 steps to go, about" in said
+    assert not folder.exists()
+
+    folder.mkdir()
+    (folder / "her").write_text("in the way")
+    assert main(command) == 1
+    said, failed = capsys.readouterr()
+    assert "torchrl-her: her/seeds_0 failed: NotADirectoryError: " in failed
+    assert "the same command goes on with it" in said
+
+    (folder / "her").unlink()
+    # another process would take seconds to start
+    monkeypatch.setattr(torchrl_her_recipes, "make_workers", lambda jobs, ray: Here())
+    assert main(command) == 0
+    assert "1 batched runs to go, 3,200 environment steps in all" in capsys.readouterr().out
+    with Image.open(folder / "mine.png") as picture:
+        assert min(picture.size) > 200
+
+    metrics = [folder / name / "seeds_0" / "metrics.csv" for name in vary["algo"]]
+    before = [file.stat().st_mtime_ns for file in metrics]
+    assert main(command) == 0
+    assert "0 batched runs to go, 0 environment steps" in capsys.readouterr().out
+    assert [file.stat().st_mtime_ns for file in metrics] == before
+
+
+def test_mappings_are_called_by_the_entries_that_differ() -> None:
+    vary: dict[str, Sequence[object]] = {
+        "algo": ["her"],
+        "options": [{"length": 4, "layers": 2}, {"length": 6, "layers": 2}],
+    }
+    study = Study(name="one", recipe={**SMALL, "task": "chain"}, vary=vary)
+    assert [label for label, _ in study.cells()] == ["her_length=4", "her_length=6"]
+
+
+def test_chains_are_compared_by_their_times_and_others_by_the_metrics_asked_for(tmp_path: Path) -> None:
+    sizes = [{"length": n, "layers": 2, "alternating": True} for n in (2, 4)]
+    times = Study(
+        name="times",
+        recipe={**SMALL, "task": "chain", "epochs": 1},
+        vary={"algo": ["her", "cher"], "options": sizes},
+        figure="times",
+    )
+    assert run_study(times, tmp_path / "a", workers=Here(), progress=False).figure
+    chains = [str(tmp_path / "a" / label) for label, _ in times.cells()]
+    assert main(["plot", "times", *chains, "--out", str(tmp_path / "again.png")]) == 0
+    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "a" / "times.png").read_bytes()
+    metrics = Study(
+        name="metrics",
+        recipe={**SMALL, "task": "treasure_hunt", "options": {"step": 25}, "epochs": 1},
+        vary={"algo": ["her"]},
+        figure=["success", "right_way"],
+    )
+    run_study(metrics, tmp_path / "b", workers=Here(), progress=False)
+    with Image.open(tmp_path / "b" / "metrics.png") as picture:
+        assert picture.size[0] > 2 * picture.size[1]
+    draw_study(replace(metrics, figure="success"), tmp_path / "b")
+    with Image.open(tmp_path / "b" / "metrics.png") as picture:
+        assert picture.size[0] < 2 * picture.size[1]
+    with pytest.raises(ValueError, match="these runs did not measure useless_share; they have run, seed"):
+        draw_study(replace(metrics, figure="useless_share"), tmp_path / "b")
+
+
+def test_the_guide_s_study_is_planned_as_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    guide = (Path(__file__).parents[3] / "docs" / "studies.md").read_text()
+    (mine,) = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text(mine)
+    assert main(["study", "mine.yaml", "--plan", "--jobs", "2"]) == 0
+    first, *lines, last = capsys.readouterr().out.splitlines()
+    assert len(lines) == 6
+    for line in (first, lines[0], last):
+        assert line in guide
+
+
+def test_a_combination_that_was_cut_short_goes_on(tmp_path: Path) -> None:
+    short = Study(name="cut", recipe={**SMALL, "epochs": 1}, vary={"algo": ["her"]})
+    run_study(short, tmp_path, workers=Here(), progress=False)
+    (home,) = Batches(tmp_path / "her").homes
+    home.config.write_text(home.config.read_text().replace("epochs: 1", "epochs: 2"))
+    assert not Batches(tmp_path / "her").is_done
+    whole = Study(name="cut", recipe={**SMALL, "epochs": 2}, vary={"algo": ["her"]})
+    result = run_study(whole, tmp_path, workers=Here(), progress=False)
+    assert result == StudyResult(figure=tmp_path / "cut.png")
+    assert Batches(tmp_path / "her").is_done
+    assert [row["epoch"] for row in home.rows()] == [1, 2]
+
+
+def test_other_options_under_the_same_name_are_refused(tmp_path: Path) -> None:
+    batch = tmp_path / "her" / "seeds_0"
+    batch.mkdir(parents=True)
+    RunFolder(batch).config.write_text(yaml.safe_dump(small(algo="her", k=2).to_dict()))
+    study = Study(name="one", recipe=SMALL, vary={"algo": ["her"]})
+    with pytest.raises(ValueError, match="holds a run with other options"):
+        run_study(study, tmp_path, workers=Here(), progress=False)
+
+
+def test_one_process_at_a_time_is_at_work_in_a_folder(tmp_path: Path) -> None:
+    study = Study(name="one", recipe=SMALL, vary={"algo": ["her"]})
+    with (
+        FileLock(tmp_path / ".lock"),
+        pytest.raises(ValueError, match=f"another process is running a study in {tmp_path}"),
+    ):
+        run_study(study, tmp_path, workers=Here(), progress=False)
+
+
+def test_without_ray_its_name_and_the_remedy_are_given(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "torchrl_her_recipes.studies.workers_ray", None)
+    assert main(["study", study_names()[0], "--plan", "--ray", "auto"]) == 2
+    said = capsys.readouterr().err
+    assert said == "torchrl-her: --ray needs Ray: pip install '.[cluster]'\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nothing"], "there is no study 'nothing'; the studies are bias, "),
+        (["ibs", "--seeds", "0"], "Invalid value for '--seeds': 0 is not in the range x>=1"),
+        (["ibs", "--frames", "-5"], "Invalid value for '--frames': -5 is not in the range x>=1"),
+        (["recipes: {}"], "a study has no recipes; it has preset, summary, recipe, vary, figure"),
+        ([""], "mine.yaml cannot be read: it must hold names and values, got None"),
+        (["vary: {algo: ["], "mine.yaml cannot be read: while parsing"),
+        (["recipe: {k: 2}"], "vary of mine must hold lists of values by option, got {}"),
+        (["vary: {algo: her}"], "vary of mine must hold lists of values by option, got {'algo': 'her'}"),
+        (["vary: {algo: [her, her]}"], "the study mine has two combinations that are called her"),
+        (["vary: {learning_rate: [1e-3, fast]}"], "learning_rate must be a number, got 'fast'"),
+        (["vary: {1: [2]}"], "options of mine must be names, got 1"),
+        (["vary: {algo: [her]}\nrecipe: {1: 2}"], "options of mine must be names, got 1"),
+        (["vary: {task.options: [{a: 1}, 3]}"], "task.options must"),
+        (["vary: {algo: [her]}\nfigure: [succes]"], "figure of mine must be times, or some of success, "),
+        (
+            ["vary: {algo: [her]}\nfigure: times"],
+            "times of mine is for the task chain, not hand_v0",
+        ),
+    ],
+)
+def test_bad_input_is_one_clear_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if arguments[0] not in ("nothing", "ibs"):  # the text of a study of one's own
+        Path("mine.yaml").write_text(arguments[0])
+        arguments = ["mine.yaml"]
+    assert main(["study", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.splitlines()) == 1

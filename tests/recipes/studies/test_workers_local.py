@@ -1,0 +1,90 @@
+"""Worker processes: they do jobs, stop when they are told to, and may die."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from torchrl_her_recipes.studies.jobs import Job, Outcome, Progress, can_resume
+from torchrl_her_recipes.studies.workers_local import LocalWorkers
+
+from ..small import small
+
+LONG = 10_000  # epochs
+
+
+@pytest.fixture
+def workers() -> Iterator[LocalWorkers]:
+    """One worker."""
+    workers = LocalWorkers(1)
+    yield workers
+    workers.close()
+
+
+@pytest.fixture
+def submit(workers: LocalWorkers) -> Iterator[Callable[[Job], Future[Outcome]]]:
+    """Gives it a job without waiting for it."""
+    threads = ThreadPoolExecutor(3)
+    yield lambda job: threads.submit(workers.run, job)
+    workers.close()
+    threads.shutdown()
+
+
+def job(folder: Path, **options: Any) -> Job:
+    label = f"epochs_{options.get('epochs')}"
+    recipe = small(task="hand_v0", compile="never", **options)
+    return Job(label=label, recipe=recipe, folder=folder / label)
+
+
+def wait_until(happened: Callable[[], bool], *, during: Future[Outcome]) -> None:
+    while not happened():
+        assert not during.done()
+        time.sleep(0.05)
+
+
+def test_one_process_does_several_jobs_until_it_is_told_to_stop(
+    tmp_path: Path, workers: LocalWorkers, submit: Callable[[Job], Future[Outcome]]
+) -> None:
+    broken, whole, endless = (job(tmp_path, epochs=epochs) for epochs in (1, 2, LONG))
+    broken.folder.write_text("this is no folder")
+    assert submit(broken).result().error.startswith("NotADirectoryError: ")
+    assert submit(whole).result() == Outcome()
+    outcome = submit(endless)
+    wait_until(lambda: workers.progress().get(endless.label, Progress()).epochs > 0, during=outcome)
+    workers.stop()
+    assert outcome.result() == Outcome(interrupted=True)
+    assert can_resume(endless.folder)
+    assert submit(whole).result() == Outcome(interrupted=True)  # there are no more to be done
+
+
+def test_a_process_that_dies_takes_only_its_job_along(
+    tmp_path: Path, workers: LocalWorkers, submit: Callable[[Job], Future[Outcome]]
+) -> None:
+    outcome = submit(job(tmp_path, epochs=LONG))
+    wait_until(lambda: bool(workers.progress()), during=outcome)
+    (pid,) = children()
+    os.kill(pid, signal.SIGKILL)
+    assert outcome.result().error == "its process was ended by SIGKILL, perhaps for want of memory"
+    assert workers.progress() == {}
+    assert children() == []  # the next job gets a new one
+
+
+def children() -> list[int]:
+    """Worker processes of this one."""
+    command = ["pgrep", "-P", str(os.getpid()), "-f", "worker_main"]
+    listed = subprocess.run(command, capture_output=True, text=True, check=False)
+    return [int(line) for line in listed.stdout.split()]
+
+
+def test_how_many_at_once() -> None:
+    assert LocalWorkers().at_once == os.cpu_count()
+    with pytest.raises(ValueError, match="jobs must be at least 1, got 0"):
+        LocalWorkers(0)

@@ -1,0 +1,103 @@
+"""Studies over a Ray cluster: two nodes on this machine, one of which dies."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from torchrl_her_recipes.config.study import Study
+from torchrl_her_recipes.studies.jobs import can_resume, read_progress
+from torchrl_her_recipes.studies.study import StudyResult, run_study
+
+from ..small import SMALL
+
+pytest.importorskip("ray", exc_type=ImportError)
+
+from ray._private import ray_constants
+from ray._private.node import Node
+from ray.cluster_utils import Cluster
+
+from torchrl_her_recipes.studies.workers_ray import RayWorkers
+
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray's own files and processes
+ALGORITHMS = ("her", "filtered_her")
+LABELS = [f"{name}/seeds_0" for name in ALGORITHMS]
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """A head that does no work."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)  # it then listens on the loopback alone
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+        yield cluster
+        cluster.shutdown()
+
+
+@pytest.fixture
+def node(cluster: Cluster) -> Iterator[Node]:
+    """A node with one core."""
+    yield cluster.add_node(num_cpus=1)
+    for node in list(cluster.worker_nodes):
+        cluster.remove_node(node, allow_graceful=False)
+
+
+def study(**recipe: Any) -> Study:
+    common = {**SMALL, "task": "hand_v0", "compile": "never", **recipe}
+    return Study(name="small", recipe=common, vary={"algo": ALGORITHMS})
+
+
+def test_a_node_that_dies_loses_only_its_run_which_is_done_again(
+    tmp_path: Path, cluster: Cluster, node: Node
+) -> None:
+    workers, epochs = RayWorkers(cluster.address), 14
+    with ThreadPoolExecutor(1) as threads:
+        result = threads.submit(run_study, study(epochs=epochs), tmp_path, workers=workers, progress=False)
+        while not (first := list(tmp_path.glob("*/*/metrics.csv"))) or not under_way(workers):
+            assert not result.done()
+            time.sleep(0.1)
+        written = [path.stat().st_mtime_ns for path in first]
+        cluster.remove_node(node, allow_graceful=False)
+        cluster.add_node(num_cpus=1)
+        assert result.result() == StudyResult(figure=tmp_path / "small.png")
+    assert [path.stat().st_mtime_ns for path in first] == written
+    for label in LABELS:
+        assert read_progress(tmp_path / label).epochs == epochs
+        assert (tmp_path / label / "policy.gif").exists()
+        assert not can_resume(tmp_path / label)  # buffers of what is done stay where they were
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", *sorted(ALGORITHMS), "small.png"]
+
+
+@pytest.mark.usefixtures("node")
+def test_ctrl_c_brings_home_what_there_is(tmp_path: Path, cluster: Cluster) -> None:
+    workers = RayWorkers(cluster.address)
+
+    def press() -> None:
+        while not under_way(workers):
+            time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as threads:
+        threads.submit(press)
+        result = run_study(study(epochs=10_000), tmp_path, workers=workers, progress=False)
+    assert result == StudyResult(figure=None, interrupted=True)
+    (label,) = (label for label in LABELS if can_resume(tmp_path / label))  # there was one core
+    assert read_progress(tmp_path / label).epochs > 0
+
+
+def under_way(workers: RayWorkers) -> bool:
+    """Whether a run has evaluated for the first time."""
+    return any(progress.epochs for progress in workers.progress().values())
+
+
+def test_no_cluster_is_one_clear_line() -> None:
+    with pytest.raises(ConnectionError, match="no Ray cluster at 127.0.0.1:1 lets us in: .*refused"):
+        RayWorkers("127.0.0.1:1")

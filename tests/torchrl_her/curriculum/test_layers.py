@@ -1,0 +1,423 @@
+"""Layers and their checks, when a layer ends, and what the unused inputs of a network do."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from torchrl_her import Curriculum, CurriculumLayer, CurriculumProgress
+from torchrl_her.curriculum import zero_unused_inputs
+from torchrl_her.modules import ActorNet, CriticNet
+
+
+def make_layer(name: str = "one", **options: Any) -> CurriculumLayer:
+    return CurriculumLayer(
+        **{
+            "name": name,
+            "observation": [0, 1],
+            "achieved_goal": [0],
+            "desired_goal": [2],
+            "threshold": 0.5,
+            **options,
+        }
+    )
+
+
+def make_three(threshold: float = 0.5) -> Curriculum:
+    """State [a, b, c, d]: a goes to b, then b to c, then c to d."""
+    return Curriculum(
+        [
+            make_layer(
+                f"layer {i}",
+                observation=range(i + 1),
+                achieved_goal=[i],
+                desired_goal=[i + 1],
+                threshold=threshold,
+            )
+            for i in range(3)
+        ],
+        4,
+    )
+
+
+# Layers
+
+
+def test_widths_and_indices_of_the_hand() -> None:
+    reach = make_layer("reach", observation=range(5), achieved_goal=[0, 1], desired_goal=[5, 6])
+    throw = make_layer("throw", observation=range(9), achieved_goal=[5, 6], desired_goal=[9, 10])
+    curriculum = Curriculum([reach, throw], 11)
+    assert len(curriculum) == 2
+    assert (curriculum.observation_width, curriculum.goal_width, curriculum.input_width) == (9, 2, 11)
+    assert curriculum.first_inputs == 7
+    assert curriculum.state_index.tolist() == [  # 11 is the zero behind the state
+        [0, 1, 2, 3, 4, 11, 11, 11, 11, 0, 1, 5, 6],
+        [0, 1, 2, 3, 4, 5, 6, 7, 8, 5, 6, 9, 10],
+    ]
+    assert curriculum.input_index.tolist() == [  # the goal stands at 9 and 10
+        [0, 1, 2, 3, 4, 9, 10, 11, 11, 11, 11],
+        [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10],
+    ]
+
+
+def test_inputs_keep_their_meaning_from_layer_to_layer() -> None:
+    curriculum = make_three()
+    state = torch.cat((torch.tensor([10.0, 20.0, 30.0, 40.0]), torch.zeros(1)))
+    inputs = []
+    for states, columns in zip(curriculum.state_index, curriculum.input_index, strict=True):
+        observation, _, goal = state[states].split([3, 1, 1])
+        inputs.append(torch.cat((observation, goal, torch.zeros(1)))[columns].tolist())
+    assert inputs == [[10.0, 20.0, 0.0, 0.0], [10.0, 20.0, 30.0, 0.0], [10.0, 20.0, 30.0, 40.0]]
+
+
+def test_names_stand_for_indices() -> None:
+    names = {"hand": [0, 1, 2], "ball": [3, 4], "hole": [5, 6]}
+    reach = make_layer("reach", observation="hand", achieved_goal=[0, 1], desired_goal="ball")
+    throw = make_layer("throw", observation=["hand", 3, 4], achieved_goal=["ball"], desired_goal="hole")
+    first, last = Curriculum([reach, throw], 7, names=names).layers
+    assert (first.observation, first.achieved_goal, first.desired_goal) == ((0, 1, 2), (0, 1), (3, 4))
+    assert (last.observation, last.achieved_goal, last.desired_goal) == ((0, 1, 2, 3, 4), (3, 4), (5, 6))
+
+
+def test_a_layer_keeps_what_it_is_given() -> None:
+    layer = Curriculum([make_layer(threshold=0.25, instructive=False)], 3).layers[0]
+    assert (layer.name, layer.threshold, layer.instructive) == ("one", 0.25, False)
+    assert make_layer().instructive
+    with pytest.raises(AttributeError, match="cannot assign"):
+        layer.threshold = 1.0  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"threshold": 0.0}, r"layer 'one': threshold must be positive and finite, got 0.0"),
+        ({"threshold": -1.0}, r"got -1.0"),
+        ({"threshold": math.nan}, r"got nan"),
+        ({"threshold": math.inf}, r"got inf"),
+        ({"observation": []}, r"layer 'one': observation must not be empty"),
+        ({"desired_goal": [-1]}, r"layer 'one': desired_goal must have indices of at least 0, got \(-1,\)"),
+        ({"observation": [0, 1, 0]}, r"layer 'one': observation must have each index once, got \(0, 1, 0\)"),
+        ({"desired_goal": [1]}, r"layer 'one': desired_goal must share no index with observation, got \[1\]"),
+        (
+            {"observation": [1], "desired_goal": [0]},
+            r"layer 'one': desired_goal must share no index with achieved_goal, got \[0\]",
+        ),
+        ({"desired_goal": [2, 3]}, r"layer 'one': .* of one width, got \(0,\) and \(2, 3\)"),
+    ],
+)
+def test_bad_layers_are_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_layer(**options)
+
+
+def test_indices_must_be_whole_numbers() -> None:
+    with pytest.raises(TypeError, match="float"):
+        make_layer(observation=[0.5])
+
+
+@pytest.mark.parametrize(
+    ("layers", "message"),
+    [
+        ([], r"at least one layer, got none"),
+        ([make_layer(desired_goal=[9])], r"layer 'one': desired_goal has index 9, .* at most 4 is allowed"),
+        (
+            [make_layer("a", observation=[0, 1, 4]), make_layer("b")],
+            r"layer 'a': observation and goal have 4 entries, but .* last one, 'b', with 3",
+        ),
+        (
+            [make_layer("a"), make_layer("b", achieved_goal=[0, 1], desired_goal=[2, 3])],
+            r"layer 'a': the goal has 1 entries, but .* as the last one, 'b': 2",
+        ),
+        ([make_layer("a", observation="arm")], r"layer 'a': .* unknown name 'arm'; known are 'hand', 'hole'"),
+        # What a layer of names hides until the names are resolved
+        ([make_layer("a", desired_goal="hand")], r"layer 'a': .* share no index with observation, got \[0\]"),
+        ([make_layer("a", observation=["hand", 0])], r"layer 'a': .* each index once, got \(0, 0\)"),
+        ([make_layer("a", desired_goal="hole")], r"layer 'a': .* of one width, got \(0,\) and \(2, 3\)"),
+    ],
+)
+def test_bad_curricula_are_named(layers: list[CurriculumLayer], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Curriculum(layers, 5, names={"hand": [0], "hole": [2, 3]})
+
+
+def test_a_layer_may_be_as_wide_as_the_last_one() -> None:
+    curriculum = Curriculum([make_layer("a"), make_layer("b", desired_goal=[3])], 4)
+    assert curriculum.first_inputs == curriculum.input_width == 3
+
+
+# The success window
+
+
+def make_progress(**options: Any) -> CurriculumProgress:
+    return CurriculumProgress(make_three(), **{"window": 4, "success_threshold": 0.75, **options})
+
+
+def flags(text: str) -> Tensor:
+    """Samples written as ``"1101"``."""
+    return torch.tensor([float(sign) for sign in text])
+
+
+def test_the_defaults_of_the_thesis() -> None:
+    progress = CurriculumProgress(make_three())
+    assert not progress.record_run(0, flags("1" * 17 + "00"))  # 19 samples are no window
+    assert progress.record_run(0, flags("1"))  # 18 of 20: exactly 0.9
+    worse = CurriculumProgress(make_three())
+    assert not worse.record_run(0, flags("1" * 17 + "000"))
+
+
+def test_only_a_full_window_counts() -> None:
+    progress = make_progress()
+    assert not progress.record_run(0, flags("111"))
+    assert progress.layers == (0,)
+    assert progress.record_run(0, flags("0"))
+    assert progress.layers == (1,)
+
+
+def test_the_window_slides() -> None:
+    progress = make_progress()
+    assert not progress.record_run(0, flags("0000110"))
+    assert progress.successes == [[0.0, 1.0, 1.0, 0.0]]
+    assert progress.record_run(0, flags("1"))  # 1 1 0 1
+
+
+def test_the_window_is_cleared_at_a_change() -> None:
+    progress = make_progress()
+    assert progress.record_run(0, flags("1111"))
+    assert progress.successes == [[]]
+    assert not progress.record_run(0, flags("111"))  # with an old sample it would be full
+    assert progress.layers == (1,)
+
+
+def test_samples_behind_the_end_of_a_layer_are_dropped() -> None:
+    progress = make_progress()
+    assert progress.record_run(0, flags("1" * 40))
+    assert progress.layers == (1,)  # a call ends one layer
+    assert progress.successes == [[]]
+
+
+def test_a_layer_ends_at_its_first_full_window_within_a_call() -> None:
+    progress = make_progress()
+    assert progress.record_run(0, flags("1111" + "0000"))  # as sample by sample
+
+
+def test_layers_are_counted_from_the_data() -> None:
+    progress = make_progress()
+    moved = [progress.record_run(0, flags("1111")) for _ in range(4)]
+    assert moved == [True, True, False, False]
+    assert progress.layers == (2,)
+
+
+def test_the_last_layer_has_no_end_but_experts() -> None:
+    progress = make_progress(runs=2)
+    progress.set_layer(1, 2)
+    assert progress.record(torch.stack((flags("1111"), flags("1110")))).tolist() == [True, False]
+    assert progress.expert.tolist() == [False, True]  # layer 0 was left, but not the last one
+    progress.record_run(1, flags("0000"))
+    assert progress.expert.tolist() == [False, True]  # it was reached
+    assert progress.layers == (1, 2)
+    progress.set_layer(1, 2)
+    assert progress.expert.tolist() == [False, False]
+
+
+def test_each_run_moves_on_by_itself() -> None:
+    progress = make_progress(runs=3)
+    moved = progress.record(torch.stack((flags("0000"), flags("1111"), flags("1100"))))
+    assert moved.tolist() == [False, True, False]
+    assert moved.dtype == torch.bool
+    assert progress.layer.tolist() == [0, 1, 0]
+    assert progress.layer.dtype == torch.int64
+    assert progress.successes == [[0.0] * 4, [], [1.0, 1.0, 0.0, 0.0]]
+    assert [progress.layer_of(run).name for run in range(3)] == ["layer 0", "layer 1", "layer 0"]
+
+
+def test_samples_may_be_bools() -> None:
+    assert make_progress().record_run(0, flags("1111").bool())
+
+
+def test_what_is_read_is_a_copy() -> None:
+    progress = make_progress()
+    progress.layer.add_(2)
+    progress.successes[0].append(1.0)
+    assert progress.layers == (0,)
+    assert progress.successes == [[]]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"runs": 0}, "runs must be at least 1, got 0"),
+        ({"window": 0}, "window must be at least 1, got 0"),
+        ({"success_threshold": 0.0}, r"success_threshold must be in \(0, 1\], got 0.0"),
+        ({"success_threshold": 1.1}, r"got 1.1"),
+        ({"success_threshold": math.nan}, r"got nan"),
+    ],
+)
+def test_bad_options_are_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_progress(**options)
+
+
+def test_bad_samples_are_named_and_none_of_them_counts() -> None:
+    progress = make_progress(runs=2)
+    good = torch.ones(4)
+    for bad, message in (
+        (torch.stack((good, 2 * good)), r"in \[0, 1\], got 2.0"),
+        (torch.stack((good, math.nan * good)), r"in \[0, 1\], got nan"),
+        (torch.ones(3, 4), r"must be \[2, n\], got \[3, 4\]"),
+        (good, r"must be \[2, n\], got \[4\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            progress.record(bad)
+    with pytest.raises(ValueError, match=r"must be \[n\], got \[\]"):
+        progress.record_run(0, torch.tensor(1.0))
+    for run in (-1, 2):
+        with pytest.raises(ValueError, match=rf"run must be in \[0, 1\], got {run}"):
+            progress.record_run(run, good)
+    with pytest.raises(ValueError, match=r"layer must be in \[0, 2\], got 3"):
+        progress.set_layer(0, 3)
+    assert progress.layers == (0, 0)
+    assert progress.successes == [[], []]
+
+
+def test_state_goes_through_a_file(tmp_path: Path) -> None:
+    progress, other = make_progress(runs=3), make_progress(runs=3)
+    progress.set_layer(2, 2)
+    progress.record(torch.stack((flags("1100"), flags("1111"), flags("1111"))))
+    torch.save(progress.state_dict(), tmp_path / "progress.pt")
+    other.load_state_dict(torch.load(tmp_path / "progress.pt", weights_only=True))
+    assert other.layers == (0, 1, 2)
+    assert other.expert.tolist() == [False, False, True]
+    assert other.successes == [[1.0, 1.0, 0.0, 0.0], [], [1.0] * 4]
+    more = flags("11").expand(3, 2)  # goes on as the first one does
+    assert other.record(more).tolist() == progress.record(more).tolist() == [False, False, False]
+    assert other.record_run(0, flags("1")) is progress.record_run(0, flags("1")) is True
+
+
+def test_state_is_not_shared() -> None:
+    progress, other = make_progress(), make_progress()
+    state = progress.state_dict()
+    other.load_state_dict(state)
+    other.record_run(0, flags("0"))
+    assert progress.successes == state["successes"] == [[]]
+
+
+def test_a_state_that_does_not_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match="the state is of 2 runs, but there are 1"):
+        make_progress().load_state_dict(make_progress(runs=2).state_dict())
+    deep = make_progress()
+    deep.set_layer(0, 2)
+    shallow = CurriculumProgress(Curriculum([make_layer()], 3))
+    with pytest.raises(ValueError, match=r"layers are \(2,\), but there are 1 layers"):
+        shallow.load_state_dict(deep.state_dict())
+
+
+def test_a_smaller_window_keeps_the_latest_samples() -> None:
+    progress, smaller = make_progress(), make_progress(window=2)
+    progress.record_run(0, flags("1001"))
+    smaller.load_state_dict(progress.state_dict())
+    assert smaller.successes == [[0.0, 1.0]]
+
+
+def test_progress_can_be_copied_and_pickled() -> None:
+    progress = make_progress()
+    progress.set_layer(0, 1)
+    for copied in (copy.deepcopy(progress), pickle.loads(pickle.dumps(progress))):
+        copied.set_layer(0, 2)
+        assert (progress.layers, copied.layers) == ((1,), (2,))
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(st.lists(st.booleans(), max_size=12), max_size=6), st.integers(1, 5), st.sampled_from([0.5, 1.0])
+)
+def test_progress_by_the_book(calls: list[list[bool]], window: int, threshold: float) -> None:
+    progress = make_progress(window=window, success_threshold=threshold)
+    layer, seen = 0, []
+    for call in calls:
+        moved = False
+        for sample in call:
+            seen.append(sample)
+            if layer < 2 and len(seen) >= window and sum(seen[-window:]) >= threshold * window:
+                layer, seen, moved = layer + 1, [], True
+                break
+        assert progress.record_run(0, torch.tensor(call, dtype=torch.bool)) is moved
+        assert progress.layers == (layer,)
+        assert progress.successes == [seen[-window:]]
+
+
+# Unused inputs
+
+
+def test_weights_of_unused_inputs_are_multiplied() -> None:
+    weight = torch.arange(1.0, 9.0).view(1, 4, 2)
+    assert zero_unused_inputs(weight, 3).tolist() == [[[1, 2], [3, 4], [5, 6], [0, 0]]]
+    assert zero_unused_inputs(weight, 2, alpha=0.5).tolist() == [[[1, 2], [3, 4], [2.5, 3], [3.5, 4]]]
+    assert torch.equal(zero_unused_inputs(weight, 1, alpha=1.0), weight)
+    assert torch.equal(zero_unused_inputs(weight, 4), weight)
+    assert weight[0, 3].tolist() == [7.0, 8.0]  # what was given stays
+
+
+@pytest.mark.parametrize(
+    ("used", "alpha", "message"),
+    [
+        (5, 0.0, r"used must be in \[0, 4\], got 5"),
+        (-1, 0.0, r"used must be in \[0, 4\], got -1"),
+        (2, -0.1, r"alpha must be finite and at least 0, got -0.1"),
+        (2, math.nan, r"got nan"),
+    ],
+)
+def test_bad_numbers_are_named(used: int, alpha: float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        zero_unused_inputs(torch.zeros(1, 4, 2), used, alpha=alpha)
+
+
+def prepare(net: ActorNet | CriticNet, used: int, alpha: float) -> nn.Parameter:
+    first = net.layers[0][0] if isinstance(net, ActorNet) else net.first[0][0]
+    with torch.no_grad():
+        first.weight.copy_(zero_unused_inputs(first.weight, used, alpha=alpha))
+    return first.weight
+
+
+def inputs_of_layer(layer: int, rows: int) -> Tensor:
+    """Network inputs of the three-layer curriculum: 2, 3 or 4 numbers, then zeros."""
+    return torch.cat((torch.randn(rows, layer + 2), torch.zeros(rows, 2 - layer)), -1)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.1])
+@pytest.mark.parametrize("kind", ["actor", "critic"])
+def test_unused_weights_stay_as_they_are_until_their_layer(kind: str, alpha: float) -> None:
+    net = ActorNet(4, 1, runs=2) if kind == "actor" else CriticNet(4, 1, runs=2)
+    weight = prepare(net, make_three().first_inputs, alpha)
+    before = weight.detach().clone()
+    optimizer = torch.optim.Adam(net.parameters(), lr=1e-2)
+    for _ in range(5):
+        seen = torch.cat((inputs_of_layer(0, 8), inputs_of_layer(1, 8)))  # run 0 and run 1
+        out = net(seen) if kind == "actor" else net(seen, torch.randn(16, 1))
+        optimizer.zero_grad()
+        out.square().sum().backward()
+        assert (weight.grad[0, 2:] == 0).all()
+        assert (weight.grad[1, 3:] == 0).all()
+        optimizer.step()
+    assert torch.equal(weight[0, 2:], before[0, 2:])
+    assert torch.equal(weight[1, 3:], before[1, 3:])
+    assert (weight[0, :2] != before[0, :2]).any()
+    assert (weight[1, 2] != before[1, 2]).any()  # run 1's layer uses this input
+
+
+def test_new_inputs_change_no_output_at_the_change_of_layer() -> None:
+    """With alpha = 0: the first inputs keep their values (b was the goal, and is b), all others are free."""
+    for alpha, same in ((0.0, True), (1.0, False)):
+        actor = ActorNet(4, 1)
+        prepare(actor, 2, alpha)
+        old = inputs_of_layer(0, 8)
+        new = torch.cat((old[:, :2], 100 * torch.randn(8, 2)), -1)
+        assert torch.equal(actor(old), actor(new)) is same

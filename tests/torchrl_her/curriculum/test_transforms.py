@@ -1,0 +1,710 @@
+"""What each layer sees and is rewarded for, run by run; TorchRL's list of tests for transforms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictSequential
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.data import Binary, Composite, LazyTensorStorage, TensorDictReplayBuffer, Unbounded
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    EnvCreator,
+    ParallelEnv,
+    SerialEnv,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_her import (
+    Curriculum,
+    CurriculumLayer,
+    CurriculumProgress,
+    GoalReward,
+    HERWriter,
+    StateToObs,
+    ZeroPad,
+    make_actor,
+)
+from torchrl_her.curriculum.transforms import take_columns
+from torchrl_her_envs import make_env
+
+
+class TinyEnv(EnvBase):
+    """Worlds of four numbers [a, b, c, d]; an action is added to a.
+
+    World n starts at 1000 n + (10, 20, 30, 40). Its own goal is a near d: it terminates there, but
+    goes on when stepped further. Its own reward is always 7.
+    """
+
+    def __init__(
+        self, batch: tuple[int, ...] = (), *, group: str | None = None, horizon: int = 50, width: int = 4
+    ) -> None:
+        super().__init__(batch_size=batch)
+        self.group, self.horizon = group, horizon
+        worlds = torch.arange(float(torch.Size(batch).numel())).view(*batch, 1)
+        self.start = 1000 * worlds + 10.0 * torch.arange(1, width + 1)
+        one, flag = partial(Unbounded, shape=(*batch, 1)), partial(Binary, n=1, shape=(*batch, 1))
+        self.observation_spec = self._spec(state=Unbounded(shape=(*batch, width)))
+        self.action_spec = self._spec(action=one())
+        self.reward_spec = self._spec(reward=one())
+        self.done_spec = self._spec(
+            **{key: flag(dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        )
+
+    def _spec(self, **entries: Any) -> Composite:
+        inner = Composite(entries, shape=self.batch_size)
+        return inner if self.group is None else Composite({self.group: inner}, shape=self.batch_size)
+
+    def _pack(self, **entries: Tensor) -> TensorDict:
+        inner = TensorDict(entries, self.batch_size)
+        return inner if self.group is None else TensorDict({self.group: inner}, self.batch_size)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get(self.reset_keys[0], None)
+        if mask is None:
+            mask = torch.ones(*self.batch_size, 1, dtype=torch.bool)
+            self.state, self.count = self.start.clone(), torch.zeros_like(mask, dtype=torch.int64)
+        self.state = torch.where(mask, self.start, self.state)
+        self.count = torch.where(mask, 0, self.count)
+        off = torch.zeros_like(mask)
+        return self._pack(state=self.state.clone(), done=off, terminated=off.clone(), truncated=off.clone())
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = (tensordict if self.group is None else tensordict[self.group])["action"]
+        self.state = torch.cat((self.state[..., :1] + action, self.state[..., 1:]), -1)
+        self.count = self.count + 1
+        terminated = (self.state[..., :1] - self.state[..., -1:]).abs() < 0.5
+        truncated = self.count >= self.horizon
+        return self._pack(
+            state=self.state.clone(),
+            reward=torch.full_like(action, 7.0),
+            terminated=terminated,
+            truncated=truncated,
+            done=terminated | truncated,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+
+def make_three(threshold: float = 0.5) -> Curriculum:
+    """a goes to b, then b to c, then c to d."""
+    return Curriculum(
+        [
+            CurriculumLayer(
+                name=f"layer {i}",
+                observation=range(i + 1),
+                achieved_goal=[i],
+                desired_goal=[i + 1],
+                threshold=threshold * 10**i,
+            )
+            for i in range(3)
+        ],
+        4,
+    )
+
+
+def make_hand() -> Curriculum:
+    reach = CurriculumLayer(
+        name="reach", observation=range(5), achieved_goal=[0, 1], desired_goal=[5, 6], threshold=0.06
+    )
+    throw = CurriculumLayer(
+        name="throw", observation=range(9), achieved_goal=[5, 6], desired_goal=[9, 10], threshold=0.1
+    )
+    return Curriculum([reach, throw], 11)
+
+
+def at(curriculum: Curriculum, *layers: int) -> CurriculumProgress:
+    """Progress of as many runs as layers are given."""
+    progress = CurriculumProgress(curriculum, runs=len(layers))
+    for run, layer in enumerate(layers):
+        progress.set_layer(run, layer)
+    return progress
+
+
+def both(progress: CurriculumProgress) -> Compose:
+    return Compose(StateToObs(progress.curriculum, progress), ZeroPad(progress.curriculum, progress))
+
+
+def wrap(env: EnvBase, *layers: int, threshold: float = 0.5) -> TransformedEnv:
+    return TransformedEnv(env, both(at(make_three(threshold), *layers)))
+
+
+def act(env: EnvBase, actions: list[float]) -> TensorDictBase:
+    """What a step gives after a reset."""
+    tensordict = env.reset()
+    tensordict["action"] = torch.tensor(actions).view(*env.batch_size, 1)
+    return env.step(tensordict)["next"]
+
+
+# What is seen
+
+
+def test_each_run_sees_its_own_layer() -> None:
+    seen = wrap(TinyEnv((6,)), 1, 0, 2).reset()
+    assert seen["observation"].tolist() == [
+        [10, 20, 0],
+        [1010, 1020, 0],
+        [2010, 0, 0],
+        [3010, 0, 0],
+        [4010, 4020, 4030],
+        [5010, 5020, 5030],
+    ]
+    assert seen["achieved_goal"].flatten().tolist() == [20, 1020, 2010, 3010, 4030, 5030]
+    assert seen["desired_goal"].flatten().tolist() == [30, 1030, 2020, 3020, 4040, 5040]
+    assert seen["input"].tolist() == [
+        [10, 20, 30, 0],
+        [1010, 1020, 1030, 0],
+        [2010, 2020, 0, 0],
+        [3010, 3020, 0, 0],
+        [4010, 4020, 4030, 4040],
+        [5010, 5020, 5030, 5040],
+    ]
+    assert seen["state"][0].tolist() == [10, 20, 30, 40]  # stays
+
+
+@pytest.mark.parametrize("layer", [0, 1, 2])
+def test_runs_all_in_one_layer_see_what_they_see_in_a_mixture(layer: int) -> None:
+    alike = act(wrap(TinyEnv((4,)), layer, layer), [1.0, 2.0, 3.0, 4.0])
+    mixed = act(wrap(TinyEnv((4,)), layer, (layer + 1) % 3), [1.0, 2.0, 3.0, 4.0])
+    assert (alike[:2] == mixed[:2]).all()
+    assert (alike["input"][2:] != mixed["input"][2:]).any()
+    assert {key: entry.dtype for key, entry in alike.items()} == {
+        key: entry.dtype for key, entry in mixed.items()
+    }
+
+
+def test_the_next_state_is_seen_too() -> None:
+    after = act(wrap(TinyEnv((3,)), 0, 1, 2), [1.0, 2.0, 3.0])
+    assert after["observation"].tolist() == [[11, 0, 0], [1012, 1020, 0], [2013, 2020, 2030]]
+    assert after["input"].tolist() == [[11, 20, 0, 0], [1012, 1020, 1030, 0], [2013, 2020, 2030, 2040]]
+
+
+def test_indices_need_not_be_in_order() -> None:
+    layer = CurriculumLayer(
+        name="odd", observation=[3, 0], achieved_goal=[0, 3], desired_goal=[2, 1], threshold=1.0
+    )
+    seen = TransformedEnv(TinyEnv(), both(at(Curriculum([layer], 4), 0))).reset()
+    assert seen["observation"].tolist() == [40, 10]
+    assert seen["achieved_goal"].tolist() == [10, 40]
+    assert seen["input"].tolist() == [40, 10, 30, 20]
+
+
+def test_a_change_of_layer_is_seen_at_once() -> None:
+    env = wrap(TinyEnv((2,)), 0, 0)
+    assert env.reset()["observation"][:, 1].tolist() == [0, 0]
+    env.transform[0].progress.set_layer(1, 2)
+    assert env.reset()["observation"].tolist() == [[10, 0, 0], [1010, 1020, 1030]]
+
+
+# Reward and ends
+
+
+def test_reward_and_ends_are_of_the_layer() -> None:
+    near = [9.6, 10.0, 9.4]  # a is then 0.4, 0 and 0.6 from b
+    after = act(wrap(TinyEnv((3,)), 0), near)
+    assert after["reward"].flatten().tolist() == [0.0, 0.0, -1.0]
+    assert after["terminated"].flatten().tolist() == [True, True, False]
+    assert after["done"].flatten().tolist() == [True, True, False]
+    assert not after["truncated"].any()
+
+
+def test_each_run_has_the_threshold_of_its_layer() -> None:
+    # b is 10 from c, and c from d: thresholds are 1.5, 15 and 150 in layers 0, 1 and 2
+    after = act(wrap(TinyEnv((6,)), 0, 1, 2, threshold=1.5), [0.0, 8.6, 0.0, 0.0, 0.0, 0.0])
+    assert after["terminated"].flatten().tolist() == [False, True, True, True, True, True]
+    after = act(wrap(TinyEnv((3,)), 2, 0, 1, threshold=0.5), [0.0, 9.0, 0.0])
+    assert after["reward"].flatten().tolist() == [0.0, -1.0, -1.0]  # 50 > 10, 0.5 < 1, 5 < 10
+
+
+def test_the_threshold_itself_is_not_near_enough() -> None:
+    for threshold, done in ((10.0, False), (10.0 + 1e-5, True)):
+        after = act(wrap(TinyEnv(), 0, threshold=threshold), [0.0])
+        assert after["terminated"].item() is done
+
+
+def test_an_end_by_the_environments_own_goal_is_none() -> None:
+    assert act(TinyEnv((2,)), [30.0, 0.0])["done"].flatten().tolist() == [True, False]
+    env = wrap(TinyEnv((2,)), 0)
+    tensordict = env.reset()
+    tensordict["action"] = torch.tensor([[30.0], [0.0]])  # to d
+    after = env.step(tensordict)["next"]
+    assert not after["done"].any()
+    assert not after["terminated"].any()
+    assert after["reward"].flatten().tolist() == [-1.0, -1.0]
+    assert env.rollout(10, lambda td: td.set("action", torch.full((2, 1), 30.0))).shape == (2, 10)
+
+
+def test_the_time_limit_is_kept() -> None:
+    env = wrap(TinyEnv((2,), horizon=1), 0)
+    after = act(env, [30.0, 10.0])  # the first achieves the environment's goal, the second the layer's
+    assert after["truncated"].flatten().tolist() == [True, True]
+    assert after["terminated"].flatten().tolist() == [False, True]
+    assert after["done"].flatten().tolist() == [True, True]
+
+
+def test_no_time_limit_below() -> None:
+    progress = at(make_three(), 0)
+    transform = StateToObs(progress.curriculum, progress, truncated_key=None)
+    env = TransformedEnv(TinyEnv((2,), horizon=1), transform)
+    assert act(env, [10.0, 0.0])["done"].flatten().tolist() == [True, False]
+
+
+def test_a_step_counter_behind_ends_episodes() -> None:
+    env = wrap(TinyEnv((2,)), 0).append_transform(StepCounter(3))
+    check_env_specs(env)
+    rollout = env.rollout(10, lambda td: td.set("action", torch.zeros(2, 1)))
+    assert rollout["next", "truncated"].squeeze(-1).tolist() == [[False, False, True]] * 2
+    assert not rollout["next", "terminated"].any()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(st.floats(-2.0, 2.0, width=32), min_size=6, max_size=6),
+    st.floats(0.01, 2.0),
+    st.tuples(*[st.integers(0, 2)] * 3),
+)
+@example([0.7] * 6, 0.7, (0, 1, 2))
+def test_rewards_agree_with_goal_reward_to_the_last_bit(
+    offsets: list[float], threshold: float, layers: tuple[int, int, int]
+) -> None:
+    env = TinyEnv((6,))
+    env.start = torch.zeros(6, 4)
+    env.start[:, 2] = 0.1
+    transformed = wrap(env, *layers, threshold=threshold)
+    after = act(transformed, offsets)
+    for row in range(6):
+        reward, terminated = GoalReward(threshold * 10 ** layers[row // 2])(
+            after["achieved_goal"][row], after["desired_goal"][row]
+        )
+        assert torch.equal(after["reward"][row], reward)
+        assert torch.equal(after["terminated"][row], terminated)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, 2), min_size=1, max_size=4), st.integers(1, 3), st.integers(0, 2), st.data())
+def test_another_runs_layer_never_touches_a_run(
+    layers: list[int], worlds: int, other: int, data: st.DataObject
+) -> None:
+    runs = len(layers)
+    which = data.draw(st.integers(0, runs - 1))
+    changed = [other if run == which else layer for run, layer in enumerate(layers)]
+    actions = torch.linspace(0.0, 12.0, runs * worlds).tolist()
+    one, two = (act(wrap(TinyEnv((runs * worlds,)), *own), actions) for own in (layers, changed))
+    rest = torch.arange(runs * worlds) // worlds != which
+    assert (one[rest] == two[rest]).all()
+    alone = act(wrap(TinyEnv((runs * worlds,)), *[other] * runs), actions)  # by the path for one layer
+    assert (two[~rest] == alone[~rest]).all()
+
+
+# On the hand
+
+
+def test_the_hand_reaches_first() -> None:
+    env = TransformedEnv(make_env("hand_v1", num_envs=4, seed=3), both(at(make_hand(), 0, 1)))
+    batch = env.rollout(60, break_when_any_done=False)
+    for part in (batch, batch["next"]):
+        state = part["state"]
+        assert torch.equal(part["observation"][:2, :, :5], state[:2, :, :5])
+        assert (part["observation"][:2, :, 5:] == 0).all()
+        assert torch.equal(part["achieved_goal"][:2], state[:2, :, :2])
+        assert torch.equal(part["desired_goal"][:2], state[:2, :, 5:7])
+        # The same inputs keep their meaning: what is the goal here is the ball's position there
+        assert torch.equal(part["input"][:, :, :7], state[:, :, :7])
+        assert (part["input"][:2, :, 7:] == 0).all()
+        assert torch.equal(part["input"][2:], state[2:])
+
+
+def test_the_last_layer_is_the_environment_itself() -> None:
+    base, env = (make_env("hand_v2", num_envs=64, seed=3) for _ in range(2))
+    transformed = TransformedEnv(env, StateToObs(make := make_hand(), at(make, 1, 1)))
+    torch.manual_seed(0)
+    expected = base.rollout(60, break_when_any_done=False)
+    torch.manual_seed(0)
+    batch = transformed.rollout(60, break_when_any_done=False)
+    assert (batch == expected).all()
+    assert expected["next", "truncated"].any()
+
+
+# TorchRL's list of tests for transforms
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_specs(batch: tuple[int, ...]) -> None:
+    env = wrap(TinyEnv(batch), 1)
+    check_env_specs(env)
+    assert env.observation_spec["observation"].shape == (*batch, 3)
+    assert env.observation_spec["input"].shape == (*batch, 4)
+    assert env.full_reward_spec["reward"].shape == (*batch, 1)
+
+
+@pytest.mark.parametrize("layers", [(0, 0), (0, 1), (1, 1)])
+def test_specs_of_the_hand(layers: tuple[int, int]) -> None:
+    check_env_specs(TransformedEnv(make_env("hand_v1", num_envs=4), both(at(make_hand(), *layers))))
+
+
+def test_float64_stays() -> None:
+    env = TransformedEnv(make_env("hand_v1", num_envs=4, dtype=torch.float64), both(at(make_hand(), 0, 1)))
+    check_env_specs(env)
+    after = env.rand_step(env.reset())["next"]
+    assert {after[key].dtype for key in ("observation", "input", "reward")} == {torch.float64}
+
+
+def test_one_transform_alone() -> None:
+    progress = at(make_three(), 1)
+    env = TransformedEnv(TinyEnv((2,)), StateToObs(progress.curriculum, progress))
+    check_env_specs(env)
+    assert "input" not in env.reset().keys()
+
+
+def test_inside_of_a_serial_env() -> None:
+    progress = at(make_three(), 1)
+    env = SerialEnv(2, lambda: TransformedEnv(TinyEnv((2,)), both(progress)))
+    check_env_specs(env)
+    progress.set_layer(0, 2)  # one process: its environments follow
+    assert env.reset()["observation"][1].tolist() == [[10, 20, 30], [1010, 1020, 1030]]
+
+
+def test_around_a_serial_env() -> None:
+    env = wrap(SerialEnv(2, partial(TinyEnv, (2,))), 0, 2)
+    check_env_specs(env)
+    seen = env.reset()
+    assert seen["observation"][0].tolist() == [[10, 0, 0], [1010, 0, 0]]
+    assert seen["observation"][1].tolist() == [[10, 20, 30], [1010, 1020, 1030]]
+
+
+@pytest.fixture(scope="module")
+def parallel_env() -> Iterator[ParallelEnv]:
+    """Two workers, each with transforms inside in the first layer. Starting them takes seconds."""
+    make = partial(make_env, "hand_v1", num_envs=2)
+    env = ParallelEnv(2, EnvCreator(lambda: TransformedEnv(make(), both(at(make_hand(), 0)))))
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_in_and_around_a_parallel_env(inside: bool, parallel_env: ParallelEnv) -> None:
+    # Transforms around it write again all that those inside wrote.
+    env = parallel_env if inside else TransformedEnv(parallel_env, both(at(make_hand(), 0, 1)))
+    check_env_specs(env)
+    seen = env.rand_step(env.reset())["next"]
+    assert (seen["input"][0, :, 7:] == 0).all()
+    assert (seen["input"][1, :, 7:] == 0).all().item() is inside
+
+
+def test_partial_resets_leave_other_worlds_as_they_are() -> None:
+    env = wrap(TinyEnv((4,)), 0, 2)
+    after = act(env, [1.0, 2.0, 3.0, 4.0])
+    mask = torch.tensor([False, True, True, False]).unsqueeze(-1)
+    reset = env.reset(after.clone().set("_reset", mask))
+    assert reset["observation"][:, 0].tolist() == [11, 1010, 2010, 3014]
+    assert reset["input"][3].tolist() == [3014, 3020, 3030, 3040]
+
+
+def test_without_environment() -> None:
+    progress = at(make_three(), 0, 2)
+    rows = make_rows(4)
+    for transform in (
+        ZeroPad(progress.curriculum, progress),
+        Compose(ZeroPad(progress.curriculum, progress)),
+    ):
+        out = transform(rows.clone())
+        assert out["input"].tolist() == [
+            [1, 100, 0, 0],
+            [11, 101, 0, 0],
+            [21, 22, 23, 102],
+            [31, 32, 33, 103],
+        ]
+        assert "next" not in out.keys()
+    with_next = ZeroPad(progress.curriculum, progress)(rows.clone().set("next", rows + 1000))
+    assert with_next["next", "input"][0].tolist() == [1001, 1100, 0, 0]
+    assert with_next["input"][0].tolist() == [1, 100, 0, 0]
+
+
+def test_with_tensors_in_place_of_a_tensordict() -> None:
+    progress = at(make_three(), 0)
+    pad = ZeroPad(progress.curriculum, progress)
+    padded = pad(observation=torch.tensor([1.0, 2.0, 3.0]), desired_goal=torch.tensor([9.0]))
+    assert padded.tolist() == [1, 9, 0, 0]
+
+
+@pytest.mark.parametrize("composed", [False, True])
+def test_state_to_obs_is_for_environments(composed: bool) -> None:
+    """Also the "replay buffer" and "model" entries of the list."""
+    progress = at(make_three(), 0)
+    transform: Transform = StateToObs(progress.curriculum, progress)
+    transform = Compose(transform) if composed else transform
+    rows = TensorDict({"state": torch.zeros(5, 4)}, [5])
+    with pytest.raises(RuntimeError, match="StateToObs is for environments: in a replay buffer"):
+        transform(rows)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(5), batch_size=2, transform=transform)
+    buffer.extend(rows)
+    with pytest.raises(RuntimeError, match="StateToObs is for environments"):
+        buffer.sample()
+
+
+def make_rows(n: int, shape: tuple[int, ...] | None = None) -> TensorDict:
+    """Row i has the observation 10 i + (1, 2, 3) and the goal 100 + i."""
+    i = torch.arange(float(n)).unsqueeze(-1)
+    rows = TensorDict({"observation": 10 * i + torch.arange(1.0, 4.0), "desired_goal": 100 + i}, [n])
+    return rows if shape is None else rows.reshape(shape)
+
+
+def test_in_a_replay_buffer() -> None:
+    progress = at(make_three(), 0, 1)
+    pad = ZeroPad(progress.curriculum, progress, run=1)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20), batch_size=8)
+    buffer.append_transform(pad)
+    rows = make_rows(20)
+    buffer.extend(rows.set("next", make_rows(20) + 1000))
+    assert "input" not in buffer.storage[:].keys(True)
+    sample = buffer.sample()
+    for part in (sample, sample["next"]):
+        assert torch.equal(part["input"][:, :2], part["observation"][:, :2])
+        assert torch.equal(part["input"][:, 2:3], part["desired_goal"])
+        assert (part["input"][:, 3] == 0).all()
+    progress.set_layer(1, 2)
+    sample = buffer.sample()
+    assert torch.equal(sample["input"], torch.cat((sample["observation"], sample["desired_goal"]), -1))
+    progress.set_layer(0, 2)  # another run's
+    progress.set_layer(1, 0)
+    assert (buffer.sample()["input"][:, 2:] == 0).all()
+
+
+@pytest.mark.parametrize("shape", [(), (6,), (3, 2), (1, 3, 2)])
+def test_rows_of_one_run_may_have_any_shape(shape: tuple[int, ...]) -> None:
+    progress = at(make_three(), 2, 0)
+    n = torch.Size(shape).numel()
+    flat = ZeroPad(progress.curriculum, progress, run=1)(make_rows(n))
+    shaped = ZeroPad(progress.curriculum, progress, run=1)(make_rows(n, shape))
+    assert torch.equal(shaped["input"], flat["input"].view(*shape, 4))
+    assert flat["input"][0].tolist() == [1, 100, 0, 0]
+
+
+@pytest.mark.parametrize("layers", [(0, 0), (0, 2)])
+def test_no_rows(layers: tuple[int, int]) -> None:
+    progress = at(make_three(), *layers)
+    assert ZeroPad(progress.curriculum, progress)(make_rows(0))["input"].shape == (0, 4)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, 2), min_size=1, max_size=4), st.integers(1, 4), st.integers(1, 3))
+def test_inputs_by_the_book(layers: list[int], worlds: int, steps: int) -> None:
+    progress = at(make_three(), *layers)
+    shape = (len(layers) * worlds, steps)
+    rows = make_rows(shape[0] * steps, shape)
+    out = ZeroPad(progress.curriculum, progress)(rows)["input"]
+    for i in range(shape[0]):
+        for t in range(steps):
+            n = layers[i // worlds] + 1
+            expected = [*rows["observation"][i, t, :n].tolist(), *rows["desired_goal"][i, t].tolist()]
+            assert out[i, t].tolist() == expected + [0.0] * (3 - n)
+
+
+def test_what_lies_behind_a_layers_entries_is_not_seen() -> None:
+    progress = at(make_three(), 0, 1)  # rows whose observation is not padded with zeros
+    assert ZeroPad(progress.curriculum, progress)(make_rows(2))["input"].tolist() == [
+        [1, 100, 0, 0],
+        [11, 12, 101, 0],
+    ]
+
+
+def test_in_a_model() -> None:
+    progress = at(make_three(), 0)
+    pad = ZeroPad(progress.curriculum, progress)
+    actor = make_actor([4], 1, in_keys=["input"])
+    for model in (nn.Sequential(pad, actor), TensorDictSequential(pad, actor)):
+        assert model(make_rows(5))["action"].shape == (5, 1)
+
+
+def test_inverse() -> None:
+    """There is none: what goes towards the environment or the storage stays as it is."""
+    progress = at(make_three(), 0)
+    rows = make_rows(3).set("state", torch.zeros(3, 4))
+    for transform in both(progress):
+        assert (transform.inv(rows) == rows).all()
+        assert set(transform.inv(rows).keys()) == set(rows.keys())
+
+
+def test_clones_follow_the_same_progress() -> None:
+    progress = at(make_three(), 0)
+    clones = [transform.clone() for transform in both(progress)]
+    progress.set_layer(0, 1)
+    assert TransformedEnv(TinyEnv(), Compose(*clones)).reset()["input"].tolist() == [10, 20, 30, 0]
+
+
+def test_nested_keys() -> None:
+    progress = at(make_three(), 0, 2)
+    names = (
+        "state",
+        "observation",
+        "achieved_goal",
+        "desired_goal",
+        "reward",
+        "terminated",
+        "truncated",
+        "done",
+    )
+    own = {name: ("agent", name) for name in names}
+    env = TransformedEnv(
+        TinyEnv((2,), group="agent"),
+        Compose(
+            StateToObs(progress.curriculum, progress, **{f"{name}_key": own[name] for name in names}),
+            ZeroPad(
+                progress.curriculum,
+                progress,
+                observation_key=own["observation"],
+                desired_goal_key=own["desired_goal"],
+                input_key=("net", "input"),
+            ),
+        ),
+    )
+    check_env_specs(env)
+    tensordict = env.reset()
+    tensordict["agent", "action"] = torch.tensor([[10.0], [30.0]])
+    after = env.step(tensordict)["next"]
+    assert after["net", "input"].tolist() == [[20, 20, 0, 0], [1040, 1020, 1030, 1040]]
+    assert after["agent", "terminated"].flatten().tolist() == [True, True]  # 10 < 50
+    assert after["agent", "reward"].flatten().tolist() == [0.0, 0.0]
+    assert "observation" not in after.keys()
+
+
+# What does not fit is said
+
+
+def test_batches_that_are_no_blocks_are_refused() -> None:
+    # Also while all runs are in one layer: it must not come out at the first change
+    for batch in ((), (3,), (3, 2)):
+        with pytest.raises(ValueError, match=r"must be 2 equal blocks, one for each run, got a batch of \["):
+            wrap(TinyEnv(batch), 0, 0).reset()
+        with pytest.raises(ValueError, match=r"must be 2 equal blocks"):
+            _ = wrap(TinyEnv(batch), 0, 0).observation_spec
+    progress = at(make_three(), 0, 1)
+    with pytest.raises(ValueError, match=r"2 equal blocks, one for each run, got a batch of \[3\]"):
+        ZeroPad(progress.curriculum, progress)(make_rows(3))
+
+
+def test_a_state_of_another_width_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"the curriculum needs 'state' of width 4, got 5"):
+        wrap(TinyEnv(width=5), 0).reset()
+    with pytest.raises(ValueError, match=r"needs 'state' of width 4, got 5"):
+        _ = wrap(TinyEnv(width=5), 0).observation_spec
+
+
+def test_missing_entries_are_named() -> None:
+    progress = at(make_three(), 0)
+    for options, message in (
+        ({"state_key": "words"}, "StateToObs needs the (entry|observation) 'words'"),
+        ({"truncated_key": "cut"}, "StateToObs needs the flag 'cut' of the environment"),
+    ):
+        with pytest.raises(KeyError, match=message):
+            check_env_specs(TransformedEnv(TinyEnv(), StateToObs(progress.curriculum, progress, **options)))
+    pad = ZeroPad(progress.curriculum, progress)
+    with pytest.raises(KeyError, match="ZeroPad needs the entry 'desired_goal'"):
+        pad(make_rows(3).exclude("desired_goal"))
+    with pytest.raises(KeyError, match="ZeroPad needs the observation 'observation'"):
+        _ = TransformedEnv(TinyEnv(), pad).observation_spec
+    with pytest.raises(ValueError, match="needs 'observation' of width 3, got 4"):
+        pad(make_rows(2).set("observation", torch.zeros(2, 4)))
+    with pytest.raises(ValueError, match="needs 'desired_goal' of width 1, got 2"):
+        pad(make_rows(2).set("desired_goal", torch.zeros(2, 2)))
+
+
+def test_parts_that_do_not_belong_together_are_refused() -> None:
+    progress = at(make_three(), 0, 0)
+    for transform in (StateToObs, ZeroPad):
+        with pytest.raises(ValueError, match="progress must be made of the same curriculum"):
+            transform(make_three(), progress)
+    for run in (-1, 2):
+        with pytest.raises(ValueError, match=rf"run must be None or in \[0, 1\], got {run}"):
+            ZeroPad(progress.curriculum, progress, run=run)
+
+
+def test_columns_of_blocks() -> None:
+    rows = torch.arange(12.0).view(4, 3)
+    assert take_columns(rows, torch.tensor([[2, 0], [1, 1]])).tolist() == [[2, 0], [5, 3], [7, 7], [10, 10]]
+
+
+# Downstream: hindsight in a layer
+
+
+def collect_and_write(exclude: tuple[str, ...]) -> tuple[CurriculumProgress, list[TensorDictReplayBuffer]]:
+    """Two runs, in layers 0 and 1 of the hand, each with a buffer of its own."""
+    progress = at(make_hand(), 0, 1)
+    env = TransformedEnv(make_env("hand_v1", num_envs=8, seed=0), both(progress))
+    collector = Collector(
+        env,
+        make_actor([11], 3, in_keys=["input"]),
+        frames_per_batch=480,
+        total_frames=-1,
+        auto_register_policy_transforms=False,
+    )
+    buffers = []
+    for run in range(2):
+        writer = HERWriter(GoalReward(progress.layer_of(run).threshold), k=4, exclude=exclude)
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(5000), writer=writer, batch_size=256)
+        buffer.set_rng(torch.Generator().manual_seed(run))
+        buffers.append(buffer)
+    for buffer, block in zip(buffers, collector.next().chunk(2), strict=True):
+        buffer.extend(block)
+    collector.shutdown()
+    return progress, buffers
+
+
+def test_rows_of_a_layer_have_its_goals() -> None:
+    _, (reach, throw) = collect_and_write(("state", "input"))
+    for buffer, achieved in ((reach, slice(0, 2)), (throw, slice(5, 7))):
+        rows = buffer[:]
+        assert not {unravel_key(key) for key in rows.keys(True, True)} & {
+            "state",
+            "input",
+            ("next", "state"),
+            ("next", "input"),
+        }
+        assert torch.equal(rows["achieved_goal"], rows["observation"][:, achieved])
+        virtual = rows[rows["virtual"].squeeze(-1)]
+        reached = {tuple(goal) for goal in rows["next", "achieved_goal"].tolist()}
+        assert len(virtual) > 500
+        assert all(tuple(goal) in reached for goal in virtual["desired_goal"].tolist())
+    real = reach[:][~reach[:]["virtual"].squeeze(-1)]
+    floor = real["desired_goal"][:, 1]  # the ball's height
+    assert torch.equal(floor, floor[:1].expand_as(floor))
+    assert (reach[:]["observation"][:, 5:] == 0).all()
+
+
+def test_the_sampled_input_holds_the_virtual_goal() -> None:
+    progress, buffers = collect_and_write(("state", "input"))
+    for run, (buffer, n) in enumerate(zip(buffers, (5, 9), strict=True)):
+        buffer.append_transform(ZeroPad(progress.curriculum, progress, run=run))
+        sample = buffer.sample()
+        virtual = sample["virtual"].squeeze(-1)
+        assert virtual.any()
+        for part in (sample, sample["next"]):
+            assert torch.equal(part["input"][:, n : n + 2], part["desired_goal"])
+            assert torch.equal(part["input"][:, :n], part["observation"][:, :n])
+            assert (part["input"][:, n + 2 :] == 0).all()
+        assert torch.equal(sample["desired_goal"], sample["next", "desired_goal"])
+
+
+def test_an_input_that_was_stored_is_replaced() -> None:
+    progress, (reach, _) = collect_and_write(("state",))
+    virtual = reach[:]["virtual"].squeeze(-1)
+    stale = (reach[:]["input"][:, 5:7] != reach[:]["desired_goal"]).any(-1)
+    assert stale[virtual].any()  # the trap: it was computed before the relabeling
+    assert not stale[~virtual].any()
+    reach.append_transform(ZeroPad(progress.curriculum, progress, run=0))
+    sample = reach.sample()
+    assert torch.equal(sample["input"][:, 5:7], sample["desired_goal"])
+    assert torch.equal(sample["next", "input"][:, 5:7], sample["next", "desired_goal"])

@@ -1,0 +1,33 @@
+"""Weights of goals: the base class, and what every weight must be."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_her import GoalWeights
+from torchrl_her.goals.weights import checked_weights
+
+
+def test_the_base_class_weighs_all_alike_and_remembers_nothing() -> None:
+    weights = GoalWeights()
+    goals = torch.randn(2, 3, 4)
+    assert weights(goals).tolist() == [[1.0] * 3] * 2
+    weights.update(goals.flatten(0, 1))
+    assert weights.state_dict() == {}
+    weights.load_state_dict({})
+    weights.clear()
+    assert weights(goals).tolist() == [[1.0] * 3] * 2
+
+
+def test_weights_become_floating_numbers() -> None:
+    assert checked_weights(torch.tensor([True, False])).tolist() == [1.0, 0.0]
+    kept = torch.tensor([0.5, 0.0], dtype=torch.float64)
+    assert checked_weights(kept) is kept
+    assert checked_weights(torch.empty(0)).shape == (0,)
+
+
+@pytest.mark.parametrize("bad", [-1e-9, float("nan"), float("inf")])
+def test_weights_that_are_negative_or_not_finite_are_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="weights of goals must be finite and at least 0, got"):
+        checked_weights(torch.tensor([1.0, bad, 2.0]))

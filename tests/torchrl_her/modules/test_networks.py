@@ -1,0 +1,172 @@
+"""Actor and critic have the layers of appendix B, and stacked networks are their runs side by side."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from torchrl_her import make_actor, make_critic
+from torchrl_her.modules import ActorNet, CriticNet, StackedLinear, stack_runs, take_run
+from torchrl_her.modules.networks import StackedBatchNorm
+
+
+def layers(net: nn.Module) -> list[tuple[int, int]]:
+    """(inputs, outputs) of all linear layers, in order."""
+    return [tuple(m.weight.shape[1:]) for m in net.modules() if isinstance(m, StackedLinear)]
+
+
+def kinds(net: nn.Module) -> list[str]:
+    """What the net consists of, in order."""
+    return [type(m).__name__ for m in net.modules() if not list(m.children())]
+
+
+def seen(*shape: int) -> tuple[Tensor, Tensor]:
+    """An observation of 9 numbers and a goal of 2."""
+    return torch.randn(*shape, 9), torch.randn(*shape, 2)
+
+
+def test_layers_of_the_actor() -> None:
+    net = ActorNet(11, 3)
+    assert layers(net) == [(11, 64), (64, 64), (64, 64), (64, 3)]
+    assert kinds(net) == ["StackedLinear", "ReLU"] * 3 + ["StackedLinear", "Tanh"]
+
+
+def test_layers_of_the_critic() -> None:
+    net = CriticNet(11, 3)
+    assert layers(net) == [(11, 64), (67, 64), (64, 64), (64, 1)]
+    assert kinds(net) == ["StackedLinear", "ReLU"] * 3 + ["StackedLinear"]
+
+
+def test_width_of_the_hidden_layers() -> None:
+    assert layers(ActorNet(5, 2, hidden=8)) == [(5, 8), (8, 8), (8, 8), (8, 2)]
+    assert layers(CriticNet(5, 2, hidden=8)) == [(5, 8), (10, 8), (8, 8), (8, 1)]
+
+
+def test_the_action_enters_behind_the_critics_first_layer() -> None:
+    net, first = CriticNet(11, 3), []
+    net.first.register_forward_hook(lambda _module, _inputs, output: first.append(output))
+    action = torch.randn(4, 3, requires_grad=True)
+    value = net(*seen(4), action)
+    (direct,) = torch.autograd.grad(first[0].sum(), action, allow_unused=True)
+    (whole,) = torch.autograd.grad(value.sum(), action)
+    assert direct is None
+    assert (whole != 0).any(-1).all()
+
+
+def test_a_layer_by_hand() -> None:
+    layer = StackedLinear(2, 1, runs=2)
+    with torch.no_grad():
+        layer.weight.copy_(torch.tensor([[[1.0], [2.0]], [[3.0], [4.0]]]))
+        layer.bias.copy_(torch.tensor([[[10.0]], [[20.0]]]))
+    x = torch.tensor([[[1.0, 1.0]], [[1.0, 1.0]]])
+    assert layer(x).flatten().tolist() == [13.0, 27.0]
+
+
+def test_weights_start_as_torchs_own_do() -> None:
+    layer = StackedLinear(100, 400)
+    spread = 0.1 / math.sqrt(3)  # of a uniform distribution over [-0.1, 0.1]
+    assert layer.weight.abs().max() <= 0.1
+    assert layer.weight.std().item() == pytest.approx(spread, rel=0.02)
+    assert layer.weight.std().item() == pytest.approx(nn.Linear(100, 400).weight.std().item(), rel=0.02)
+
+
+def test_early_actions_and_values_are_small() -> None:
+    observation, goal = seen(1000)
+    assert ActorNet(11, 3)(observation, goal).abs().max() < 0.1
+    assert CriticNet(11, 3)(observation, goal, torch.randn(1000, 3)).abs().max() < 0.1
+
+
+def test_actions_are_within_the_range_of_tanh() -> None:
+    net = ActorNet(11, 3)
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.mul_(100.0)
+    actions = net(*seen(100))
+    assert actions.abs().max() <= 1.0
+    assert actions.abs().max() > 0.99
+
+
+@pytest.mark.parametrize(("normalize", "count"), [(False, 0), (True, 4)])
+def test_batch_normalization_is_of_the_critics_input_and_hidden_layers(normalize: bool, count: int) -> None:
+    critic = make_critic((9, 2), 3, normalize=normalize)
+    norms = [m.num_features for m in critic.modules() if isinstance(m, nn.BatchNorm1d)]
+    assert norms == [11, 64, 64, 64][:count]
+    assert not any(isinstance(m, nn.BatchNorm1d) for m in make_actor((9, 2), 3).modules())
+
+
+def test_batch_normalization_is_that_of_torch() -> None:
+    rows = torch.randn(16, 5) * 3.0 + 7.0
+    norm, own = nn.BatchNorm1d(5), StackedBatchNorm(5)
+    assert torch.allclose(own(rows.unsqueeze(0))[0], norm(rows), atol=1e-5)
+    assert torch.allclose(own.norm.running_mean, norm.running_mean, atol=1e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(1, 3), max_size=3))
+def test_any_batch_shape(shape: list[int]) -> None:
+    observation, goal, action = torch.randn(*shape, 9), torch.randn(*shape, 2), torch.randn(*shape, 3)
+    for net, inputs in (
+        (ActorNet(11, 3), (observation, goal)),
+        (CriticNet(11, 3), (observation, goal, action)),
+    ):
+        flat = net(*(x.reshape(-1, x.shape[-1]) for x in inputs))
+        assert torch.allclose(net(*inputs), flat.view(*shape, -1), atol=1e-6)
+
+
+def test_keys_of_ones_own() -> None:
+    keys, action, value = [("agent", "seen"), "wanted"], ("agent", "action"), ("agent", "value")
+    actor = make_actor((4, 2), 3, in_keys=keys, action_key=action)
+    critic = make_critic((4, 2), 3, in_keys=keys, action_key=action, value_key=value)
+    data = TensorDict({"agent": {"seen": torch.randn(5, 4)}, "wanted": torch.randn(5, 2)}, batch_size=[5])
+    critic(actor(data))
+    assert data[action].shape == (5, 3)
+    assert data[value].shape == (5, 1)
+    assert torch.equal(data[action], actor.module(data["agent", "seen"], data["wanted"]))
+
+
+def make_nets(kind: str, runs: int) -> nn.Module:
+    if kind == "actor":
+        return ActorNet(11, 3, hidden=8, runs=runs)
+    return CriticNet(11, 3, hidden=8, normalize=kind == "normalized critic", runs=runs)
+
+
+@pytest.mark.parametrize("kind", ["actor", "critic", "normalized critic"])
+def test_stacked_runs_are_the_single_ones_side_by_side(kind: str) -> None:
+    singles = [make_nets(kind, 1) for _ in range(3)]
+    stacked = make_nets(kind, 3)
+    stacked.load_state_dict(stack_runs([net.state_dict() for net in singles]))
+    inputs = [torch.randn(3, 6, 9), torch.randn(3, 6, 2)] + (
+        [] if kind == "actor" else [torch.randn(3, 6, 3)]
+    )
+    expected = torch.stack([net(*(x[run] for x in inputs)) for run, net in enumerate(singles)])
+    assert torch.allclose(stacked(*inputs), expected, atol=1e-5)
+    one_after_the_other = stacked.eval()(*(x.flatten(0, 1) for x in inputs))
+    assert torch.allclose(one_after_the_other.view_as(expected), stacked(*inputs), atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["actor", "normalized critic"])
+def test_a_run_taken_out_is_what_was_stacked(kind: str) -> None:
+    states = [make_nets(kind, 1).state_dict() for _ in range(3)]
+    taken = take_run(stack_runs(states), 1, 3)
+    assert taken.keys() == states[1].keys()
+    assert all(torch.equal(taken[key], states[1][key]) for key in taken)
+    assert not any(
+        torch.equal(taken[key], states[0][key])
+        for key in taken
+        if key.endswith("weight") and "norm" not in key
+    )
+
+
+def test_runs_do_not_reach_each_other() -> None:
+    net = CriticNet(11, 3, runs=2, normalize=True)
+    value = net(torch.randn(2, 6, 9), torch.randn(2, 6, 2), torch.randn(2, 6, 3))
+    value[0].sum().backward()
+    gradients = {name: p.grad for name, p in net.named_parameters() if p.ndim == 3}
+    assert all((gradient[1] == 0).all() for gradient in gradients.values())
+    assert all((gradient[0] != 0).any() for gradient in gradients.values())

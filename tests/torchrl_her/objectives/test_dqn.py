@@ -1,0 +1,53 @@
+"""DQN: targets by hand, and learning a known value."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torchrl.objectives import SoftUpdate
+
+from torchrl_her import LossLearner, make_dqn_loss, make_q_actor
+
+from ..lost_game import rows
+
+
+def test_dqn_targets_are_double_and_clamped() -> None:
+    """By hand: the online network chooses action 1, whose value by the target network is -7."""
+    actor, _ = make_q_actor((4, 2), 2)
+    loss = make_dqn_loss(actor, gamma=0.5)
+    SoftUpdate(loss, tau=0.1)
+    for params, values in (
+        (loss.value_network_params, [0.0, 1.0]),
+        (loss.target_value_network_params, [-1.0, -7.0]),
+    ):
+        for value in params.values(True, True):
+            value.data.zero_()
+        params["module", "0", "module", "layers", "3", "bias"].data.copy_(torch.tensor([[values]]))
+    batch = rows(1, action=torch.zeros(1, 1, dtype=torch.int64))[0]
+    loss(batch)
+    # -1 + 0.5 * -7 = -4.5 is below -1 / (1 - 0.5) = -2, and the value of action 0 is 0
+    assert float(batch["td_error"]) == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize("runs", [1, 2])
+def test_dqn_learns_the_value_of_a_lost_game(runs: int) -> None:
+    torch.manual_seed(0)
+    actor, _ = make_q_actor((4, 2), 3, runs=runs)
+    loss = make_dqn_loss(actor, gamma=0.5, reduction="none")
+    learner = LossLearner(
+        loss, torch.optim.Adam(loss.parameters(), lr=1e-2), SoftUpdate(loss, tau=0.1), runs=runs
+    )
+    for _ in range(200):
+        batch = rows(32, action=torch.randint(3, (runs, 32)), runs=runs)
+        measured = learner.update(batch if runs > 1 else batch[0].unsqueeze(0))
+    assert measured["loss"].shape == (1, runs)
+    seen = rows(64, action=torch.zeros(runs, 64, dtype=torch.int64), runs=runs)
+    with torch.no_grad():
+        value = actor(seen.select("observation", "desired_goal").reshape(-1))["chosen_action_value"]
+    assert float(value.mean()) == pytest.approx(-2.0, abs=0.2)
+
+
+@pytest.mark.parametrize("gamma", [-0.1, 1.0])
+def test_a_discount_out_of_range_is_named(gamma: float) -> None:
+    with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):
+        make_dqn_loss(make_q_actor((4, 2), 3)[0], gamma=gamma)

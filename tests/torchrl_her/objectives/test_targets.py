@@ -1,0 +1,103 @@
+"""One-step targets by hand, and how target networks move."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
+
+from torchrl_her import LossLearner, make_target_updater
+
+from ..ddpg_data import batch, constant_loss, make_loss, rows, weights
+
+# Most of these tests ask a loss for its numbers, and have no target networks to move.
+pytestmark = pytest.mark.filterwarnings("ignore:No target network updater has been associated")
+
+
+def numbers(loss: LossModule, parameters: str) -> Tensor:
+    """A copy of all numbers of one set of parameters, trained or not."""
+    return torch.cat([p.detach().flatten() for p in getattr(loss, parameters).values(True, True)]).clone()
+
+
+# Targets
+
+
+def test_truncated_rows_bootstrap_and_terminated_ones_do_not() -> None:
+    data = rows([-1.0, -1.0, -1.0, 0.0], terminated=[0, 0, 1, 1], done=[0, 1, 1, 1])
+    target = constant_loss(-5.0, gamma=0.5, reward_range=(-10.0, 0.0))(data)["target_value"]
+    assert target.tolist() == [-3.5, -3.5, -1.0, 0.0]  # -1 - 0.5 * 5 where the episode may go on
+
+
+@pytest.mark.parametrize(("gamma", "expected"), [(0.98, -1.0 - 0.98 * 10), (0.5, -6.0), (0.0, -1.0)])
+def test_gamma_is_the_one_that_was_given(gamma: float, expected: float) -> None:
+    loss = constant_loss(-10.0, gamma=gamma, reward_range=(-100.0, 0.0))
+    assert loss(rows([-1.0]))["target_value"].item() == pytest.approx(expected)
+
+
+def test_gamma_is_098_by_default() -> None:
+    assert constant_loss(-10.0)(rows([-1.0]))["target_value"].item() == pytest.approx(-10.8)
+
+
+def test_targets_are_clamped_to_what_is_possible() -> None:
+    assert constant_loss(-200.0)(rows([-1.0]))["target_value"].item() == pytest.approx(-50.0)
+    assert constant_loss(100.0)(rows([-1.0]))["target_value"].item() == 0.0
+    assert constant_loss(-49.0)(rows([-1.0]))["target_value"].item() == pytest.approx(-49.02)
+
+
+@pytest.mark.parametrize(
+    ("reward_range", "low", "high"),
+    [((-1.0, 0.0), -2.0, 0.0), ((0.0, 1.0), 0.0, 2.0), ((-2.0, 3.0), -4.0, 6.0), ((1.0, 2.0), 1.0, 4.0)],
+)
+def test_bounds_of_targets(reward_range: tuple[float, float], low: float, high: float) -> None:
+    for value, expected in ((-1000.0, low), (1000.0, high)):
+        loss = constant_loss(value, gamma=0.5, reward_range=reward_range)
+        assert loss(rows([0.0]))["target_value"].item() == expected
+
+
+@pytest.mark.parametrize("gamma", [1.0, -0.1])
+def test_a_discount_out_of_range_is_named(gamma: float) -> None:
+    with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):
+        make_loss(gamma=gamma)
+
+
+def test_the_priority_is_the_square_of_the_error() -> None:
+    # Priorities get half of Schaul's alpha because of this: should TorchRL change it, so must that.
+    data = rows([-1.0, -1.0], terminated=[1, 0])
+    out = constant_loss(-4.0, gamma=0.5)(data)
+    assert data["td_error"].tolist() == [9.0, 4.0]  # -4 against -1, and against -2: -1 - 0.5 * 4, clamped
+    assert out["loss_value"].item() == 6.5
+
+
+@pytest.mark.parametrize("network", ["actor", "value"])
+def test_targets_move_softly(network: str) -> None:
+    loss = make_loss()
+    learner = LossLearner(
+        loss, torch.optim.SGD(loss.parameters(), lr=1.0), make_target_updater(loss, tau=0.25, hard_interval=0)
+    )
+    online, target = f"{network}_network_params", f"target_{network}_network_params"
+    before = numbers(loss, target)
+    learner.update(batch())
+    moved = 0.75 * before + 0.25 * numbers(loss, online)
+    assert not torch.allclose(numbers(loss, online), before, atol=1e-4)
+    assert torch.allclose(numbers(loss, target), moved, atol=1e-6)
+
+
+@pytest.mark.parametrize("interval", [1, 3])
+def test_targets_are_copied_every_so_many_steps(interval: int) -> None:
+    loss = make_loss()
+    learner = LossLearner(
+        loss,
+        torch.optim.SGD(loss.parameters(), lr=0.1),
+        make_target_updater(loss, tau=0.01, hard_interval=interval),
+    )
+    copied = []
+    for _ in range(2 * interval):
+        learner.update(batch())
+        copied.append(torch.equal(numbers(loss, "target_value_network_params"), weights(loss, "value")))
+    assert copied == ([False] * (interval - 1) + [True]) * 2
+
+
+def test_kinds_of_target_updates() -> None:
+    assert type(make_target_updater(make_loss(), tau=0.1, hard_interval=0)) is SoftUpdate
+    assert type(make_target_updater(make_loss(), tau=0.1, hard_interval=5)) is HardUpdate

@@ -1,0 +1,72 @@
+"""Episodes are found whole, whatever order their rows arrive in."""
+
+from __future__ import annotations
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchrl_her.replay_buffers import find_episodes
+
+
+def test_episodes_of_different_lengths_are_padded_with_their_last_row() -> None:
+    lanes = torch.zeros(5, dtype=torch.int64)
+    done = torch.tensor([False, False, True, False, True])
+    episodes, left = find_episodes(lanes, done)
+    assert episodes.rows.tolist() == [[0, 1, 2], [3, 4, 4]]
+    assert episodes.lengths.tolist() == [3, 2]
+    assert episodes.inside.tolist() == [[True, True, True], [True, True, False]]
+    assert left.tolist() == []
+
+
+def test_interleaved_lanes_are_told_apart() -> None:
+    lanes = torch.tensor([0, 1, 2, 0, 1, 2, 0, 1, 2])
+    done = torch.tensor([False, False, True, False, True, False, True, False, False])
+    episodes, left = find_episodes(lanes, done)
+    assert [rows[:n] for rows, n in zip(episodes.rows.tolist(), episodes.lengths.tolist(), strict=True)] == [
+        [0, 3, 6],
+        [1, 4],
+        [2],
+    ]
+    assert left.tolist() == [5, 7, 8]
+
+
+def test_nothing_closed_is_no_episode() -> None:
+    episodes, left = find_episodes(torch.tensor([0, 0]), torch.tensor([False, False]))
+    assert len(episodes.lengths) == 0
+    assert episodes.split(3) == []
+    assert left.tolist() == [0, 1]
+
+
+def test_no_rows_at_all() -> None:
+    nothing = torch.empty(0, dtype=torch.int64)
+    episodes, left = find_episodes(nothing, nothing.bool(), nothing)
+    assert len(episodes.lengths) == len(left) == 0
+
+
+def test_an_environment_that_was_reset_from_outside_ends_its_episode() -> None:
+    lanes = torch.zeros(4, dtype=torch.int64)
+    never = torch.zeros(4, dtype=torch.bool)
+    episodes, left = find_episodes(lanes, never, torch.tensor([7, 7, 8, 8]))
+    assert episodes.rows.tolist() == [[0, 1]]
+    assert left.tolist() == [2, 3]
+
+
+def test_split_keeps_order() -> None:
+    lanes = torch.arange(5)
+    episodes, _ = find_episodes(lanes, torch.ones(5, dtype=torch.bool))
+    assert [part.rows.flatten().tolist() for part in episodes.split(2)] == [[0, 1], [2, 3], [4]]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=40))
+def test_every_row_is_in_one_episode_or_left(rows: list[tuple[int, bool]]) -> None:
+    lanes, done = torch.tensor([lane for lane, _ in rows]), torch.tensor([end for _, end in rows])
+    episodes, left = find_episodes(lanes, done)
+    inside = episodes.rows[episodes.inside].tolist()
+    assert sorted(inside + left.tolist()) == list(range(len(rows)))
+    for row, length in zip(episodes.rows, episodes.lengths, strict=True):
+        own = row[:length]
+        assert len(set(lanes[own].tolist())) == 1
+        assert own.tolist() == sorted(own.tolist())
+        assert done[own].tolist() == [False] * (int(length) - 1) + [True]

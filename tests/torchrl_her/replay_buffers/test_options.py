@@ -1,0 +1,171 @@
+"""The options that the writer and the sample unit share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import FrozenInstanceError, fields, replace
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from torchrl_her import GoalReward, GoalWeights, HERSampleUnit, HERWriter, HindsightOptions, register_strategy
+from torchrl_her.goals import STRATEGIES
+
+from ..her_data import make_batch, tag
+
+REWARD = GoalReward(0.5)  # tags differ by at least 1
+OTHERS = {
+    "k": 2,
+    "strategy": "episode",
+    "filter_achieved": True,
+    "achieved_reward": -0.5,
+    "exclude": ("state", "action"),
+    "achieved_goal_key": ("goals", "got"),
+    "desired_goal_key": ("goals", "wanted"),
+    "reward_key": "cost",
+    "terminated_key": "reached",
+    "truncated_key": "cut",
+    "done_key": "over",
+    "trajectory_key": "path",
+    "virtual_key": None,
+}
+
+both = pytest.mark.parametrize("make", [HERWriter, HERSampleUnit])
+
+
+def relabeled(make: Callable[..., Any], *args: Any, **options: Any) -> TensorDict:
+    """Ten episodes of four steps: as they are stored by a writer, or a sample of them by a unit."""
+    part = make(REWARD, *args, **options)
+    parts = {"writer": part} if make is HERWriter else {"sample_unit": part, "collate_fn": part.relabel}
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), batch_size=2_000, **parts)
+    buffer.set_rng(torch.Generator().manual_seed(3))
+    buffer.extend(make_batch([[4] * 10]).squeeze(0))
+    return buffer[:] if make is HERWriter else buffer.sample()
+
+
+def lent(transitions: TensorDict) -> set[tuple[float, float]]:
+    """(step, step that achieved the goal) of all virtual transitions of the first episode."""
+    own = transitions[transitions["virtual"].squeeze(-1)]
+    pairs = zip(own["achieved_goal"][:, 0].tolist(), own["desired_goal"][:, 0].tolist(), strict=True)
+    return {(before, goal - 1) for before, goal in pairs if before < tag(0, 1, 0)}
+
+
+def test_every_option_has_another_value_in_these_tests() -> None:
+    defaults = HindsightOptions()
+    assert [field.name for field in fields(defaults)] == list(OTHERS)
+    assert all(getattr(defaults, name) != value for name, value in OTHERS.items())
+
+
+@both
+def test_writer_and_unit_take_the_same_options(make: Callable[..., Any]) -> None:
+    as_object = make(REWARD, HindsightOptions(**OTHERS))
+    as_keywords = make(REWARD, **OTHERS)
+    changed = make(REWARD, HindsightOptions(k=9, strategy="final"), **OTHERS)
+    assert as_object.options == as_keywords.options == changed.options == HindsightOptions(**OTHERS)
+    assert make(REWARD).options == HindsightOptions()
+    assert as_object.reward_fn is REWARD
+
+
+@both
+def test_an_object_and_keywords_relabel_alike(make: Callable[..., Any]) -> None:
+    options = {"k": 3, "strategy": "episode", "filter_achieved": True, "exclude": ["state", "action"]}
+    first, second = relabeled(make, **options), relabeled(make, HindsightOptions(**options))
+    keys = list(first.keys(True, True))
+    assert keys == list(second.keys(True, True))
+    assert all(torch.equal(first[key], second[key]) for key in keys)
+    assert "action" not in first.keys()
+
+
+@both
+def test_options_are_read_and_set_as_attributes(make: Callable[..., Any]) -> None:
+    part = make(REWARD, k=2)
+    part.k, part.strategy, part.filter_achieved, part.achieved_reward = 7, "final", True, 0.5
+    assert part.options == HindsightOptions(k=7, strategy="final", filter_achieved=True, achieved_reward=0.5)
+    assert (part.k, part.strategy, part.filter_achieved, part.achieved_reward) == (7, "final", True, 0.5)
+    for name, value, message in (("k", -1, "k must be at least 0, got -1"), ("strategy", "past", "'past'")):
+        with pytest.raises(ValueError, match=message):
+            setattr(part, name, value)
+    assert (part.k, part.strategy) == (7, "final")
+    part.options = replace(part.options, reward_key="cost", exclude=("seen",))
+    assert part._keys.reward == ("next", "cost")
+    assert part._exclude == ["seen", ("next", "seen")]
+
+
+@both
+def test_an_unknown_option_is_named_with_the_nearest(make: Callable[..., Any]) -> None:
+    with pytest.raises(TypeError, match="there is no option 'stratgy'; did you mean 'strategy'?"):
+        make(REWARD, stratgy="future")
+    with pytest.raises(TypeError, match=r"no option 'zzz'\. The options are k, strategy, .*virtual_key$"):
+        make(REWARD, zzz=1)
+    with pytest.raises(TypeError, match=r"options must be HindsightOptions or None, got \{'k': 3\}"):
+        make(REWARD, {"k": 3})
+
+
+def test_options_that_cannot_be_are_named_and_options_stay_as_they_are() -> None:
+    with pytest.raises(ValueError, match="k must be at least 0, got -1"):
+        HindsightOptions(k=-1)
+    with pytest.raises(ValueError, match="unknown goal strategy 'nearest'"):
+        HindsightOptions(strategy="nearest")
+    with pytest.raises(TypeError, match="keys must be given as a list, got 'state'"):
+        HindsightOptions(exclude="state")
+    options = HindsightOptions()
+    with pytest.raises(FrozenInstanceError):
+        options.k = 3  # type: ignore[misc]
+    assert options.changed({"k": 3}).k == 3
+    assert options.k == 4
+
+
+# Strategies of one's own
+
+
+def next_only(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """The goal of the next transition; at the end of an episode its own."""
+    goal = torch.minimum(time + 1, lengths - 1)
+    return goal, goal + 1
+
+
+NEXT_ONLY = {(0.0, 1.0), (1.0, 2.0), (2.0, 3.0), (3.0, 3.0)}  # of an episode of four steps
+
+
+@pytest.fixture
+def registered() -> Iterator[str]:
+    register_strategy("next_only", next_only)
+    yield "next_only"
+    del STRATEGIES["next_only"]
+
+
+class PreferFar(GoalWeights):
+    """Weights that make the draw look up likelihoods."""
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        return goals[..., 0] + 1.0
+
+
+@both
+@pytest.mark.parametrize("weights", [None, PreferFar()])
+def test_a_function_and_its_name_choose_the_goals(
+    make: Callable[..., Any], weights: GoalWeights | None, registered: str
+) -> None:
+    for strategy in (next_only, registered):
+        assert lent(relabeled(make, strategy=strategy, weights=weights)) == NEXT_ONLY
+
+
+@both
+def test_the_filter_works_with_a_function(make: Callable[..., Any]) -> None:
+    def itself(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+        return time, time + 1
+
+    assert lent(relabeled(make, strategy=itself, filter_achieved=True)) == {(i, i) for i in range(4)}
+
+
+@both
+def test_a_function_that_leaves_the_episode_is_refused_when_it_is_used(make: Callable[..., Any]) -> None:
+    def beyond(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+        return time, lengths + 1
+
+    with pytest.raises(ValueError, match="goal strategy 'beyond' gives step"):
+        relabeled(make, strategy=beyond)

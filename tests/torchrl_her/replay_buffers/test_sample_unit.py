@@ -1,0 +1,699 @@
+"""HERSampleUnit and its index of episodes: hindsight at sampling time, and what TorchRL's own class does.
+
+Goals are tagged with the environment, episode and state that they come from (see ``her_data``).
+"""
+
+from __future__ import annotations
+
+import pickle
+import re
+from itertools import chain
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import (
+    HERReplayBuffer,
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ListStorage,
+    TensorDictPrioritizedReplayBuffer,
+    TensorDictReplayBuffer,
+    TensorStorage,
+)
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, SamplerWithoutReplacement
+from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
+
+from torchrl_her import EnvReward, GoalReward, GoalWeights, HERSampleUnit
+from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
+
+from ..her_data import WANTED, make_batch, tag
+
+REWARD = GoalReward(0.5)  # tags differ by at least 1
+
+
+NEVER_REAL = 10**6  # as k: practically all rows are virtual
+
+
+def make_buffer(
+    capacity: int = 10_000, *, per: bool = False, ndim: int = 1, seed: int = 0, **options: Any
+) -> TensorDictReplayBuffer:
+    unit = HERSampleUnit(options.pop("reward", REWARD), **options)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity, ndim=ndim),
+        sampler=PrioritizedSampler(capacity, alpha=1.0, beta=0.4) if per else RandomSampler(),
+        sample_unit=unit,
+        collate_fn=unit.relabel,
+    )
+    buffer.set_rng(torch.Generator().manual_seed(seed))
+    return buffer
+
+
+def make_torchrl(capacity: int = 1_000, *, ndim: int = 1, **options: Any) -> HERReplayBuffer:
+    """TorchRL's own class, made to relabel every row, with a reward of the right goal."""
+
+    def reward(rows: TensorDict) -> Tensor:
+        return REWARD(rows["next", "achieved_goal"], rows["desired_goal"])[0]
+
+    return HERReplayBuffer(
+        reward, storage=LazyTensorStorage(capacity, ndim=ndim), her_ratio=1.0, batch_size=256, **options
+    )
+
+
+def flat(lengths: list[list[int]], **options: Any) -> TensorDict:
+    return make_batch(lengths, **options).reshape(-1)
+
+
+def tags(x: Tensor) -> list[float]:
+    return x[..., 0].tolist()
+
+
+def pairs(rows: TensorDict) -> set[tuple[float, float]]:
+    """Observations and the goals that they were given; real goals are left out."""
+    own = zip(tags(rows["observation"]), tags(rows["desired_goal"]), strict=True)
+    return {pair for pair in own if pair[1] != WANTED}
+
+
+def virtual_rows(buffer: TensorDictReplayBuffer, size: int = 2_000) -> TensorDict:
+    rows = buffer.sample(size)
+    return rows[rows["virtual"].squeeze(-1)]
+
+
+# Where goals come from
+
+
+@pytest.mark.parametrize(
+    ("strategy", "expected"),
+    [
+        ("future", {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)}),
+        ("final", {(0, 3), (1, 3), (2, 3)}),
+        ("episode", {(t, g) for t in range(3) for g in range(1, 4)}),
+    ],
+)
+def test_goals_are_those_of_next_states(strategy: str, expected: set[tuple[int, int]]) -> None:
+    buffer = make_buffer(strategy=strategy)
+    buffer.extend(flat([[3]]))
+    assert pairs(buffer.sample(500)) == expected
+
+
+def test_torchrl_never_lends_the_last_state_and_lends_goals_that_are_achieved_already() -> None:
+    buffer = make_torchrl()
+    buffer.extend(flat([[3]]))
+    # It reads the root's achieved goals: 3 is never lent, and (t, t) is where the row begins.
+    assert pairs(buffer.sample()) == {(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)}
+
+
+def test_every_candidate_is_as_likely_as_any_other() -> None:
+    buffer = make_buffer(k=NEVER_REAL)
+    buffer.extend(flat([[4]]))
+    rows = buffer.sample(12_000)
+    first = rows["desired_goal"][rows["observation"][:, 0] == 0, 0]
+    shares = [(first == goal).float().mean().item() for goal in (1, 2, 3, 4)]
+    assert shares == pytest.approx([0.25] * 4, abs=0.04)  # five standard deviations
+
+
+def test_episodes_of_length_one() -> None:
+    buffer = make_buffer(k=NEVER_REAL)
+    buffer.extend(flat([[1, 1, 1]], terminated=True))
+    rows = buffer.sample(100)
+    assert pairs(rows) == {(0, 1), (100, 101), (200, 201)}
+    assert (rows["next", "reward"] == 0).all()
+
+
+def test_rows_of_an_open_episode_may_take_goals_up_to_the_newest() -> None:
+    for strategy in ("future", "final"):
+        buffer = make_buffer(strategy=strategy)
+        buffer.extend(flat([[9]], steps=2))
+        assert pairs(buffer.sample(200)) == {(0, 2), (1, 2)} | ({(0, 1)} if strategy == "future" else set())
+        buffer.extend(flat([[9]], steps=1, first=[(0, 2)]))
+        assert (0.0, 3.0) in pairs(buffer.sample(200))
+
+
+def test_stretches_of_environments_in_turn_make_whole_episodes() -> None:
+    buffer = make_buffer(strategy="final")
+    whole = make_batch([[6], [6]])
+    for start in (0, 2, 4):  # what a collector of two steps an environment gives, flattened
+        buffer.extend(whole[:, start : start + 2].reshape(-1).clone())
+    expected = {(tag(env, 0, t), tag(env, 0, 6)) for env in (0, 1) for t in range(6)}
+    assert pairs(buffer.sample(1_000)) == expected
+
+
+def test_torchrl_leaks_between_environments() -> None:
+    rows = flat([[9], [9]], steps=3)  # two open episodes, one behind the other
+    theirs, ours = make_torchrl(strategy="final"), make_buffer(strategy="final")
+    theirs.extend(rows.clone())
+    ours.extend(rows.clone())
+    assert (0.0, 1002.0) in pairs(theirs.sample())
+    assert pairs(ours.sample(500)) == {(tag(env, 0, t), tag(env, 0, 3)) for env in (0, 1) for t in range(3)}
+
+
+def test_torchrl_leaks_where_the_ring_begins_again() -> None:
+    theirs, ours = make_torchrl(8, strategy="final"), make_buffer(8, strategy="final")
+    rows = flat([[3, 3, 4]])
+    for buffer in (theirs, ours):
+        buffer.extend(rows[:6].clone())
+        buffer.extend(rows[6:].clone())  # slots 6, 7, 0 and 1
+    assert (200.0, 102.0) in pairs(theirs.sample())
+    assert pairs(ours.sample(500)) == {
+        *((200.0 + t, 204.0) for t in range(4)),
+        *((100.0 + t, 103.0) for t in range(3)),
+        (2.0, 3.0),  # what is left of the first episode
+    }
+
+
+def test_torchrl_cannot_sample_a_full_buffer_that_was_written_again() -> None:
+    theirs, ours = make_torchrl(12), make_buffer(12)
+    for buffer in (theirs, ours):
+        buffer.extend(flat([[4, 4, 4]]))
+        buffer.sample(256)
+        buffer.extend(flat([[4] * 9], steps=4, first=[(3, 0)]))
+    with pytest.raises(RuntimeError, match="must match the size"):  # it compares the cursors of two batches
+        theirs.sample()
+    assert {observation // 100 for observation, _ in pairs(ours.sample(300))} == {1, 2, 3}
+
+
+def test_torchrl_takes_no_storage_of_two_dimensions() -> None:
+    theirs = make_torchrl(ndim=2)
+    theirs.extend(make_batch([[3], [4]]))
+    with pytest.raises(NotImplementedError, match="1D storages"):
+        theirs.sample()
+
+
+@pytest.mark.parametrize("per", [False, True])
+def test_a_storage_of_two_dimensions(per: bool) -> None:
+    buffer = make_buffer(20, ndim=2, per=per, strategy="final")
+    whole = make_batch([[3, 4, 7], [6, 2, 6]])
+    for start in (0, 7):
+        buffer.extend(whole[:, start : start + 7].clone())  # the ring holds ten steps: 4 to 13
+    rows = buffer.sample(3_000)
+    assert pairs(rows) == {
+        *((100.0 + t, 104.0) for t in range(1, 4)),
+        *((200.0 + t, 207.0) for t in range(7)),
+        *((1000.0 + t, 1006.0) for t in range(4, 6)),
+        *((1100.0 + t, 1102.0) for t in range(2)),
+        *((1200.0 + t, 1206.0) for t in range(6)),
+    }
+    index = rows["index"]
+    assert torch.equal(buffer.storage[:]["observation"][index[:, 0], index[:, 1]], rows["observation"])
+
+
+def test_the_last_slot_of_a_capacity_that_is_no_multiple_of_the_environments() -> None:
+    buffer = make_buffer(11, ndim=2, k=NEVER_REAL, strategy="final")  # two environments, six slots
+    whole = make_batch([[8], [8]])
+    for steps in (slice(0, 4), slice(4, 6), slice(6, 8)):
+        buffer.extend(whole[:, steps].clone())
+    assert pairs(buffer.sample(500)) == {
+        (tag(env, 0, t), tag(env, 0, 8)) for env in (0, 1) for t in range(2, 8)
+    }
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.lists(st.integers(1, 6), min_size=1, max_size=4), min_size=1, max_size=3),
+    st.integers(1, 7),
+    st.sampled_from(["future", "final", "episode"]),
+    st.sampled_from([13, 24, 10_000]),
+    st.booleans(),
+    st.sampled_from([1, 2]),
+    st.booleans(),
+)
+def test_no_goal_ever_leaks(
+    lengths: list[list[int]], size: int, strategy: str, capacity: int, per: bool, ndim: int, filtered: bool
+) -> None:
+    """Batches of any size, buffers that wrap: the goals are exactly the ones that are stored and allowed."""
+    buffer = make_buffer(
+        capacity, strategy=strategy, per=per, ndim=ndim, filter_achieved=filtered, k=NEVER_REAL
+    )
+    whole = make_batch(lengths)
+    size = max(ndim, min(size, capacity // len(lengths)))
+    for start in range(0, max(whole.shape[1], ndim), size):
+        batch = whole[:, start : start + size].clone()
+        if batch.shape[1] >= ndim:  # TorchRL cannot write single steps to a storage of two dimensions
+            buffer.extend(batch if ndim == 2 else batch.reshape(-1))
+    if not len(buffer):
+        return
+    stored = buffer.storage[:]["observation"][..., 0].flatten()
+    rows = buffer.sample(200)
+    assert rows["virtual"].all()
+    observation, goal = rows["observation"][:, 0], rows["desired_goal"][:, 0]
+    assert torch.isin(goal - 1, stored).all()
+    assert torch.equal((observation / 100).floor(), ((goal - 1) / 100).floor())
+    if strategy == "future":
+        assert (goal > observation).all()
+    if strategy == "final":
+        newest = [float(stored[(stored / 100).floor() == (o / 100).floor()].max()) + 1 for o in observation]
+        assert goal.tolist() == newest
+
+
+# What follows from a goal
+
+
+def test_reward_terminated_and_done_are_recomputed_and_truncated_stays() -> None:
+    buffer = make_buffer(strategy="final")
+    buffer.extend(flat([[3]]))
+    rows = virtual_rows(buffer)
+    last = rows["observation"][:, :1] == 2
+    after = rows["next"]
+    assert torch.equal(after["reward"], last.float() - 1)
+    for key in ("terminated", "truncated", "done"):
+        assert torch.equal(after[key], last)
+    assert torch.equal(rows["desired_goal"], after["desired_goal"])
+
+
+def test_torchrl_leaves_terminated_as_it_was() -> None:
+    buffer = make_torchrl()
+    buffer.extend(flat([[3]]))
+    after = buffer.sample()["next"]
+    assert (after["reward"] == 0).any()
+    assert not after["terminated"].any()
+
+
+def test_a_real_termination_is_undone_where_the_goal_is_not_reached() -> None:
+    reward = EnvReward(
+        lambda a, d: -torch.ones_like(a[..., :1]), lambda a, d: torch.zeros_like(a[..., :1]).bool()
+    )
+    buffer = make_buffer(reward=reward)
+    buffer.extend(flat([[3]], terminated=True))
+    rows = buffer.sample(300)
+    virtual = rows["virtual"]
+    assert not rows["next", "done"][virtual].any()
+    assert rows["next", "done"][~virtual].any()
+
+
+def test_real_rows_and_other_entries_stay_and_the_storage_is_untouched() -> None:
+    batch = flat([[4, 2]])
+    buffer = make_buffer()
+    buffer.extend(batch.clone())
+    rows = buffer.sample(300)
+    origin, real = batch[rows["index"]], ~rows["virtual"].squeeze(-1)
+    assert 0 < real.sum() < 300
+    for key in batch.exclude("state", ("next", "state")).keys(True, True):
+        assert torch.equal(rows[key][real], origin[key][real]), key
+    for key in ("observation", "action", "achieved_goal", ("next", "observation"), ("next", "truncated")):
+        assert torch.equal(rows[key], origin[key]), key
+    for key in batch.keys(True, True):
+        assert torch.equal(buffer[:][key], batch[key]), key  # reading shows the rows as they are
+    assert "state" not in rows.keys()
+    assert ("next", "state") not in rows.keys(True)
+
+
+def test_transforms_see_the_lent_goal_and_torchrls_do_not() -> None:
+    def with_input(rows: TensorDict) -> TensorDict:
+        return rows.set("input", torch.cat((rows["observation"], rows["desired_goal"]), -1))
+
+    theirs, ours = make_torchrl(), make_buffer()
+    for buffer in (theirs, ours):
+        buffer.append_transform(with_input)
+        buffer.extend(flat([[4]]))
+    rows = ours.sample(64)
+    assert rows["virtual"].any()
+    assert torch.equal(rows["input"][:, 2:], rows["desired_goal"])
+    rows = theirs.sample()
+    assert (rows["input"][:, 2] == WANTED).all()
+    assert (rows["desired_goal"][:, 0] != WANTED).all()
+
+
+def test_the_reward_is_asked_in_the_order_achieved_desired() -> None:
+    def compute_reward(achieved: Tensor, desired: Tensor) -> Tensor:
+        return (achieved[..., :1] >= desired[..., :1]).float() - 1.0
+
+    reward = EnvReward(compute_reward, lambda a, d: compute_reward(a, d) == 0)
+    buffer = make_buffer(reward=reward, strategy="episode")
+    buffer.extend(flat([[6]]))
+    rows = virtual_rows(buffer)
+    expected = (rows["next", "achieved_goal"][:, :1] >= rows["desired_goal"][:, :1]).float() - 1.0
+    assert torch.equal(rows["next", "reward"], expected)
+    assert 0 < (expected == 0).float().mean() < 1
+
+
+def test_shapes_and_kinds_of_numbers_are_those_of_the_storage() -> None:
+    batch = flat([[4]])
+    batch["next", "reward"] = batch["next", "reward"].double().squeeze(-1)
+    batch["next", "done"] = batch["next", "done"].squeeze(-1)
+    buffer = make_buffer()
+    buffer.extend(batch.clone())
+    rows = buffer.sample(50)
+    for key in batch.exclude("state", ("next", "state")).keys(True, True):
+        assert (rows[key].dtype, rows[key].shape[1:]) == (batch[key].dtype, batch[key].shape[1:]), key
+    assert (rows["virtual"].dtype, rows["virtual"].shape) == (torch.bool, (50, 1))
+
+
+# Filter and weights
+
+
+def along(path: list[float], episodes: int = 1) -> TensorDict:
+    """Episodes whose achieved goals are those of a path; the observation is the step."""
+    batch = make_batch([[len(path) - 1]] * episodes)
+    states = torch.tensor(path)
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = states[:-1], states[1:]
+    batch["observation"][..., 0] = torch.arange(len(path) - 1.0)
+    return batch.reshape(-1)
+
+
+def test_the_filter_leaves_out_goals_already_achieved_before_the_action() -> None:
+    buffer = make_buffer(filter_achieved=True)
+    buffer.extend(along([0, 0, 0, 1, 2, 3]))  # the ball moves from step 2 on
+    assert pairs(buffer.sample(2_000)) == {
+        (t, g)
+        for t, goals in ((0, (1, 2, 3)), (1, (1, 2, 3)), (2, (1, 2, 3)), (3, (2, 3)), (4, (3,)))
+        for g in goals
+    }
+
+
+def test_rows_without_a_candidate_stay_real() -> None:
+    buffer = make_buffer(filter_achieved=True, k=NEVER_REAL)
+    buffer.extend(along([0, 1, 1, 1]))
+    rows = buffer.sample(300)
+    assert torch.equal(rows["virtual"], rows["observation"][:, :1] == 0)
+    assert pairs(rows) == {(0.0, 1.0)}
+    real = ~rows["virtual"]
+    assert (rows["next", "reward"][real] == -1).all()
+    assert not rows["next", "terminated"][real].any()
+
+
+def test_the_filter_asks_the_reward_even_where_nothing_ever_terminates() -> None:
+    endless = EnvReward(lambda a, d: REWARD(a, d)[0], lambda a, d: torch.zeros_like(a[..., :1]).bool())
+    buffer = make_buffer(reward=endless, filter_achieved=True)
+    buffer.extend(along([0, 0, 0]))
+    assert not buffer.sample(100)["virtual"].any()
+
+
+class PreferFar(GoalWeights):
+    """A goal is as useful as it is far away."""
+
+    def __init__(self) -> None:
+        self.lent = 0
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        return goals[..., 0]
+
+    def update(self, goals: Tensor) -> None:
+        self.lent += len(goals)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_goals_that_pass_the_filter_are_drawn_in_proportion(weighted: bool) -> None:
+    weights = PreferFar() if weighted else None
+    buffer = make_buffer(filter_achieved=True, weights=weights, k=NEVER_REAL)
+    buffer.extend(along([0, 0, 1, 3, 0], episodes=3))
+    rows = buffer.sample(16_000)
+    time, goal = rows["observation"][:, 0], rows["desired_goal"][:, 0]
+    virtual = rows["virtual"].squeeze(-1)
+    for t, kept in enumerate([[1.0, 3.0], [1.0, 3.0], [3.0, 0.0], [0.0]]):  # the goal 0 is achieved at first
+        drawn = goal[(time == t) & virtual]
+        total = sum(kept) if weighted else len(kept)
+        assert (len(drawn) > 3_500) == bool(total)
+        for value in kept if total else []:
+            share = (drawn == value).float().mean().item()
+            assert share == pytest.approx((value if weighted else 1) / total, abs=0.05)  # six deviations
+    if weights is not None:
+        assert weights.lent == int(virtual.sum())
+
+
+def test_many_rows_are_drawn_piece_by_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchrl_her.replay_buffers.sample_unit._LIKELIHOODS", 64)
+    buffer = make_buffer(weights=PreferFar(), strategy="episode", k=NEVER_REAL)
+    buffer.extend(along([5, 0, 1, 3]))
+    rows = buffer.sample(3_000)
+    assert (rows["desired_goal"][:, 0] == 3).float().mean().item() == pytest.approx(0.75, abs=0.04)
+
+
+def test_weights_that_promise_to_be_alike_are_not_asked() -> None:
+    class Alike(PreferFar):
+        alike = True
+
+        def __call__(self, goals: Tensor) -> Tensor:
+            raise AssertionError("asked")
+
+    buffer = make_buffer(weights=Alike())
+    buffer.extend(flat([[4]]))
+    assert buffer.sample(50)["virtual"].any()
+
+
+@pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf")])
+def test_weights_that_cannot_be_are_refused(bad: float) -> None:
+    class Bad(GoalWeights):
+        def __call__(self, goals: Tensor) -> Tensor:
+            return torch.full(goals.shape[:-1], bad)
+
+    buffer = make_buffer(weights=Bad())
+    buffer.extend(flat([[4]]))
+    with pytest.raises(ValueError, match="weights of goals must be finite and at least 0"):
+        buffer.sample(20)
+
+
+def test_weights_may_be_yes_or_no() -> None:
+    class Never(GoalWeights):
+        def __call__(self, goals: Tensor) -> Tensor:
+            return torch.zeros(goals.shape[:-1], dtype=torch.bool)
+
+    buffer = make_buffer(weights=Never())
+    buffer.extend(flat([[4]]))
+    assert not buffer.sample(20)["virtual"].any()
+
+
+# Buffers
+
+
+@pytest.mark.parametrize(("k", "share"), [(0, 0.0), (1, 0.5), (4, 0.8)])
+def test_share_of_virtual_rows_in_a_batch(k: int, share: float) -> None:
+    buffer = make_buffer(k=k)
+    buffer.extend(flat([[20] * 5] * 3))
+    rows = buffer.sample(20_000)
+    assert rows["virtual"].float().mean().item() == pytest.approx(share, abs=0.015)
+    assert torch.equal(rows["virtual"].squeeze(-1), rows["desired_goal"][:, 0] != WANTED)
+
+
+@pytest.mark.parametrize("ndim", [1, 2])
+def test_priorities_are_those_of_the_real_rows(ndim: int) -> None:
+    buffer = make_buffer(40, per=True, ndim=ndim)
+    batch = make_batch([[10], [10]])
+    buffer.extend(batch if ndim == 2 else batch.reshape(-1))
+    rows = buffer.sample(2_000)
+    assert rows["virtual"].any()
+    assert (rows["priority_weight"] == 1).all()
+    rows["td_error"] = (rows["observation"][:, 0] == 1004).float() * 100 + 1e-6
+    buffer.update_tensordict_priority(rows)
+    rows = buffer.sample(200)
+    assert (rows["observation"][:, 0] == 1004).all()
+    assert rows["virtual"].float().mean().item() == pytest.approx(0.8, abs=0.12)
+    assert set(tags(rows["desired_goal"])) == {WANTED, *(1005.0 + t for t in range(6))}
+
+
+def test_a_prioritized_buffer_of_torchrls() -> None:
+    unit = HERSampleUnit(REWARD)
+    buffer = TensorDictPrioritizedReplayBuffer(
+        alpha=0.6, beta=0.4, storage=LazyTensorStorage(50), sample_unit=unit, collate_fn=unit.relabel
+    )
+    buffer.extend(flat([[5]]))
+    assert buffer.sample(50)["virtual"].any()
+
+
+def test_rows_drawn_without_replacement_are_each_drawn_once() -> None:
+    unit = HERSampleUnit(REWARD)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(50),
+        sampler=SamplerWithoutReplacement(),
+        sample_unit=unit,
+        collate_fn=unit.relabel,
+        batch_size=5,
+    )
+    buffer.extend(flat([[4, 6]]))
+    seen = [tags(batch["observation"]) for batch in buffer]
+    assert sorted(chain.from_iterable(seen)) == [0, 1, 2, 3, 100, 101, 102, 103, 104, 105]
+
+
+def test_batches_that_are_prefetched_by_threads() -> None:
+    unit = HERSampleUnit(REWARD)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(1_000),
+        sample_unit=unit,
+        collate_fn=unit.relabel,
+        batch_size=64,
+        prefetch=4,
+    )
+    buffer.extend(flat([[7] * 20] * 4))
+    for _ in range(40):
+        rows = buffer.sample()
+        observation, goal = rows["observation"][:, 0], rows["desired_goal"][:, 0]
+        lent = goal != WANTED
+        assert torch.equal(lent, rows["virtual"].squeeze(-1))
+        assert torch.equal((observation / 100).floor()[lent], ((goal - 1) / 100).floor()[lent])
+    buffer.shutdown()
+
+
+def test_rows_on_disk() -> None:
+    unit = HERSampleUnit(REWARD)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyMemmapStorage(20), sample_unit=unit, collate_fn=unit.relabel, batch_size=100
+    )
+    batch = flat([[4, 6]])
+    buffer.extend(batch.clone())
+    assert buffer.sample()["virtual"].any()
+    assert torch.equal(buffer[:]["desired_goal"], batch["desired_goal"])
+
+
+def test_a_data_set_that_nobody_writes() -> None:
+    unit = HERSampleUnit(REWARD, strategy="final")
+    buffer = TensorDictReplayBuffer(
+        storage=TensorStorage(flat([[4, 6]])),
+        writer=ImmutableDatasetWriter(),
+        sample_unit=unit,
+        collate_fn=unit.relabel,
+        batch_size=300,
+    )
+    assert pairs(buffer.sample()) == {*((t, 4) for t in range(4)), *((100 + t, 106) for t in range(6))}
+
+
+def test_a_buffer_that_only_reads_asks_the_one_that_writes() -> None:
+    storage, unit = LazyTensorStorage(5), HERSampleUnit(REWARD, strategy="final")
+    reads = TensorDictReplayBuffer(storage=storage, sample_unit=unit, collate_fn=unit.relabel, batch_size=200)
+    writes = TensorDictReplayBuffer(storage=storage)
+    rows = flat([[3, 4]]).exclude("collector")  # only the cursor keeps the two apart
+    writes.extend(rows[:3].clone())
+    writes.extend(rows[3:].clone())  # slots 3, 4, 0 and 1
+    assert pairs(reads.sample()) == {(2.0, 3.0), *((100.0 + t, 104.0) for t in range(4))}
+
+
+def test_a_full_buffer_that_was_loaded_goes_on_as_the_one_that_was_saved() -> None:
+    first, second = (make_buffer(7, strategy="final") for _ in range(2))
+    rows = flat([[3, 9]], steps=9).exclude("collector")
+    first.extend(rows[:4].clone())
+    first.extend(rows[4:].clone())
+    load_buffer_state_dict(second, buffer_state_dict(first))
+    expected, loaded = first.sample(100), second.sample(100)
+    assert torch.equal(expected["desired_goal"], loaded["desired_goal"])
+    assert pairs(loaded) == {(2.0, 3.0), *((100.0 + t, 106.0) for t in range(6))}
+
+
+def test_an_emptied_buffer_forgets_its_episodes() -> None:
+    buffer = make_buffer(12)
+    buffer.extend(flat([[9]]))
+    buffer.sample(5)
+    buffer.empty()
+    buffer.extend(flat([[9] * 3], steps=3, first=[(2, 0)]))
+    assert pairs(buffer.sample(200)) == {(200 + t, 200 + g) for t in range(3) for g in range(t + 1, 4)}
+
+
+@pytest.mark.parametrize("per", [False, True])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_seeds_make_sampling_repeat(per: bool, weighted: bool) -> None:
+    batches = []
+    for seed in (1, 1, 2):
+        weights = PreferFar() if weighted else None
+        buffer = make_buffer(seed=seed, per=per, filter_achieved=True, weights=weights)
+        buffer.extend(along([0, 0, 0, 1, 2, 3, 4]))  # the filter refuses some of the first proposals
+        batches.append(buffer.sample(200))
+    same, again, differs = batches
+    for key in same.keys(True, True):
+        assert torch.equal(same[key], again[key]), key
+    assert not torch.equal(same["desired_goal"], differs["desired_goal"])
+
+
+def test_torchrl_ignores_the_buffers_generator() -> None:
+    batches = []
+    for _ in range(2):
+        buffer = make_torchrl()
+        buffer.set_rng(torch.Generator().manual_seed(0))
+        buffer.extend(flat([[30]]))
+        batches.append(buffer.sample())
+    assert torch.equal(batches[0]["index"], batches[1]["index"])
+    assert not torch.equal(batches[0]["desired_goal"], batches[1]["desired_goal"])
+
+
+def test_a_generator_of_its_own() -> None:
+    batches = []
+    for seed in (1, 1, 2):
+        buffer = make_buffer(generator=torch.Generator().manual_seed(seed))
+        buffer.extend(flat([[9, 9]]))
+        batches.append(buffer.sample(50))
+    assert all(torch.equal(batch["index"], batches[0]["index"]) for batch in batches)
+    assert torch.equal(batches[0]["desired_goal"], batches[1]["desired_goal"])
+    assert not torch.equal(batches[0]["desired_goal"], batches[2]["desired_goal"])
+
+
+def test_a_used_unit_can_be_copied_to_another_process() -> None:
+    unit = HERSampleUnit(REWARD, k=2, generator=torch.Generator())
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(9), sample_unit=unit, collate_fn=unit.relabel, batch_size=4
+    )
+    buffer.extend(flat([[9]]))
+    buffer.sample()
+    copy = pickle.loads(pickle.dumps(unit))
+    assert (copy.k, copy.generator) == (2, None)
+
+
+# Options
+
+
+def test_keys_of_ones_own() -> None:
+    batch = flat([[4]])
+    for rows in (batch, batch["next"]):
+        rows.rename_key_("desired_goal", ("goals", "wanted")).rename_key_("achieved_goal", ("goals", "got"))
+    batch["next"].rename_key_("reward", "cost")
+    buffer = make_buffer(
+        achieved_goal_key=("goals", "got"),
+        desired_goal_key=("goals", "wanted"),
+        reward_key="cost",
+        virtual_key=None,
+    )
+    buffer.extend(batch)
+    rows = buffer.sample(100)
+    assert "virtual" not in rows.keys()
+    lent = rows["goals", "wanted"][:, 0] != WANTED
+    assert lent.any()
+    assert torch.equal(rows["goals", "wanted"], rows["next", "goals", "wanted"])
+    assert (rows["next", "cost"][lent] == 0).any()
+
+
+def test_bad_options_are_named() -> None:
+    with pytest.raises(ValueError, match="k must be at least 0, got -1"):
+        HERSampleUnit(REWARD, k=-1)
+    with pytest.raises(ValueError, match="unknown goal strategy 'nearest'"):
+        HERSampleUnit(REWARD, strategy="nearest")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["achieved_goal", "desired_goal", ("next", "achieved_goal"), ("next", "done"), ("next", "truncated")],
+)
+def test_a_missing_entry_is_named(key: Any) -> None:
+    buffer = make_buffer(k=NEVER_REAL)
+    buffer.extend(flat([[4]]).exclude(key))
+    with pytest.raises(KeyError, match=f"relabeling needs the entry {re.escape(repr(key))}"):
+        buffer.sample(4)
+
+
+def test_a_storage_without_tensordicts_is_refused() -> None:
+    unit = HERSampleUnit(REWARD)
+    buffer = TensorDictReplayBuffer(
+        storage=ListStorage(9), sample_unit=unit, collate_fn=lambda rows: unit.relabel(torch.stack(rows))
+    )
+    buffer.extend(flat([[4]]))
+    with pytest.raises(
+        TypeError, match="needs a storage of tensordicts.* got a ListStorage that gives a list"
+    ):
+        buffer.sample(4)
+
+
+def test_a_unit_without_its_other_half_is_noticed() -> None:
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(9), sample_unit=HERSampleUnit(REWARD), batch_size=4
+    )
+    buffer.extend(flat([[4]]))
+    buffer.sample()
+    with pytest.raises(RuntimeError, match="never relabeled: make the buffer with collate_fn=unit.relabel"):
+        buffer.sample()
+
+
+def test_a_batch_of_another_size_is_refused() -> None:
+    unit = HERSampleUnit(REWARD)
+    buffer = make_buffer()
+    buffer.extend(flat([[4]]))
+    unit.expand(torch.arange(3), {}, buffer.storage)
+    with pytest.raises(RuntimeError, match=r"3 rows were drawn, but a batch \[4\] was read"):
+        unit.relabel(buffer[:])

@@ -1,0 +1,643 @@
+"""HERWriter: every way in which relabeling is known to go wrong.
+
+Goals are tagged with the environment, episode and state that they come from (see ``her_data``).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
+
+from torchrl_her import EnvReward, GoalReward, GoalWeights, HERWriter
+
+from ..her_data import WANTED, make_batch, tag
+
+REWARD = GoalReward(0.5)  # tags differ by at least 1
+
+
+def make_buffer(
+    capacity: int = 10_000, *, per: bool = False, seed: int = 0, **options: Any
+) -> TensorDictReplayBuffer:
+    sampler = PrioritizedSampler(capacity, alpha=0.6, beta=0.4) if per else RandomSampler()
+    writer = HERWriter(options.pop("reward", REWARD), **options)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), writer=writer, sampler=sampler)
+    buffer.set_rng(torch.Generator().manual_seed(seed))
+    return buffer
+
+
+def split(buffer: TensorDictReplayBuffer) -> tuple[TensorDict, TensorDict]:
+    """The real and the virtual rows."""
+    rows = buffer[:]
+    virtual = rows["virtual"].squeeze(-1)
+    return rows[~virtual], rows[virtual]
+
+
+def tags(x: Tensor) -> list[float]:
+    return x[..., 0].tolist()
+
+
+# Where virtual goals come from
+
+
+@pytest.mark.parametrize("strategy", ["future", "final", "episode"])
+def test_goals_are_achieved_by_next_states_of_the_same_episode(strategy: str) -> None:
+    buffer = make_buffer(strategy=strategy, k=8)
+    buffer.extend(make_batch([[5, 3], [2, 6]]))
+    _, virtual = split(buffer)
+    assert len(virtual) == 8 * 16
+    lengths = {0: 5, 100: 3, 1000: 2, 1100: 6}
+    for observation, goal in zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True):
+        origin, t = divmod(observation, 100)
+        length = lengths[int(origin * 100)]
+        allowed = {
+            "future": range(int(t) + 1, length + 1),
+            "final": [length],
+            "episode": range(1, length + 1),
+        }
+        assert goal - origin * 100 in allowed[strategy]
+
+
+def test_future_reaches_every_later_state_and_the_state_that_this_action_led_to() -> None:
+    buffer = make_buffer(k=200)
+    buffer.extend(make_batch([[3]]))
+    _, virtual = split(buffer)
+    goals = {t: set(tags(virtual["desired_goal"][virtual["observation"][:, 0] == t])) for t in range(3)}
+    assert goals == {0: {1.0, 2.0, 3.0}, 1: {2.0, 3.0}, 2: {3.0}}
+
+
+def test_the_goal_is_replaced_in_next_too() -> None:
+    buffer = make_buffer()
+    buffer.extend(make_batch([[6]]))
+    _, virtual = split(buffer)
+    assert torch.equal(virtual["desired_goal"], virtual["next", "desired_goal"])
+    assert (virtual["desired_goal"][:, 0] != WANTED).all()
+
+
+# What follows from a virtual goal
+
+
+def test_reward_terminated_and_done_are_recomputed_and_truncated_stays() -> None:
+    buffer = make_buffer(strategy="final", k=1)
+    buffer.extend(make_batch([[3]]))
+    _, virtual = split(buffer)
+    order = virtual["observation"][:, 0].argsort()
+    after = virtual["next"][order]
+    assert after["reward"].flatten().tolist() == [-1.0, -1.0, 0.0]
+    assert after["terminated"].flatten().tolist() == [False, False, True]
+    assert after["truncated"].flatten().tolist() == [False, False, True]
+    assert after["done"].flatten().tolist() == [False, False, True]
+
+
+def test_a_real_termination_is_undone_when_the_virtual_goal_is_not_reached_there() -> None:
+    reward = EnvReward(
+        lambda a, d: -torch.ones_like(a[..., :1]), lambda a, d: torch.zeros_like(a[..., :1]).bool()
+    )
+    buffer = make_buffer(reward=reward, k=1)
+    buffer.extend(make_batch([[3]], terminated=True))
+    real, virtual = split(buffer)
+    assert real["next", "terminated"].sum() == 1
+    assert not virtual["next", "terminated"].any()
+    assert not virtual["next", "done"].any()
+
+
+def test_success_at_the_last_step_is_terminated_and_truncated_at_once() -> None:
+    batch = make_batch([[2]])
+    batch["next", "terminated"][0, 1] = True
+    buffer = make_buffer(strategy="final", k=1)
+    buffer.extend(batch)
+    real, virtual = split(buffer)
+    for rows in (real, virtual):
+        last = rows["next"][rows["observation"][:, 0] == 1]
+        assert last["terminated"].all()
+        assert last["truncated"].all()
+
+
+def test_real_rows_and_all_other_entries_stay_as_they_were() -> None:
+    batch = make_batch([[4, 2]])
+    buffer = make_buffer()
+    index = buffer.extend(batch.clone())
+    stored = buffer[:][index.flatten()]
+    flat = batch.reshape(-1).exclude("state", ("next", "state"))
+    for key in flat.keys(True, True):
+        assert torch.equal(stored[key], flat[key]), key
+    _, virtual = split(buffer)
+    real_by_tag = {float(row["observation"][0]): row for row in flat}
+    for row in virtual:
+        origin = real_by_tag[float(row["observation"][0])]
+        for key in ("action", "achieved_goal", ("next", "observation"), ("next", "achieved_goal")):
+            assert torch.equal(row[key], origin[key])
+
+
+def test_the_state_that_holds_the_real_goal_is_not_stored() -> None:
+    buffer = make_buffer()
+    buffer.extend(make_batch([[4]]))
+    assert "state" not in buffer[:].keys()
+    assert ("next", "state") not in buffer[:].keys(True)
+
+
+def test_an_input_made_of_the_goal_follows_the_virtual_goal_when_made_after_sampling() -> None:
+    def with_input(rows: TensorDict) -> TensorDict:
+        return rows.set("input", torch.cat((rows["observation"], rows["desired_goal"]), -1))
+
+    buffer = make_buffer()
+    buffer.append_transform(with_input)
+    buffer.extend(make_batch([[4]]))
+    rows = buffer.sample(64)
+    assert torch.equal(rows["input"][:, 2:], rows["desired_goal"])
+    assert rows["virtual"].any()
+
+
+def test_the_reward_is_asked_in_the_order_achieved_desired() -> None:
+    # Asymmetric: achieved is anything at or beyond the desired goal.
+    def compute_reward(achieved: Tensor, desired: Tensor) -> Tensor:
+        return (achieved[..., :1] >= desired[..., :1]).float() - 1.0
+
+    buffer = make_buffer(
+        reward=EnvReward(compute_reward, lambda a, d: compute_reward(a, d) == 0), strategy="episode"
+    )
+    buffer.extend(make_batch([[6]]))
+    _, virtual = split(buffer)
+    expected = (virtual["next", "achieved_goal"][:, :1] >= virtual["desired_goal"][:, :1]).float() - 1.0
+    assert torch.equal(virtual["next", "reward"], expected)
+    assert 0 < (expected == 0).float().mean() < 1
+
+
+# The filter
+
+
+def test_filter_leaves_out_goals_already_achieved_before_the_action() -> None:
+    batch = make_batch([[5]])
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0, 2.0, 3.0])  # the ball moves from step 2 on
+    batch["achieved_goal"][0, :, 0] = still[:-1]
+    batch["next", "achieved_goal"][0, :, 0] = still[1:]
+    buffer = make_buffer(filter_achieved=True, k=50)
+    buffer.extend(batch)
+    real, virtual = split(buffer)
+    assert len(real) == 5
+    pairs = set(zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True))
+    # Not (0, 0) and (1, 0): the goal 0 is where the ball already is. Step 2 achieves 1 by itself: kept.
+    assert pairs == {
+        (t, g)
+        for t, goals in ((0, (1, 2, 3)), (1, (1, 2, 3)), (2, (1, 2, 3)), (3, (2, 3)), (4, (3,)))
+        for g in goals
+    }
+
+
+def test_an_episode_in_which_nothing_moved_writes_real_rows_only() -> None:
+    batch = make_batch([[4]])
+    batch["achieved_goal"].zero_()
+    batch["next", "achieved_goal"].zero_()
+    buffer = make_buffer(filter_achieved=True)
+    index = buffer.extend(batch)
+    real, virtual = split(buffer)
+    assert (len(real), len(virtual)) == (4, 0)
+    assert index.tolist() == [[0, 1, 2, 3]]
+    assert buffer.writer.counts.virtual == 0
+
+
+def test_the_filter_asks_the_reward_even_where_nothing_ever_terminates() -> None:
+    reward = GoalReward(0.5)
+    endless = EnvReward(lambda a, d: reward(a, d)[0], lambda a, d: torch.zeros_like(a[..., :1]).bool())
+    batch = make_batch([[4]])
+    batch["achieved_goal"].zero_()
+    batch["next", "achieved_goal"].zero_()
+    buffer = make_buffer(reward=endless, filter_achieved=True)
+    buffer.extend(batch)
+    assert len(split(buffer)[1]) == 0
+
+
+# Episodes, environments, batches
+
+
+class PreferFar(GoalWeights):
+    """A goal is as useful as it is far away."""
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        return goals[..., 0]
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_goals_that_pass_the_filter_are_drawn_in_proportion(weighted: bool) -> None:
+    batch = make_batch([[4]] * 2_000)
+    path = torch.tensor([0.0, 0.0, 1.0, 3.0, 0.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    batch["observation"][..., 0] = torch.arange(4.0)
+    buffer = make_buffer(80_000, k=2, filter_achieved=True, weights=PreferFar() if weighted else None)
+    buffer.extend(batch)
+    virtual = buffer[:][buffer[:]["virtual"].squeeze(-1)]
+    time, goal = virtual["observation"][:, 0], virtual["desired_goal"][:, 0]
+    for t, kept in enumerate([[1.0, 3.0], [1.0, 3.0], [3.0, 0.0], [0.0]]):  # the goal 0 is achieved at first
+        drawn = goal[time == t]
+        total = sum(kept) if weighted else len(kept)
+        assert len(drawn) == (4_000 if total else 0)
+        for value in (0.0, 1.0, 3.0):
+            expected = (value if weighted else 1.0) / total if value in kept and total else 0.0
+            share = (drawn == value).sum().item() / 4_000
+            assert share == pytest.approx(expected, abs=0.05)  # six standard deviations
+
+
+def test_episodes_of_length_one_and_success_at_the_first_step() -> None:
+    buffer = make_buffer(k=2)
+    buffer.extend(make_batch([[1, 1, 1]], terminated=True))
+    real, virtual = split(buffer)
+    assert tags(virtual["desired_goal"]) == [t + 1 for t in tags(virtual["observation"])]
+    assert (virtual["next", "reward"] == 0).all()
+    assert (len(real), len(virtual)) == (3, 6)
+
+
+def test_an_open_episode_is_held_back_until_it_closes() -> None:
+    buffer = make_buffer(strategy="final", k=1)
+    first = buffer.extend(make_batch([[5], [2, 9]], steps=3))
+    assert first.tolist() == [[-1, -1, -1], [2, 3, -1]]
+    assert buffer.writer.held_back == 4
+    second = buffer.extend(make_batch([[5], [2, 9]], steps=2, first=[(0, 3), (1, 1)]))
+    assert (second[0] >= 0).all()
+    assert (second[1] == -1).all()
+    _, virtual = split(buffer)
+    own = virtual["observation"][:, 0] < 100
+    assert tags(virtual["observation"][own]) == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert set(tags(virtual["desired_goal"][own])) == {tag(0, 0, 5)}
+
+
+def test_nothing_closed_writes_nothing() -> None:
+    for per in (False, True):
+        buffer = make_buffer(per=per)
+        index = buffer.extend(make_batch([[9]], steps=3))
+        assert index.tolist() == [[-1, -1, -1]]
+        assert len(buffer) == 0
+
+
+def test_flat_rows_are_told_apart_by_their_trajectories() -> None:
+    batch = make_batch([[4, 2], [3, 3]])
+    flat = batch.reshape(-1)
+    shuffled = flat[torch.tensor([0, 6, 1, 7, 2, 8, 3, 9, 4, 10, 5, 11])]  # interleaved
+    buffer = make_buffer(strategy="final", k=1)
+    index = buffer.extend(shuffled)
+    assert index.shape == (12,)
+    assert torch.equal(buffer[:][index]["observation"], shuffled["observation"])
+    _, virtual = split(buffer)
+    last = {0: 4.0, 1: 102.0, 10: 1003.0, 11: 1103.0}
+    for observation, goal in zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True):
+        assert goal == last[int(observation // 100)]
+
+
+def test_flat_rows_without_trajectories_are_one_stream() -> None:
+    buffer = make_buffer(strategy="final", k=1)
+    index = buffer.extend(make_batch([[2, 3]], steps=4).squeeze(0).exclude("collector"))
+    assert index.tolist() == [2, 3, -1, -1]
+
+
+def test_single_steps_may_be_added() -> None:
+    buffer = make_buffer(strategy="final", k=1)
+    for step in make_batch([[3]]).squeeze(0):
+        buffer.add(step)
+    real, virtual = split(buffer)
+    assert tags(real["observation"]) == [0.0, 1.0, 2.0]
+    assert tags(virtual["desired_goal"]) == [3.0, 3.0, 3.0]
+
+
+def test_an_environment_reset_from_outside_leaks_nothing() -> None:
+    buffer = make_buffer(strategy="final", k=1)
+    buffer.extend(make_batch([[9]], steps=3))
+    later = make_batch([[9, 2]], steps=2, first=[(1, 0)])
+    buffer.extend(later)
+    _, virtual = split(buffer)
+    pairs = set(zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True))
+    assert pairs == {(0.0, 3.0), (1.0, 3.0), (2.0, 3.0), (100.0, 102.0), (101.0, 102.0)}
+
+
+@pytest.mark.filterwarnings("ignore:.*wait for their end")  # in buffers of 13 rows
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.lists(st.integers(1, 6), min_size=1, max_size=4), min_size=1, max_size=3),
+    st.integers(1, 7),
+    st.sampled_from(["future", "final", "episode"]),
+    st.sampled_from([13, 40, 10_000]),
+    st.booleans(),
+)
+def test_no_goal_ever_leaks(
+    lengths: list[list[int]], size: int, strategy: str, capacity: int, per: bool
+) -> None:
+    """Batches of any size, buffers that wrap: every virtual goal is of its own episode."""
+    buffer = make_buffer(capacity, strategy=strategy, k=3, per=per)
+    whole = make_batch(lengths)
+    for start in range(0, whole.shape[1], size):
+        buffer.extend(whole[:, start : start + size].clone())
+    if not len(buffer):
+        return
+    rows = buffer[:]
+    virtual = rows[rows["virtual"].squeeze(-1)]
+    observation, goal = virtual["observation"][:, 0], virtual["desired_goal"][:, 0]
+    assert torch.equal((observation / 100).floor(), ((goal - 1) / 100).floor())
+    if strategy == "future":
+        assert (goal > observation).all()
+    real = rows[~rows["virtual"].squeeze(-1)]
+    assert (real["desired_goal"][:, 0] == WANTED).all()
+
+
+# Buffers
+
+
+@pytest.mark.parametrize("per", [False, True])
+def test_a_full_buffer_keeps_the_newest_rows_and_can_be_sampled(per: bool) -> None:
+    buffer = make_buffer(60, per=per, k=4)
+    for episode in range(7):
+        buffer.extend(make_batch([[10] * 7], steps=10, first=[(episode, 0)]))
+    assert len(buffer) == 60
+    assert set((buffer[:]["observation"][:, 0] // 100).tolist()) == {5.0, 6.0}
+    rows = buffer.sample(500)
+    assert (rows["observation"][:, 0] >= 500).all()
+
+
+@pytest.mark.parametrize("per", [False, True])
+def test_a_batch_larger_than_the_buffer(per: bool) -> None:
+    buffer = make_buffer(50, per=per, k=4)
+    index = buffer.extend(make_batch([[10] * 5]))
+    assert len(buffer) == 50
+    assert index[0, :40].tolist() == [-1] * 40  # pushed out by later rows of the same batch
+    stored = buffer[:][index[0, 40:]]
+    assert tags(stored["observation"]) == [400.0 + t for t in range(10)]
+    assert (buffer.sample(200)["observation"][:, 0] >= 400).all()
+
+
+def test_an_episode_larger_than_the_buffer_keeps_its_real_rows() -> None:
+    buffer = make_buffer(12, k=4)
+    buffer.extend(make_batch([[10]]))
+    assert len(buffer) == 12
+    assert len(split(buffer)[0]) == 10
+
+
+def test_all_rows_are_new_to_a_prioritized_sampler() -> None:
+    buffer = make_buffer(per=True, k=4)
+    buffer.extend(make_batch([[10]]))
+    buffer.update_priority(torch.arange(50), torch.full((50,), 1e-6))
+    buffer.extend(make_batch([[10, 10]], steps=10, first=[(1, 0)]))
+    rows = buffer.sample(2000)
+    assert (rows["observation"][:, 0] >= 100).float().mean() > 0.95
+    assert rows["virtual"].float().mean().item() == pytest.approx(0.8, abs=0.05)
+
+
+@pytest.mark.parametrize(("k", "share"), [(0, 0.0), (1, 0.5), (4, 0.8)])
+def test_share_of_virtual_rows_in_a_batch(k: int, share: float) -> None:
+    buffer = make_buffer(k=k)
+    buffer.extend(make_batch([[20] * 5] * 3))
+    assert buffer.sample(20_000)["virtual"].float().mean().item() == pytest.approx(share, abs=0.015)
+
+
+def test_held_back_rows_are_skipped_by_priority_updates() -> None:
+    buffer = make_buffer(per=True)
+    index = buffer.extend(make_batch([[3, 9]], steps=5)).flatten()
+    buffer.update_priority(index, torch.full((5,), 2.0))
+    assert (index == -1).sum() == 2
+    assert len(buffer.sample(10)) == 10
+
+
+# Memory of its own
+
+
+def test_seeds_make_writing_and_sampling_repeat() -> None:
+    first, second, other = (make_buffer(seed=seed) for seed in (1, 1, 2))
+    for buffer in (first, second, other):
+        buffer.extend(make_batch([[9, 9]]))
+    assert torch.equal(first[:]["desired_goal"], second[:]["desired_goal"])
+    assert torch.equal(first.sample(50)["index"], second.sample(50)["index"])
+    assert not torch.equal(first[:]["desired_goal"], other[:]["desired_goal"])
+
+
+class CountingWeights(GoalWeights):
+    """Prefers the largest goal, and counts what was written."""
+
+    def __init__(self) -> None:
+        self.written = 0
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        return (goals[..., 0] == goals[..., 0].max()).float()
+
+    def update(self, goals: Tensor) -> None:
+        self.written += len(goals)
+
+    def clear(self) -> None:
+        self.written = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"written": self.written}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.written = state["written"]
+
+
+def test_weights_choose_goals_and_are_told_what_was_written() -> None:
+    buffer = make_buffer(weights=CountingWeights(), k=2)
+    buffer.extend(make_batch([[5]]))
+    _, virtual = split(buffer)
+    assert set(tags(virtual["desired_goal"])) == {5.0}
+    assert buffer.writer.weights.written == 10
+
+
+def test_weights_of_zero_write_no_virtual_row() -> None:
+    class Nothing(GoalWeights):
+        def __call__(self, goals: Tensor) -> Tensor:
+            return torch.zeros(goals.shape[:-1])
+
+    buffer = make_buffer(weights=Nothing())
+    buffer.extend(make_batch([[5]]))
+    assert [len(rows) for rows in split(buffer)] == [5, 0]
+
+
+def roundtrip(buffer: TensorDictReplayBuffer, other: TensorDictReplayBuffer, path: Path | None) -> None:
+    if path is None:
+        other.writer.load_state_dict(buffer.writer.state_dict())
+    else:
+        buffer.writer.dumps(path)
+        other.writer.loads(path)
+
+
+@pytest.mark.parametrize("by_file", [False, True])
+def test_state_carries_held_back_episodes_counts_and_weights(by_file: bool, tmp_path: Path) -> None:
+    first, second = make_buffer(weights=CountingWeights()), make_buffer(weights=CountingWeights())
+    first.extend(make_batch([[3, 9]], steps=5))
+    second.storage.set(torch.arange(15), first[:])
+    roundtrip(first, second, tmp_path if by_file else None)
+    assert second.writer.held_back == 2
+    assert second.writer.counts == first.writer.counts
+    assert second.writer.totals == first.writer.totals
+    assert second.writer.weights.written == 12
+    index = second.extend(make_batch([[3, 9]], steps=7, first=[(1, 2)]))
+    assert second.writer.held_back == 0
+    assert (index >= 15).all()  # behind the fifteen rows that the first one wrote
+    held = second[:][15 + 36 :]["observation"]
+    assert tags(held) == [tag(0, 1, t) for t in range(9)]
+
+
+def test_held_back_episodes_end_where_a_new_collector_begins_anew() -> None:
+    """Its trajectories are counted from 0 again, so ids do not tell."""
+    first, second = make_buffer(strategy="final"), make_buffer(strategy="final")
+    first.extend(make_batch([[9], [9]], steps=4))
+    second.writer.load_state_dict(first.writer.state_dict())
+    other = make_batch([[9], [9]], first=[(0, 0), (0, 4)])  # the second environment goes on
+    other["collector", "traj_ids"] = make_batch([[9], [9]])["collector", "traj_ids"]
+    second.extend(other[:, :5])
+    real, virtual = split(second)
+    assert (len(real), second.writer.held_back) == (4 + 9, 5)
+    assert set(tags(virtual["desired_goal"])) == {tag(0, 0, 4), tag(1, 0, 9)}
+
+
+def test_a_batch_that_cannot_be_written_costs_no_open_episode() -> None:
+    class Once(GoalWeights):
+        bad = True
+
+        def __call__(self, goals: Tensor) -> Tensor:
+            return torch.full(goals.shape[:-1], -1.0 if self.bad else 1.0)
+
+    buffer = make_buffer(weights=Once())
+    buffer.extend(make_batch([[9]], steps=4))
+    with pytest.raises(ValueError, match="at least 0"):
+        buffer.extend(make_batch([[9]], steps=5, first=[(0, 4)]))
+    assert buffer.writer.held_back == 4
+    buffer.writer.weights.bad = False
+    buffer.extend(make_batch([[9]], steps=5, first=[(0, 4)]))
+    assert tags(split(buffer)[0]["observation"]) == [float(t) for t in range(9)]
+
+
+def test_emptying_forgets_everything() -> None:
+    buffer = make_buffer(weights=CountingWeights())
+    buffer.extend(make_batch([[3, 9]], steps=5))
+    buffer.empty()
+    assert (len(buffer), buffer.writer.held_back, buffer.writer.counts.real) == (0, 0, 0)
+    assert buffer.writer.weights.written == 0
+
+
+def test_counts_by_hand() -> None:
+    batch = make_batch([[3]], terminated=True)
+    batch["next", "reward"][0, 2] = 0.0
+    buffer = make_buffer(strategy="final", k=2)
+    buffer.extend(batch)
+    counts = buffer.writer.counts
+    assert (counts.real, counts.virtual, counts.real_positive) == (3, 6, 1)
+    assert (counts.virtual_positive, counts.useful_virtual_positive) == (2, 2)
+    assert buffer.write_count == 9
+
+
+def test_a_goal_that_was_achieved_before_is_no_useful_positive() -> None:
+    batch, path = make_batch([[2]]), torch.tensor([5.0, 0.0, 0.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    buffer = make_buffer(strategy="final", k=1)
+    buffer.extend(batch)
+    counts = buffer.writer.counts
+    assert (counts.virtual_positive, counts.useful_virtual_positive) == (2, 1)
+
+
+def test_totals_outlive_an_emptied_buffer() -> None:
+    buffer = make_buffer(strategy="final", k=2)
+    buffer.extend(make_batch([[3]], terminated=True))
+    before = replace(buffer.writer.totals)
+    assert before == buffer.writer.counts
+    buffer.empty()
+    assert buffer.writer.totals == before
+    buffer.extend(make_batch([[3]], terminated=True))
+    assert (buffer.writer.totals.real, buffer.writer.counts.real) == (6, 3)
+
+
+@pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf")])
+def test_weights_that_cannot_be_are_refused(bad: float) -> None:
+    class Bad(GoalWeights):
+        def __call__(self, goals: Tensor) -> Tensor:
+            return torch.full(goals.shape[:-1], bad)
+
+    with pytest.raises(ValueError, match="weights of goals must be finite and at least 0"):
+        make_buffer(weights=Bad()).extend(make_batch([[3]], terminated=True))
+
+
+def test_weights_may_be_yes_or_no() -> None:
+    class Never(GoalWeights):
+        def __call__(self, goals: Tensor) -> Tensor:
+            return torch.zeros(goals.shape[:-1], dtype=torch.bool)
+
+    buffer = make_buffer(weights=Never())
+    buffer.extend(make_batch([[3]], terminated=True))
+    assert buffer.writer.counts.virtual == 0
+
+
+# Options
+
+
+def test_keys_of_ones_own() -> None:
+    batch = make_batch([[4]])
+    renamed = batch.rename_key_("desired_goal", ("goals", "wanted")).rename_key_(
+        "achieved_goal", ("goals", "got")
+    )
+    after = renamed["next"]
+    after.rename_key_("desired_goal", ("goals", "wanted")).rename_key_("achieved_goal", ("goals", "got"))
+    after.rename_key_("reward", "cost")
+    buffer = make_buffer(
+        achieved_goal_key=("goals", "got"),
+        desired_goal_key=("goals", "wanted"),
+        reward_key="cost",
+        virtual_key=None,
+    )
+    buffer.extend(renamed)
+    rows = buffer[:]
+    assert "virtual" not in rows.keys()
+    relabeled = rows["goals", "wanted"][:, 0] != WANTED
+    assert relabeled.sum() == 16
+    assert torch.equal(rows["goals", "wanted"], rows["next", "goals", "wanted"])
+
+
+def test_bad_options_are_named() -> None:
+    with pytest.raises(ValueError, match="k must be at least 0, got -1"):
+        HERWriter(REWARD, k=-1)
+    with pytest.raises(ValueError, match="unknown goal strategy 'nearest'"):
+        HERWriter(REWARD, strategy="nearest")  # type: ignore[arg-type]
+
+
+def test_a_storage_of_two_dimensions_is_refused() -> None:
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100, ndim=2), writer=HERWriter(REWARD), batch_size=4
+    )
+    with pytest.raises(ValueError, match="storage of 1 dimension, got one of 2"):
+        buffer.extend(make_batch([[3]]))
+
+
+def test_one_key_is_no_list_of_keys() -> None:
+    with pytest.raises(TypeError, match=r"keys must be given as a list, got 'state': write \['state'\]"):
+        HERWriter(REWARD, exclude="state")
+
+
+NEXT = [("next", key) for key in ("achieved_goal", "desired_goal", "reward", "truncated", "done")]
+
+
+@pytest.mark.parametrize("key", ["achieved_goal", "desired_goal", *NEXT])
+def test_a_missing_entry_is_named(key: str | tuple[str, str]) -> None:
+    with pytest.raises(KeyError, match=f"relabeling needs the entry {re.escape(repr(key))}, got "):
+        make_buffer(filter_achieved=True).extend(make_batch([[3]]).exclude(key))
+
+
+def test_without_virtual_rows_no_goals_are_needed() -> None:
+    buffer = make_buffer(k=0)
+    goals = ("achieved_goal", "desired_goal")
+    buffer.extend(make_batch([[3]]).exclude(*goals, *(("next", key) for key in goals)))
+    assert len(buffer) == 3
+
+
+def test_padded_trajectories_are_refused() -> None:
+    batch = make_batch([[3], [2]])
+    batch["collector", "mask"] = torch.ones(2, 3, dtype=torch.bool)
+    with pytest.raises(ValueError, match="split_trajs=False"):
+        make_buffer().extend(batch)
+
+
+def test_rows_that_wait_in_vain_are_noticed() -> None:
+    buffer = make_buffer(capacity=5)
+    with pytest.warns(UserWarning, match="6 transitions of open episodes wait .* than the buffer's 5"):
+        buffer.extend(make_batch([[9]], steps=6))

@@ -1,0 +1,16 @@
+"""Curriculum-HER: layers, their transforms, and how a run moves from one to the next."""
+
+from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress, zero_unused_inputs
+from torchrl_her.curriculum.switch import enter_layer, set_layer_goals
+from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
+
+__all__ = [
+    "Curriculum",
+    "CurriculumLayer",
+    "CurriculumProgress",
+    "StateToObs",
+    "ZeroPad",
+    "enter_layer",
+    "set_layer_goals",
+    "zero_unused_inputs",
+]

@@ -1,0 +1,400 @@
+"""CHER: what each layer of a curriculum sees and wants, and which layer each run is in.
+
+After chapter 6 (Curriculum HER) of the thesis that the method is from. The transforms that apply
+this to environments and to replay buffers are :class:`~torchrl_her.StateToObs` and
+:class:`~torchrl_her.ZeroPad`.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Indices = str | Sequence[int | str]
+_LISTS = ("observation", "achieved_goal", "desired_goal")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurriculumLayer:
+    """One layer of a curriculum: which entries of the state it sees, achieves and wants achieved.
+
+    Args:
+        name: for messages and reports.
+        observation, achieved_goal, desired_goal: indices into the state vector, or names for them that
+            :class:`~torchrl_her.Curriculum` is given.
+        threshold: the goal is achieved at distances below this, in the unit of the state.
+        instructive: whether IBS weights apply in this layer.
+
+    Raises:
+        ValueError: a list is empty, an index is negative or repeated, the desired goal shares an index with
+            another list, the goals differ in width, or the threshold is not positive.
+
+    Example:
+        >>> CurriculumLayer(
+        ...     name="reach", observation=[0, 1], achieved_goal=[0], desired_goal=[2], threshold=0.1
+        ... ).observation
+        (0, 1)
+    """
+
+    name: str
+    observation: Indices
+    achieved_goal: Indices
+    desired_goal: Indices
+    threshold: float
+    instructive: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 < self.threshold < math.inf:
+            raise ValueError(
+                f"layer {self.name!r}: threshold must be positive and finite, got {self.threshold}"
+            )
+        for key in _LISTS:
+            given = getattr(self, key)
+            entries = [given] if isinstance(given, str) else list(given)
+            if not entries:
+                raise ValueError(f"layer {self.name!r}: {key} must not be empty")
+            object.__setattr__(
+                self, key, tuple(e if isinstance(e, str) else operator.index(e) for e in entries)
+            )
+        if not any(isinstance(entry, str) for key in _LISTS for entry in getattr(self, key)):
+            self._check_indices()
+
+    def _check_indices(self) -> None:
+        """The checks that need no width of the state, once all names are resolved."""
+        for key in _LISTS:
+            entries = getattr(self, key)
+            if min(entries) < 0:
+                raise ValueError(f"layer {self.name!r}: {key} must have indices of at least 0, got {entries}")
+            if len(set(entries)) < len(entries):
+                raise ValueError(f"layer {self.name!r}: {key} must have each index once, got {entries}")
+        for key in ("observation", "achieved_goal"):  # these two usually share entries
+            shared = sorted(set(self.desired_goal) & set(getattr(self, key)))
+            if shared:
+                raise ValueError(
+                    f"layer {self.name!r}: desired_goal must share no index with {key}, got {shared} in both"
+                )
+        if len(self.achieved_goal) != len(self.desired_goal):
+            raise ValueError(
+                f"layer {self.name!r}: achieved_goal and desired_goal must be of one width, "
+                f"got {self.achieved_goal} and {self.desired_goal}"
+            )
+
+
+class Curriculum:
+    """Layers in the order in which they are trained, the last one being the full task.
+
+    The network's input is, in each layer, [its n observation entries | its desired goal | zeros],
+    as wide as the last layer's. Order the state so that a layer's inputs, its observation and then its
+    desired goal, are the first inputs of the next layer. Inputs then keep their meaning, and what was
+    learned carries over: with the hand, reaching sees [hand | ball], throwing [hand | ball | speed | black
+    hole].
+
+    Args:
+        layers: one or more.
+        state_width: of the state vector, the real observation with the real goal behind it.
+
+    Keyword Args:
+        names: the indices into the state that names in the layers' lists stand for.
+
+    Attributes:
+        layers: the layers, with indices in place of names.
+        observation_width, goal_width: widths of these entries, the same in every layer.
+        input_width: width of the network's input.
+        first_inputs: number of inputs that the first layer uses; they are the leading ones.
+        state_index: [layers, observation_width + 2 * goal_width], indices of observation, achieved and
+            desired goal in the state with a zero appended.
+        input_index: [layers, input_width], indices of the network's input in the observation with the
+            desired goal and a zero appended.
+
+    Raises:
+        ValueError: there is no layer, a name is unknown, an index lies outside of the state, goals differ in
+            width, or a layer is wider than the last one.
+
+    Example:
+        >>> parts = {"hand": [0, 1], "ball": [2], "hole": [3]}
+        >>> reach = CurriculumLayer(
+        ...     name="reach", observation="hand", achieved_goal=[0], desired_goal="ball", threshold=0.1
+        ... )
+        >>> throw = CurriculumLayer(
+        ...     name="throw",
+        ...     observation=["hand", "ball"],
+        ...     achieved_goal="ball",
+        ...     desired_goal="hole",
+        ...     threshold=0.2,
+        ... )
+        >>> curriculum = Curriculum([reach, throw], 4, names=parts)
+        >>> curriculum.observation_width, curriculum.input_width, curriculum.first_inputs
+        (3, 4, 3)
+    """
+
+    def __init__(
+        self,
+        layers: Sequence[CurriculumLayer],
+        state_width: int,
+        *,
+        names: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
+        if not layers:
+            raise ValueError("a curriculum needs at least one layer, got none")
+        self.layers = tuple(_resolve(layer, names or {}) for layer in layers)
+        self.state_width = state_width
+        self.observation_width = len(self.layers[-1].observation)
+        self.goal_width = len(self.layers[-1].desired_goal)
+        for layer in self.layers:
+            self._check(layer)
+        self.input_width = self.observation_width + self.goal_width
+        self.first_inputs = len(self.layers[0].observation) + self.goal_width
+        self.state_index = torch.tensor([self._state_index(layer) for layer in self.layers])
+        self.input_index = torch.tensor([self._input_index(layer) for layer in self.layers])
+
+    def __len__(self) -> int:
+        return len(self.layers)
+
+    def _check(self, layer: CurriculumLayer) -> None:
+        last = self.layers[-1]
+        for key in _LISTS:
+            highest = max(getattr(layer, key))
+            if highest >= self.state_width:
+                raise ValueError(
+                    f"layer {layer.name!r}: {key} has index {highest}, "
+                    f"but the state has {self.state_width} entries: at most {self.state_width - 1} is allowed"
+                )
+        if len(layer.desired_goal) != self.goal_width:
+            raise ValueError(
+                f"layer {layer.name!r}: the goal has {len(layer.desired_goal)} entries, but all layers need "
+                f"as many as the last one, {last.name!r}: {self.goal_width}"
+            )
+        if len(layer.observation) > self.observation_width:
+            raise ValueError(
+                f"layer {layer.name!r}: observation and goal have "
+                f"{len(layer.observation) + self.goal_width} entries, but no layer may be wider than the "
+                f"last one, {last.name!r}, with {self.observation_width + self.goal_width}"
+            )
+
+    def _state_index(self, layer: CurriculumLayer) -> list[Any]:
+        zeros = [self.state_width] * (self.observation_width - len(layer.observation))
+        return [*layer.observation, *zeros, *layer.achieved_goal, *layer.desired_goal]
+
+    def _input_index(self, layer: CurriculumLayer) -> list[int]:
+        n, goal = len(layer.observation), range(self.observation_width, self.input_width)
+        return [*range(n), *goal, *([self.input_width] * (self.observation_width - n))]
+
+
+def _resolve(layer: CurriculumLayer, names: Mapping[str, Sequence[int]]) -> CurriculumLayer:
+    """The layer with indices in place of names, and all checks made."""
+
+    def indices(key: str) -> list[int]:
+        found: list[int] = []
+        for entry in getattr(layer, key):
+            if isinstance(entry, str) and entry not in names:
+                raise ValueError(
+                    f"layer {layer.name!r}: {key} has the unknown name {entry!r}; "
+                    f"known are {', '.join(map(repr, names)) or 'none'}"
+                )
+            found += names[entry] if isinstance(entry, str) else [entry]
+        return found
+
+    return replace(layer, **{key: indices(key) for key in _LISTS})  # type: ignore[arg-type]
+
+
+class CurriculumProgress:
+    """Which layer each of R independent runs is in, and its recent successes there.
+
+    A run moves to the next layer when the mean of its last ``window`` samples of success reaches the
+    threshold. The window is then cleared, so that samples of earlier layers never count. The last layer has
+    no end.
+
+    Args:
+        curriculum: the layers.
+
+    Keyword Args:
+        runs: R.
+        window: number of samples that are averaged; with fewer a run stays in its layer.
+        success_threshold: the mean at which a layer ends.
+
+    Attributes:
+        layers: R numbers, the layer of each run, from 0.
+
+    Raises:
+        ValueError: ``runs`` or ``window`` is below 1, or the threshold is outside of (0, 1].
+
+    Example:
+        >>> first, last = (
+        ...     CurriculumLayer(
+        ...         name=name, observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
+        ...     )
+        ...     for name in ("first", "last")
+        ... )
+        >>> progress = CurriculumProgress(Curriculum([first, last], 2), runs=2, window=3)
+        >>> progress.record(torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, 1.0]])).tolist()
+        [True, False]
+        >>> progress.layers
+        (1, 0)
+    """
+
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        *,
+        runs: int = 1,
+        window: int = 20,
+        success_threshold: float = 0.9,
+    ) -> None:
+        if runs < 1:
+            raise ValueError(f"runs must be at least 1, got {runs}")
+        if window < 1:
+            raise ValueError(f"window must be at least 1, got {window}")
+        if not 0.0 < success_threshold <= 1.0:
+            raise ValueError(f"success_threshold must be in (0, 1], got {success_threshold}")
+        self.curriculum, self.runs = curriculum, runs
+        self.window, self.success_threshold = window, success_threshold
+        # Plain numbers: transforms read them in every step, and must not wait for a device.
+        self.layers = (0,) * runs
+        self._successes: list[list[float]] = [[] for _ in range(runs)]
+        self._expert = [False] * runs
+
+    @property
+    def layer(self) -> Tensor:
+        """[R] of int64, a copy: :meth:`set_layer` changes it."""
+        return torch.tensor(self.layers)
+
+    @property
+    def expert(self) -> Tensor:
+        """[R] of bool: whether the run has ever reached the threshold in the last layer."""
+        return torch.tensor(self._expert)
+
+    @property
+    def successes(self) -> list[list[float]]:
+        """Copies of the R windows: samples of the present layer, the latest at the end."""
+        return [list(own) for own in self._successes]
+
+    def layer_of(self, run: int) -> CurriculumLayer:
+        """The present layer of a run."""
+        return self.curriculum.layers[self.layers[self._check_run(run)]]
+
+    def set_layer(self, run: int, layer: int) -> None:
+        """Moves a run by hand, and clears its window.
+
+        Raises:
+            ValueError: there is no such run or layer.
+        """
+        self._check_run(run)
+        if not 0 <= layer < len(self.curriculum):
+            raise ValueError(f"layer must be in [0, {len(self.curriculum) - 1}], got {layer}")
+        self.layers = (*self.layers[:run], layer, *self.layers[run + 1 :])
+        self._successes[run], self._expert[run] = [], False
+
+    def record(self, successes: Tensor) -> Tensor:
+        """Adds samples of all runs; see :meth:`record_run`.
+
+        Args:
+            successes: [R, n], each in [0, 1] (or of bool), the earliest first.
+
+        Returns:
+            [R] of bool: which runs moved on.
+        """
+        if successes.ndim != 2 or len(successes) != self.runs:
+            raise ValueError(f"successes must be [{self.runs}, n], got {list(successes.shape)}")
+        samples = [_samples(own) for own in successes]  # all are checked before any counts
+        return torch.tensor([self._record(run, own) for run, own in enumerate(samples)])
+
+    def record_run(self, run: int, successes: Tensor) -> bool:
+        """Adds samples of one run, one after the other.
+
+        A layer ends at the first sample that completes it. The samples after that one were made in the
+        old layer and are dropped, so a call ends at most one layer.
+
+        Args:
+            run: the run's number, from 0.
+            successes: [n], each in [0, 1] (or of bool), the earliest first.
+
+        Returns:
+            Whether the run moved on to its next layer.
+
+        Raises:
+            ValueError: there is no such run, the shape is another one, or a sample is outside of [0, 1].
+        """
+        return self._record(self._check_run(run), _samples(successes))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain data that :meth:`load_state_dict` takes."""
+        return {"layer": self.layer, "expert": self.expert, "successes": self.successes}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: it has another number of runs, or a layer that does not exist.
+        """
+        layers = tuple(state["layer"].tolist())
+        if len(layers) != self.runs:
+            raise ValueError(f"the state is of {len(layers)} runs, but there are {self.runs}")
+        if not all(0 <= layer < len(self.curriculum) for layer in layers):
+            raise ValueError(f"the state's layers are {layers}, but there are {len(self.curriculum)} layers")
+        self.layers, self._expert = layers, state["expert"].tolist()
+        self._successes = [list(own)[-self.window :] for own in state["successes"]]
+
+    def _record(self, run: int, samples: list[float]) -> bool:
+        own, last = self._successes[run], len(self.curriculum) - 1
+        for sample in samples:
+            own.append(sample)
+            del own[: -self.window]
+            if len(own) < self.window or sum(own) / self.window < self.success_threshold:
+                continue
+            if self.layers[run] < last:
+                self.set_layer(run, self.layers[run] + 1)
+                return True
+            self._expert[run] = True
+        return False
+
+    def _check_run(self, run: int) -> int:
+        if not 0 <= run < self.runs:
+            raise ValueError(f"run must be in [0, {self.runs - 1}], got {run}")
+        return run
+
+
+def _samples(successes: Tensor) -> list[float]:
+    if successes.ndim != 1:
+        raise ValueError(f"successes of a run must be [n], got {list(successes.shape)}")
+    samples = successes.to(torch.float64)
+    bad = samples[~((samples >= 0.0) & (samples <= 1.0))]
+    if len(bad):
+        raise ValueError(f"successes must be in [0, 1], got {bad[0].item()}")
+    return samples.tolist()
+
+
+def zero_unused_inputs(weight: Tensor, used: int, *, alpha: float = 0.0) -> Tensor:
+    """The weights of a network's first layer, with those of inputs that are not used yet scaled down.
+
+    Unused inputs are 0, so these weights have gradients of 0 and stay as they are until their layer begins
+    (under an optimizer without weight decay). With ``alpha = 0``, the outputs at that moment do not depend
+    on the new inputs, so the change of layer does not change what the network does.
+
+    Args:
+        weight: [..., inputs, outputs], as :class:`~torchrl_her.modules.StackedLinear` has it
+            (``nn.Linear`` has it transposed).
+        used: how many of the leading inputs are used; see ``Curriculum.first_inputs``.
+        alpha: factor for the weights of all other inputs.
+
+    Returns:
+        A new tensor like ``weight``.
+
+    Raises:
+        ValueError: ``used`` is not in [0, inputs], or ``alpha`` is negative or not finite.
+
+    Example:
+        >>> zero_unused_inputs(torch.ones(1, 3, 1), 2).flatten().tolist()
+        [1.0, 1.0, 0.0]
+    """
+    inputs = weight.shape[-2]
+    if not 0 <= used <= inputs:
+        raise ValueError(f"used must be in [0, {inputs}], got {used}")
+    if not 0.0 <= alpha < math.inf:
+        raise ValueError(f"alpha must be finite and at least 0, got {alpha}")
+    return torch.cat((weight[..., :used, :], weight[..., used:, :] * alpha), -2)

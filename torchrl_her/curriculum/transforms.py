@@ -1,0 +1,334 @@
+"""CHER as TorchRL transforms: a layer's view of an environment, and the network's input."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import dispatch
+from torch import Tensor
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+from torchrl_her.curriculum.layers import Curriculum, CurriculumProgress
+
+
+def take_columns(rows: Tensor, index: Tensor) -> Tensor:
+    """Selects columns of rows; each of B equal blocks of rows has columns of its own.
+
+    Args:
+        rows: [..., width]; the first dimension is B equal blocks.
+        index: [B, n] of int64.
+
+    Returns:
+        [..., n]
+
+    Example:
+        >>> take_columns(torch.tensor([[1, 2], [3, 4]]), torch.tensor([[0], [1]])).tolist()
+        [[1], [4]]
+    """
+    if len(index) == 1:
+        return rows.index_select(-1, index[0])
+    blocks = rows.reshape(len(index), -1, rows.shape[-1])
+    taken = blocks.gather(-1, index.unsqueeze(1).expand(-1, blocks.shape[1], -1))
+    return taken.view(*rows.shape[:-1], index.shape[-1])
+
+
+class _LayerTransform(Transform):
+    """A transform that depends on the layers that the runs are in at the moment."""
+
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        progress: CurriculumProgress,
+        run: int | None,
+        in_keys: list[NestedKey],
+        out_keys: list[NestedKey],
+    ) -> None:
+        if progress.curriculum is not curriculum:
+            raise ValueError("progress must be made of the same curriculum, got one of another")
+        if run is not None and not 0 <= run < progress.runs:
+            raise ValueError(f"run must be None or in [0, {progress.runs - 1}], got {run}")
+        super().__init__(in_keys=in_keys, out_keys=out_keys)
+        self.curriculum, self.progress, self.run = curriculum, progress, run
+        self._tables: tuple[Any, Any] = (None, None)  # what the tables were made for, and the tables
+
+    def _layers(self) -> tuple[int, ...]:
+        """The layer of each block of rows; a single one if all runs are in the same layer."""
+        layers = self.progress.layers
+        if self.run is not None:
+            return layers[self.run : self.run + 1]
+        return layers[:1] if layers.count(layers[0]) == len(layers) else layers
+
+    def _check_blocks(self, shape: torch.Size) -> None:
+        """Raises if a batch of ``shape`` [..., width] is not one equal block for each run."""
+        runs = self.progress.runs if self.run is None else 1
+        if runs > 1 and (len(shape) < 2 or shape[0] % runs):
+            raise ValueError(
+                f"the first dimension of a batch must be {runs} equal blocks, one for each run, "
+                f"got a batch of {list(shape[:-1])}"
+            )
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def _get(self, tensordict: TensorDictBase, key: NestedKey, width: int) -> Tensor:
+        """An entry, which must have that width."""
+        entry = tensordict.get(key, None)
+        if entry is None:
+            raise KeyError(f"{type(self).__name__} needs the entry {key!r}, got {list(tensordict.keys())}")
+        if entry.shape[-1] != width:
+            raise ValueError(f"the curriculum needs {key!r} of width {width}, got {entry.shape[-1]}")
+        return entry
+
+    def _seen(self, spec: Composite, key: NestedKey, width: int) -> TensorSpec:
+        """The spec of an entry, which must have that width."""
+        if key not in spec.keys(True, True):
+            raise KeyError(
+                f"{type(self).__name__} needs the observation {key!r}, got {list(spec.keys(True, True))}"
+            )
+        if spec[key].shape[-1] != width:
+            raise ValueError(f"the curriculum needs {key!r} of width {width}, got {spec[key].shape[-1]}")
+        self._check_blocks(spec[key].shape)
+        return spec[key]
+
+
+class StateToObs(_LayerTransform):
+    """Shows an environment as each run's layer sees it: observation, goals, reward and ends.
+
+    ``observation`` always has the width of the last layer: the entries of the present layer, then zeros.
+    ``next`` also gets the layer's reward (0 if the goal is nearer than the layer's threshold, else -1),
+    ``terminated``, and ``done``, which is ``terminated | truncated``. ``truncated`` stays as it was, so the
+    environment must set it at its time limit even if its own goal is achieved. Where the environment
+    terminates by its own goal, the episode goes on here: it must be possible to step it further.
+
+    The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
+    Put the transform around a ParallelEnv and not inside of its workers: they hold copies of ``progress`` and
+    would stay in the layers in which they were started. Change layers only between episodes.
+
+    GymWrapper shows an entry ``state`` of a dict as ``observation``: put a RenameTransform before this one.
+
+    The transform is for environments only. In a replay buffer it would bring the real goal back into
+    transitions that were relabeled.
+
+    Args:
+        curriculum: the layers.
+        progress: which layer each run is in; looked up in every call.
+
+    Keyword Args:
+        state_key: the state vector, which is read.
+        observation_key, achieved_goal_key, desired_goal_key, reward_key, terminated_key, done_key: what is
+            written.
+        truncated_key: read; None if the environment below has no time limit (a StepCounter after this
+            transform may add one).
+
+    Raises:
+        ValueError: ``progress`` belongs to another curriculum; when used, the state has another width, or the
+            batch is not R equal blocks.
+        KeyError: when used, the environment has no such state or flags.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torchrl_her import CurriculumLayer
+        >>> from torchrl_her_envs import make_env
+        >>> hand, ball = [0, 1, 2, 3, 4], [5, 6]
+        >>> reach = CurriculumLayer(
+        ...     name="reach", observation=hand, achieved_goal=[0, 1], desired_goal=ball, threshold=0.06
+        ... )
+        >>> throw = CurriculumLayer(
+        ...     name="throw", observation=range(9), achieved_goal=ball, desired_goal=[9, 10], threshold=0.1
+        ... )
+        >>> curriculum = Curriculum([reach, throw], 11)
+        >>> progress = CurriculumProgress(curriculum, runs=2)
+        >>> env = TransformedEnv(make_env("hand_v1", num_envs=4), StateToObs(curriculum, progress))
+        >>> progress.set_layer(1, 1)
+        >>> (env.reset()["observation"][:, 5:7] != 0).any(-1).tolist()  # who sees the ball
+        [False, False, True, True]
+    """
+
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        progress: CurriculumProgress,
+        *,
+        state_key: NestedKey = "state",
+        observation_key: NestedKey = "observation",
+        achieved_goal_key: NestedKey = "achieved_goal",
+        desired_goal_key: NestedKey = "desired_goal",
+        reward_key: NestedKey = "reward",
+        terminated_key: NestedKey = "terminated",
+        truncated_key: NestedKey | None = "truncated",
+        done_key: NestedKey = "done",
+    ) -> None:
+        shown = [observation_key, achieved_goal_key, desired_goal_key]
+        super().__init__(curriculum, progress, None, [state_key], shown)
+        self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
+        self.truncated_key = None if truncated_key is None else unravel_key(truncated_key)
+        self.done_key = unravel_key(done_key)
+        goal = curriculum.goal_width
+        self._widths = [curriculum.observation_width, goal, goal]
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._observe(next_tensordict)
+        return next_tensordict
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        achieved_goal, desired_goal, squares = self._observe(next_tensordict)
+        # Coordinate by coordinate, as in goals.achieved; here each block of rows has its own threshold.
+        pairs = zip(achieved_goal.unbind(-1), desired_goal.unbind(-1), strict=True)
+        distances = reduce(torch.add, [(one - other).square() for one, other in pairs])
+        near = distances.reshape(len(squares), -1) < squares
+        terminated = near.view(*distances.shape, 1)
+        done = terminated.clone()
+        if self.truncated_key is not None:
+            done |= next_tensordict.get(self.truncated_key)
+        next_tensordict.set(self.reward_key, terminated.to(achieved_goal.dtype) - 1.0)
+        next_tensordict.set(self.terminated_key, terminated)
+        next_tensordict.set(self.done_key, done)
+        return next_tensordict
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Raises a RuntimeError: sampled transitions would lose their virtual goals."""
+        raise RuntimeError(
+            "StateToObs is for environments: in a replay buffer it would put real goals into virtual rows"
+        )
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        seen = self._seen(observation_spec, self.in_keys[0], self.curriculum.state_width)
+        for key, width in zip(self.out_keys, self._widths, strict=True):
+            shape = (*seen.shape[:-1], width)
+            observation_spec[key] = Unbounded(shape=shape, dtype=seen.dtype, device=seen.device)
+        return observation_spec
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
+        seen = self.parent.full_observation_spec[self.in_keys[0]]
+        shape = (*seen.shape[:-1], 1)
+        reward_spec[self.reward_key] = Bounded(
+            low=-1.0, high=0.0, shape=shape, dtype=seen.dtype, device=seen.device
+        )
+        return reward_spec
+
+    def transform_done_spec(self, done_spec: Composite) -> Composite:
+        known = list(done_spec.keys(True, True))
+        for key in (self.terminated_key, self.truncated_key, self.done_key):
+            if key is not None and key not in known:
+                raise KeyError(f"StateToObs needs the flag {key!r} of the environment, got {known}")
+        return done_spec
+
+    def _observe(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """Sets what the layers see; returns the goals and the squared thresholds [B, 1]."""
+        state = self._get(tensordict, self.in_keys[0], self.curriculum.state_width)
+        index, squares = self._lookup(state)
+        with_zero = torch.nn.functional.pad(state, (0, 1))
+        entries = take_columns(with_zero, index).split(self._widths, -1)
+        for key, entry in zip(self.out_keys, entries, strict=True):
+            tensordict.set(key, entry)
+        return entries[1], entries[2], squares
+
+    def _lookup(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Columns [B, n] and squared thresholds [B, 1] of the present layers."""
+        made_for = (layers := self._layers(), state.device, state.dtype)
+        if self._tables[0] != made_for:
+            index = self.curriculum.state_index[list(layers)].to(state.device)
+            # Squared before they are rounded, as in goals.achieved: rewards agree to the last bit.
+            squares = [[self.curriculum.layers[layer].threshold ** 2] for layer in layers]
+            table = torch.tensor(squares, dtype=state.dtype, device=state.device)
+            self._tables = made_for, (index, table)
+        return self._tables[1]
+
+
+class ZeroPad(_LayerTransform):
+    """The network's input: [n entries of the observation | desired goal | zeros], n of the run's layer.
+
+    Put it where the goal is final: for acting, after :class:`~torchrl_her.StateToObs` in the environment; for
+    learning, in the replay buffer, where it works on sampled transitions after they were relabeled. The input
+    should not be stored: name it in ``HERWriter(exclude=("state", "input"))``. If it was stored nevertheless,
+    this transform replaces it.
+
+    It works on the root and, as a module or in a replay buffer, also on ``next`` if there is one.
+
+    Args:
+        curriculum: the layers.
+        progress: which layer each run is in; looked up in every call.
+
+    Keyword Args:
+        run: the run that all transitions belong to, in batches of any shape; None if the first
+            dimension is R equal blocks, in the order of the runs.
+        observation_key, desired_goal_key: read.
+        input_key: written.
+
+    Raises:
+        ValueError: ``progress`` belongs to another curriculum, or there is no such run; when used, an entry
+            has another width, or the batch is not R equal blocks.
+        KeyError: when used, an entry is missing.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_her import CurriculumLayer
+        >>> layers = [
+        ...     CurriculumLayer(
+        ...         name="one", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=1.0
+        ...     ),
+        ...     CurriculumLayer(
+        ...         name="two", observation=[0, 1], achieved_goal=[1], desired_goal=[2], threshold=1.0
+        ...     ),
+        ... ]
+        >>> curriculum = Curriculum(layers, 3)
+        >>> pad = ZeroPad(curriculum, CurriculumProgress(curriculum))
+        >>> rows = TensorDict(
+        ...     {"observation": torch.tensor([[5.0, 0.0]]), "desired_goal": torch.tensor([[7.0]])}, [1]
+        ... )
+        >>> pad(rows)["input"].tolist()
+        [[5.0, 7.0, 0.0]]
+    """
+
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        progress: CurriculumProgress,
+        *,
+        run: int | None = None,
+        observation_key: NestedKey = "observation",
+        desired_goal_key: NestedKey = "desired_goal",
+        input_key: NestedKey = "input",
+    ) -> None:
+        super().__init__(curriculum, progress, run, [observation_key, desired_goal_key], [input_key])
+        self._sizes = [len(layer.observation) for layer in curriculum.layers]
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        observation = self._get(next_tensordict, self.in_keys[0], self.curriculum.observation_width)
+        goal = self._get(next_tensordict, self.in_keys[1], self.curriculum.goal_width)
+        next_tensordict.set(self.out_keys[0], self._pad(observation, goal))
+        return next_tensordict
+
+    @dispatch(source="in_keys", dest="out_keys")
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Sets the input in the root and, where there is one, in ``next``."""
+        self._call(tensordict)
+        after = tensordict.get("next", None)
+        if after is not None:
+            self._call(after)
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        widths = (self.curriculum.observation_width, self.curriculum.goal_width)
+        for key, width in zip(self.in_keys, widths, strict=True):
+            seen = self._seen(observation_spec, key, width)
+        shape = (*seen.shape[:-1], self.curriculum.input_width)
+        observation_spec[self.out_keys[0]] = Unbounded(shape=shape, dtype=seen.dtype, device=seen.device)
+        return observation_spec
+
+    def _pad(self, observation: Tensor, goal: Tensor) -> Tensor:
+        self._check_blocks(observation.shape)
+        layers = self._layers()
+        if len(layers) == 1:
+            size = self._sizes[layers[0]]
+            unused = observation.new_zeros(*observation.shape[:-1], observation.shape[-1] - size)
+            return torch.cat((observation[..., :size], goal, unused), -1)
+        made_for = (layers, observation.device)
+        if self._tables[0] != made_for:
+            self._tables = made_for, self.curriculum.input_index[list(layers)].to(observation.device)
+        zero = observation.new_zeros(*observation.shape[:-1], 1)
+        return take_columns(torch.cat((observation, goal, zero), -1), self._tables[1])

@@ -1,0 +1,43 @@
+"""Goals: rewards, which goals to relabel with, and how useful each of them is."""
+
+from torchrl_her.goals.factors import candidates, combine, draw, draw_alike, draw_weighted
+from torchrl_her.goals.grid import GoalGrid, box_target, kl_divergence, sampled_target
+from torchrl_her.goals.ibs import GoalHistogram, Instructiveness
+from torchrl_her.goals.rewards import EnvReward, GoalReward, RewardFunction, achieved, distance
+from torchrl_her.goals.strategies import (
+    STRATEGIES,
+    Strategy,
+    StrategyFunction,
+    candidate_range,
+    get_strategy,
+    register_strategy,
+    strategy_name,
+)
+from torchrl_her.goals.weights import GoalWeights
+
+__all__ = [
+    "STRATEGIES",
+    "EnvReward",
+    "GoalGrid",
+    "GoalHistogram",
+    "GoalReward",
+    "GoalWeights",
+    "Instructiveness",
+    "RewardFunction",
+    "Strategy",
+    "StrategyFunction",
+    "achieved",
+    "box_target",
+    "candidate_range",
+    "candidates",
+    "combine",
+    "distance",
+    "draw",
+    "draw_alike",
+    "draw_weighted",
+    "get_strategy",
+    "kl_divergence",
+    "register_strategy",
+    "sampled_target",
+    "strategy_name",
+]

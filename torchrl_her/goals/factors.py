@@ -1,0 +1,154 @@
+"""Drawing virtual goals: candidates times weights times filter, then k draws for each transition.
+
+For transition t of an episode of length T, the goal achieved by transition t' is drawn with
+probability proportional to ``candidate(t, t') * weight(g_t') * keep(t, t')``. Plain HER, filtered
+HER, instructive goals (IBS) and their combinations differ only in these factors. All functions work on
+episodes padded to a common horizon T and take any leading batch shape.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchrl_her.goals.strategies import Strategy, candidate_range
+
+_NARROW = 1e3  # greatest weight over the least one for which float32 draws them to a thousandth
+
+
+def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
+    """Which achieved goals each transition may take as its virtual goal, as a table.
+
+    Args:
+        strategy: a name or a function: see :func:`~torchrl_her.goals.candidate_range`.
+        lengths: [...] int64, lengths of the episodes.
+        horizon: T, the length to which they are padded.
+
+    Returns:
+        [..., T, T] of bool, indexed by (t, t'); False wherever t or t' is padding.
+
+    Raises:
+        ValueError: an unknown strategy, or one that leaves the episode.
+
+    Example:
+        >>> candidates("future", torch.tensor(2), 3).int().tolist()
+        [[1, 1, 0], [0, 1, 0], [0, 0, 0]]
+    """
+    time = torch.arange(horizon, device=lengths.device)
+    inside = time < lengths.unsqueeze(-1)
+    return between(*candidate_range(strategy, time, lengths.unsqueeze(-1)), horizon) & inside.unsqueeze(-1)
+
+
+def between(first: Tensor, end: Tensor, horizon: int) -> Tensor:
+    """The candidates of :func:`~torchrl_her.goals.candidate_range` as a mask [..., T]; T is the horizon."""
+    time = torch.arange(horizon, device=first.device)
+    return (time >= first.unsqueeze(-1)) & (time < end.unsqueeze(-1))
+
+
+def combine(candidate: Tensor, weight: Tensor | None = None, keep: Tensor | None = None) -> Tensor:
+    """The product of the factors: how likely each goal is to be drawn, before normalizing.
+
+    Args:
+        candidate: [..., T] of bool, from :func:`~torchrl_her.goals.candidates` or ``between``.
+        weight: [..., T], how useful each achieved goal is, at least 0; None for all alike.
+        keep: [..., T] of bool, the filter; None to keep all. The three are broadcast against each other.
+
+    Returns:
+        [..., T] of float.
+
+    Example:
+        >>> combine(torch.tensor([[True, True], [False, True]]), torch.tensor([1.0, 3.0])).tolist()
+        [[1.0, 3.0], [0.0, 3.0]]
+    """
+    if keep is not None:
+        candidate = candidate & keep
+    if weight is None:
+        return candidate.float()
+    return candidate * weight
+
+
+def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: torch.Generator | None = None) -> Tensor:
+    """Draws k goals, with replacement, for each transition; all its candidates are equally likely.
+
+    The result is that of :func:`~torchrl_her.goals.draw` from a table of candidates. No table is made, as it
+    would be as large as the number of transitions times the horizon.
+
+    Args:
+        first: [...] int64, the first candidate.
+        end: [...] int64, one more than the last candidate; above ``first``.
+        k: number of draws.
+        generator: source of the random numbers.
+
+    Returns:
+        [..., k] of int64, the transition that achieved the goal.
+
+    Example:
+        >>> draw_alike(torch.tensor([5, 7]), torch.tensor([6, 8]), 3).tolist()
+        [[5, 5, 5], [7, 7, 7]]
+    """
+    u = torch.rand(*first.shape, k, device=first.device, generator=generator)
+    return first.unsqueeze(-1) + (u * (end - first).unsqueeze(-1)).long()
+
+
+def draw_weighted(
+    weight: Tensor, first: Tensor, end: Tensor, k: int, *, generator: torch.Generator | None = None
+) -> Tensor:
+    """Draws k goals, with replacement, for each transition, in proportion to the goals' weights.
+
+    The result is that of :func:`~torchrl_her.goals.draw` from a table of the candidates' weights. No table is
+    made: all transitions of an episode look up their draws in the same running sum.
+
+    Args:
+        weight: [..., T], at least 0, of each goal of an episode.
+        first: [..., n] int64, the first candidate of each transition.
+        end: [..., n] int64, one more than the last candidate; above ``first``.
+        k: number of draws.
+        generator: source of the random numbers.
+
+    Returns:
+        [..., n, k] of int64, the transition that achieved the goal. Where all candidates have weight 0
+        one of them is drawn nevertheless, so check the weights of what was drawn.
+
+    Example:
+        >>> weight = torch.tensor([1.0, 0.0, 2.0, 5.0])
+        >>> draw_weighted(weight, torch.tensor([1, 3]), torch.tensor([3, 4]), 2).tolist()
+        [[2, 2], [3, 3]]
+    """
+    # In float32, differences of a running sum would lose weights that are far below the greatest.
+    wide = weight.numel() > 0 and bool(weight.max() > _NARROW * weight.min())
+    cumulative = torch.nn.functional.pad((weight.double() if wide else weight).cumsum(-1), (1, 0))
+    low, high = cumulative.gather(-1, first), cumulative.gather(-1, end)
+    u = torch.rand(*first.shape, k, dtype=cumulative.dtype, device=first.device, generator=generator)
+    mass = low.unsqueeze(-1) + u * (high - low).unsqueeze(-1)
+    # 32 bits are enough, and take half the time
+    index = torch.searchsorted(cumulative, mass.flatten(-2), right=True, out_int32=True).view_as(mass)
+    # u * mass can round up to a weight of 0 at the end of the candidates, and beyond it
+    low, high = (bound.int().unsqueeze(-1) for bound in (first + 1, end))
+    return index.clamp_(low, high).long() - 1
+
+
+def draw(likelihood: Tensor, k: int, *, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    """Draws k goals, with replacement, for each transition.
+
+    Args:
+        likelihood: [..., T], at least 0, from :func:`~torchrl_her.goals.combine`.
+        k: number of draws.
+        generator: source of the random numbers.
+
+    Returns:
+        ``(index, valid)``: [..., k] of int64, the transition that achieved the goal, and [...] of
+        bool, False where all candidates of a transition have likelihood 0 (its indices are then
+        meaningless).
+
+    Example:
+        >>> index, valid = draw(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]), 2)
+        >>> index[0].tolist(), valid.tolist()
+        ([2, 2], [True, False])
+    """
+    cumulative = likelihood.cumsum(-1)
+    total = cumulative[..., -1:]
+    u = torch.rand(*total.shape[:-1], k, dtype=total.dtype, device=total.device, generator=generator)
+    # u * total can round up to total itself, which lies beyond the last goal that may be drawn
+    mass = torch.minimum(u * total, torch.nextafter(total, torch.zeros_like(total)))
+    index = torch.searchsorted(cumulative, mass, right=True)
+    return index.clamp_(max=likelihood.shape[-1] - 1), total.squeeze(-1) > 0

@@ -1,0 +1,184 @@
+"""IBS: a goal's weight is its instructiveness, the target q* minus the proposal q.
+
+Equations are those of chapter 4 (Instructional Based Strategy) of the thesis that the method is from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_her.goals.grid import GoalGrid, kl_divergence
+from torchrl_her.goals.weights import GoalWeights
+
+
+class GoalHistogram(GoalWeights):
+    """Gives all goals the same weight, and counts the virtual goals since the buffer was last emptied.
+
+    Args:
+        grid: cells to count in.
+
+    Attributes:
+        counts: [cells] of int64, on the device of the goals that were counted last.
+
+    Example:
+        >>> histogram = GoalHistogram(GoalGrid(0.0, 1.0, [2]))
+        >>> histogram.update(torch.tensor([[0.1], [0.2], [0.3], [0.8]]))
+        >>> histogram.q.tolist()
+        [0.75, 0.25]
+    """
+
+    alike = True
+
+    def __init__(self, grid: GoalGrid) -> None:
+        self.grid = grid
+        self.counts = torch.zeros(grid.num_cells, dtype=torch.int64)
+
+    @property
+    def q(self) -> Tensor:
+        """The proposal distribution [cells] of float64; zeros before the first write. Equation 4.8."""
+        return self.counts.double() / self.counts.sum().clamp_min(1)
+
+    def divergence_to(self, q_star: Tensor) -> float:
+        """KL(q || q*) in nats for a target [cells]; NaN before the first write, when there is no q."""
+        q = self.q
+        return float(kl_divergence(q, q_star.to(q))) if q.any() else math.nan
+
+    def update(self, goals: Tensor) -> None:
+        cells = self.grid.cell(goals).flatten()
+        self.counts = self.counts.to(cells.device) + cells.bincount(minlength=self.grid.num_cells)
+
+    def clear(self) -> None:
+        self.counts = torch.zeros_like(self.counts)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"counts": self.counts.clone()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        if state["counts"].shape != self.counts.shape:
+            raise ValueError(f"the grid has {self.grid.num_cells} cells, the state {len(state['counts'])}")
+        self.counts = state["counts"].to(self.counts.device, copy=True)
+
+
+class Instructiveness(GoalHistogram):
+    """The weights of IBS: max(q* - q, floor) in a goal's cell. Equations 4.5 and 4.9.
+
+    The kernel's sigma starts larger and shrinks at each :meth:`step` down to its final value. Emptying the
+    buffer (:meth:`clear`) forgets q but not sigma; :meth:`restart` sets sigma back to its first value.
+
+    Args:
+        grid: cells over the range of achieved goals.
+        target: maps a sigma to q* [cells], for instance ``partial(box_target, grid, low, high)``.
+
+    Keyword Args:
+        sigma: the final standard deviation of the kernel, in the unit of the goals.
+        start_factor: the first sigma divided by the final one; at least 1.
+        decay: what a step multiplies the covariance by, in (0, 1]; 1 never shrinks it.
+        floor: the least weight of a goal. At 0, a goal is no longer drawn once q reaches q* in its cell.
+        floor_is_relative: whether ``floor`` is multiplied by the largest q*; the thesis's floor is absolute.
+        subtract: False for the weights q* alone, without q and floor (the sequential architecture).
+
+    Attributes:
+        sigma, q_star: their present values.
+        final_sigma, final_q_star: their values at the end of the schedule.
+
+    Raises:
+        ValueError: an option is out of its range, or the target does not fit the grid.
+
+    Example:
+        >>> grid = GoalGrid(0.0, 1.0, [2])
+        >>> weights = Instructiveness(grid, lambda sigma: torch.tensor([0.25, 0.75]), sigma=0.2)
+        >>> weights(torch.tensor([[0.1], [0.9]])).tolist()
+        [0.25, 0.75]
+        >>> weights.update(torch.tensor([[0.1], [0.6]]))  # q is now a half each
+        >>> weights(torch.tensor([[0.1], [0.9]]))
+        tensor([0.0015, 0.2500])
+    """
+
+    alike = False
+
+    def __init__(
+        self,
+        grid: GoalGrid,
+        target: Callable[[float], Tensor],
+        *,
+        sigma: float,
+        start_factor: float = 3.0,
+        decay: float = 0.9,
+        floor: float = 0.002,
+        floor_is_relative: bool = True,
+        subtract: bool = True,
+    ) -> None:
+        if not 0 < sigma < math.inf:
+            raise ValueError(f"sigma must be positive and finite, got {sigma}")
+        if not 1 <= start_factor < math.inf:
+            raise ValueError(f"start_factor must be at least 1 and finite, got {start_factor}")
+        if not 0 < decay <= 1:
+            raise ValueError(f"decay must be above 0 and at most 1, got {decay}")
+        if not 0 <= floor < math.inf:
+            raise ValueError(f"floor must be at least 0 and finite, got {floor}")
+        super().__init__(grid)
+        self.target, self.final_sigma, self.start_factor, self.decay = target, sigma, start_factor, decay
+        self.floor, self.floor_is_relative, self.subtract = floor, floor_is_relative, subtract
+        self.final_q_star = self._target(sigma)
+        self.restart()
+
+    @property
+    def divergence(self) -> float:
+        """KL(q || q*) in nats, with q* at the final and not the present sigma; NaN before the first write."""
+        return self.divergence_to(self.final_q_star)
+
+    def step(self) -> None:
+        """Shrinks sigma; to be called at the end of each epoch."""
+        self._set_sigma(max(self.final_sigma, self.sigma * math.sqrt(self.decay)))
+
+    def restart(self) -> None:
+        """Sets sigma back to its first value."""
+        self._set_sigma(self.final_sigma * self.start_factor)
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        cells = self.grid.cell(goals)
+        dtype = goals.dtype if goals.is_floating_point() else None  # weights are not integers
+        return self._weights.to(goals.device, dtype).index_select(0, cells.flatten()).view(cells.shape)
+
+    def update(self, goals: Tensor) -> None:
+        super().update(goals)
+        self._refresh()
+
+    def clear(self) -> None:
+        super().clear()
+        self._refresh()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "sigma": self.sigma}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self._set_sigma(state["sigma"])
+
+    def _set_sigma(self, sigma: float) -> None:
+        self.sigma, self.q_star = sigma, self._target(sigma)
+        self._refresh()
+
+    def _target(self, sigma: float) -> Tensor:
+        q_star = self.target(sigma)
+        # NaN fails both comparisons
+        if q_star.shape != self.counts.shape or not ((q_star >= 0).all() and abs(q_star.sum() - 1) < 1e-3):
+            raise ValueError(
+                f"the target must give {self.grid.num_cells} numbers of at least 0 that sum to 1, "
+                f"got a shape of {list(q_star.shape)}, a least of {q_star.min()}, a sum of {q_star.sum()}"
+            )
+        return q_star.double()
+
+    def _refresh(self) -> None:
+        """The table [cells] that weights are looked up in."""
+        q_star = self.q_star = self.q_star.to(self.counts.device)
+        if self.subtract:
+            floor = self.floor * q_star.max() if self.floor_is_relative else self.floor
+            self._weights = (q_star - self.q).clamp_min(floor)
+        else:
+            self._weights = q_star

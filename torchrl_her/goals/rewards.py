@@ -1,0 +1,129 @@
+"""Goals as points: distance, whether one is achieved, and the sparse reward made of that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import reduce
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+
+class RewardFunction(Protocol):
+    """Maps achieved and desired goals [..., g] to (reward, terminated), each [..., 1].
+
+    The achieved goal comes first, as in gymnasium's ``compute_reward``.
+    """
+
+    def __call__(self, achieved_goal: Tensor, desired_goal: Tensor, /) -> tuple[Tensor, Tensor]: ...
+
+
+def distance(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    """Euclidean distance between goals.
+
+    Args:
+        achieved_goal: [..., g].
+        desired_goal: [..., g], broadcast against ``achieved_goal``.
+
+    Returns:
+        [...]
+
+    Example:
+        >>> distance(torch.tensor([0.0, 3.0]), torch.tensor([4.0, 0.0]))
+        tensor(5.)
+    """
+    return torch.linalg.vector_norm(achieved_goal - desired_goal, dim=-1)
+
+
+def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> Tensor:
+    """Whether the achieved goal is nearer to the desired goal than a threshold.
+
+    Args:
+        achieved_goal: [..., g].
+        desired_goal: [..., g], broadcast against ``achieved_goal``.
+        threshold: in the unit of the goals.
+
+    Returns:
+        [...] of bool.
+    """
+    if not achieved_goal.is_floating_point():  # squares of small whole numbers wrap around
+        achieved_goal, desired_goal = achieved_goal.float(), desired_goal.float()
+    # Coordinate by coordinate: summing over so short a dimension would take torch several times as long.
+    pairs = zip(achieved_goal.unbind(-1), desired_goal.unbind(-1), strict=True)
+    return reduce(torch.add, [(one - other).square() for one, other in pairs]) < threshold**2
+
+
+class GoalReward:
+    """The sparse reward: 0 where the goal is achieved, which terminates the episode, and -1 elsewhere.
+
+    Args:
+        threshold: goals nearer than this count as achieved; in the unit of the goals.
+
+    Raises:
+        ValueError: ``threshold`` is not positive.
+
+    Example:
+        >>> reward, terminated = GoalReward(0.1)(torch.zeros(2, 2), torch.tensor([[0.05, 0.0], [0.2, 0.0]]))
+        >>> reward.tolist(), terminated.tolist()
+        ([[0.0], [-1.0]], [[True], [False]])
+    """
+
+    def __init__(self, threshold: float) -> None:
+        if not threshold > 0:
+            raise ValueError(f"threshold must be positive, got {threshold}")
+        self.threshold = threshold
+
+    def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns (reward, terminated), each [..., 1], for goals [..., g]."""
+        terminated = achieved(achieved_goal, desired_goal, self.threshold).unsqueeze(-1)
+        dtype = achieved_goal.dtype if achieved_goal.is_floating_point() else torch.get_default_dtype()
+        return terminated.to(dtype) - 1.0, terminated
+
+
+class EnvReward:
+    """An environment's own functions as a :class:`~torchrl_her.goals.RewardFunction`.
+
+    Args:
+        compute_reward: (achieved, desired) goals [..., g] to rewards [..., 1].
+        compute_terminated: (achieved, desired) goals [..., g] to bool [..., 1]: where the episode terminates.
+
+    Example:
+        >>> rule = EnvReward(lambda a, d: -(a - d).abs(), lambda a, d: a == d)
+        >>> rule(torch.tensor([1.0]), torch.tensor([3.0]))
+        (tensor([-2.]), tensor([False]))
+    """
+
+    def __init__(
+        self,
+        compute_reward: Callable[[Tensor, Tensor], Tensor],
+        compute_terminated: Callable[[Tensor, Tensor], Tensor],
+    ) -> None:
+        self.compute_reward = compute_reward
+        self.compute_terminated = compute_terminated
+
+    def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns (reward, terminated), each [..., 1], for goals [..., g]."""
+        return self.compute_reward(achieved_goal, desired_goal), self.compute_terminated(
+            achieved_goal, desired_goal
+        )
+
+
+def missed(
+    reward_fn: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor, achieved_reward: float
+) -> Tensor:
+    """Where a goal is not achieved, as the reward tells: [...] of bool, for goals [..., g].
+
+    ``terminated`` is half of the work and not needed, so it is not computed where that can be avoided.
+
+    Args:
+        reward_fn: maps (achieved, desired) goals to (reward, terminated).
+        achieved_goal: [..., g].
+        desired_goal: [..., g], broadcast against ``achieved_goal``.
+        achieved_reward: the reward of an achieved goal.
+    """
+    if isinstance(reward_fn, EnvReward):
+        value = reward_fn.compute_reward(achieved_goal, desired_goal)
+    else:
+        value = reward_fn(achieved_goal, desired_goal)[0]
+    return value.squeeze(-1) < achieved_reward

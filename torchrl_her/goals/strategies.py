@@ -1,0 +1,139 @@
+"""Goal strategies: which achieved goals of an episode a transition may take, and their registry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from difflib import get_close_matches
+
+import torch
+from torch import Tensor
+
+StrategyFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+Strategy = str | StrategyFunction
+
+
+def future(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """The goals that this action and all later ones achieved."""
+    return time, lengths
+
+
+def final(_time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """The goal that the episode's last action achieved."""
+    return lengths - 1, lengths
+
+
+def episode(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """All goals that were achieved in the episode, earlier ones too."""
+    return torch.zeros_like(time), lengths
+
+
+STRATEGIES: dict[str, StrategyFunction] = {"future": future, "final": final, "episode": episode}
+_SAFE = tuple(STRATEGIES.values())  # these never leave the episode, so that is not checked
+
+
+def register_strategy(name: str, function: StrategyFunction) -> None:
+    """Gives a goal strategy a name, which is then accepted wherever ``"future"`` is.
+
+    A function can also be used without a name: ``HERWriter(reward_fn, strategy=function)``.
+
+    Args:
+        name: not yet taken.
+        function: maps the steps of transitions and the lengths of their episodes, both [...] int64, to
+            ``(first, end)``, both [...] int64: the candidates are the transitions ``first <= t' < end``.
+            There must be at least one, and all must lie within the episode.
+
+    Raises:
+        ValueError: the name is taken or empty.
+        TypeError: the function cannot be called.
+
+    Example:
+        >>> def next_two(time, lengths):
+        ...     return time, torch.minimum(time + 2, lengths)
+        >>> register_strategy("next_two", next_two)
+        >>> get_strategy("next_two") is next_two
+        True
+        >>> del STRATEGIES["next_two"]  # for this example only
+    """
+    if not name:
+        raise ValueError(f"a goal strategy needs a name, got {name!r}")
+    if name in STRATEGIES:
+        raise ValueError(f"the name {name!r} is taken by another goal strategy; taken are {_known()}")
+    if not callable(function):
+        raise TypeError(f"goal strategy {name!r} must be a function, got {function!r}")
+    STRATEGIES[name] = function
+
+
+def get_strategy(strategy: Strategy) -> StrategyFunction:
+    """The function of a goal strategy that is given by its name, or as a function already.
+
+    Raises:
+        ValueError: there is no strategy of that name.
+
+    Example:
+        >>> first, end = get_strategy("future")(torch.tensor([0, 1]), torch.tensor([2, 2]))
+        >>> first.tolist(), end.tolist()
+        ([0, 1], [2, 2])
+    """
+    if callable(strategy):
+        return strategy
+    if strategy in STRATEGIES:
+        return STRATEGIES[strategy]
+    nearest = get_close_matches(str(strategy), STRATEGIES, n=1)
+    hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+    raise ValueError(f"unknown goal strategy {strategy!r}; the strategies are {_known()}{hint}")
+
+
+def strategy_name(strategy: Strategy) -> str:
+    """What to call a strategy in a report: its name, or that of its function.
+
+    Example:
+        >>> strategy_name("final"), strategy_name(future)
+        ('final', 'future')
+    """
+    if isinstance(strategy, str):
+        return strategy
+    return getattr(strategy, "__name__", type(strategy).__name__)
+
+
+def candidate_range(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """The first candidate of each transition, and the end of its candidates.
+
+    A candidate is a transition t' of the same episode. Its achieved goal is that of the state it leads
+    to, so with ``"future"`` (t' >= t) no goal is achieved before the action. Andrychowicz et al.,
+    Hindsight Experience Replay, 2017, section 4.5.
+
+    Args:
+        strategy: ``"future"``, ``"final"``, ``"episode"`` (any transition of the episode), another name
+            given to :func:`~torchrl_her.register_strategy`, or a function.
+        time: [...] int64, the transitions' steps t, from 0.
+        lengths: [...] int64, lengths of their episodes; broadcast against ``time``.
+
+    Returns:
+        ``(first, end)``, [...] each: the candidates are ``first <= t' < end``.
+
+    Raises:
+        ValueError: an unknown strategy, or a function of one's own that gives a transition no candidate,
+            or one outside of its episode.
+
+    Example:
+        >>> first, end = candidate_range("future", torch.tensor([0, 1]), torch.tensor(2))
+        >>> first.tolist(), end.tolist()
+        ([0, 1], [2, 2])
+    """
+    function = get_strategy(strategy)
+    time, lengths = torch.broadcast_tensors(time, lengths)
+    first, end = function(time, lengths)
+    if not any(function is safe for safe in _SAFE):
+        first, end, _ = torch.broadcast_tensors(first, end, time)
+        wrong = (time < lengths) & ((first < 0) | (first >= end) | (end > lengths))  # padding may be anything
+        if bool(wrong.any()):
+            t, length, low, high = (int(x[wrong][0]) for x in (time, lengths, first, end))
+            raise ValueError(
+                f"goal strategy {strategy_name(strategy)!r} gives step {t} of an episode of {length} the "
+                f"candidates first={low}, end={high}, but 0 <= first < end <= {length} must hold"
+            )
+    return first, end
+
+
+def _known() -> str:
+    return ", ".join(STRATEGIES)

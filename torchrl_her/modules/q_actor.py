@@ -1,0 +1,88 @@
+"""The values of discrete actions, and the policy that is greedy in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import Categorical
+from torchrl.modules import QValueActor
+
+from torchrl_her.modules.networks import StackedLinear, by_run, hidden_layer
+
+
+class QNet(nn.Module):
+    """(observation, goal) to the values of all actions.
+
+    Args:
+        inputs: width of all inputs together.
+        actions: how many actions there are.
+        hidden: width of each of the three hidden layers.
+        runs: R, how many independent networks.
+
+    Example:
+        >>> QNet(6, 4)(torch.zeros(2, 3), torch.zeros(2, 3)).shape
+        torch.Size([2, 4])
+    """
+
+    def __init__(self, inputs: int, actions: int, *, hidden: int = 64, runs: int = 1) -> None:
+        super().__init__()
+        self.runs = runs
+        widths = [inputs, hidden, hidden, hidden]
+        layers = [hidden_layer(widths[i], widths[i + 1], runs=runs) for i in range(3)]
+        self.layers = nn.Sequential(*layers, StackedLinear(hidden, actions, runs=runs))
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """[..., widths] of the inputs to [..., actions]."""
+        x = torch.cat(inputs, -1)
+        return self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
+
+
+class _ChosenValue(nn.Module):
+    """(observation, goal, action) to the action's value [..., 1]."""
+
+    def __init__(self, net: QNet) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        *seen, action = inputs
+        return self.net(*seen).gather(-1, action.unsqueeze(-1))
+
+
+def make_q_actor(
+    widths: Sequence[int],
+    actions: int,
+    *,
+    hidden: int = 64,
+    runs: int = 1,
+    in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
+    value_key: NestedKey = "state_action_value",
+) -> tuple[QValueActor, TensorDictModule]:
+    """A policy that is greedy in the values of a :class:`~torchrl_her.modules.QNet`, and the matching critic.
+
+    Args:
+        widths: of the inputs, one for each of ``in_keys``.
+        actions: how many actions there are; they are integers (``Categorical``).
+        hidden: width of the hidden layers.
+        runs: R, how many independent networks.
+        in_keys: what it sees; the goal must be among them.
+        value_key: where the value of a given action is written.
+
+    Returns:
+        ``(actor, critic)``, which share their weights; the critic gives the value of the action that it is
+        given.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> actor, critic = make_q_actor((3, 3), 4)
+        >>> seen = TensorDict({"observation": torch.zeros(2, 3), "desired_goal": torch.ones(2, 3)}, [2])
+        >>> critic(actor(seen))["state_action_value"].shape
+        torch.Size([2, 1])
+    """
+    net = QNet(sum(widths), actions, hidden=hidden, runs=runs)
+    actor = QValueActor(net, spec=Categorical(actions), in_keys=list(in_keys), action_space="categorical")
+    return actor, TensorDictModule(_ChosenValue(net), in_keys=[*in_keys, "action"], out_keys=[value_key])

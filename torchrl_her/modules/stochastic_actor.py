@@ -1,0 +1,76 @@
+"""The stochastic actor of SAC: a normal distribution squashed into the range of actions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import Bounded
+from torchrl.modules import ProbabilisticActor, TanhNormal
+
+from torchrl_her.modules.networks import StackedLinear, hidden_layer
+
+_LEAST_SCALE, _GREATEST_SCALE = -10.0, 2.0  # of the logarithm: Haarnoja et al., 2018
+
+
+class StochasticActorNet(nn.Module):
+    """(observation, goal) to the location and the scale of a normal distribution.
+
+    Args:
+        inputs: width of all inputs together.
+        actions: width of the action.
+        hidden: width of each of the three hidden layers.
+
+    Example:
+        >>> location, scale = StochasticActorNet(11, 3)(torch.zeros(2, 9), torch.zeros(2, 2))
+        >>> location.shape, bool((scale > 0).all())
+        (torch.Size([2, 3]), True)
+    """
+
+    def __init__(self, inputs: int, actions: int, *, hidden: int = 64) -> None:
+        super().__init__()
+        widths = [inputs, hidden, hidden, hidden]
+        layers = [hidden_layer(widths[i], widths[i + 1]) for i in range(3)]
+        self.layers = nn.Sequential(*layers, StackedLinear(hidden, 2 * actions))
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """[..., widths] of the inputs to two of [..., actions]."""
+        x = torch.cat(inputs, -1)
+        out = self.layers(x.reshape(1, -1, x.shape[-1])).view(*x.shape[:-1], -1)
+        location, scale = out.chunk(2, -1)
+        return location, scale.clamp(_LEAST_SCALE, _GREATEST_SCALE).exp()
+
+
+def make_stochastic_actor(
+    widths: Sequence[int],
+    action_spec: Bounded,
+    *,
+    hidden: int = 64,
+    in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
+) -> ProbabilisticActor:
+    """SAC's actor: draws from a squashed normal distribution; its greedy action is the squashed location.
+
+    Args:
+        widths: of the inputs, one for each of ``in_keys``.
+        action_spec: least and greatest actions, of one environment.
+        hidden: width of the hidden layers.
+        in_keys: what it sees; the goal must be among them.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> actor = make_stochastic_actor((9, 2), Bounded(-1.0, 1.0, (3,)))
+        >>> seen = TensorDict({"observation": torch.zeros(4, 9), "desired_goal": torch.zeros(4, 2)}, [4])
+        >>> actor(seen)["action"].shape
+        torch.Size([4, 3])
+    """
+    net = StochasticActorNet(sum(widths), action_spec.shape[-1], hidden=hidden)
+    return ProbabilisticActor(
+        TensorDictModule(net, in_keys=list(in_keys), out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": action_spec.space.low, "high": action_spec.space.high},
+        spec=action_spec,
+    )

@@ -1,0 +1,18 @@
+"""TorchRL's losses of DDPG, TD3, SAC and DQN, with clamped targets; DDPG with an action L2 penalty."""
+
+from torchrl_her.objectives.ddpg import PenalizedDDPGLoss, make_ddpg_loss
+from torchrl_her.objectives.dqn import make_dqn_loss
+from torchrl_her.objectives.sac import make_sac_loss
+from torchrl_her.objectives.targets import ClampedTD0, clamped_td0, make_target_updater
+from torchrl_her.objectives.td3 import make_td3_loss
+
+__all__ = [
+    "ClampedTD0",
+    "PenalizedDDPGLoss",
+    "clamped_td0",
+    "make_ddpg_loss",
+    "make_dqn_loss",
+    "make_sac_loss",
+    "make_target_updater",
+    "make_td3_loss",
+]

@@ -1,0 +1,79 @@
+"""Clamped one-step targets, and how target networks follow the online ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
+from torchrl.objectives.utils import TargetNetUpdater
+from torchrl.objectives.value import TD0Estimator
+
+
+class ClampedTD0(TD0Estimator):
+    """One-step targets, clamped to the values that are possible.
+
+    With rewards in [-1, 0], for example, no value is below -1 / (1 - gamma) or above 0. Andrychowicz et al.,
+    Hindsight Experience Replay, 2017, appendix A.
+
+    Args:
+        low: least target.
+        high: greatest target.
+        **kwargs: of :class:`torchrl.objectives.value.TD0Estimator`.
+    """
+
+    def __init__(self, *, low: float, high: float, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.low, self.high = low, high
+
+    def value_estimate(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Tensor:
+        """The targets, clamped."""
+        return super().value_estimate(tensordict, *args, **kwargs).clamp(self.low, self.high)
+
+
+def clamped_td0(
+    gamma: float, reward_range: tuple[float, float], value_network: TensorDictModule | None = None
+) -> ClampedTD0:
+    """One-step targets for ``loss.make_value_estimator``, clamped to the returns that are possible.
+
+    Args:
+        gamma: discount, in [0, 1).
+        reward_range: least and greatest reward.
+        value_network: gives the value of the next state; None if the loss passes it.
+
+    Raises:
+        ValueError: ``gamma`` is outside of [0, 1).
+    """
+    if not 0.0 <= gamma < 1.0:
+        raise ValueError(f"gamma must be in [0, 1), got {gamma}")
+    least, greatest = reward_range
+    return ClampedTD0(
+        low=min(least, least / (1.0 - gamma)),  # paid once, if the episode ends there, or forever
+        high=max(greatest, greatest / (1.0 - gamma)),
+        gamma=gamma,
+        value_network=value_network,
+    )
+
+
+def make_target_updater(loss: LossModule, *, tau: float, hard_interval: int) -> TargetNetUpdater:
+    """What moves the target networks of a loss, one step at a time.
+
+    Args:
+        loss: with target networks.
+
+    Keyword Args:
+        tau: share of the online weights in a soft update, which follows each step if ``hard_interval`` is 0.
+        hard_interval: copies the online weights every so many steps; 0 for soft updates.
+
+    Example:
+        >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss
+        >>> loss = make_ddpg_loss(make_actor((9, 2), 3), make_critic((9, 2), 3))
+        >>> type(make_target_updater(loss, tau=0.01, hard_interval=0)).__name__
+        'SoftUpdate'
+    """
+    if hard_interval > 0:
+        # TorchRL counts that many steps without a copy before each step with one
+        return HardUpdate(loss, value_network_update_interval=hard_interval - 1)
+    return SoftUpdate(loss, tau=tau)

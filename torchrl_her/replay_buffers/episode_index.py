@@ -1,0 +1,102 @@
+"""Finding the episodes of a ring buffer, and which rows of the storage belong to each of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class EpisodeIndex:
+    """Where the episodes of a ring buffer lie.
+
+    A row is a stored transition, a lane is an environment, and a run is a stretch of rows of one lane that
+    belong to the same episode without a break. Each row has a *position*, in the order of lanes and then
+    time, and a *place*: in the order of places, all rows of an episode follow each other.
+
+    Attributes:
+        slots: T, the length of the ring, as far as it is filled.
+        lanes: N, rows in each slot; row ``slot * N + lane`` is that of a lane in a slot.
+        oldest: slot of the oldest rows.
+        begins: [R] int64, positions at which runs begin, ascending.
+        places: [R] int64, the places of the rows at ``begins``.
+        ordered_begins: [R] int64, ``begins`` in the order of episodes.
+        ordered_places: [R] int64, ``places`` in the order of episodes, ascending.
+        first: [E + 1] int64, places at which episodes begin, and the number of all rows.
+    """
+
+    slots: int
+    lanes: int
+    oldest: int
+    begins: Tensor
+    places: Tensor
+    ordered_begins: Tensor
+    ordered_places: Tensor
+    first: Tensor
+
+    def place(self, row: Tensor) -> Tensor:
+        """Places [...] of rows [...]."""
+        position = row % self.lanes * self.slots + (row // self.lanes - self.oldest) % self.slots
+        run = torch.searchsorted(self.begins, position, right=True) - 1
+        return self.places[run] + position - self.begins[run]
+
+    def row(self, place: Tensor) -> Tensor:
+        """The rows [...] at places [...], the inverse of :meth:`place`."""
+        run = torch.searchsorted(self.ordered_places, place, right=True) - 1
+        position = self.ordered_begins[run] + place - self.ordered_places[run]
+        return (position % self.slots + self.oldest) % self.slots * self.lanes + position // self.slots
+
+    def episode(self, place: Tensor) -> tuple[Tensor, Tensor]:
+        """For places [...], the places at which their episodes begin, and those after their newest rows."""
+        episode = torch.searchsorted(self.first, place, right=True) - 1
+        return self.first[episode], self.first[episode + 1]
+
+
+def index_episodes(done: Tensor, trajectory: Tensor | None = None, *, oldest: int = 0) -> EpisodeIndex:
+    """Finds the episodes of a ring buffer.
+
+    An episode ends with a row that is done, before a row of its lane with another trajectory id, or with the
+    newest row. In flat storages, rows with the same id belong together wherever they lie, since a
+    collector's batches, flattened, hold a stretch of each environment in turn. Without ids, flat rows are
+    one lane.
+
+    Args:
+        done: [T, N] of bool, time first, N environments; or flat, [T].
+        trajectory: ids of the trajectories, integers of the same shape. In flat storages, an id may only be
+            used again after its episode was done.
+        oldest: slot of the oldest row: 0 until the ring is full, then the slot that is overwritten next.
+
+    Returns:
+        The index. An episode that was partly overwritten consists of the rows that are left.
+
+    Example:
+        >>> # Slots 0 and 1 were written last: trajectory 3 began in slot 4, and goes on in them
+        >>> index = index_episodes(torch.zeros(5).bool(), torch.tensor([3, 3, 1, 1, 3]), oldest=2)
+        >>> first, end = index.episode(index.place(torch.tensor([0, 2])))
+        >>> [index.row(torch.arange(*bounds)).tolist() for bounds in zip(first, end)]
+        [[4, 0, 1], [2, 3]]
+    """
+    slots, rows = len(done), done.numel()
+    new = done.roll(1, 0)  # whether an episode begins: the row before was done
+    if trajectory is not None:
+        new[1:] |= trajectory[1:] != trajectory[:-1]
+        new[0] |= trajectory[0] != trajectory[-1]
+    new[oldest] = True
+    # Only these flags are put in the order of time: moving the ids would take eight times as long.
+    begins = new.roll(-oldest, 0).t().reshape(-1).nonzero().squeeze(-1)
+    lanes, behind = rows // slots, begins.new_tensor([rows])
+    if trajectory is None or done.ndim > 1:  # every run is an episode
+        first = torch.cat((begins, behind))
+        return EpisodeIndex(slots, lanes, oldest, begins, begins, begins, begins, first)
+    lengths = begins.diff(append=behind)
+    own, order = trajectory[(begins + oldest) % slots].sort(stable=True)
+    ordered_begins, ordered_lengths = begins[order], lengths[order]
+    ordered_places = ordered_lengths.cumsum(0) - ordered_lengths
+    places = torch.empty_like(begins).index_copy_(0, order, ordered_places)
+    whole = done[(ordered_begins + ordered_lengths - 1 + oldest) % slots]
+    opens = torch.ones_like(whole)
+    opens[1:] = (own[1:] != own[:-1]) | whole[:-1]
+    first = torch.cat((ordered_places[opens], behind))
+    return EpisodeIndex(slots, lanes, oldest, begins, places, ordered_begins, ordered_places, first)

@@ -1,0 +1,76 @@
+"""Finding whole episodes among the transitions of many environments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Whole episodes, as positions of transitions (rows) in a batch.
+
+    Attributes:
+        rows: [E, T] int64; an episode shorter than T is padded with its last row.
+        lengths: [E] int64.
+    """
+
+    rows: Tensor
+    lengths: Tensor
+
+    @property
+    def inside(self) -> Tensor:
+        """[E, T] of bool: which entries are not padding."""
+        return torch.arange(self.rows.shape[1], device=self.rows.device) < self.lengths.unsqueeze(-1)
+
+    def split(self, size: int) -> list[Episodes]:
+        """The same episodes in order, at most ``size`` at a time."""
+        starts = range(0, len(self.lengths), size)
+        return [Episodes(self.rows[i : i + size], self.lengths[i : i + size]) for i in starts]
+
+
+def find_episodes(lanes: Tensor, done: Tensor, trajectory: Tensor | None = None) -> tuple[Episodes, Tensor]:
+    """Sorts rows into whole episodes and rows of episodes that are still open.
+
+    An episode ends with a row that is done, or before a row of its lane with another trajectory id, as when
+    an environment was reset from outside.
+
+    Args:
+        lanes: [n] int64, the environment or trajectory that each row is of. Rows of one lane are in the order
+            of time, one episode after the other.
+        done: [n] of bool.
+        trajectory: [n] of int64, ids of the trajectories, if lanes are environments.
+
+    Returns:
+        ``(episodes, left)``: the whole episodes, and the positions [m] of all other rows, in order.
+
+    Example:
+        >>> lanes = torch.tensor([0, 1, 0, 1, 0])  # two environments, three and two steps
+        >>> done = torch.tensor([False, False, True, False, False])
+        >>> episodes, left = find_episodes(lanes, done)
+        >>> episodes.rows.tolist(), left.tolist()
+        ([[0, 2]], [1, 3, 4])
+    """
+    order = torch.arange(len(lanes), device=lanes.device)
+    if bool((lanes[1:] < lanes[:-1]).any()):  # a batch [N, T] comes in order, and sorting takes long
+        order = lanes.argsort(stable=True)
+    lane, end = lanes[order], done[order].clone()
+    same_lane = lane[1:] == lane[:-1]
+    if trajectory is not None:
+        ids = trajectory[order]
+        end[:-1] |= same_lane & (ids[1:] != ids[:-1])
+    begins = torch.ones_like(end)
+    begins[1:] = end[:-1] | ~same_lane
+    first = begins.nonzero().squeeze(-1)
+    length = torch.diff(first, append=first.new_tensor([len(lanes)]))
+    whole = end[first + length - 1]
+    left = order[~whole.repeat_interleave(length)].sort().values
+    return _pad(order, first[whole], length[whole]), left
+
+
+def _pad(order: Tensor, first: Tensor, length: Tensor) -> Episodes:
+    horizon = int(length.max()) if len(length) else 0
+    step = torch.arange(horizon, device=order.device).minimum(length.unsqueeze(-1) - 1)
+    return Episodes(order[first.unsqueeze(-1) + step], length)

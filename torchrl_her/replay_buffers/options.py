@@ -1,0 +1,172 @@
+"""The options that :class:`~torchrl_her.HERWriter` and :class:`~torchrl_her.HERSampleUnit` share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
+from typing import Any, Generic, TypeVar, overload
+
+from tensordict import NestedKey, unravel_key
+from torch import Tensor
+
+from torchrl_her.goals.rewards import RewardFunction, missed
+from torchrl_her.goals.strategies import Strategy, get_strategy
+from torchrl_her.goals.weights import GoalWeights
+from torchrl_her.replay_buffers.keys import TransitionKeys, in_root_and_next, under_next
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HindsightOptions:
+    """How transitions are relabeled, and under which keys their entries are.
+
+    Args:
+        k: virtual transitions for each real one (on average, when relabeling while sampling); 0 makes none.
+        strategy: which achieved goals of its episode a transition may take: ``"future"`` (those achieved by
+            its action or later), ``"final"`` (the last one), ``"episode"`` (any), another name given to
+            :func:`~torchrl_her.register_strategy`, or a function as described there.
+        filter_achieved: take no goal that was already achieved in the state before the action
+            (Filtered-HER). This asks the reward and not ``terminated``, since many environments never
+            terminate.
+        achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved.
+        exclude: entries to leave out, in the root and under ``next``. ``state`` is one of them because it
+            holds the real goal. Add whatever else was computed from the desired goal.
+        achieved_goal_key, desired_goal_key: goals, in the root and under ``next``.
+        reward_key, terminated_key, truncated_key, done_key: under ``next``.
+        trajectory_key: ids that tell trajectories apart; the entry may be missing.
+        virtual_key: where a bool [..., 1] marks virtual transitions; None for no mark.
+
+    Raises:
+        ValueError: ``k`` is negative, or there is no such strategy.
+        TypeError: ``exclude`` is a single key.
+
+    Example:
+        >>> options = HindsightOptions(k=8, filter_achieved=True)
+        >>> options.k, options.strategy
+        (8, 'future')
+    """
+
+    k: int = 4
+    strategy: Strategy = "future"
+    filter_achieved: bool = False
+    achieved_reward: float = 0.0
+    exclude: Sequence[NestedKey] = ("state",)
+    achieved_goal_key: NestedKey = "achieved_goal"
+    desired_goal_key: NestedKey = "desired_goal"
+    reward_key: NestedKey = "reward"
+    terminated_key: NestedKey = "terminated"
+    truncated_key: NestedKey = "truncated"
+    done_key: NestedKey = "done"
+    trajectory_key: NestedKey = ("collector", "traj_ids")
+    virtual_key: NestedKey | None = "virtual"
+
+    def __post_init__(self) -> None:
+        if self.k < 0:
+            raise ValueError(f"k must be at least 0, got {self.k}")
+        get_strategy(self.strategy)
+        in_root_and_next(self.exclude)
+
+    def changed(self, changes: dict[str, Any]) -> HindsightOptions:
+        """The same options, some of them changed.
+
+        Raises:
+            TypeError: there is no option of one of these names.
+
+        Example:
+            >>> HindsightOptions(k=8).changed({"strategy": "final"}).strategy
+            'final'
+        """
+        known = [field.name for field in fields(self)]
+        for name in changes:
+            if name not in known:
+                nearest = get_close_matches(name, known, n=1)
+                hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
+                raise TypeError(f"there is no option {name!r}{hint} The options are {', '.join(known)}")
+        return replace(self, **changes)
+
+    def transition_keys(self) -> TransitionKeys:
+        """The full keys of what relabeling reads and writes."""
+        return TransitionKeys(
+            achieved=unravel_key(self.achieved_goal_key),
+            next_achieved=under_next(self.achieved_goal_key),
+            goals=(unravel_key(self.desired_goal_key), under_next(self.desired_goal_key)),
+            reward=under_next(self.reward_key),
+            terminated=under_next(self.terminated_key),
+            truncated=under_next(self.truncated_key),
+            done=under_next(self.done_key),
+            trajectory=unravel_key(self.trajectory_key),
+        )
+
+
+class _Option(Generic[T]):
+    """One of the options, to be read and set as an attribute of what they belong to."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> _Option[T]: ...
+    @overload
+    def __get__(self, instance: Any, owner: type) -> T: ...
+
+    def __get__(self, instance: Any, owner: type) -> _Option[T] | T:
+        return self if instance is None else getattr(instance.options, self.name)
+
+    def __set__(self, instance: Any, value: T) -> None:
+        instance.options = replace(instance.options, **{self.name: value})
+
+
+class HindsightBase:
+    """What relabeling in a writer and relabeling while sampling have in common.
+
+    Args:
+        reward_fn: maps (achieved, desired) goals to (reward, terminated).
+        options: None for the defaults.
+
+    Keyword Args:
+        weights: prefers some goals to others; None for all alike.
+        **changes: options that differ from ``options``.
+
+    Attributes:
+        options: as a whole; assign another :class:`~torchrl_her.HindsightOptions` to change them.
+        k, strategy, filter_achieved, achieved_reward: the options of that name; can be set, too.
+
+    Raises:
+        ValueError: an option that cannot be.
+        TypeError: an unknown option.
+    """
+
+    k = _Option[int]()
+    strategy = _Option[Strategy]()
+    filter_achieved = _Option[bool]()
+    achieved_reward = _Option[float]()
+
+    def __init__(
+        self,
+        reward_fn: RewardFunction,
+        options: HindsightOptions | None = None,
+        *,
+        weights: GoalWeights | None = None,
+        **changes: Any,
+    ) -> None:
+        super().__init__()
+        if options is not None and not isinstance(options, HindsightOptions):
+            raise TypeError(f"options must be HindsightOptions or None, got {options!r}")
+        self.reward_fn, self.weights = reward_fn, weights
+        self.options = (options or HindsightOptions()).changed(changes)
+
+    @property
+    def options(self) -> HindsightOptions:
+        """How transitions are relabeled."""
+        return self._options
+
+    @options.setter
+    def options(self, options: HindsightOptions) -> None:
+        self._options = options
+        self._keys, self._exclude = options.transition_keys(), in_root_and_next(options.exclude)
+
+    def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
+        """The filter, [...]: False where a goal [..., g] was already achieved before the action."""
+        return missed(self.reward_fn, before, goals, self.achieved_reward)

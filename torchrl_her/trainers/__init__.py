@@ -1,0 +1,45 @@
+"""The training loop: learners, evaluation metrics, checkpoints."""
+
+from torchrl_her.trainers.checkpoint import (
+    CheckpointError,
+    buffer_state_dict,
+    collector_state_dict,
+    load_buffer_state_dict,
+    load_checkpoint,
+    load_collector_state_dict,
+    load_newest_checkpoint,
+    save_checkpoint,
+)
+from torchrl_her.trainers.compile import CompiledOnce
+from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner, can_fuse, is_plain_adam
+from torchrl_her.trainers.learner import Learner, LossLearner
+from torchrl_her.trainers.metrics import discounted_return, final_distance, first_episode, q_bias, success
+from torchrl_her.trainers.runs import clip_by_run, keep_runs
+from torchrl_her.trainers.trainer import Schedule, Trainer, evaluate
+
+__all__ = [
+    "CheckpointError",
+    "CompiledOnce",
+    "FusedDDPGLearner",
+    "Learner",
+    "LossLearner",
+    "Schedule",
+    "Trainer",
+    "buffer_state_dict",
+    "can_fuse",
+    "clip_by_run",
+    "collector_state_dict",
+    "discounted_return",
+    "evaluate",
+    "final_distance",
+    "first_episode",
+    "is_plain_adam",
+    "keep_runs",
+    "load_buffer_state_dict",
+    "load_checkpoint",
+    "load_collector_state_dict",
+    "load_newest_checkpoint",
+    "q_bias",
+    "save_checkpoint",
+    "success",
+]

@@ -1,0 +1,304 @@
+"""Checkpoints of a whole run: written atomically, checksummed, and made of tensors and plain data only."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import warnings
+from collections import OrderedDict
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torch.utils.serialization import config
+from torchrl.collectors import BaseCollector
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler
+
+_MAGIC = b"torchrl-her checkpoint 1\n"
+_PIECE = 1 << 26  # bytes that are written before they are synced to disk
+_BODY = len(_MAGIC) + hashlib.sha256().digest_size  # where it begins
+
+
+_PLAIN = (bool, int, float, complex, str, bytes, type(None), torch.Size, torch.dtype, torch.device)
+
+
+class CheckpointError(ValueError):
+    """A file is not a checkpoint, or is damaged."""
+
+
+class _Stream:
+    """What torch.save writes to: a file, and the checksum of what went into it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file, self.hash = file, hashlib.sha256()
+        self.flush = file.flush
+        self._waiting = 0
+
+    def write(self, data: bytes) -> int:
+        self.hash.update(data)
+        written = self.file.write(data)
+        self._waiting += written
+        if self._waiting >= _PIECE:
+            self.sync()
+        return written
+
+    def sync(self) -> None:
+        """Syncs to disk and empties the page cache of the file, whose growth would slow down writing."""
+        self.file.flush()
+        os.fsync(self.file.fileno())
+        if hasattr(os, "posix_fadvise"):
+            os.posix_fadvise(self.file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        self._waiting = 0
+
+
+def save_checkpoint(state: dict[str, Any], path: str | Path, *, keep: int = 1) -> None:
+    """Writes a checkpoint atomically: the file is always either the new checkpoint or the one before.
+
+    Args:
+        state: nested dicts and lists of tensors and plain data.
+        path: the file. It is written under another name beside it and renamed when it is on the disk.
+
+    Keyword Args:
+        keep: how many checkpoints to keep: ``checkpoint.pt`` is the newest, ``checkpoint.1.pt`` the one
+            before it, and so on.
+
+    Raises:
+        TypeError: something in ``state`` is neither a tensor nor plain data, so it could not be loaded.
+        OSError: the file cannot be written; the one before is untouched.
+    """
+    _check_plain(state, "the state")
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        with open(part, "wb") as file:
+            _write(state, file)
+        for newer, older in reversed(list(pairwise(_generations(path, keep)))):
+            if newer.exists():
+                os.replace(newer, older)
+        os.replace(part, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        part.unlink(missing_ok=True)  # missing if all went well; otherwise it would waste a full disk
+    _sync_folder(path.parent)
+
+
+def _check_plain(value: Any, name: str) -> None:
+    """Raises a TypeError that names the entry that a safe load would refuse."""
+    if type(value) in (dict, OrderedDict):
+        for key, entry in value.items():
+            _check_plain(entry, f"{name}[{key!r}]")
+    elif type(value) in (list, tuple):
+        for index, entry in enumerate(value):
+            _check_plain(entry, f"{name}[{index}]")
+    elif not isinstance(value, Tensor) and type(value) not in _PLAIN:  # numpy's floats are floats, too
+        raise TypeError(f"{name} must be a tensor or plain data, got {type(value).__name__} {value!r}")
+
+
+def _write(state: dict[str, Any], file: BinaryIO) -> None:
+    """Writes mark, checksum and torch's file to disk, without ever holding the file in memory."""
+    file.write(_MAGIC.ljust(_BODY, b"\0"))
+    stream = _Stream(file)
+    try:
+        # Without torch's own checksum, which would add half of the time of ours.
+        with config.patch("save.compute_crc32", False):  # type: ignore[attr-defined]
+            torch.save(state, stream)  # type: ignore[arg-type]
+    except RuntimeError as error:
+        if isinstance(error.__context__, OSError):  # torch hides why it could not write
+            raise error.__context__ from None
+        raise
+    file.seek(len(_MAGIC))
+    file.write(stream.hash.digest())
+    stream.sync()
+
+
+def _generations(path: Path, keep: int) -> list[Path]:
+    """The paths of a checkpoint and of those before it, the newest first."""
+    return [path, *(path.with_name(f"{path.stem}.{age}{path.suffix}") for age in range(1, keep))]
+
+
+def _sync_folder(folder: Path) -> None:
+    """Makes the renaming of files survive a loss of power."""
+    if os.name == "posix":  # elsewhere a folder cannot be opened
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+
+
+def load_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Reads a checkpoint. Nothing in the file is executed.
+
+    Args:
+        path: a file that :func:`~torchrl_her.save_checkpoint` wrote.
+
+    Raises:
+        CheckpointError: the file is damaged, not a checkpoint, or holds more than tensors and plain data.
+        OSError: the file cannot be read.
+    """
+    with open(path, "rb") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise CheckpointError(f"{path} is not a checkpoint of torchrl-her")
+        digest = file.read(_BODY - len(_MAGIC))
+        if hashlib.file_digest(file, "sha256").digest() != digest:
+            raise CheckpointError(f"{path} is damaged: its checksum does not match")
+        file.seek(_BODY)
+        try:
+            return torch.load(file, weights_only=True)
+        except pickle.UnpicklingError as error:
+            raise CheckpointError(f"{path} holds more than tensors and plain data") from error
+        except Exception as error:  # of any type: a file with a right checksum may still hold anything
+            reason = str(error).split("\n")[0]
+            raise CheckpointError(f"{path} cannot be read: {reason}") from error
+
+
+def load_newest_checkpoint(path: str | Path, *, keep: int = 2) -> dict[str, Any]:
+    """Reads the newest checkpoint that is not damaged, and warns if a newer one is damaged.
+
+    Args:
+        path: as given to :func:`~torchrl_her.save_checkpoint`.
+
+    Keyword Args:
+        keep: as given to it, too.
+
+    Raises:
+        CheckpointError: all of them are damaged.
+        OSError: there is none, or it cannot be read.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for epoch in (1, 2):
+        ...         save_checkpoint({"epoch": epoch}, f"{folder}/checkpoint.pt", keep=2)
+        ...     load_newest_checkpoint(f"{folder}/checkpoint.pt")
+        {'epoch': 2}
+    """
+    path, damage = Path(path), []
+    for own in [file for file in _generations(path, keep) if file.exists()] or [path]:
+        try:
+            state = load_checkpoint(own)
+        except CheckpointError as error:
+            damage.append(str(error))
+            continue
+        if damage:
+            warnings.warn(f"{'; '.join(damage)}; {own.name}, the one before, is used instead", stacklevel=2)
+        return state
+    raise CheckpointError("; ".join(damage))
+
+
+def collector_state_dict(collector: BaseCollector) -> dict[str, Any]:
+    """The state of a collector between two batches, without its policy: counters and open episodes.
+
+    TorchRL's own state leaves out open episodes, since most environments cannot continue them. If the
+    environment's state is restored too, a run continues exactly. Collectors in several processes do not
+    give their episodes away: they continue with new ones.
+    """
+    state = {name: value for name, value in collector.state_dict().items() if name != "policy_state_dict"}
+    carrier = getattr(collector, "_carrier", None)
+    return {**state, "carrier": None if carrier is None else carrier.clone().to_dict()}
+
+
+def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -> None:
+    """Puts back what :func:`~torchrl_her.trainers.collector_state_dict` gave.
+
+    Args:
+        collector: made in the same way as the one that the state is of.
+        state: the state.
+    """
+    own = {name: value for name, value in state.items() if name != "carrier"}
+    if state.get("carrier") is None:
+        collector.load_state_dict(own)
+        return
+    collector.load_state_dict(own, strict=False)  # its policy stays
+    carrier = collector._carrier
+    shown = TensorDict.from_dict(state["carrier"], batch_size=carrier.batch_size)
+    collector._carrier = carrier.empty().update(shown)
+    if "traj_pool" in own:  # TorchRL has drawn new ids, but the episodes have theirs
+        collector._traj_pool.load_state_dict(own["traj_pool"])
+
+
+def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> dict[str, Any]:
+    """The state of a replay buffer: stored transitions, writer, and priorities if there are any.
+
+    TorchRL's own state has the size of the whole capacity, and with a prioritized sampler it holds objects
+    that a safe load refuses.
+
+    Args:
+        buffer: the buffer.
+
+    Keyword Args:
+        copy: whether the transitions are copied. If not, save them before the buffer changes.
+    """
+    n = len(buffer)
+    rows = buffer.storage[:] if n else None  # as stored, without what transforms add
+    state: dict[str, Any] = {
+        "rows": None if rows is None else rows.apply(torch.clone if copy else _alone).to_dict(),
+        "shape": [] if rows is None else list(rows.batch_size),
+        "size": n,
+        "capacity": _capacity(buffer),
+        "writer": buffer.writer.state_dict(),
+        "sampler": None,
+    }
+    if isinstance(buffer.sampler, PrioritizedSampler):
+        sampler = buffer.sampler.state_dict()
+        filled = torch.arange(n)
+        state["sampler"] = {
+            "sum": torch.as_tensor(sampler["_sum_tree"][filled]) if n else None,
+            "min": torch.as_tensor(sampler["_min_tree"][filled]) if n else None,
+            "max_priority": [
+                None if value is None else torch.as_tensor(value) for value in sampler["_max_priority"]
+            ],
+        }
+    return state
+
+
+def _capacity(buffer: TensorDictReplayBuffer) -> int:
+    """The capacity; 0 for storages of several dimensions, which round it up when they are first written."""
+    return buffer.storage.max_size if buffer.storage.ndim == 1 else 0
+
+
+def _alone(rows: Tensor) -> Tensor:
+    """Some rows of a tensor as a tensor of their own, without copying; torch.save would write all rows."""
+    if not rows.is_contiguous():
+        return rows.clone()
+    start = rows.storage_offset() * rows.itemsize
+    own = rows.untyped_storage()[start : start + rows.nbytes]
+    return torch.empty(0, dtype=rows.dtype, device=rows.device).set_(own, 0, rows.shape, rows.stride())
+
+
+def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:
+    """Puts back what :func:`~torchrl_her.trainers.buffer_state_dict` gave.
+
+    Args:
+        buffer: empty, and made in the same way as the one that the state is of.
+        state: the state.
+
+    Raises:
+        ValueError: the buffer is not empty, or has another capacity or another kind of sampler.
+    """
+    n, capacity = state["size"], _capacity(buffer)
+    if len(buffer):
+        raise ValueError(f"the buffer must be empty, it holds {len(buffer):,} rows")
+    if capacity != state["capacity"]:
+        raise ValueError(f"the state is that of a buffer of {state['capacity']:,} rows, not of {capacity:,}")
+    if isinstance(buffer.sampler, PrioritizedSampler) != (state["sampler"] is not None):
+        whose = "without priorities" if state["sampler"] is None else "with priorities"
+        raise ValueError(f"the state is that of a sampler {whose}, not of a {type(buffer.sampler).__name__}")
+    if n:
+        rows = TensorDict.from_dict(state["rows"], batch_size=state["shape"])
+        buffer.storage.set(torch.arange(len(rows)), rows)
+    buffer.writer.load_state_dict(state["writer"])
+    if state["sampler"] is not None:
+        sampler = buffer.sampler.state_dict()
+        filled = torch.arange(n)
+        if n:
+            sampler["_sum_tree"][filled] = state["sampler"]["sum"]
+            sampler["_min_tree"][filled] = state["sampler"]["min"]
+        sampler["_max_priority"] = tuple(state["sampler"]["max_priority"])
+        buffer.sampler.load_state_dict(sampler)

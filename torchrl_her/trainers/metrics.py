@@ -1,0 +1,103 @@
+"""Metrics of greedy episodes: functions of a rollout [N, T], time last.
+
+An environment may have begun new episodes after the first one ended; only the first one counts.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_her.goals.rewards import distance
+
+
+def first_episode(done: Tensor) -> Tensor:
+    """Tells which steps belong to the first episode.
+
+    Args:
+        done: [..., T] of bool.
+
+    Returns:
+        [..., T] of bool.
+
+    Example:
+        >>> first_episode(torch.tensor([False, True, False, True])).tolist()
+        [True, True, False, False]
+    """
+    return done.long().cumsum(-1) - done.long() == 0
+
+
+def success(rollout: TensorDictBase, *, achieved_reward: float = 0.0) -> Tensor:
+    """Whether the goal was achieved at some step.
+
+    Args:
+        rollout: [N, T].
+        achieved_reward: the reward of an achieved goal.
+
+    Returns:
+        [N] of bool.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> reward, done = torch.tensor([[[-1.0], [0.0]]]), torch.tensor([[[False], [True]]])
+        >>> success(TensorDict({"next": {"reward": reward, "done": done}}, [1, 2])).tolist()
+        [True]
+    """
+    reward = rollout.get(("next", "reward")).squeeze(-1)
+    inside = first_episode(rollout.get(("next", "done")).squeeze(-1))
+    return (inside & (reward >= achieved_reward)).any(-1)
+
+
+def final_distance(rollout: TensorDictBase) -> Tensor:
+    """Distance of the achieved goal from the desired goal at the last step of the episode.
+
+    Args:
+        rollout: [N, T].
+
+    Returns:
+        [N], in the unit of the goals.
+    """
+    last = first_episode(rollout.get(("next", "done")).squeeze(-1)).sum(-1, keepdim=True) - 1
+    gap = distance(rollout.get(("next", "achieved_goal")), rollout.get(("next", "desired_goal")))
+    return gap.gather(-1, last).squeeze(-1)
+
+
+def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: float = -1.0) -> Tensor:
+    """The return of the first episode, from its first state, [N].
+
+    After a truncation, ``tail_reward`` is counted forever, because a critic bootstraps there and so
+    estimates such a return as well.
+
+    Args:
+        rollout: [N, T].
+        gamma: discount.
+        tail_reward: reward of every step after a truncation.
+
+    Returns:
+        [N]
+
+    Raises:
+        ValueError: ``gamma`` is outside of [0, 1).
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> reward, done = -torch.ones(1, 2, 1), torch.tensor([[[False], [True]]])
+        >>> after = {"reward": reward, "done": done, "terminated": torch.zeros_like(done)}
+        >>> discounted_return(TensorDict({"next": after}, [1, 2]), 0.5).tolist()  # truncated: -1 forever
+        [-2.0]
+    """
+    if not 0.0 <= gamma < 1.0:
+        raise ValueError(f"gamma must be in [0, 1), got {gamma}")
+    reward = rollout.get(("next", "reward")).squeeze(-1)
+    inside = first_episode(rollout.get(("next", "done")).squeeze(-1))
+    discount = gamma ** torch.arange(reward.shape[-1], dtype=reward.dtype, device=reward.device)
+    total = (reward * inside * discount).sum(-1)
+    ended = (inside & rollout.get(("next", "terminated")).squeeze(-1)).any(-1)
+    tail = tail_reward * gamma ** inside.sum(-1).to(reward.dtype) / (1.0 - gamma)
+    return torch.where(ended, total, total + tail)
+
+
+def q_bias(initial_value: Tensor, returns: Tensor) -> Tensor:
+    """The critic's bias: estimated value of initial states minus the actual return, both [N]."""
+    return initial_value.reshape(returns.shape) - returns

@@ -1,0 +1,246 @@
+"""The training loop: collect, write, update. It reads no configuration and writes no files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.collectors import BaseCollector
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_her.trainers.learner import Learner
+
+_IDLE = -torch.inf  # measured by a run that did not learn; NaN would hide runs that diverged
+
+
+class Schedule(Protocol):
+    """Something that changes from epoch to epoch and keeps its own state."""
+
+    def step(self) -> None:
+        """Called when an epoch has ended."""
+        ...
+
+
+_MUST_BE_FINITE = ("action", "observation", "achieved_goal", "desired_goal", "reward")
+
+
+def check_finite(batch: TensorDictBase, keys: tuple[str, ...] = _MUST_BE_FINITE) -> None:
+    """Raises a ValueError that names the entry if a batch holds NaN or infinite numbers."""
+    for key in keys:
+        for name in (key, ("next", key)):
+            value = batch.get(name, None)
+            if value is not None and not bool(value.isfinite().all()):
+                raise ValueError(f"the collected {name!r} must be finite, got NaN or infinity in it")
+
+
+class Trainer:
+    """Trains in epochs of a fixed number of frames, each beginning with fresh episodes.
+
+    If ``on_batch`` raises an exception in the middle of an epoch, the next call of :meth:`epoch` finishes
+    that epoch.
+
+    The same loop trains one run or many independent ones. The environments of R runs are R equal blocks of
+    one batch; each run has its own replay buffer.
+
+    Args:
+        collector: yields batches [R * E, T] that the exploring policy played.
+        buffers: one for each of R runs, usually with a :class:`~torchrl_her.HERWriter`.
+        learner: learns from what is sampled.
+        schedules: take a step after each epoch, for example exploration and weights of goals.
+
+    Keyword Args:
+        epoch_frames: environment steps of each run in an epoch, rounded up to whole batches.
+        frames_per_update: environment steps of each run for each of its gradient steps.
+        warmup_frames: environment steps of each run before its first gradient step. The gradient steps that
+            belong to these frames follow then. With enough frames to end an episode in each environment, all
+            runs have transitions to learn from at their first gradient step.
+        batch_size: transitions in a gradient step of one run.
+        batches_per_sample: gradient steps whose transitions are drawn in one call. Priorities that change
+            during these steps count from the next call on.
+
+    Raises:
+        ValueError: a number is too small; when running, a batch is not finite, has no trajectory ids, or
+            cannot be divided equally among the runs.
+
+    Attributes:
+        frames: environment steps of each run so far.
+        updates: gradient steps of each run so far.
+        epochs: epochs so far.
+        in_epoch: whether an epoch has begun and not yet ended.
+    """
+
+    def __init__(
+        self,
+        *,
+        collector: BaseCollector,
+        buffers: Sequence[TensorDictReplayBuffer],
+        learner: Learner,
+        schedules: Sequence[Schedule] = (),
+        epoch_frames: int = 20_480,
+        frames_per_update: float = 20.0,
+        warmup_frames: int = 0,
+        batch_size: int = 256,
+        batches_per_sample: int = 8,
+    ) -> None:
+        counts = {
+            "epoch_frames": epoch_frames,
+            "batch_size": batch_size,
+            "batches_per_sample": batches_per_sample,
+        }
+        for name, count in counts.items():
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}")
+        if not frames_per_update > 0:
+            raise ValueError(f"frames_per_update must be positive, got {frames_per_update}")
+        if not buffers:
+            raise ValueError("there must be a buffer for each run, got none")
+        self.collector, self.buffers, self.learner = collector, buffers, learner
+        self.schedules = list(schedules)
+        self.epoch_frames, self.frames_per_update = epoch_frames, frames_per_update
+        self.warmup_frames = warmup_frames
+        self.batch_size, self.batches_per_sample = batch_size, batches_per_sample
+        self.frames = self.updates = self.epochs = 0
+        self._credit = 0.0  # gradient steps that the frames so far allow and that were not made yet
+        self._measured: list[dict[str, Tensor]] | None = None  # in the epoch under way
+
+    @property
+    def in_epoch(self) -> bool:
+        """Whether an epoch is under way."""
+        return self._measured is not None
+
+    def epoch(self, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
+        """Runs one epoch, or the rest of one; returns the means [R] of what the learner measured.
+
+        Args:
+            on_batch: called after each batch, for example for a progress bar.
+        """
+        if self._measured is None:
+            self.collector.reset()
+            self._measured = []
+        self._work((self.epochs + 1) * self.epoch_frames, self._measured, on_batch)
+        measured, self._measured = _means(self._measured), None
+        self.epochs += 1
+        for schedule in self.schedules:
+            schedule.step()
+        return measured
+
+    def run(self, frames: int, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
+        """Collects and learns for a number of frames of each run, rounded up to whole batches."""
+        measured: list[dict[str, Tensor]] = []
+        self._work(self.frames + frames, measured, on_batch)
+        return _means(measured)
+
+    def _work(
+        self, end: int, measured: list[dict[str, Tensor]], on_batch: Callable[[Trainer], None] | None
+    ) -> None:
+        """Collects and learns up to a number of frames, and notes what the learner measures."""
+        while self.frames < end:
+            batch = self.collector.next()
+            check_finite(batch)
+            if ("collector", "traj_ids") not in batch.keys(True):
+                raise ValueError("the collector must mark trajectories: episodes are cut where epochs begin")
+            collected = self._write(batch)
+            self.frames += collected
+            self._credit += collected / self.frames_per_update
+            measured += self._learn()
+            if on_batch is not None:
+                on_batch(self)
+
+    def _write(self, batch: TensorDictBase) -> int:
+        """Writes each run's block of the batch into its buffer; returns the number of frames of one run."""
+        runs = len(self.buffers)
+        if len(batch) % runs:
+            raise ValueError(f"{len(batch)} environments cannot be shared out among {runs} runs")
+        blocks = batch.chunk(runs)
+        for buffer, block in zip(self.buffers, blocks, strict=True):
+            buffer.extend(block)
+        return blocks[0].numel()
+
+    def _learn(self) -> list[dict[str, Tensor]]:
+        """Makes all gradient steps that the collected frames allow."""
+        # Runs must not depend on each other: one whose buffer is still empty skips its steps.
+        if self.frames < self.warmup_frames:
+            return []
+        idle = [run for run, buffer in enumerate(self.buffers) if len(buffer) == 0]
+        measured = []
+        while self._credit >= 1.0:
+            steps = min(self.batches_per_sample, int(self._credit))
+            self._credit -= steps
+            if len(idle) < len(self.buffers):
+                measured.append(self._learn_from(idle, steps))
+                self.updates += steps
+        return measured
+
+    def _learn_from(self, idle: list[int], steps: int) -> dict[str, Tensor]:
+        """Gradient steps of all runs but the idle ones; returns what was measured, [steps, R] each."""
+        size = self.batch_size * steps
+        drawn = [None if run in idle else buffer.sample(size) for run, buffer in enumerate(self.buffers)]
+        stand_in = next(rows for rows in drawn if rows is not None)
+        rows = torch.stack([stand_in if own is None else own for own in drawn])
+        measured = self.learner.update(rows, steps, idle=idle)
+        self._set_priorities(drawn, rows)
+        nothing = torch.tensor(idle, dtype=torch.int64)
+        return {key: value.index_fill(1, nothing, _IDLE) for key, value in measured.items()}
+
+    def _set_priorities(self, drawn: list[TensorDictBase | None], rows: TensorDictBase) -> None:
+        """Gives each run's sampler the new priorities of the transitions that were learned from."""
+        key = self.buffers[0].priority_key
+        priorities = rows.get(key, None)
+        if priorities is None:
+            return
+        for buffer, own, priority in zip(self.buffers, drawn, priorities, strict=True):
+            if own is not None:
+                own.set(key, priority.float())  # the type of TorchRL's trees, also for networks in float64
+                buffer.update_tensordict_priority(own)  # does nothing under a sampler without priorities
+
+    def state_dict(self) -> dict[str, Any]:
+        """The counters, and what was measured in the epoch under way; the parts keep their own state."""
+        counters = {"frames": self.frames, "updates": self.updates, "epochs": self.epochs}
+        measured = None if self._measured is None else _joined(self._measured)
+        return {**counters, "credit": self._credit, "measured": measured}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` gave."""
+        self.frames, self.updates, self.epochs = state["frames"], state["updates"], state["epochs"]
+        self._credit = state["credit"]
+        measured = state.get("measured")
+        self._measured = None if measured is None else [measured] if measured else []
+
+
+def _joined(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """All steps [..., R] of each entry, joined."""
+    return {key: torch.cat([own[key] for own in measured]) for key in (measured[0] if measured else {})}
+
+
+def _means(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """The means [R] of each entry over the steps in which a run learned; NaN where it never did."""
+    return {key: _mean(values) for key, values in _joined(measured).items()}
+
+
+def _mean(values: Tensor) -> Tensor:
+    learned = values != _IDLE
+    return torch.where(learned, values, 0.0).sum(0) / learned.sum(0)
+
+
+@torch.no_grad()
+def evaluate(
+    env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], *, max_steps: int
+) -> TensorDictBase:
+    """Plays greedy episodes, one in each environment of a batch.
+
+    Args:
+        env: batched, [N]; not the one that is trained in, whose episodes it would disturb.
+        policy: its exploration is switched off meanwhile.
+        max_steps: T.
+
+    Returns:
+        The rollout [N, T]. Environments whose episode ends early go on; metrics such as
+        :func:`~torchrl_her.success` look at the first episode only.
+    """
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return env.rollout(max_steps, policy, break_when_any_done=False)
