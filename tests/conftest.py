@@ -21,3 +21,8 @@ def _seed() -> Iterator[None]:
     before = exploration_type()
     yield
     assert exploration_type() is before
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that take long begin first, so that no worker is left alone with one of them at the end."""
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)

@@ -61,6 +61,7 @@ def test_the_page_has_five_examples_and_names_them_all() -> None:
         assert len(uses) == 1
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("section", SECTIONS)
 def test_an_example_runs(section: str, tmp_path: Path) -> None:

@@ -279,6 +279,7 @@ def test_pictures() -> None:
         env.render(size=0)
 
 
+@pytest.mark.long
 def test_environments_made_without_pictures_give_none() -> None:
     assert not walk().can_render
     with pytest.raises(ValueError, match='pictures need render_mode="rgb_array", got None'):

@@ -45,6 +45,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     sys.modules.pop("own_learner", None)
 
 
+@pytest.mark.long
 def test_the_command_line_imports_before_it_reads_the_command(
     own: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -74,8 +74,9 @@ def damage(path: Path) -> None:
 # Killed
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="a fork server that shares torch is for Linux")
-@pytest.mark.parametrize("most", [3, pytest.param(KILLS, marks=pytest.mark.full)])
+@pytest.mark.parametrize("most", [2, pytest.param(KILLS, marks=pytest.mark.full)])
 def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not(
     most: int, no_pictures: None, tmp_path: Path
 ) -> None:

@@ -55,6 +55,7 @@ def test_every_study_is_made_of_recipes_that_work_and_can_be_shrunk(name: str) -
     assert sum(recipe.total_frames * recipe.run.num_runs for recipe in quick.values()) < 300_000
 
 
+@pytest.mark.long
 def test_seeds_and_frames_take_the_place_of_the_study_s() -> None:
     recipe = next(recipe for _, recipe in load_study("ibs", seeds=3, frames=20_000).cells())
     assert recipe.run.num_runs == 3
@@ -202,7 +203,8 @@ def test_without_ray_its_name_and_the_remedy_are_given(
         (["vary: {learning_rate: [1e-3, fast]}"], "learning_rate must be a number, got 'fast'"),
         (["vary: {1: [2]}"], "options of mine must be names, got 1"),
         (["vary: {algo: [her]}\nrecipe: {1: 2}"], "options of mine must be names, got 1"),
-        (["vary: {task.options: [{a: 1}, 3]}"], "task.options must"),
+        (["vary: {task.options: [{a: 1}, 3]}"], "hand_v0 takes no option 'a'"),
+        (["vary: {task.options: [3]}"], "task.options must be a mapping of options by name, got 3"),
         (["vary: {algo: [her]}\nfigure: [succes]"], "figure of mine must be times, or some of success, "),
         (
             ["vary: {algo: [her]}\nfigure: times"],

@@ -44,6 +44,7 @@ def job(folder: Path, **options: Any) -> Job:
     return Job(label=label, recipe=recipe, folder=folder / label)
 
 
+@pytest.mark.long
 def wait_until(happened: Callable[[], bool], *, during: Future[Outcome]) -> None:
     while not happened():
         assert not during.done()

@@ -50,6 +50,7 @@ def node(cluster: Cluster) -> Iterator[Node]:
         cluster.remove_node(node, allow_graceful=False)
 
 
+@pytest.mark.long
 def study(**recipe: Any) -> Study:
     common = {**SMALL, "task": "hand_v0", "compile": "never", **recipe}
     return Study(name="small", recipe=common, vary={"algo": ALGORITHMS})
@@ -76,6 +77,7 @@ def test_a_node_that_dies_loses_only_its_run_which_is_done_again(
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", *sorted(ALGORITHMS), "small.png"]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("node")
 def test_ctrl_c_brings_home_what_there_is(tmp_path: Path, cluster: Cluster) -> None:
     workers = RayWorkers(cluster.address)

@@ -394,6 +394,7 @@ def parallel_env() -> Iterator[ParallelEnv]:
     env.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("inside", [True, False])
 def test_in_and_around_a_parallel_env(inside: bool, parallel_env: ParallelEnv) -> None:
     # Transforms around it write again all that those inside wrote.

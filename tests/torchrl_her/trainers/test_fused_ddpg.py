@@ -108,6 +108,7 @@ def check_same_weights(plain: FusedDDPGLearner, compiling: FusedDDPGLearner) -> 
         torch.testing.assert_close(value, state[name], msg=name)
 
 
+@pytest.mark.long
 # Compiling takes up to half a minute, so that one form is compiled for all; others with the full tests.
 @pytest.mark.skipif(shutil.which("c++") is None, reason="there is no C++ compiler")
 @pytest.mark.parametrize("runs", [pytest.param(1, marks=pytest.mark.full), 2])
