@@ -77,6 +77,7 @@ def test_a_node_that_dies_loses_only_its_run_which_is_done_again(
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", *sorted(ALGORITHMS), "small.png"]
 
 
+@pytest.mark.full
 @pytest.mark.long
 @pytest.mark.usefixtures("node")
 def test_ctrl_c_brings_home_what_there_is(tmp_path: Path, cluster: Cluster) -> None:
