@@ -14,6 +14,7 @@ from torchrl_her_recipes.config.learners import LEARNERS
 from torchrl_her_recipes.config.shipped import preset_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, locate
 
+ARGUMENTS = ("preset", "folder")  # besides options; names, even if YAML reads something else in them
 _OPENING, _CLOSING = "[{(", "]})"
 
 
@@ -135,7 +136,6 @@ def sweep(arguments: Sequence[tuple[str, str]]) -> Iterator[dict[str, Any]]:
         {'algo': 'her', 'seed': 1}
     """
     names = [name for name, _ in arguments]
-    kept = ("preset",)  # a name, even if it reads as something else in YAML
     for values in product(*(split_sweep(text) for _, text in arguments)):
         pairs = zip(names, values, strict=True)
-        yield {name: value if name in kept else parse_value(value) for name, value in pairs}
+        yield {name: value if name in ARGUMENTS else parse_value(value) for name, value in pairs}

@@ -8,6 +8,7 @@ import click
 from click.shell_completion import CompletionItem
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `play`
+from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.shipped import policy_names
 
@@ -53,7 +54,7 @@ def export(run: Path, out: Path | None, index: int | None, task: str | None) -> 
     if not run.is_dir():
         raise ValueError(f"{run} is no folder of a run: it has no config.yaml")
     name = task or recipes.RunFolder(run).recipe().task.name
-    file = out or run / f"{name.replace('/', '_').replace(':', '_')}.pt"
+    file = out or run / f"{file_name(name)}.pt"
     policy = recipes.export_policy(run, file, run=index, task=task)
     click.echo(f"seed {policy.recipe.run.seed}, success {policy.success:.0%} on {policy.task}: {file}")
     return 0

@@ -33,3 +33,13 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, MemoryError):
         return "there is not enough memory: buffer_size, hidden or batch_size may be too large"
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def file_name(task: str) -> str:
+    """The name of a task as part of a file's name: gym:ID has letters that some file systems refuse.
+
+    Example:
+        >>> file_name("gym:torchrl_her/HandThrow-v1")
+        'gym_torchrl_her_HandThrow-v1'
+    """
+    return task.replace("/", "_").replace(":", "_")

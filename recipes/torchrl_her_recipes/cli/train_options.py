@@ -12,15 +12,14 @@ import click
 from click.shell_completion import CompletionItem
 
 from torchrl_her_envs.registry import task_names
-from torchrl_her_recipes.cli.overrides import check_once, parse_override, parse_value, split_sweep, sweep
+from torchrl_her_recipes.cli.overrides import ARGUMENTS, check_once, parse_override, split_sweep, sweep
+from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
 from torchrl_her_recipes.config.learners import LEARNERS, options_of
 from torchrl_her_recipes.config.options import default_of
 from torchrl_her_recipes.config.recipe import Recipe, make_recipe
 from torchrl_her_recipes.config.shipped import load_preset, preset_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, option_names
-
-_ALSO = ("preset", "folder")  # arguments besides the options of a recipe
 
 
 @dataclass(frozen=True)
@@ -41,13 +40,16 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
     Raises:
         ValueError: a mistake in an argument.
     """
-    pairs = [parse_override(text, _ALSO) for text in options]
-    check_once(pairs, _ALSO)
+    pairs = [parse_override(text, ARGUMENTS) for text in options]
+    check_once(pairs, ARGUMENTS)
     given = dict(pairs)
     folder = given.pop("folder", None)
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     if not multirun:
-        recipe = _recipe({name: _single(name, text) for name, text in given.items()})
+        for name, text in given.items():
+            _check_single(name, text)
+        (values,) = sweep(list(given.items()))
+        recipe = _recipe(values)
         yield RunRequest(recipe, Path(folder or f"runs/{now}_{_label(recipe)}"))
         return
     root = Path(folder or f"runs/sweep_{now}")
@@ -56,11 +58,10 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
         yield RunRequest(recipe, root / f"{_label(recipe)}_{number}")
 
 
-def _single(name: str, text: str) -> Any:
-    """The value of an option of a single run."""
+def _check_single(name: str, text: str) -> None:
+    """Raises a ValueError for several values where no sweep was asked for."""
     if len(split_sweep(text)) > 1:
         raise ValueError(f"{name} must be one value, got {text}; several are a sweep: torchrl-her train -m")
-    return text if name in _ALSO else parse_value(text)
 
 
 def _recipe(values: Mapping[str, Any]) -> Recipe:
@@ -71,7 +72,7 @@ def _recipe(values: Mapping[str, Any]) -> Recipe:
 
 def _label(recipe: Recipe) -> str:
     """The name of a run's folder; its letters are allowed on every file system."""
-    task = recipe.task.name.replace("/", "_").replace(":", "_")
+    task = file_name(recipe.task.name)
     return f"{task}_{recipe.hindsight.algo}_s{recipe.run.seed}"
 
 
@@ -107,7 +108,7 @@ def complete(_context: click.Context, _parameter: click.Parameter, incomplete: s
     if equals:
         return [CompletionItem(f"{name}={own}") for own in _values().get(name, []) if own.startswith(begun)]
     known = [own for names in options.values() for own in names if own != "name"]
-    names = ["task", "algo", "learner", "curriculum", *_ALSO, *known]
+    names = ["task", "algo", "learner", "curriculum", *ARGUMENTS, *known]
     if "." in name:
         names = [f"{group}.{own}" for group, own_names in options.items() for own in own_names]
     return [CompletionItem(f"{own}=") for own in dict.fromkeys(names) if own.startswith(name)]

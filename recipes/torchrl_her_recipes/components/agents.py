@@ -42,7 +42,7 @@ def make_agent(
         ValueError: the learner cannot choose such actions, or cannot train several runs.
     """
     builder = _builder(recipe, env, curriculum)
-    actor, critic = make_networks(recipe, env, curriculum=curriculum)
+    actor, critic = _networks(builder, recipe, curriculum)
     exploration, options = builder.exploration(generators), recipe.learner
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.run.seed)  # second critics are drawn anew
@@ -90,7 +90,10 @@ def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:
 
 def make_networks(recipe: Recipe, env: EnvBase, *, curriculum: Curriculum | None = None) -> Networks:
     """The actor and the critic; the weights of each run depend on its own seed alone."""
-    builder = _builder(recipe, env, curriculum)
+    return _networks(_builder(recipe, env, curriculum), recipe, curriculum)
+
+
+def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | None) -> Networks:
     with torch.random.fork_rng(devices=[]):
         alone = []
         for seed in recipe.seeds:

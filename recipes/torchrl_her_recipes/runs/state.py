@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from torchrl_her.curriculum.switch import set_layer_goals
+from torchrl_her.goals.strategies import strategy_name
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.checkpoint import (
     buffer_state_dict,
@@ -86,7 +87,7 @@ def _made_of(components: Components) -> dict[str, str]:
     if isinstance(writer, HERWriter):
         hindsight = [
             writer.k,
-            getattr(writer.strategy, "__name__", writer.strategy),
+            strategy_name(writer.strategy),
             writer.filter_achieved,
             type(writer.weights).__name__,
         ]

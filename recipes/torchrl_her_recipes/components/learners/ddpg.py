@@ -14,17 +14,23 @@ class DDPGBuilder(LearnerBuilder):
     """See :func:`~torchrl_her.make_ddpg_loss`."""
 
     def networks(self, runs: int) -> Networks:
-        options, actions = self.options, self.action_spec.shape[-1]
-        actor = make_actor(self.widths, actions, hidden=options.hidden, runs=runs, in_keys=self.in_keys)
-        critic = make_critic(
+        return self.actor(runs).to(self.dtype), self.critic(runs).to(self.dtype)
+
+    def actor(self, runs: int) -> TensorDictModule:
+        """The deterministic actor of some runs side by side."""
+        actions, hidden = self.action_spec.shape[-1], self.options.hidden
+        return make_actor(self.widths, actions, hidden=hidden, runs=runs, in_keys=self.in_keys)
+
+    def critic(self, runs: int) -> TensorDictModule:
+        """Their critic."""
+        return make_critic(
             self.widths,
-            actions,
-            hidden=options.hidden,
-            normalize=options.batch_norm,
+            self.action_spec.shape[-1],
+            hidden=self.options.hidden,
+            normalize=self.options.batch_norm,
             runs=runs,
             in_keys=self.in_keys,
         )
-        return actor.to(self.dtype), critic.to(self.dtype)
 
     def loss(
         self, actor: TensorDictModule, critic: TensorDictModule, rewards: tuple[float, float]
