@@ -23,6 +23,7 @@ from torchrl_her.objectives.dqn import make_dqn_loss
 from torchrl_her.objectives.sac import make_sac_loss
 from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her.objectives.td3 import make_td3_loss
+from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her.replay_buffers.options import HindsightOptions
 from torchrl_her.replay_buffers.sample_unit import HERSampleUnit
 from torchrl_her.replay_buffers.writer import HERWriter
@@ -38,6 +39,7 @@ __all__ = [
     "CurriculumProgress",
     "DecayingEpsilon",
     "DecayingEpsilonGreedy",
+    "EnvIds",
     "EnvReward",
     "FusedDDPGLearner",
     "GoalGrid",

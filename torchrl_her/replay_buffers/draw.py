@@ -11,6 +11,7 @@ from torchrl_her.goals.factors import between, combine, draw, draw_alike, draw_w
 from torchrl_her.goals.strategies import Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
 from torchrl_her.replay_buffers.episodes import Episodes
+from torchrl_her.replay_buffers.options import Per
 
 # Likelihoods of goals [transitions, T] that are held in memory at once.
 _LIKELIHOODS = 1 << 17
@@ -27,9 +28,10 @@ def draw_goals(
     strategy: Strategy = "future",
     weights: GoalWeights | None = None,
     keep: Keep | None = None,
+    per: Per = "transition",
     generator: torch.Generator | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Draws k virtual goals for each transition, by strategy times weights times filter.
+    """Draws k virtual goals for each transition, or each episode, by strategy times weights times filter.
 
     To save work, goals are first proposed by strategy and weights alone. If the filter rejects one of a
     transition's k goals, all k are drawn again, from the likelihoods of all its candidates. The result still
@@ -46,6 +48,7 @@ def draw_goals(
         weights: how useful each goal is; None for all alike.
         keep: the filter. It maps goals achieved before and goals wanted, [..., g] each and broadcast against
             each other, to bool [...]: which of them may be drawn; None for all.
+        per: whether each transition gets k goals, or each episode: those of its first transition.
         generator: source of the random numbers.
 
     Returns:
@@ -62,11 +65,15 @@ def draw_goals(
         >>> source.tolist(), goal_source.tolist()
         ([0, 0, 1, 1, 2, 2], [2, 2, 2, 2, 2, 2])
     """
-    real = episodes.rows[episodes.inside]
-    if k == 0:
+    if per == "episode":
+        real, episode = episodes.rows[:, 0], torch.arange(len(episodes.lengths), device=episodes.rows.device)
+        time = torch.zeros_like(episode)
+    else:
+        real = episodes.rows[episodes.inside]
+        episode, time = episodes.inside.nonzero(as_tuple=True)
+    if k == 0 or len(real) == 0:
         return real[:0], real[:0]
     weight = None if weights is None or weights.alike else checked_weights(weights(after[episodes.rows]))
-    episode, time = episodes.inside.nonzero(as_tuple=True)  # of each real row
     index = _propose(episodes, episode, time, k, strategy, weight, generator)
     valid = torch.ones_like(real, dtype=torch.bool)
     begin = (episode * episodes.rows.shape[1]).unsqueeze(-1)  # of the episode in the flat table of rows
@@ -101,7 +108,7 @@ def _propose(
         first, end = candidate_range(strategy, time, episodes.lengths[episode])
         return draw_alike(first, end, k, generator=generator)
     # Padding draws goals too, which are not used.
-    steps = torch.arange(weight.shape[1], device=weight.device)
+    steps = torch.arange(int(time.max()) + 1, device=weight.device)
     length = episodes.lengths.unsqueeze(-1)
     first, end = candidate_range(strategy, steps.minimum(length - 1), length)
     return draw_weighted(weight, first, end, k, generator=generator)[episode, time]

@@ -31,17 +31,27 @@ class Episodes:
         return [Episodes(self.rows[i : i + size], self.lengths[i : i + size]) for i in starts]
 
 
-def find_episodes(lanes: Tensor, done: Tensor, trajectory: Tensor | None = None) -> tuple[Episodes, Tensor]:
-    """Sorts rows into whole episodes and rows of episodes that are still open.
+def time_order(lanes: Tensor) -> Tensor:
+    """Positions [n] that put rows in the order of lanes, and each lane in the order in which it came.
 
-    An episode ends with a row that is done, or before a row of its lane with another trajectory id, as when
-    an environment was reset from outside.
+    Args:
+        lanes: [n] int64, the environment or trajectory that each row is of.
+    """
+    if bool((lanes[1:] < lanes[:-1]).any()):
+        return lanes.argsort(stable=True)
+    return torch.arange(
+        len(lanes), device=lanes.device
+    )  # a batch [N, T] comes in order, and sorting takes long
+
+
+def find_episodes(lanes: Tensor, end: Tensor, order: Tensor | None = None) -> tuple[Episodes, Tensor]:
+    """Sorts rows into whole episodes and rows of episodes that are still open.
 
     Args:
         lanes: [n] int64, the environment or trajectory that each row is of. Rows of one lane are in the order
             of time, one episode after the other.
-        done: [n] of bool.
-        trajectory: [n] of int64, ids of the trajectories, if lanes are environments.
+        end: [n] of bool, the last rows of episodes.
+        order: [n], from :func:`time_order`, if it is known already.
 
     Returns:
         ``(episodes, left)``: the whole episodes, and the positions [m] of all other rows, in order.
@@ -53,16 +63,10 @@ def find_episodes(lanes: Tensor, done: Tensor, trajectory: Tensor | None = None)
         >>> episodes.rows.tolist(), left.tolist()
         ([[0, 2]], [1, 3, 4])
     """
-    order = torch.arange(len(lanes), device=lanes.device)
-    if bool((lanes[1:] < lanes[:-1]).any()):  # a batch [N, T] comes in order, and sorting takes long
-        order = lanes.argsort(stable=True)
-    lane, end = lanes[order], done[order].clone()
-    same_lane = lane[1:] == lane[:-1]
-    if trajectory is not None:
-        ids = trajectory[order]
-        end[:-1] |= same_lane & (ids[1:] != ids[:-1])
+    order = time_order(lanes) if order is None else order
+    lane, end = lanes[order], end[order]
     begins = torch.ones_like(end)
-    begins[1:] = end[:-1] | ~same_lane
+    begins[1:] = end[:-1] | (lane[1:] != lane[:-1])
     first = begins.nonzero().squeeze(-1)
     length = torch.diff(first, append=first.new_tensor([len(lanes)]))
     whole = end[first + length - 1]

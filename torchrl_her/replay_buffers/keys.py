@@ -17,7 +17,7 @@ class TransitionKeys:
         achieved, next_achieved: the goal achieved before the action, and the one achieved by it.
         goals: the desired goal, in the root and under ``next``.
         reward, terminated, truncated, done: under ``next``.
-        trajectory: ids.
+        trajectory, env_ids: ids.
     """
 
     achieved: NestedKey
@@ -28,6 +28,7 @@ class TransitionKeys:
     truncated: NestedKey
     done: NestedKey
     trajectory: NestedKey
+    env_ids: NestedKey
 
     def changes(
         self, goals: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
-from typing import Any, Generic, TypeVar, overload
+from typing import Any, Generic, Literal, TypeVar, get_args, overload
 
 from tensordict import NestedKey, unravel_key
 from torch import Tensor
@@ -16,6 +16,7 @@ from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.replay_buffers.keys import TransitionKeys, in_root_and_next, under_next
 
 T = TypeVar("T")
+Per = Literal["transition", "episode"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +28,14 @@ class HindsightOptions:
         strategy: which achieved goals of its episode a transition may take: ``"future"`` (those achieved by
             its action or later), ``"final"`` (the last one), ``"episode"`` (any), another name given to
             :func:`~torchrl_her.register_strategy`, or a function as described there.
+        per: what gets a goal of its own. ``"transition"``: each transition, for learning from single
+            transitions. ``"episode"``: each copy of a whole episode, for learning from sequences, as
+            recurrent policies do; see :class:`~torchrl_her.HERWriter`.
+        n_steps: transitions reach over up to n steps: ``reward`` is the discounted sum of the rewards for
+            their goal, ``next`` is that of the last step, and ``steps_to_next_obs`` the number of steps,
+            by which TorchRL's losses discount. They end where the reward function terminates, or with the
+            episode. Sutton and Barto, Reinforcement Learning, 2018, equation 7.1.
+        gamma: the discount of these sums; needed with ``n_steps`` above 1, and the same as the loss's.
         filter_achieved: take no goal that was already achieved in the state before the action
             (Filtered-HER). This asks the reward and not ``terminated``, since many environments never
             terminate.
@@ -36,10 +45,13 @@ class HindsightOptions:
         achieved_goal_key, desired_goal_key: goals, in the root and under ``next``.
         reward_key, terminated_key, truncated_key, done_key: under ``next``.
         trajectory_key: ids that tell trajectories apart; the entry may be missing.
+        env_ids_key: ids that tell environments apart, as :class:`~torchrl_her.EnvIds` gives them; the entry
+            may be missing, and is not stored by the writer.
         virtual_key: where a bool [..., 1] marks virtual transitions; None for no mark.
 
     Raises:
-        ValueError: ``k`` is negative, or there is no such strategy.
+        ValueError: ``k`` is negative, there is no such strategy, ``n_steps`` is below 1 or above 1 without
+            ``gamma`` or with whole episodes, ``per`` is neither of the two.
         TypeError: ``exclude`` is a single key.
 
     Example:
@@ -50,6 +62,9 @@ class HindsightOptions:
 
     k: int = 4
     strategy: Strategy = "future"
+    per: Per = "transition"
+    n_steps: int = 1
+    gamma: float | None = None
     filter_achieved: bool = False
     achieved_reward: float = 0.0
     exclude: Sequence[NestedKey] = ("state",)
@@ -60,11 +75,23 @@ class HindsightOptions:
     truncated_key: NestedKey = "truncated"
     done_key: NestedKey = "done"
     trajectory_key: NestedKey = ("collector", "traj_ids")
+    env_ids_key: NestedKey = "env_ids"
     virtual_key: NestedKey | None = "virtual"
 
     def __post_init__(self) -> None:
         if self.k < 0:
             raise ValueError(f"k must be at least 0, got {self.k}")
+        if self.per not in get_args(Per):
+            raise ValueError(f"per must be one of {', '.join(get_args(Per))}, got {self.per!r}")
+        if self.n_steps < 1:
+            raise ValueError(f"n_steps must be at least 1, got {self.n_steps}")
+        if self.n_steps > 1 and self.per == "episode":
+            raise ValueError(
+                f"n_steps={self.n_steps} makes single transitions, which cannot be sampled as sequences: use "
+                "per='transition', or make the n-step returns of per='episode' from the sampled sequences"
+            )
+        if self.n_steps > 1 and (self.gamma is None or not 0 < self.gamma <= 1):
+            raise ValueError(f"n_steps={self.n_steps} needs 0 < gamma <= 1, the loss's; got {self.gamma}")
         get_strategy(self.strategy)
         in_root_and_next(self.exclude)
 
@@ -97,6 +124,7 @@ class HindsightOptions:
             truncated=under_next(self.truncated_key),
             done=under_next(self.done_key),
             trajectory=unravel_key(self.trajectory_key),
+            env_ids=unravel_key(self.env_ids_key),
         )
 
 

@@ -2,22 +2,39 @@
 
 from __future__ import annotations
 
+import os
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
+from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 from torch import Tensor
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights
+from torchrl_her.replay_buffers.copies import (
+    Copies,
+    episode_numbers,
+    real_copies,
+    virtual_copies,
+    virtual_episodes,
+)
 from torchrl_her.replay_buffers.draw import draw_goals
-from torchrl_her.replay_buffers.episodes import Episodes, find_episodes
-from torchrl_her.replay_buffers.keys import entry_of
+from torchrl_her.replay_buffers.episodes import Episodes, find_episodes, time_order
+from torchrl_her.replay_buffers.keys import entry_of, in_root_and_next
+from torchrl_her.replay_buffers.lanes import BY_ENV, broken, ends_of_held, find_lanes, in_order
+from torchrl_her.replay_buffers.neighbors import (
+    SHARED,
+    has_slices,
+    refuse_consuming,
+    refuse_n_steps,
+    refuse_priorities,
+)
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 
 # Transitions written at once: larger pieces touch fresh memory each time, smaller ones need more calls.
@@ -120,7 +137,11 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self.counts, self.totals = WriterCounts(), WriterCounts()
         self._held: TensorDictBase | None = None  # transitions of open episodes, oldest first
         self._held_lanes: Tensor = torch.empty(0, dtype=torch.int64)
-        self._loaded = False  # whether the held ones came with a state, and nothing was written since
+        self._held_kind = ""  # what these are known by
+        self._episodes = 0  # copies of episodes ever written, if whole ones are
+        self._process = os.getpid()
+        # Whether the held ones came with a state, or are over, and nothing was written since.
+        self._loaded = self._all_over = False
 
     @property
     def held_back(self) -> int:
@@ -137,36 +158,37 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         """Writes all episodes that end in a batch.
 
         Args:
-            data: [N, T] with time last; or flat, with trajectory ids, without which all of it is one
-                trajectory. Within a trajectory, transitions are in the order of time.
+            data: [N, T] with time last; or flat, with trajectory ids or environment ids, without which all of
+                it is one environment's. Within an environment, transitions are in the order of time.
 
         Returns:
             The index of each incoming transition in the storage, in the incoming shape; -1 if it is held
             back, or if later ones of the same batch have already pushed it out of a small buffer.
 
         Raises:
-            ValueError: the storage has several dimensions, or trajectories were split and padded.
+            ValueError: the writer cannot work beside another part of the buffer or collector; trajectories
+                were split and padded; environments cannot be told apart.
             KeyError: an entry is missing.
+            RuntimeError: the buffer was made by another process.
         """
-        if _MASK in data.keys(True):
-            raise ValueError(
-                "HERWriter takes batches as they are collected, not split and padded: split_trajs=False"
-            )
-        if self._storage.ndim > 1:
-            raise ValueError(f"HERWriter needs a storage of 1 dimension, got one of {self._storage.ndim}")
+        self._refuse(data)
         held = self.held_back
-        rows, lanes, ids = self._with_held(data)
+        rows, kind, ids = self._with_held(data)
+        lanes = in_order(ids) if kind == BY_ENV else ids
+        order = time_order(lanes)
         ends = entry_of(rows, self._keys.done).reshape(-1)
-        if self._loaded and held:
-            ends = ends | self._broken(rows, lanes, held)
-        episodes, left = find_episodes(lanes, ends, ids)
+        if self._all_over:
+            ends = ends | ends_of_held(lanes, order, held)
+        over = broken(rows, lanes, order, ends, self._keys, kind=kind, held=held, resumed=self._loaded)
+        episodes, left = find_episodes(lanes, ends | over, order)
         cursor, written = self._cursor, 0
         place = lanes.new_full((len(lanes),), -1)  # of each row, in the order of writing
         for piece in episodes.split(self._episodes_at_once(episodes)):
             written += self._write(rows, piece, place, written)
         # Last of all, so that a batch that cannot be written loses nothing that was held back before.
-        self._held, self._held_lanes = (rows[left] if len(left) else None), lanes[left]
-        self._loaded = False
+        self._held = rows[left] if len(left) else None
+        self._held_lanes, self._held_kind = ids[left], kind
+        self._loaded = self._all_over = False
         capacity = self._storage.max_size
         if self.held_back > capacity:
             warnings.warn(
@@ -178,11 +200,19 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         index = ((cursor + place) % capacity).masked_fill_(lost, -1)
         return index[held:].reshape(data.shape)
 
+    def end_episodes(self) -> None:
+        """Tells that all environments were reset, so that episodes which are held back do not go on.
+
+        They are written with the next batch. Call it after ``collector.reset()``.
+        """
+        self._all_over = True
+
     def state_dict(self) -> dict[str, Any]:
         """The writer's whole state, as tensors and plain data."""
         state = super().state_dict()
         state["held"] = None if self._held is None else self._held.to_dict()
-        state["held_lanes"] = self._held_lanes.clone()
+        state["held_lanes"], state["held_kind"] = self._held_lanes.clone(), self._held_kind
+        state["episodes"], state["all_over"] = self._episodes, self._all_over
         state["counts"], state["totals"] = asdict(self.counts), asdict(self.totals)
         state["weights"] = None if self.weights is None else self.weights.state_dict()
         return state
@@ -195,7 +225,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         continue them.
         """
         super().load_state_dict(state_dict)
-        self._held_lanes = state_dict["held_lanes"].clone()
+        self._held_lanes, self._held_kind = state_dict["held_lanes"].clone(), state_dict["held_kind"]
+        self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
         held, shape = state_dict["held"], self._held_lanes.shape
         self._held = None if held is None else TensorDict.from_dict(held, batch_size=shape).clone()
@@ -214,76 +245,111 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     def _empty(self, empty_write_count: bool = True) -> None:
         super()._empty(empty_write_count)
-        self._held, self._held_lanes = None, self._held_lanes[:0]
+        self._held, self._held_lanes, self._all_over = None, self._held_lanes[:0], False
         self.counts = WriterCounts()
         if self.weights is not None:
             self.weights.clear()
 
+    def __getstate__(self) -> dict[str, Any]:
+        if get_spawning_popen() is not None:
+            raise RuntimeError(f"HERWriter cannot be shared between processes: {SHARED}")
+        return super().__getstate__()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__({**state, "_process": os.getpid()})
+
     # The work
 
-    def _with_held(self, data: TensorDictBase) -> tuple[TensorDictBase, Tensor, Tensor | None]:
-        """Flat transitions, those held back first; their lanes; trajectory ids if lanes are environments."""
-        rows = data.reshape(-1)
-        ids = rows.get(self._keys.trajectory, None)
-        if data.ndim > 1:
-            steps = data.shape[-1]
-            lanes = torch.arange(len(rows) // max(steps, 1), device=rows.device).repeat_interleave(steps)
-        else:
-            one_lane = torch.zeros(len(rows), dtype=torch.int64, device=rows.device)
-            lanes = one_lane if ids is None else ids.reshape(-1)
-        if self._held is not None:
-            rows = torch.cat((self._held, rows))
-            lanes = torch.cat((self._held_lanes, lanes))
-        if data.ndim == 1 or ids is None:
-            return rows, lanes, None
-        return rows, lanes, rows.get(self._keys.trajectory).reshape(-1)
+    def _refuse(self, data: TensorDictBase) -> None:
+        """Raises an error beside parts and batches that would be written wrongly."""
+        if os.getpid() != self._process:
+            raise RuntimeError(f"HERWriter writes only in the process that made its buffer: {SHARED}")
+        if _MASK in data.keys(True):
+            raise ValueError(
+                "HERWriter takes batches as they are collected, not split and padded: split_trajs=False"
+            )
+        if self._storage.ndim > 1:
+            raise ValueError(f"HERWriter needs a storage of 1 dimension, got one of {self._storage.ndim}")
+        refuse_n_steps("HERWriter", data)
+        refuse_consuming("HERWriter", self._storage)
+        refuse_priorities("HERWriter", self._storage, data)
+        if has_slices(self._storage) and self.k > 0 and self.options.per == "transition":
+            raise ValueError(
+                "under a sampler of slices, HERWriter needs per='episode': with per='transition' a slice "
+                "would hold copies of one transition for several goals, and no sequence"
+            )
+        if has_slices(self._storage) and self.options.n_steps > 1:
+            raise ValueError(
+                f"under a sampler of slices, HERWriter needs n_steps=1, got {self.options.n_steps}: "
+                "the steps of a slice follow each other already"
+            )
 
-    def _broken(self, rows: TensorDictBase, lanes: Tensor, held: int) -> Tensor:
-        """Which transitions [n] were held back last in a lane that then continues with another episode."""
-        order = lanes.argsort(stable=True)
-        last, new = order[:-1], order[1:]
-        seam = (lanes[last] == lanes[new]) & (last < held) & (new >= held)
-        last, new = last[seam], new[seam]
-        joins = [(self._keys.next_achieved, self._keys.achieved), (self._keys.goals[1], self._keys.goals[0])]
-        differs = torch.zeros_like(last, dtype=torch.bool)
-        for after, before in joins:
-            pair = entry_of(rows, after)[last], entry_of(rows, before)[new]
-            differs |= (pair[0] != pair[1]).flatten(1).any(1)
-        return torch.zeros_like(lanes, dtype=torch.bool).index_fill_(0, last[differs], True)
+    def _with_held(self, data: TensorDictBase) -> tuple[TensorDictBase, str, Tensor]:
+        """Flat transitions, those held back first; what lanes are known by, and which lane each is of."""
+        kind, ids = find_lanes(data, self._keys)
+        rows = data.reshape(-1)
+        if self._held is None:
+            return rows, kind, ids
+        if kind != self._held_kind:
+            raise ValueError(
+                f"episodes that are still open were told apart by {self._held_kind}, this batch by {kind}: "
+                "hand over all batches in one form, [N, T] or flat, and with the same ids"
+            )
+        return torch.cat((self._held, rows)), kind, torch.cat((self._held_lanes, ids))
 
     def _episodes_at_once(self, episodes: Episodes) -> int:
         rows_of_each = max(1, episodes.rows.shape[1]) * (self.k + 1)
         return max(1, min(_ROWS, self._storage.max_size) // rows_of_each)
 
     def _write(self, rows: TensorDictBase, episodes: Episodes, place: Tensor, written: int) -> int:
-        """Stores the real and virtual transitions of some episodes, and notes where the real ones went."""
-        real = episodes.rows[episodes.inside]
+        """Stores the real and virtual transitions of some episodes, and notes where the real ones went.
+
+        If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out.
+        """
+        n_step = {"n_steps": self.options.n_steps, "gamma": self.options.gamma}
+        real = real_copies(rows, episodes, self._keys, **n_step)
         source, goal_source = self._draw(rows, episodes)
-        virtual = len(source)
-        out = self._build(rows, real, source, self._relabel(rows, source, goal_source) if virtual else {})
-        place[real] = torch.arange(written + virtual, written + len(out), device=place.device)
-        positive = self._positives(entry_of(out, self._keys.reward)[virtual:])
-        self._count(real=len(real), virtual=virtual, real_positive=positive)
+        parts = [real]
+        if len(source) > 0:
+            goals = entry_of(rows, self._keys.next_achieved).index_select(0, goal_source)
+            if self.options.per == "episode":
+                virtual, copy = virtual_episodes(rows, episodes, source, goals, self.reward_fn, self._keys)
+                virtual = self._with_ids(virtual, copy, len(source))
+            else:
+                virtual = virtual_copies(rows, episodes, source, goals, self.reward_fn, self._keys, **n_step)
+            self._note(rows, virtual)
+            parts = [virtual, real]
+        if self.options.per == "episode":
+            parts[-1] = self._with_ids(real, episode_numbers(episodes), len(episodes.lengths))
+        out = self._build(rows, parts)
+        behind = len(out) - len(real.root)
+        place[real.root] = torch.arange(written + behind, written + len(out), device=place.device)
+        self._count(real=len(real.root), virtual=behind, real_positive=self._positives(real.reward))
         excess = max(0, len(out) - self._storage.max_size)
         self._cursor = (self._cursor + excess) % self._storage.max_size
         self._store(out[excess:])
         return len(out)
 
-    def _build(
-        self, rows: TensorDictBase, real: Tensor, source: Tensor, changed: dict[NestedKey, Tensor]
-    ) -> TensorDictBase:
-        """Virtual transitions, made of ``source`` and the changed entries, and then the real ones.
+    def _with_ids(self, copies: Copies, number: Tensor, count: int) -> Copies:
+        """The same with trajectory ids that no other stored episode has, real or virtual."""
+        first, self._episodes = self._episodes, self._episodes + count
+        return replace(copies, changes={**copies.changes, self._keys.trajectory: number + first})
 
-        If a batch does not fit into the buffer, those in front are the first to be pushed out.
-        """
-        order = torch.cat((source, real))
-        same = rows.exclude(*self._exclude, *changed)
-        out = same.apply(partial(_take, index=order), batch_size=order.shape, is_leaf=is_leaf_nontensor)
-        for key, value in changed.items():
-            entry = entry_of(rows, key).index_select(0, real)
-            out.set(key, torch.cat((value.to(entry.dtype).view(-1, *entry.shape[1:]), entry)))
+    def _build(self, rows: TensorDictBase, parts: list[Copies]) -> TensorDictBase:
+        """Transitions, part after part; the last part is that of the real ones."""
+        changed = list(dict.fromkeys(key for part in parts for key in part.changes))
+        env_ids = in_root_and_next([self._keys.env_ids])
+        same = rows.exclude(*self._exclude, *env_ids, *changed)
+        root = torch.cat([part.root for part in parts])
+        if self.options.n_steps == 1:
+            out = _rows(same, root)
+        else:
+            out = _rows(same.exclude("next"), root)
+            out.set("next", _rows(same.get("next"), torch.cat([part.last for part in parts])))
+        for key in changed:
+            out.set(key, torch.cat([part.entry(rows, key) for part in parts]))
         if self.options.virtual_key is not None:
-            marks = torch.arange(len(order), device=order.device) < len(source)
+            marks = torch.arange(len(root), device=root.device) < len(root) - len(parts[-1].root)
             out.set(self.options.virtual_key, marks.unsqueeze(-1))
         return out
 
@@ -312,25 +378,19 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             strategy=self.strategy,
             weights=self.weights,
             keep=self._keep if self.filter_achieved else None,
+            per=self.options.per,
             generator=self._rng,
         )
 
-    def _relabel(self, rows: TensorDictBase, source: Tensor, goal_source: Tensor) -> dict[NestedKey, Tensor]:
-        """The entries in which virtual transitions differ from the real ones they are made of."""
-        achieved = entry_of(rows, self._keys.next_achieved)
-        goals = achieved.index_select(0, goal_source)
-        reward, terminated = self.reward_fn(achieved.index_select(0, source), goals)
-        self._note(rows, source, goals, reward)
-        truncated = entry_of(rows, self._keys.truncated).index_select(0, source)
-        return self._keys.changes(goals, reward, terminated, truncated)
-
-    def _note(self, rows: TensorDictBase, source: Tensor, goals: Tensor, reward: Tensor) -> None:
+    def _note(self, rows: TensorDictBase, virtual: Copies) -> None:
         """Counts the rewards of virtual transitions, and tells the weights which goals were written."""
-        useful = reward
+        useful, goals = virtual.reward, virtual.changes[self._keys.goals[0]]
         if not self.filter_achieved:  # otherwise all are useful
-            before = rows.get(self._keys.achieved).index_select(0, source)
-            useful = reward[self._keep(before, goals)]
-        self._count(virtual_positive=self._positives(reward), useful_virtual_positive=self._positives(useful))
+            before = entry_of(rows, self._keys.achieved).index_select(0, virtual.root)
+            useful = useful[self._keep(before, goals)]
+        self._count(
+            virtual_positive=self._positives(virtual.reward), useful_virtual_positive=self._positives(useful)
+        )
         if self.weights is not None:
             self.weights.update(goals)
 
@@ -341,6 +401,11 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     def _positives(self, reward: Tensor) -> int:
         return int((reward >= self.achieved_reward).count_nonzero())
+
+
+def _rows(transitions: TensorDictBase, index: Tensor) -> TensorDictBase:
+    out = transitions.apply(partial(_take, index=index), batch_size=index.shape, is_leaf=is_leaf_nontensor)
+    return TensorDict(batch_size=index.shape, device=index.device) if out is None else out
 
 
 def _take(entry: Any, index: Tensor) -> Any:

@@ -13,6 +13,8 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_her.replay_buffers.writer import HERWriter
+from torchrl_her.trainers.cut import cut_episodes
 from torchrl_her.trainers.learner import Learner
 
 _IDLE = -torch.inf  # measured by a run that did not learn; NaN would hide runs that diverged
@@ -40,6 +42,9 @@ def check_finite(batch: TensorDictBase, keys: tuple[str, ...] = _MUST_BE_FINITE)
 
 class Trainer:
     """Trains in epochs of a fixed number of frames, each beginning with fresh episodes.
+
+    Episodes that are still open when an epoch ends are truncated there: their transitions are stored and
+    learned from like those of any other episode.
 
     If ``on_batch`` raises an exception in the middle of an epoch, the next call of :meth:`epoch` finishes
     that epoch.
@@ -107,6 +112,7 @@ class Trainer:
         self.frames = self.updates = self.epochs = 0
         self._credit = 0.0  # gradient steps that the frames so far allow and that were not made yet
         self._measured: list[dict[str, Tensor]] | None = None  # in the epoch under way
+        self._open = False  # whether episodes go on that were written in part
 
     @property
     def in_epoch(self) -> bool:
@@ -120,9 +126,9 @@ class Trainer:
             on_batch: called after each batch, for example for a progress bar.
         """
         if self._measured is None:
-            self.collector.reset()
+            self._reset_collector()
             self._measured = []
-        self._work((self.epochs + 1) * self.epoch_frames, self._measured, on_batch)
+        self._work((self.epochs + 1) * self.epoch_frames, self._measured, on_batch, cut=True)
         measured, self._measured = _means(self._measured), None
         self.epochs += 1
         for schedule in self.schedules:
@@ -130,21 +136,40 @@ class Trainer:
         return measured
 
     def run(self, frames: int, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
-        """Collects and learns for a number of frames of each run, rounded up to whole batches."""
+        """Collects and learns for a number of frames of each run, rounded up to whole batches.
+
+        Episodes that are open at the end go on in the next call, also if that is an epoch.
+        """
         measured: list[dict[str, Tensor]] = []
-        self._work(self.frames + frames, measured, on_batch)
+        self._work(self.frames + frames, measured, on_batch, cut=False)
         return _means(measured)
 
+    def _reset_collector(self) -> None:
+        """Begins new episodes everywhere. Those that were under way are written as far as they got."""
+        self.collector.reset()
+        for buffer in self.buffers:
+            if isinstance(buffer.writer, HERWriter):
+                buffer.writer.end_episodes()
+
     def _work(
-        self, end: int, measured: list[dict[str, Tensor]], on_batch: Callable[[Trainer], None] | None
+        self,
+        end: int,
+        measured: list[dict[str, Tensor]],
+        on_batch: Callable[[Trainer], None] | None,
+        *,
+        cut: bool,
     ) -> None:
-        """Collects and learns up to a number of frames, and notes what the learner measures."""
+        """Collects and learns up to a number of frames, and notes what the learner measures.
+
+        ``cut`` truncates the episodes that are open at the end, since a reset follows.
+        """
         while self.frames < end:
             batch = self.collector.next()
             check_finite(batch)
             if ("collector", "traj_ids") not in batch.keys(True):
                 raise ValueError("the collector must mark trajectories: episodes are cut where epochs begin")
-            collected = self._write(batch)
+            self._open = not (cut and self.frames + batch.numel() // len(self.buffers) >= end)
+            collected = self._write(batch if self._open else cut_episodes(batch))
             self.frames += collected
             self._credit += collected / self.frames_per_update
             measured += self._learn()

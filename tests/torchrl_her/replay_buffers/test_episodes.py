@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_her.replay_buffers import find_episodes
+from torchrl_her.replay_buffers.episodes import time_order
 
 
 def test_episodes_of_different_lengths_are_padded_with_their_last_row() -> None:
@@ -40,16 +41,15 @@ def test_nothing_closed_is_no_episode() -> None:
 
 def test_no_rows_at_all() -> None:
     nothing = torch.empty(0, dtype=torch.int64)
-    episodes, left = find_episodes(nothing, nothing.bool(), nothing)
+    episodes, left = find_episodes(nothing, nothing.bool())
     assert len(episodes.lengths) == len(left) == 0
 
 
-def test_an_environment_that_was_reset_from_outside_ends_its_episode() -> None:
-    lanes = torch.zeros(4, dtype=torch.int64)
-    never = torch.zeros(4, dtype=torch.bool)
-    episodes, left = find_episodes(lanes, never, torch.tensor([7, 7, 8, 8]))
-    assert episodes.rows.tolist() == [[0, 1]]
-    assert left.tolist() == [2, 3]
+def test_an_order_that_is_known_is_used() -> None:
+    lanes, end = torch.tensor([1, 0, 1, 0]), torch.tensor([False, True, False, True])
+    episodes, left = find_episodes(lanes, end, time_order(lanes))
+    assert episodes.rows.tolist() == [[1], [3]]
+    assert left.tolist() == [0, 2]
 
 
 def test_split_keeps_order() -> None:

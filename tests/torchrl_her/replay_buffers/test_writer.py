@@ -5,6 +5,9 @@ Goals are tagged with the environment, episode and state that they come from (se
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import pickle
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +20,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, SliceSampler
+from torchrl.envs.transforms import MultiStepTransform
 
 from torchrl_her import EnvReward, GoalReward, GoalWeights, HERWriter
 
@@ -27,9 +31,9 @@ REWARD = GoalReward(0.5)  # tags differ by at least 1
 
 
 def make_buffer(
-    capacity: int = 10_000, *, per: bool = False, seed: int = 0, **options: Any
+    capacity: int = 10_000, *, prioritized: bool = False, seed: int = 0, **options: Any
 ) -> TensorDictReplayBuffer:
-    sampler = PrioritizedSampler(capacity, alpha=0.6, beta=0.4) if per else RandomSampler()
+    sampler = PrioritizedSampler(capacity, alpha=0.6, beta=0.4) if prioritized else RandomSampler()
     writer = HERWriter(options.pop("reward", REWARD), **options)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), writer=writer, sampler=sampler)
     buffer.set_rng(torch.Generator().manual_seed(seed))
@@ -271,8 +275,8 @@ def test_an_open_episode_is_held_back_until_it_closes() -> None:
 
 
 def test_nothing_closed_writes_nothing() -> None:
-    for per in (False, True):
-        buffer = make_buffer(per=per)
+    for prioritized in (False, True):
+        buffer = make_buffer(prioritized=prioritized)
         index = buffer.extend(make_batch([[9]], steps=3))
         assert index.tolist() == [[-1, -1, -1]]
         assert len(buffer) == 0
@@ -307,11 +311,25 @@ def test_single_steps_may_be_added() -> None:
     assert tags(virtual["desired_goal"]) == [3.0, 3.0, 3.0]
 
 
-def test_an_environment_reset_from_outside_leaks_nothing() -> None:
+def with_env_ids(batch: TensorDict) -> TensorDict:
+    """As with the transform ``EnvIds``: of thousands, so that their order is not that of the lanes."""
+    ids = 7_000 - batch["observation"][..., :1].div(1_000, rounding_mode="floor").long()
+    return batch.set("env_ids", ids).set(("next", "env_ids"), ids)
+
+
+@pytest.mark.parametrize("how", ["told", "known by ids"])
+def test_an_environment_reset_from_outside_leaks_nothing(how: str) -> None:
     buffer = make_buffer(strategy="final", k=1)
-    buffer.extend(make_batch([[9]], steps=3))
-    later = make_batch([[9, 2]], steps=2, first=[(1, 0)])
-    buffer.extend(later)
+    first, later = make_batch([[9]], steps=3), make_batch([[9, 2]], steps=2, first=[(1, 0)])
+    if how == "told":
+        buffer.extend(first)
+        buffer.writer.end_episodes()
+        buffer.extend(later)
+    else:
+        buffer.extend(with_env_ids(first))
+        buffer.extend(with_env_ids(later))
+        assert "env_ids" not in buffer[:].keys()
+        assert ("next", "env_ids") not in buffer[:].keys(True)
     _, virtual = split(buffer)
     pairs = set(zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True))
     assert pairs == {(0.0, 3.0), (1.0, 3.0), (2.0, 3.0), (100.0, 102.0), (101.0, 102.0)}
@@ -327,10 +345,10 @@ def test_an_environment_reset_from_outside_leaks_nothing() -> None:
     st.booleans(),
 )
 def test_no_goal_ever_leaks(
-    lengths: list[list[int]], size: int, strategy: str, capacity: int, per: bool
+    lengths: list[list[int]], size: int, strategy: str, capacity: int, prioritized: bool
 ) -> None:
     """Batches of any size, buffers that wrap: every virtual goal is of its own episode."""
-    buffer = make_buffer(capacity, strategy=strategy, k=3, per=per)
+    buffer = make_buffer(capacity, strategy=strategy, k=3, prioritized=prioritized)
     whole = make_batch(lengths)
     for start in range(0, whole.shape[1], size):
         buffer.extend(whole[:, start : start + size].clone())
@@ -349,9 +367,9 @@ def test_no_goal_ever_leaks(
 # Buffers
 
 
-@pytest.mark.parametrize("per", [False, True])
-def test_a_full_buffer_keeps_the_newest_rows_and_can_be_sampled(per: bool) -> None:
-    buffer = make_buffer(60, per=per, k=4)
+@pytest.mark.parametrize("prioritized", [False, True])
+def test_a_full_buffer_keeps_the_newest_rows_and_can_be_sampled(prioritized: bool) -> None:
+    buffer = make_buffer(60, prioritized=prioritized, k=4)
     for episode in range(7):
         buffer.extend(make_batch([[10] * 7], steps=10, first=[(episode, 0)]))
     assert len(buffer) == 60
@@ -360,9 +378,9 @@ def test_a_full_buffer_keeps_the_newest_rows_and_can_be_sampled(per: bool) -> No
     assert (rows["observation"][:, 0] >= 500).all()
 
 
-@pytest.mark.parametrize("per", [False, True])
-def test_a_batch_larger_than_the_buffer(per: bool) -> None:
-    buffer = make_buffer(50, per=per, k=4)
+@pytest.mark.parametrize("prioritized", [False, True])
+def test_a_batch_larger_than_the_buffer(prioritized: bool) -> None:
+    buffer = make_buffer(50, prioritized=prioritized, k=4)
     index = buffer.extend(make_batch([[10] * 5]))
     assert len(buffer) == 50
     assert index[0, :40].tolist() == [-1] * 40  # pushed out by later rows of the same batch
@@ -379,7 +397,7 @@ def test_an_episode_larger_than_the_buffer_keeps_its_real_rows() -> None:
 
 
 def test_all_rows_are_new_to_a_prioritized_sampler() -> None:
-    buffer = make_buffer(per=True, k=4)
+    buffer = make_buffer(prioritized=True, k=4)
     buffer.extend(make_batch([[10]]))
     buffer.update_priority(torch.arange(50), torch.full((50,), 1e-6))
     buffer.extend(make_batch([[10, 10]], steps=10, first=[(1, 0)]))
@@ -396,7 +414,7 @@ def test_share_of_virtual_rows_in_a_batch(k: int, share: float) -> None:
 
 
 def test_held_back_rows_are_skipped_by_priority_updates() -> None:
-    buffer = make_buffer(per=True)
+    buffer = make_buffer(prioritized=True)
     index = buffer.extend(make_batch([[3, 9]], steps=5)).flatten()
     buffer.update_priority(index, torch.full((5,), 2.0))
     assert (index == -1).sum() == 2
@@ -641,3 +659,298 @@ def test_rows_that_wait_in_vain_are_noticed() -> None:
     buffer = make_buffer(capacity=5)
     with pytest.warns(UserWarning, match="6 transitions of open episodes wait .* than the buffer's 5"):
         buffer.extend(make_batch([[9]], steps=6))
+
+
+# Beside other collectors
+
+
+@pytest.mark.parametrize("ids", [True, False])
+def test_batches_in_which_places_are_taken_by_others_are_refused(ids: bool) -> None:
+    buffer = make_buffer()
+    first, other = make_batch([[9]], steps=3), make_batch([[9], [9]], steps=3)[1:]
+    if not ids:
+        first, other = first.exclude("collector"), other.exclude("collector")
+    buffer.extend(first)
+    with pytest.raises(ValueError, match=r"1 episodes are not over, but .*EnvIds\(\)"):
+        buffer.extend(other)
+    assert buffer.writer.held_back == 3
+
+
+def test_another_trajectory_within_a_batch_is_refused_without_environment_ids() -> None:
+    workers = make_batch([[9], [9]], steps=3)
+    with pytest.raises(ValueError, match="1 episodes are not over"):
+        make_buffer().extend(workers.reshape(1, 6))  # cat_results=-1
+
+
+@pytest.mark.parametrize("joined", [True, False])
+def test_environments_of_several_workers_are_told_apart_by_their_ids(joined: bool) -> None:
+    """In turns, as from an asynchronous collector, or one behind the other, as with cat_results=-1."""
+    whole = with_env_ids(make_batch([[5, 3], [4, 4], [2, 6], [8]]))
+    buffer = make_buffer(strategy="final", k=1)
+    for start in range(0, 8, 2):
+        one, two = whole[:2, start : start + 2].clone(), whole[2:, start : start + 2].clone()
+        for part in [torch.cat((one, two), 1)] if joined else [two, one]:
+            buffer.extend(part)
+    real, virtual = split(buffer)
+    assert (len(real), len(virtual), buffer.writer.held_back) == (32, 32, 0)
+    last = {0: 5.0, 1: 103.0, 10: 1004.0, 11: 1104.0, 20: 2002.0, 21: 2106.0, 30: 3008.0}
+    for observation, goal in zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True):
+        assert goal == last[int(observation // 100)]
+
+
+def test_the_values_of_environment_ids_do_not_matter() -> None:
+    batch = make_batch([[5], [3], [4]])
+    stored = []
+    for ids in ([3, 1, 2], [10**15, 7, 4]):
+        own = batch.clone().set("env_ids", torch.tensor(ids).view(3, 1, 1).expand(3, 5, 1))
+        buffer = make_buffer()
+        buffer.extend(own)
+        stored.append(buffer[:])
+    assert all(torch.equal(stored[0][key], stored[1][key]) for key in stored[0].keys(True, True))
+
+
+def test_ids_that_are_used_again_join_no_episodes() -> None:
+    first = make_batch([[9]], steps=3).squeeze(0)
+    again = make_batch([[9, 4]], first=[(1, 0)], steps=4).squeeze(0)
+    again["collector", "traj_ids"] = torch.zeros(4, dtype=torch.int64)  # a second collector counts from 0
+    buffer = make_buffer(strategy="final", k=1)
+    buffer.extend(first)
+    buffer.extend(again)
+    _, virtual = split(buffer)
+    pairs = set(zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True))
+    assert pairs == {(0.0, 3.0), (1.0, 3.0), (2.0, 3.0)} | {(100.0 + t, 104.0) for t in range(4)}
+
+
+def test_batches_in_another_form_are_refused_while_episodes_are_open() -> None:
+    buffer = make_buffer()
+    buffer.extend(make_batch([[9]], steps=3))
+    with pytest.raises(ValueError, match="by places in the batch, this batch by trajectory ids"):
+        buffer.extend(make_batch([[9]], first=[(0, 3)], steps=3).squeeze(0))
+
+
+# Whole episodes
+
+
+def make_sliced(**options: Any) -> TensorDictReplayBuffer:
+    sampler = SliceSampler(num_slices=20, traj_key=("collector", "traj_ids"), strict_length=False)
+    writer = HERWriter(REWARD, per="episode", **options)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(10_000), writer=writer, sampler=sampler, batch_size=20 * 4
+    )
+    buffer.set_rng(torch.Generator().manual_seed(0))
+    return buffer
+
+
+def test_whole_episodes_by_hand() -> None:
+    batch, path = make_batch([[4]]), torch.tensor([0.0, 1.0, 2.0, 1.0, 5.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    buffer = make_sliced(k=200)
+    buffer.extend(batch)
+    rows = buffer[:]
+    ids = rows["collector", "traj_ids"]
+    seen = {}
+    for number in ids.unique().tolist():
+        own = rows[ids == number]
+        if not own["virtual"].any():
+            continue
+        goal = own["desired_goal"][:, 0].unique()
+        assert len(goal) == 1
+        assert torch.equal(own["desired_goal"], own["next", "desired_goal"])
+        after = own["next"]
+        assert torch.equal(after["done"], after["terminated"] | after["truncated"])
+        seen[goal.item()] = (
+            tags(own["observation"]),
+            after["reward"].flatten().tolist(),
+            after["terminated"].flatten().tolist(),
+            after["truncated"].flatten().tolist(),
+        )
+    no = [False, False, False]
+    assert seen == {
+        1.0: ([0.0], [0.0], [True], [False]),  # achieved by the first step, so the episode ends there
+        2.0: ([0.0, 1.0], [-1.0, 0.0], [False, True], [False, False]),
+        5.0: ([0.0, 1.0, 2.0, 3.0], [-1.0, -1.0, -1.0, 0.0], [*no, True], [*no, True]),
+    }
+    assert len(ids.unique()) == 201
+    assert tags(rows[~rows["virtual"].squeeze(-1)]["observation"]) == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_an_episode_that_does_not_terminate_for_its_goal_is_truncated() -> None:
+    endless = EnvReward(lambda a, d: REWARD(a, d)[0], lambda a, d: torch.zeros_like(a[..., :1]).bool())
+    batch = make_batch([[3]], terminated=True)
+    buffer = make_buffer(reward=endless, per="episode", k=1)
+    buffer.extend(batch)
+    _, virtual = split(buffer)
+    assert len(virtual) == 3
+    assert virtual["next", "truncated"].flatten().tolist() == [False, False, True]
+    assert virtual["next", "done"].flatten().tolist() == [False, False, True]
+    assert not virtual["next", "terminated"].any()
+
+
+def test_goals_of_whole_episodes_follow_weights_and_filter() -> None:
+    batch, path = make_batch([[4]]), torch.tensor([1.0, 1.0, 2.0, 1.0, 6.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    buffer = make_buffer(per="episode", k=4_000, filter_achieved=True, weights=PreferFar(), seed=3, capacity=20_000)
+    buffer.extend(batch)
+    _, virtual = split(buffer)
+    first = virtual[virtual["observation"][:, 0] == 0]
+    goals, counts = first["desired_goal"][:, 0].unique(return_counts=True)
+    assert goals.tolist() == [2.0, 6.0]  # 1 is achieved in the first state
+    assert (counts / 4_000).tolist() == pytest.approx([0.25, 0.75], abs=0.04)
+
+
+def test_an_episode_in_which_nothing_moved_has_no_virtual_copy() -> None:
+    batch = make_batch([[4]])
+    batch["achieved_goal"].zero_()
+    batch["next", "achieved_goal"].zero_()
+    buffer = make_buffer(per="episode", filter_achieved=True)
+    buffer.extend(batch)
+    assert [len(rows) for rows in split(buffer)] == [4, 0]
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(st.lists(st.integers(1, 6), min_size=1, max_size=4), min_size=1, max_size=3),
+    st.integers(1, 7),
+    st.sampled_from(["future", "final"]),
+)
+def test_slices_are_sequences_with_one_goal(lengths: list[list[int]], size: int, strategy: str) -> None:
+    buffer = make_sliced(strategy=strategy, k=3)
+    whole = make_batch(lengths)
+    for start in range(0, whole.shape[1], size):
+        buffer.extend(whole[:, start : start + size].clone())
+    if not len(buffer):
+        return
+    rows = buffer.sample()
+    slices = rows.split((torch.diff(_ends(rows), prepend=torch.tensor([-1]))).tolist())
+    assert len(slices) == 20
+    for part in slices:
+        step = part["observation"][:, 0]
+        assert torch.equal(step, step[0] + torch.arange(len(part)))
+        assert (part["desired_goal"] == part["desired_goal"][0]).all()
+        assert len(part["collector", "traj_ids"].unique()) == 1
+        if part["virtual"][0]:
+            goal = part["desired_goal"][:, 0]
+            assert ((goal / 100).floor() == (step / 100).floor()).all()
+            assert torch.equal(part["next", "terminated"].flatten(), step + 1 == goal)
+
+
+def _ends(rows: TensorDict) -> Tensor:
+    """Where slices end, which the sampler marks as truncated."""
+    return rows["next", "truncated"].flatten().nonzero().squeeze(-1)
+
+
+# Several steps
+
+
+@pytest.mark.parametrize("n_steps", [2, 3, 10])
+def test_returns_over_several_steps_by_hand(n_steps: int) -> None:
+    batch, gamma = make_batch([[4]]), 0.5
+    batch["next", "reward"][0, :, 0] = torch.tensor([-1.0, -2.0, -4.0, -8.0])
+    buffer = make_buffer(strategy="final", k=1, n_steps=n_steps, gamma=gamma)
+    buffer.extend(batch)
+    real, virtual = split(buffer)
+    sums = {
+        2: ([-2.0, -4.0, -8.0, -8.0], [-1.5, -1.5, -1.0, 0.0], [2, 2, 2, 1]),
+        3: ([-3.0, -6.0, -8.0, -8.0], [-1.75, -1.5, -1.0, 0.0], [3, 3, 2, 1]),
+        10: ([-4.0, -6.0, -8.0, -8.0], [-1.75, -1.5, -1.0, 0.0], [4, 3, 2, 1]),
+    }[n_steps]
+    for rows, reward in ((real, sums[0]), (virtual, sums[1])):
+        rows = rows[rows["observation"][:, 0].argsort()]
+        assert rows["next", "reward"].flatten().tolist() == reward
+        assert rows["steps_to_next_obs"].flatten().tolist() == sums[2]
+        behind = [t + steps for t, steps in enumerate(sums[2])]
+        assert tags(rows["next", "observation"]) == behind
+        at_end = [state == 4 for state in behind]
+        assert rows["next", "truncated"].flatten().tolist() == at_end
+        assert rows["next", "done"].flatten().tolist() == at_end
+        assert rows["next", "terminated"].flatten().tolist() == (
+            at_end if rows["virtual"][0] else [False] * 4
+        )
+
+
+def test_goals_that_are_passed_on_the_way_cut_the_steps() -> None:
+    batch, path = make_batch([[4]]), torch.tensor([0.0, 1.0, 2.0, 3.0, 1.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    buffer = make_buffer(strategy="final", k=1, n_steps=3, gamma=0.5)
+    buffer.extend(batch)
+    _, virtual = split(buffer)
+    first = virtual[virtual["observation"][:, 0] == 0].squeeze(0)
+    assert first["next", "reward"].item() == 0.0  # the goal 1 is achieved by the first step, not by the last
+    assert (first["next", "terminated"].item(), first["next", "done"].item()) == (True, True)
+    assert (first["steps_to_next_obs"].item(), first["next", "observation"][0].item()) == (1, 1.0)
+    assert not first["next", "truncated"].item()
+    second = virtual[virtual["observation"][:, 0] == 1].squeeze(0)
+    assert second["next", "reward"].item() == -1.5
+    assert (second["steps_to_next_obs"].item(), second["next", "terminated"].item()) == (3, True)
+
+
+def test_steps_never_cross_episodes_or_environments() -> None:
+    buffer = make_buffer(k=4, n_steps=3, gamma=0.9)
+    whole = make_batch([[5, 3], [2, 6]])
+    for start in range(0, 8, 3):
+        buffer.extend(whole[:, start : start + 3].clone())
+    rows = buffer[:]
+    steps = rows["steps_to_next_obs"][:, 0]
+    assert torch.equal(rows["next", "observation"][:, 0], rows["observation"][:, 0] + steps)
+    ends = {0: 5.0, 1: 103.0, 10: 1002.0, 11: 1106.0}
+    for before, after in zip(tags(rows["observation"]), tags(rows["next", "observation"]), strict=True):
+        assert after <= ends[int(before // 100)]
+    assert steps.max() == 3
+
+
+def test_one_step_is_as_without_the_option() -> None:
+    one, plain = make_buffer(n_steps=1, gamma=0.9), make_buffer()
+    for buffer in (one, plain):
+        buffer.extend(make_batch([[5, 3], [2, 6]]))
+    assert all(torch.equal(one[:][key], plain[:][key]) for key in plain[:].keys(True, True))
+    assert "steps_to_next_obs" not in one[:].keys()
+
+
+# Parts that cannot work together
+
+
+def test_slices_of_single_copies_are_refused() -> None:
+    buffer = make_sliced()
+    buffer.writer.options = replace(buffer.writer.options, per="transition")
+    with pytest.raises(ValueError, match="under a sampler of slices, HERWriter needs per='episode'"):
+        buffer.extend(make_batch([[3]]))
+    buffer.writer.options = replace(buffer.writer.options, k=0, n_steps=2, gamma=0.9)
+    with pytest.raises(ValueError, match="needs n_steps=1, got 2"):
+        buffer.extend(make_batch([[3]]))
+
+
+def test_rows_over_several_steps_are_refused() -> None:
+    buffer = make_buffer()
+    buffer.append_transform(MultiStepTransform(n_steps=2, gamma=0.9))
+    with pytest.raises(ValueError, match="options n_steps and gamma"):
+        buffer.extend(make_batch([[5]]))
+
+
+def test_a_buffer_that_consumes_is_refused() -> None:
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100), writer=HERWriter(REWARD), batch_size=4, consume_after_n_samples=1
+    )
+    with pytest.raises(ValueError, match="cannot work in a buffer that consumes"):
+        buffer.extend(make_batch([[5]]))
+
+
+def test_a_copy_in_another_process_is_refused() -> None:
+    buffer = make_buffer()
+    with pytest.raises(RuntimeError, match="workers send episodes and the learner extends"):
+        multiprocessing.get_context("spawn").Process(target=len, args=(buffer.writer,)).start()
+    buffer.writer._process += 1  # as in a fork, which copies without asking
+    with pytest.raises(RuntimeError, match="only in the process that made its buffer"):
+        buffer.extend(make_batch([[5]]))
+    other = pickle.loads(pickle.dumps(buffer.writer))  # moved as a whole, as Ray does
+    assert other._process == os.getpid()
+
+
+def test_priorities_in_a_batch_are_those_of_real_rows_if_it_is_flat() -> None:
+    batch = make_batch([[3, 9]], steps=5)
+    batch["td_error"] = torch.full((1, 5), 1e6)
+    buffer = make_buffer(prioritized=True)
+    with pytest.raises(ValueError, match=r"holds priorities \('td_error'\)"):
+        buffer.extend(batch)
+    index = buffer.extend(batch.squeeze(0))
+    assert index.tolist() == [12, 13, 14, -1, -1]
+    assert not buffer.sample(100)["virtual"].any()

@@ -1,0 +1,136 @@
+"""Lanes: which environment, or which trajectory, each transition of a batch belongs to.
+
+Batches come from one collector or from several, with or without ids. Transitions of one lane are in the order
+of time, one episode after the other, and a lane goes on from batch to batch.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_her.replay_buffers.keys import TransitionKeys
+
+BY_ENV, BY_TRAJECTORY, BY_PLACE = "environment ids", "trajectory ids", "places in the batch"
+
+_REMEDY = (
+    "Append the transform torchrl_her.EnvIds() to the environments, so that they can be told apart. "
+    "If it was you who reset them (collector.reset()), call HERWriter.end_episodes(), too"
+)
+
+
+def find_lanes(data: TensorDictBase, keys: TransitionKeys) -> tuple[str, Tensor]:
+    """The lanes of a batch [N, T], time last, or of a flat batch [n].
+
+    Environment ids are used if there are any. Without them, a row of a batch [N, T] is an environment; a flat
+    batch is split by trajectory ids, or is a single environment's if it has none of these either.
+
+    Returns:
+        ``(kind, lanes)``: what lanes are known by, and the lane of each transition, int64, flat.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_her import HindsightOptions
+        >>> kind, lanes = find_lanes(TensorDict(batch_size=[2, 3]), HindsightOptions().transition_keys())
+        >>> kind, lanes.tolist()
+        ('places in the batch', [0, 0, 0, 1, 1, 1])
+    """
+    if (envs := data.get(keys.env_ids, None)) is not None:
+        return BY_ENV, envs.reshape(-1)
+    if data.ndim == 1 and (trajectory := data.get(keys.trajectory, None)) is not None:
+        return BY_TRAJECTORY, trajectory.reshape(-1)
+    steps = max(data.shape[-1], 1)
+    places = torch.arange(data.numel() // steps, device=data.device)
+    return BY_PLACE, places.repeat_interleave(steps)
+
+
+def in_order(lanes: Tensor) -> Tensor:
+    """Lanes [n], numbered in the order in which they first appear: random ids leave no trace in results.
+
+    Example:
+        >>> in_order(torch.tensor([7, 7, 3, 7, 5])).tolist()
+        [0, 0, 1, 0, 2]
+    """
+    _, number = lanes.unique(return_inverse=True)
+    place = torch.arange(len(lanes), device=lanes.device)
+    first = place.new_full((int(number.max()) + 1 if len(lanes) else 0,), len(lanes))
+    first = first.scatter_reduce(0, number, place, "amin")
+    return first.argsort().argsort()[number]
+
+
+def broken(
+    rows: TensorDictBase,
+    lanes: Tensor,
+    order: Tensor,
+    done: Tensor,
+    keys: TransitionKeys,
+    *,
+    kind: str,
+    held: int,
+    resumed: bool,
+) -> Tensor:
+    """Where an episode is over although its last transition does not say so, [n] of bool.
+
+    That is where another episode's transition follows in the same lane: an environment was reset from
+    outside, or another collector uses the same ids again.
+
+    Args:
+        rows: [n], the first of which were held back, as their episodes were open.
+        lanes: [n], of all rows.
+        order: [n], of :func:`~torchrl_her.replay_buffers.episodes.time_order`.
+        done: [n] of bool, where episodes are known to be over.
+        keys: where goals are.
+        kind: what lanes are known by.
+        held: how many were held back.
+        resumed: whether they come from a checkpoint: their episodes may then end anywhere.
+
+    Raises:
+        ValueError: lanes are places in the batch, and it cannot be known whether an episode is over, or
+            whether this batch comes from other environments than the one before.
+    """
+    over = torch.zeros_like(lanes, dtype=torch.bool)
+    trajectory = None if kind == BY_TRAJECTORY else rows.get(keys.trajectory, None)
+    if trajectory is None and held == 0:
+        return over
+    last, new = order[:-1], order[1:]
+    same = lanes[last] == lanes[new]
+    jumps = torch.zeros_like(same)
+    if trajectory is not None:
+        ids = trajectory.reshape(-1)[order]
+        jumps = same & (ids[1:] != ids[:-1])
+    if held > 0:
+        jumps |= _jumps(rows, keys, last, new, same & (last < held) & (new >= held))
+    over[last] = jumps
+    over &= ~done
+    if kind == BY_PLACE and not resumed and bool(over.any()):
+        raise ValueError(
+            f"{int(over.count_nonzero())} episodes are not over, but other ones follow in their places: "
+            "either environments were reset from outside, or batches come from several collectors. " + _REMEDY
+        )
+    return over
+
+
+def ends_of_held(lanes: Tensor, order: Tensor, held: int) -> Tensor:
+    """The last transition of each lane, among those that were held back: [n] of bool.
+
+    Args:
+        lanes, order, held: as for :func:`broken`.
+    """
+    own = order[order < held]
+    last = torch.ones_like(own, dtype=torch.bool)
+    last[:-1] = lanes[own[1:]] != lanes[own[:-1]]
+    return torch.zeros_like(lanes, dtype=torch.bool).index_fill_(0, own[last], True)
+
+
+def _jumps(rows: TensorDictBase, keys: TransitionKeys, last: Tensor, new: Tensor, seam: Tensor) -> Tensor:
+    """For neighbors [n - 1] at a seam between two batches: which of them do not fit together."""
+    at = seam.nonzero().squeeze(-1)
+    jumps = torch.zeros_like(seam)
+    if len(at) == 0:
+        return jumps
+    for after, before in ((keys.next_achieved, keys.achieved), (keys.goals[1], keys.goals[0])):
+        if (one := rows.get(after, None)) is None or (other := rows.get(before, None)) is None:
+            continue  # goals are not needed where none are drawn
+        jumps[at] |= (one[last[at]] != other[new[at]]).flatten(1).any(1)
+    return jumps

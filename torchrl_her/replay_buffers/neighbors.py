@@ -1,0 +1,76 @@
+"""The parts of a replay buffer beside which hindsight would silently be wrong; these are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.data.replay_buffers.samplers import ConsumingSampler, Sampler, SamplerEnsemble, SliceSampler
+from torchrl.data.replay_buffers.storages import Storage
+
+from torchrl_her.replay_buffers.n_steps import STEPS_KEY
+
+SHARED = (
+    "workers send episodes and the learner extends. Leave replay_buffer= of the collector out, and extend "
+    "the buffer with what the collector yields"
+)
+
+
+def samplers_of(storage: Storage) -> Iterator[Sampler]:
+    """The samplers of all buffers that read a storage, those of ensembles one by one."""
+    waiting: list[Any] = [getattr(buffer, "_sampler", None) for buffer in storage._attached_entities]
+    while waiting:
+        sampler = waiting.pop()
+        if isinstance(sampler, SamplerEnsemble):
+            waiting.extend(sampler._samplers)
+        elif isinstance(sampler, Sampler):
+            yield sampler
+
+
+def refuse_priorities(name: str, storage: Storage, transitions: TensorDictBase) -> None:
+    """Raises an error if a batch of several dimensions brings its own priorities, which TorchRL cannot set.
+
+    Raises:
+        ValueError: it does.
+    """
+    for buffer in storage._attached_entities:
+        key = getattr(buffer, "priority_key", None)
+        if transitions.ndim > 1 and key is not None and transitions.get(key, None) is not None:
+            raise ValueError(
+                f"{name} got a batch {list(transitions.shape)} that holds priorities ({key!r}): leave them "
+                f"out, batch.exclude({key!r}), or extend with flat batches"
+            )
+
+
+def has_slices(storage: Storage) -> bool:
+    """Whether sequences are sampled from a storage."""
+    return any(isinstance(sampler, SliceSampler) for sampler in samplers_of(storage))
+
+
+def refuse_consuming(name: str, storage: Storage) -> None:
+    """Raises an error if transitions are removed as they are sampled.
+
+    Raises:
+        ValueError: a buffer of this storage consumes its transitions.
+    """
+    if any(isinstance(sampler, ConsumingSampler) for sampler in samplers_of(storage)):
+        raise ValueError(
+            f"{name} cannot work in a buffer that consumes its transitions (consume_after_n_samples, "
+            "ConsumingSampler): new ones take the places of sampled ones, in no order of time. "
+            "Use another sampler"
+        )
+
+
+def refuse_n_steps(name: str, transitions: TensorDictBase) -> None:
+    """Raises an error if transitions span several steps already.
+
+    Raises:
+        ValueError: they do.
+    """
+    if transitions.get(STEPS_KEY, None) is not None:
+        raise ValueError(
+            f"{name} got transitions that span several steps (entry {STEPS_KEY!r}, as MultiStep and "
+            "MultiStepTransform write it): goals that are passed on the way would be missed. Leave that "
+            f"transform out, and give {name} the options n_steps and gamma"
+        )
