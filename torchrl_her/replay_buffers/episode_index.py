@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -54,7 +55,13 @@ class EpisodeIndex:
         return self.first[episode], self.first[episode + 1]
 
 
-def index_episodes(done: Tensor, trajectory: Tensor | None = None, *, oldest: int = 0) -> EpisodeIndex:
+def index_episodes(
+    done: Tensor,
+    trajectory: Tensor | None = None,
+    *,
+    oldest: int = 0,
+    goals: tuple[Tensor, Tensor] | None = None,
+) -> EpisodeIndex:
     """Finds the episodes of a ring buffer.
 
     An episode ends with a row that is done, before a row of its lane with another trajectory id, or with the
@@ -64,9 +71,11 @@ def index_episodes(done: Tensor, trajectory: Tensor | None = None, *, oldest: in
 
     Args:
         done: [T, N] of bool, time first, N environments; or flat, [T].
-        trajectory: ids of the trajectories, integers of the same shape. In flat storages, an id may only be
-            used again after its episode was done.
+        trajectory: ids of the trajectories, integers of the same shape.
         oldest: slot of the oldest row: 0 until the ring is full, then the slot that is overwritten next.
+        goals: the goals achieved before and after each row's action, each [n, g] in the order of rows. An
+            episode ends where they do not fit together: where a second collector uses an id again, or
+            another environment's rows follow.
 
     Returns:
         The index. An episode that was partly overwritten consists of the rows that are left.
@@ -83,6 +92,10 @@ def index_episodes(done: Tensor, trajectory: Tensor | None = None, *, oldest: in
     if trajectory is not None:
         new[1:] |= trajectory[1:] != trajectory[:-1]
         new[0] |= trajectory[0] != trajectory[-1]
+    if goals is not None:
+        before, after = (goal.view(*done.shape, -1) for goal in goals)
+        new[1:] |= _differ(after[:-1], before[1:])
+        new[0] |= _differ(after[-1], before[0])
     new[oldest] = True
     # Only these flags are put in the order of time: moving the ids would take eight times as long.
     begins = new.roll(-oldest, 0).t().reshape(-1).nonzero().squeeze(-1)
@@ -98,5 +111,14 @@ def index_episodes(done: Tensor, trajectory: Tensor | None = None, *, oldest: in
     whole = done[(ordered_begins + ordered_lengths - 1 + oldest) % slots]
     opens = torch.ones_like(whole)
     opens[1:] = (own[1:] != own[:-1]) | whole[:-1]
+    if goals is not None:  # a run goes on in another one only if that begins where it ends
+        last = (ordered_begins + ordered_lengths - 1 + oldest) % slots
+        opens[1:] |= _differ(goals[1][last[:-1]], goals[0][(ordered_begins[1:] + oldest) % slots])
     first = torch.cat((ordered_places[opens], behind))
     return EpisodeIndex(slots, lanes, oldest, begins, places, ordered_begins, ordered_places, first)
+
+
+def _differ(one: Tensor, other: Tensor) -> Tensor:
+    """Where goals [..., g] differ, [...]; coordinate by coordinate, as torch is slow over few of them."""
+    pairs = zip(one.unbind(-1), other.unbind(-1), strict=True)
+    return reduce(torch.logical_or, [a != b for a, b in pairs])

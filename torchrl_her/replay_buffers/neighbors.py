@@ -8,8 +8,10 @@ from typing import Any
 from tensordict import TensorDictBase
 from torchrl.data.replay_buffers.samplers import ConsumingSampler, Sampler, SamplerEnsemble, SliceSampler
 from torchrl.data.replay_buffers.storages import Storage
+from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, RoundRobinWriter, Writer
 
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY
+from torchrl_her.replay_buffers.options import HindsightBase
 
 SHARED = (
     "workers send episodes and the learner extends. Leave replay_buffer= of the collector out, and extend "
@@ -26,6 +28,26 @@ def samplers_of(storage: Storage) -> Iterator[Sampler]:
             waiting.extend(sampler._samplers)
         elif isinstance(sampler, Sampler):
             yield sampler
+
+
+def refuse_unordered(name: str, storage: Storage) -> None:
+    """Raises an error if a storage's transitions are not real ones in the order of time.
+
+    Raises:
+        ValueError: a buffer of this storage writes them in another order, or relabels them.
+    """
+    for buffer in storage._attached_entities:
+        writer = getattr(buffer, "_writer", None)
+        if isinstance(writer, HindsightBase) and writer.k > 0:
+            raise ValueError(
+                f"{name} needs real transitions, but a {type(writer).__name__} with k={writer.k} relabels "
+                "them: use one of the two"
+            )
+        if isinstance(writer, Writer) and not isinstance(writer, RoundRobinWriter | ImmutableDatasetWriter):
+            raise ValueError(
+                f"{name} needs transitions in the order of time, which {type(writer).__name__} does not "
+                "keep: use RoundRobinWriter"
+            )
 
 
 def refuse_priorities(name: str, storage: Storage, transitions: TensorDictBase) -> None:

@@ -16,12 +16,15 @@ index and priorities are those of the real transitions, and reading (``buffer[:]
 from __future__ import annotations
 
 from threading import get_ident
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
+from uuid import uuid4
 
 import torch
-from tensordict import TensorDictBase, is_tensor_collection
+from tensordict import TensorDictBase, is_tensor_collection, unravel_key
 from torch import Tensor
-from torchrl.data import SampleUnit, Storage
+from torchrl.data import ReplayBuffer, SampleUnit, Storage
+from torchrl.data.replay_buffers.samplers import SliceSampler
+from torchrl.data.replay_buffers.storages import StorageEnsemble
 
 from torchrl_her.goals.factors import combine, draw, draw_alike
 from torchrl_her.goals.rewards import RewardFunction
@@ -29,6 +32,8 @@ from torchrl_her.goals.strategies import candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
 from torchrl_her.replay_buffers.keys import entry_of
+from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_return, windows
+from torchrl_her.replay_buffers.neighbors import refuse_consuming, refuse_n_steps, refuse_unordered
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 
 # Likelihoods of goals [transitions, T] that are held in memory at once.
@@ -40,9 +45,17 @@ class _Stored(NamedTuple):
 
     storage: Storage
     state: tuple[int, int]
+    rows: TensorDictBase  # [n], a view
     before: Tensor  # [n, g], goals achieved before the action
     after: Tensor  # [n, g], those that the action achieved: the candidates
     episodes: EpisodeIndex
+
+
+class _Ahead(NamedTuple):
+    """What transitions over several steps hold."""
+
+    next: TensorDictBase  # [B], of the last step
+    returns: NStepReturn  # for the goals that were chosen
 
 
 class _Chosen(NamedTuple):
@@ -51,6 +64,8 @@ class _Chosen(NamedTuple):
     size: int
     rows: Tensor  # [V], places in the batch
     goals: Tensor  # [V, g]
+    cut: Tensor | None  # [B, 1], where a sampler of slices ends them
+    ahead: _Ahead | None
 
 
 class HERSampleUnit(HindsightBase, SampleUnit):
@@ -66,8 +81,12 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     Candidates are the transitions of the same episode that are still stored. If an episode's beginning was
     overwritten, they are the remaining ones; if an episode is still open, those up to the newest one, which
     is also the goal of ``"final"`` then. Flat transitions of several environments are told apart by
-    trajectory ids. Under samplers of slices, each transition of a slice gets a goal of its own. A priority
-    belongs to the real transition, whatever goal it had when the priority was computed.
+    trajectory ids. Under samplers of slices, all transitions of a slice get the same goal: one that its last
+    transition may take and, with the filter, that was not achieved before. A priority belongs to the real
+    transition, whatever goal it had when the priority was computed.
+
+    Read stored transitions from the storage (``buffer.storage[:]``), not from the buffer. In a
+    ``ReplayBufferEnsemble``, which samples without its members' units, this raises an error, too.
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated), for instance
@@ -83,10 +102,12 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             :class:`~torchrl_her.HindsightOptions`.
 
     Raises:
-        ValueError: an option cannot be; when sampling, weights are negative or not finite.
+        ValueError: an option cannot be; when sampling, weights are negative or not finite, or the unit cannot
+            work beside another part of the buffer.
         TypeError: an unknown option; when sampling, the storage holds no tensordicts.
         KeyError: when sampling, the storage lacks an entry.
-        RuntimeError: at the second batch, :meth:`relabel` was not handed to the buffer.
+        RuntimeError: :meth:`relabel` was not handed to the buffer (at the second batch), or is given a batch
+            for which no goals were chosen.
 
     Example:
         >>> from tensordict import TensorDict
@@ -137,127 +158,238 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         super().__init__(reward_fn, options, weights=weights, **changes)
         self.generator = generator
         self._stored: _Stored | None = None
-        # For each thread: a buffer that prefetches draws and collates several batches at once.
-        self._chosen: dict[int, _Chosen] = {}
+        self._token = uuid4().hex
+
+    # Waits for ``relabel``, for each unit and thread: a buffer that prefetches draws several batches at once.
+    # It is kept here because unit and ``relabel`` may be copied to another process one by one (Ray).
+    _chosen: ClassVar[dict[tuple[str, int], _Chosen]] = {}
 
     # TorchRL's hooks
 
     def expand(
         self, index: Tensor | tuple[Tensor, ...], info: dict[str, Any], storage: Storage
     ) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        """Chooses the goals that :meth:`relabel` puts in; returns index and info unchanged."""
-        if self._chosen.pop(get_ident(), None) is not None:
+        """Chooses the goals that :meth:`relabel` puts in.
+
+        Returns:
+            ``(index, info)``, unchanged; but under a sampler of slices without its entries that are written
+            over a batch afterwards and would hide where it terminates.
+        """
+        if self._chosen.pop(self._key(), None) is not None:
             raise RuntimeError(
                 "the batch before was never relabeled: make the buffer with collate_fn=unit.relabel, too"
             )
         stored = self._read(storage)
         row = _flat(index, storage.shape).to(stored.after.device)
+        sampler = self._slice_sampler(storage)
+        ends = None if sampler is None else info.get(sampler.truncated_key)
+        group = row.unsqueeze(-1) if sampler is None else self._slices(stored, row, info, ends)
         generator = self.generator if self.generator is not None else storage._rng
-        coin = torch.rand(len(row), device=row.device, generator=generator)
-        rows = (coin < self.k / (self.k + 1)).nonzero().squeeze(-1)
-        source, valid = self._draw(stored, row[rows], generator)
+        coin = torch.rand(len(group), device=row.device, generator=generator)
+        own = (coin < self.k / (self.k + 1)).nonzero().squeeze(-1)
+        source, valid = self._draw(stored, row[group[own]] if sampler is not None else group[own], generator)
         if valid is not None:
-            rows, source = rows[valid], source[valid]
-        goals = stored.after[source]
+            own, source = own[valid], source[valid]
+        if sampler is None:
+            rows, goals = own, stored.after[source]
+        else:
+            goal_of = torch.full_like(row, -1)
+            goal_of[group[own]] = source.unsqueeze(-1).expand(-1, group.shape[1])
+            rows = (goal_of >= 0).nonzero().squeeze(-1)
+            goals = stored.after[goal_of[rows]]
         if self.weights is not None:
             self.weights.update(goals)
-        self._chosen[get_ident()] = _Chosen(len(row), rows, goals)
+        ahead = None if self.options.n_steps == 1 else self._look_ahead(stored, row, rows, goals)
+        own_ends = sampler is not None and unravel_key(sampler.truncated_key) == self._keys.truncated
+        cut = ends if own_ends else None
+        self._chosen[self._key()] = _Chosen(len(row), rows, goals, cut, ahead)
+        if cut is not None:
+            hidden = {self._keys.terminated, self._keys.done}
+            info = {key: value for key, value in info.items() if key not in hidden}
         return index, info
 
     def relabel(self, data: TensorDictBase) -> TensorDictBase:
         """Puts the chosen goals into a batch that was just sampled, with their rewards and ends.
 
         Args:
-            data: [B], as read from the storage. A batch that was read without sampling is returned unchanged.
+            data: [B], as read from the storage.
 
         Returns:
             [B], with the goals chosen by :meth:`expand`, and the mark of virtual transitions.
+
+        Raises:
+            RuntimeError: no goals were chosen for this batch.
         """
-        chosen = self._chosen.pop(get_ident(), None)
+        chosen = self._chosen.pop(self._key(), None)
         if chosen is None:
-            return data
+            raise RuntimeError(
+                "no goals were chosen for this batch: HERSampleUnit works in sample() of a single buffer. "
+                "Read what is stored from buffer.storage[...]; in a ReplayBufferEnsemble, relabel while "
+                "writing, with HERWriter"
+            )
         if data.batch_size != (chosen.size,):
             raise RuntimeError(f"{chosen.size} rows were drawn, but a batch {list(data.shape)} was read")
         out, rows = data.exclude(*self._exclude), chosen.rows
         if self.options.virtual_key is not None:
             marks = torch.zeros(chosen.size, 1, dtype=torch.bool, device=rows.device)
             out.set(self.options.virtual_key, marks.index_fill_(0, rows, True))
+        if chosen.ahead is not None:
+            after, returns = chosen.ahead
+            out.set("next", after.exclude(*(key[1:] for key in self._exclude if isinstance(key, tuple))))
+            out.set(self._keys.reward, returns.reward).set(STEPS_KEY, returns.steps)
+        if chosen.cut is not None:
+            done = entry_of(out, self._keys.done)
+            out.set(self._keys.truncated, chosen.cut)
+            out.set(self._keys.done, done | chosen.cut.view_as(done))
         if len(rows) == 0:
             return out
-        achieved = entry_of(data, self._keys.next_achieved)[rows]
-        reward, terminated = self.reward_fn(achieved, chosen.goals)
-        truncated = entry_of(data, self._keys.truncated)[rows]
+        if chosen.ahead is not None:
+            reward, terminated = chosen.ahead.returns.reward[rows], chosen.ahead.returns.terminated[rows]
+        else:
+            reward, terminated = self.reward_fn(entry_of(data, self._keys.next_achieved)[rows], chosen.goals)
+        truncated = entry_of(out, self._keys.truncated)[rows]
         for key, value in self._keys.changes(chosen.goals, reward, terminated, truncated).items():
-            entry = entry_of(data, key)
+            entry = entry_of(out, key)
             value = value.to(entry.dtype).view(len(rows), *entry.shape[1:])
             out.set(key, entry.index_copy(0, rows, value))  # a copy: what was read might be the storage
         return out
 
     def __getstate__(self) -> dict[str, Any]:
         # As TorchRL does: a generator cannot be copied to another process. The storage can be read again.
-        return {**self.__dict__, "generator": None, "_stored": None, "_chosen": {}}
+        return {**self.__dict__, "generator": None, "_stored": None}
 
     # The work
 
+    def _key(self) -> tuple[str, int]:
+        return self._token, get_ident()
+
+    def _slice_sampler(self, storage: Storage) -> SliceSampler | None:
+        """The sampler of this unit's buffer, if it samples sequences."""
+        for buffer in storage._attached_entities:
+            own = isinstance(buffer, ReplayBuffer) and buffer._sample_unit is self
+            if own and isinstance(buffer._sampler, SliceSampler):
+                if self.options.n_steps > 1:
+                    raise ValueError(
+                        "under a sampler of slices, HERSampleUnit needs n_steps=1, got "
+                        f"{self.options.n_steps}: the steps of a slice follow each other already"
+                    )
+                return buffer._sampler
+        if self.options.per == "episode":
+            raise ValueError("HERSampleUnit(per='episode') needs a sampler of slices, such as SliceSampler")
+        return None
+
+    def _slices(self, stored: _Stored, row: Tensor, info: dict[Any, Any], ends: Tensor | None) -> Tensor:
+        """Positions [S, L] in a batch of the transitions of each slice; short ones repeat their last one."""
+        place = stored.episodes.place(row)
+        begins = torch.ones_like(row, dtype=torch.bool)
+        begins[1:] = place[1:] != place[:-1] + 1
+        if ends is not None:
+            begins[1:] |= ends.flatten()[:-1]
+        mask = info.get(("collector", "mask"))  # False where a slice was padded by its last transition
+        if mask is not None:
+            begins &= mask.flatten()
+        episode, _ = stored.episodes.episode(place)
+        begins[1:] |= episode[1:] != episode[:-1]
+        first = begins.nonzero().squeeze(-1)
+        length = torch.diff(first, append=first.new_tensor([len(row)]))
+        steps = torch.arange(int(length.max()), device=row.device)
+        return first.unsqueeze(-1) + steps.minimum(length.unsqueeze(-1) - 1)
+
+    def _look_ahead(self, stored: _Stored, row: Tensor, virtual: Tensor, goals: Tensor) -> _Ahead:
+        """The steps that follow rows [B], some of which are virtual and have other goals."""
+        gamma = self.options.gamma or 1.0
+        place = stored.episodes.place(row)
+        places, inside = windows(place, stored.episodes.episode(place)[1], self.options.n_steps)
+        window = stored.episodes.row(places)
+        reward = entry_of(stored.rows, self._keys.reward).reshape(-1, 1)[window]
+        end = entry_of(stored.rows, self._keys.done).reshape(-1, 1)[window]
+        if len(virtual) > 0:
+            wanted = goals.unsqueeze(1).expand(-1, self.options.n_steps, -1)
+            own_reward, own_end = self.reward_fn(stored.after[window[virtual]], wanted)
+            reward[virtual], end[virtual] = own_reward.to(reward.dtype), own_end
+        returns = n_step_return(reward, end, inside, gamma)
+        last = window.gather(-1, returns.last.unsqueeze(-1)).squeeze(-1)
+        return _Ahead(stored.rows.get("next")[last], returns)
+
     def _read(self, storage: Storage) -> _Stored:
         """Goals and episodes of a storage; read again only after something was written."""
+        if isinstance(storage, StorageEnsemble):
+            raise ValueError(
+                "HERSampleUnit cannot work in a ReplayBufferEnsemble: relabel while writing, with HERWriter"
+            )
         state = (storage._mutation_revision, _oldest(storage))
         stored = self._stored
         if stored is None or stored.storage is not storage or stored.state != state:
+            refuse_consuming("HERSampleUnit", storage)
+            refuse_unordered("HERSampleUnit", storage)
             rows = storage[:]  # a view
             if not is_tensor_collection(rows):
                 raise TypeError(
                     f"HERSampleUnit needs a storage of tensordicts, such as LazyTensorStorage, "
                     f"got a {type(storage).__name__} that gives a {type(rows).__name__}"
                 )
+            refuse_n_steps("HERSampleUnit", rows)
             dims, shape = storage.ndim, rows.shape[: storage.ndim]
             grid = shape if dims == 1 else torch.Size([shape[0], shape[1:].numel()])
-            ids = rows.get(self._keys.trajectory, None)
-            episodes = index_episodes(
-                entry_of(rows, self._keys.done).reshape(grid),
-                None if ids is None else ids.reshape(grid),
-                oldest=state[1],
-            )
+            ids, done = rows.get(self._keys.trajectory, None), entry_of(rows, self._keys.done)
+            if done.numel() != grid.numel():
+                raise ValueError(
+                    f"HERSampleUnit needs single transitions, but each item of this storage (ndim={dims}) "
+                    f"holds {done.numel() // grid.numel()}: extend with batch.reshape(-1), or give the "
+                    "storage ndim=2"
+                )
             before, after = (
                 entry_of(rows, key).flatten(0, dims - 1)
                 for key in (self._keys.achieved, self._keys.next_achieved)
             )
-            self._stored = stored = _Stored(storage, state, before, after, episodes)
+            episodes = index_episodes(
+                done.reshape(grid),
+                None if ids is None else ids.reshape(grid),
+                oldest=state[1],
+                goals=(before, after),
+            )
+            rows = rows if dims == 1 else rows.flatten(0, dims - 1)
+            self._stored = stored = _Stored(storage, state, rows, before, after, episodes)
         return stored
 
     def _draw(
-        self, stored: _Stored, row: Tensor, generator: torch.Generator | None
+        self, stored: _Stored, group: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor | None]:
-        """For rows [V], the rows [V] whose goals they take, and which [V] may take one; None for all."""
-        episodes = stored.episodes
+        """The rows [V] whose goals are taken, and where [V] one may be taken; None for everywhere.
+
+        Groups [V, L] are rows that get the same goal, which is one of their last row: single rows, or slices.
+        """
+        episodes, row = stored.episodes, group[:, -1]
         place = episodes.place(row)
         begin, behind = episodes.episode(place)
         first, end = (
             bound + begin for bound in candidate_range(self.strategy, place - begin, behind - begin)
         )
         if self.weights is not None and not self.weights.alike:
-            return self._draw_by_likelihood(stored, row, first, end, generator)
+            return self._draw_by_likelihood(stored, group, first, end, generator)
         source = episodes.row(draw_alike(first, end, 1, generator=generator).squeeze(-1))
         if not self.filter_achieved:
             return source, None
         # Goals are proposed without the filter; only where it rejects one are all candidates looked at.
-        again = (~self._keep(stored.before[row], stored.after[source])).nonzero().squeeze(-1)
+        kept = self._keep(stored.before[group], stored.after[source].unsqueeze(1)).all(-1)
+        again = (~kept).nonzero().squeeze(-1)
         valid = torch.ones_like(row, dtype=torch.bool)
         source[again], valid[again] = self._draw_by_likelihood(
-            stored, row[again], first[again], end[again], generator
+            stored, group[again], first[again], end[again], generator
         )
         return source, valid
 
     def _draw_by_likelihood(
-        self, stored: _Stored, row: Tensor, first: Tensor, end: Tensor, generator: torch.Generator | None
+        self, stored: _Stored, group: Tensor, first: Tensor, end: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """The same as ``_draw``, computed from all candidates of each row, ``first`` to ``end``."""
-        if len(row) == 0:
-            return row, torch.ones_like(row, dtype=torch.bool)
+        """The same as ``_draw``, computed from all candidates of each group, ``first`` to ``end``."""
+        source, valid = torch.empty_like(first), torch.ones_like(first, dtype=torch.bool)
+        if len(group) == 0:
+            return source, valid
         widest = int((end - first).max())
-        steps = torch.arange(widest, device=row.device)
-        source, valid = torch.empty_like(row), torch.empty_like(row, dtype=torch.bool)
-        for part in torch.arange(len(row), device=row.device).split(max(1, _LIKELIHOODS // widest)):
+        steps = torch.arange(widest, device=first.device)
+        at_once = max(1, _LIKELIHOODS // (widest * group.shape[1]))
+        for part in torch.arange(len(group), device=first.device).split(at_once):
             width = (end - first)[part].unsqueeze(-1)
             candidate = stored.episodes.row(first[part].unsqueeze(-1) + steps.minimum(width - 1))
             goals = stored.after[candidate]
@@ -265,7 +397,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             if self.weights is not None and not self.weights.alike:
                 weight = checked_weights(self.weights(goals))
             if self.filter_achieved:
-                keep = self._keep(stored.before[row[part]].unsqueeze(1), goals)
+                keep = self._keep(stored.before[group[part]].unsqueeze(2), goals.unsqueeze(1)).all(1)
             drawn, valid[part] = draw(combine(steps < width, weight, keep), 1, generator=generator)
             source[part] = candidate.gather(1, drawn).squeeze(-1)
         return source, valid

@@ -306,8 +306,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
         If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out.
         """
-        n_step = {"n_steps": self.options.n_steps, "gamma": self.options.gamma}
-        real = real_copies(rows, episodes, self._keys, **n_step)
+        n_steps, gamma = self.options.n_steps, self.options.gamma
+        real = real_copies(rows, episodes, self._keys, n_steps=n_steps, gamma=gamma)
         source, goal_source = self._draw(rows, episodes)
         parts = [real]
         if len(source) > 0:
@@ -316,7 +316,16 @@ class HERWriter(HindsightBase, RoundRobinWriter):
                 virtual, copy = virtual_episodes(rows, episodes, source, goals, self.reward_fn, self._keys)
                 virtual = self._with_ids(virtual, copy, len(source))
             else:
-                virtual = virtual_copies(rows, episodes, source, goals, self.reward_fn, self._keys, **n_step)
+                virtual = virtual_copies(
+                    rows,
+                    episodes,
+                    source,
+                    goals,
+                    self.reward_fn,
+                    self._keys,
+                    n_steps=n_steps,
+                    gamma=gamma,
+                )
             self._note(rows, virtual)
             parts = [virtual, real]
         if self.options.per == "episode":

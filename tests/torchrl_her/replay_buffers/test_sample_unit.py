@@ -25,10 +25,20 @@ from torchrl.data import (
     TensorDictReplayBuffer,
     TensorStorage,
 )
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, SamplerWithoutReplacement
-from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
+from torchrl.data.replay_buffers import ReplayBufferEnsemble
+from torchrl.data.replay_buffers.samplers import (
+    PrioritizedSampler,
+    PrioritizedSliceSampler,
+    RandomSampler,
+    Sampler,
+    SamplerWithoutReplacement,
+    SliceSampler,
+    SliceSamplerWithoutReplacement,
+)
+from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictMaxValueWriter
+from torchrl.envs.transforms import MultiStepTransform
 
-from torchrl_her import EnvReward, GoalReward, GoalWeights, HERSampleUnit
+from torchrl_her import EnvReward, GoalReward, GoalWeights, HERSampleUnit, HERWriter
 from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
 
 from ..her_data import WANTED, make_batch, tag
@@ -40,12 +50,19 @@ NEVER_REAL = 10**6  # as k: practically all rows are virtual
 
 
 def make_buffer(
-    capacity: int = 10_000, *, per: bool = False, ndim: int = 1, seed: int = 0, **options: Any
+    capacity: int = 10_000,
+    *,
+    per: bool = False,
+    sampler: Sampler | None = None,
+    ndim: int = 1,
+    seed: int = 0,
+    **options: Any,
 ) -> TensorDictReplayBuffer:
     unit = HERSampleUnit(options.pop("reward", REWARD), **options)
+    by_default = PrioritizedSampler(capacity, alpha=1.0, beta=0.4) if per else RandomSampler()
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, ndim=ndim),
-        sampler=PrioritizedSampler(capacity, alpha=1.0, beta=0.4) if per else RandomSampler(),
+        sampler=by_default if sampler is None else sampler,
         sample_unit=unit,
         collate_fn=unit.relabel,
     )
@@ -296,7 +313,7 @@ def test_real_rows_and_other_entries_stay_and_the_storage_is_untouched() -> None
     for key in ("observation", "action", "achieved_goal", ("next", "observation"), ("next", "truncated")):
         assert torch.equal(rows[key], origin[key]), key
     for key in batch.keys(True, True):
-        assert torch.equal(buffer[:][key], batch[key]), key  # reading shows the rows as they are
+        assert torch.equal(buffer.storage[:][key], batch[key]), key
     assert "state" not in rows.keys()
     assert ("next", "state") not in rows.keys(True)
 
@@ -534,7 +551,7 @@ def test_rows_on_disk() -> None:
     batch = flat([[4, 6]])
     buffer.extend(batch.clone())
     assert buffer.sample()["virtual"].any()
-    assert torch.equal(buffer[:]["desired_goal"], batch["desired_goal"])
+    assert torch.equal(buffer.storage[:]["desired_goal"], batch["desired_goal"])
 
 
 def test_a_data_set_that_nobody_writes() -> None:
@@ -696,4 +713,230 @@ def test_a_batch_of_another_size_is_refused() -> None:
     buffer.extend(flat([[4]]))
     unit.expand(torch.arange(3), {}, buffer.storage)
     with pytest.raises(RuntimeError, match=r"3 rows were drawn, but a batch \[4\] was read"):
-        unit.relabel(buffer[:])
+        unit.relabel(buffer.storage[:])
+
+
+# Slices
+
+IDS = ("collector", "traj_ids")
+SLICES = {
+    "slices": lambda: SliceSampler(slice_len=4, traj_key=IDS),
+    "without replacement": lambda: SliceSamplerWithoutReplacement(slice_len=4, traj_key=IDS),
+    "prioritized": lambda: PrioritizedSliceSampler(10_000, 0.7, 0.5, slice_len=4, traj_key=IDS),
+    "short ones too": lambda: SliceSampler(slice_len=4, traj_key=IDS, strict_length=False),
+    "padded": lambda: SliceSampler(slice_len=4, traj_key=IDS, strict_length=False, pad_output=True),
+    "no ends": lambda: SliceSampler(slice_len=4, traj_key=IDS, truncated_key=None),
+    "by ends": lambda: SliceSampler(slice_len=4, end_key=("next", "done")),
+}
+
+
+def sequences(rows: TensorDict) -> list[TensorDict]:
+    """The parts of a batch in which observations follow each other, up to an end, without padding."""
+    if ("collector", "mask") in rows.keys(True):
+        rows = rows[rows["collector", "mask"].flatten()]
+    step = rows["observation"][:, 0]
+    new = (step[1:] != step[:-1] + 1) | rows["next", "truncated"][:-1, 0]
+    first = torch.cat((torch.tensor([0]), new.nonzero().squeeze(-1) + 1, torch.tensor([len(rows)])))
+    return list(rows.split(first.diff().tolist()))
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+@pytest.mark.parametrize("kind", list(SLICES))
+def test_a_slice_gets_one_goal_and_keeps_its_ends(kind: str, filtered: bool) -> None:
+    buffer = make_buffer(sampler=SLICES[kind](), k=4, filter_achieved=filtered)
+    buffer.extend(flat([[6, 9, 5], [8, 4, 8]], terminated=True))
+    seen = 0
+    for part in chain.from_iterable(sequences(buffer.sample(40)) for _ in range(10)):
+        step, goal = part["observation"][:, 0], part["desired_goal"][:, 0]
+        virtual = part["virtual"].flatten()
+        if kind != "no ends":  # where slices can follow each other unnoticed
+            assert len(goal.unique()) == 1
+            assert virtual.all() or not virtual.any()
+        own = part[virtual]
+        if len(own) == 0:
+            continue
+        seen += 1
+        step, goal = own["observation"][:, 0], own["desired_goal"][:, 0]
+        assert torch.equal((goal / 100).floor(), (step / 100).floor())
+        assert goal[-1] > step[-1]  # of the last one, which may be the first to achieve it
+        after = own["next"]
+        assert torch.equal(after["terminated"].flatten(), step + 1 == goal)
+        assert torch.equal(after["reward"].flatten(), (step + 1 == goal).float() - 1.0)
+        assert torch.equal(after["done"], after["terminated"] | after["truncated"])
+        if kind != "no ends":
+            assert after["truncated"][..., 0].nonzero().flatten().tolist()[0] == step.argmax()
+    assert seen > 30
+
+
+def test_the_filter_looks_at_all_of_a_slice() -> None:
+    batch, path = make_batch([[4]]), torch.tensor([0.0, 1.0, 2.0, 1.0, 3.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    goals = {}
+    for filtered in (False, True):
+        sampler = SliceSampler(slice_len=3, traj_key=IDS)
+        buffer = make_buffer(sampler=sampler, k=NEVER_REAL, filter_achieved=filtered)
+        buffer.extend(batch.squeeze(0))
+        rows = buffer.sample(600)
+        goals[filtered] = set(zip(tags(rows["observation"]), tags(rows["desired_goal"]), strict=True))
+    # Slices 0-2 and 1-3: 1 is achieved in the last state of the first one, but before, too.
+    early, late = {(float(t), g) for t in range(3) for g in (1.0, 3.0)}, {(float(t), 3.0) for t in (1, 2, 3)}
+    assert goals[False] == early | late
+    assert goals[True] == {(float(t), 3.0) for t in range(4)}
+
+
+def test_whole_episodes_need_slices() -> None:
+    unit = HERSampleUnit(REWARD, per="episode")
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), sample_unit=unit, collate_fn=unit.relabel)
+    buffer.extend(flat([[5]]))
+    with pytest.raises(ValueError, match="needs a sampler of slices"):
+        buffer.sample(4)
+
+
+# Several steps
+
+
+@pytest.mark.parametrize("ndim", [1, 2])
+@pytest.mark.parametrize("n_steps", [2, 3, 10])
+def test_returns_over_several_steps_by_hand(n_steps: int, ndim: int) -> None:
+    batch = make_batch([[4]])
+    batch["next", "reward"][0, :, 0] = torch.tensor([-1.0, -2.0, -4.0, -8.0])
+    buffer = make_buffer(ndim=ndim, strategy="final", k=1, n_steps=n_steps, gamma=0.5)
+    buffer.extend(batch.squeeze(0) if ndim == 1 else batch)
+    sums = {
+        2: ([-2.0, -4.0, -8.0, -8.0], [-1.5, -1.5, -1.0, 0.0], [2, 2, 2, 1]),
+        3: ([-3.0, -6.0, -8.0, -8.0], [-1.75, -1.5, -1.0, 0.0], [3, 3, 2, 1]),
+        10: ([-4.0, -6.0, -8.0, -8.0], [-1.75, -1.5, -1.0, 0.0], [4, 3, 2, 1]),
+    }[n_steps]
+    rows = buffer.sample(200)
+    for is_virtual in (False, True):
+        own = rows[rows["virtual"].flatten() == is_virtual]
+        step = own["observation"][:, 0].long()
+        assert set(step.tolist()) == {0, 1, 2, 3}
+        assert torch.equal(own["next", "reward"][:, 0], torch.tensor(sums[is_virtual])[step])
+        assert torch.equal(own["steps_to_next_obs"][:, 0], torch.tensor(sums[2])[step])
+        behind = step + torch.tensor(sums[2])[step]
+        assert torch.equal(own["next", "observation"][:, 0], behind.float())
+        assert torch.equal(own["next", "truncated"][:, 0], behind == 4)
+        assert torch.equal(own["next", "done"][:, 0], behind == 4)
+        assert torch.equal(own["next", "terminated"][:, 0], (behind == 4) & is_virtual)
+        assert torch.equal(own["desired_goal"], own["next", "desired_goal"])
+        assert "state" not in own["next"].keys()
+
+
+def test_goals_that_are_passed_on_the_way_cut_the_steps() -> None:
+    batch, path = make_batch([[4]]), torch.tensor([0.0, 1.0, 2.0, 3.0, 1.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    buffer = make_buffer(strategy="final", k=NEVER_REAL, n_steps=3, gamma=0.5)
+    buffer.extend(batch.squeeze(0))
+    rows = buffer.sample(100)
+    first = rows[rows["observation"][:, 0] == 0][0]
+    assert (first["next", "reward"].item(), first["next", "terminated"].item()) == (0.0, True)
+    assert (first["steps_to_next_obs"].item(), first["next", "observation"][0].item()) == (1, 1.0)
+
+
+def test_steps_never_cross_episodes_in_a_ring() -> None:
+    buffer = make_buffer(14, k=1, n_steps=3, gamma=0.9)
+    for episode in range(4):
+        buffer.extend(flat([[5] * 4], steps=5, first=[(episode, 0)]))
+    rows = buffer.sample(500)
+    ahead = rows["next", "observation"][:, 0] - rows["observation"][:, 0]
+    assert torch.equal(ahead, rows["steps_to_next_obs"][:, 0].float())
+    assert ((rows["next", "observation"][:, 0] % 100) <= 5).all()
+
+
+# Ids that are used again
+
+
+@pytest.mark.parametrize("ndim", [1, 2])
+def test_ids_that_are_used_again_join_no_episodes(ndim: int) -> None:
+    first = make_batch([[9], [9]], steps=3)
+    again = make_batch([[9, 4], [9, 4]], first=[(1, 0), (1, 0)], steps=4)
+    again["collector", "traj_ids"] = first["collector", "traj_ids"][:, :1].expand(2, 4).clone()
+    buffer = make_buffer(ndim=ndim, strategy="final", k=NEVER_REAL)
+    for batch in (first, again):
+        buffer.extend(batch.reshape(-1) if ndim == 1 else batch)
+    last = {0: 3.0, 1: 104.0, 10: 1003.0, 11: 1104.0}
+    for observation, goal in pairs(buffer.sample(500)):
+        assert goal == last[int(observation // 100)]
+
+
+# Parts that cannot work together
+
+
+def test_an_ensemble_is_refused_at_its_first_sample() -> None:
+    members = [make_buffer(), make_buffer()]
+    for member in members:
+        member.extend(flat([[5]]))
+    with pytest.raises(RuntimeError, match="no goals were chosen .* in a ReplayBufferEnsemble, relabel"):
+        ReplayBufferEnsemble(*members, batch_size=10).sample()
+    unit = HERSampleUnit(REWARD)
+    plain = [TensorDictReplayBuffer(storage=LazyTensorStorage(20)) for _ in range(2)]
+    for member in plain:
+        member.extend(flat([[5]]))
+    with pytest.raises(ValueError, match="cannot work in a ReplayBufferEnsemble"):
+        ReplayBufferEnsemble(*plain, batch_size=10, sample_unit=unit).sample()
+
+
+def test_unit_and_relabel_may_be_copied_one_by_one() -> None:
+    unit = HERSampleUnit(REWARD)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100),
+        sample_unit=pickle.loads(pickle.dumps(unit)),
+        collate_fn=pickle.loads(pickle.dumps(unit.relabel)),
+        batch_size=50,
+    )
+    buffer.extend(flat([[5]]))
+    assert buffer.sample()["virtual"].any()
+
+
+def test_two_units_do_not_mix_up_their_batches() -> None:
+    one, other = make_buffer(), make_buffer(strategy="final")
+    for buffer in (one, other):
+        buffer.extend(flat([[5]]))
+    index, info = one.sampler.sample(one.storage, 10)
+    one._sample_unit.expand(index, info, one.storage)
+    assert other.sample(20)["virtual"].any()
+    assert one._sample_unit.relabel(one.storage[index])["virtual"].any()
+
+
+def make_beside(**parts: Any) -> TensorDictReplayBuffer:
+    unit = HERSampleUnit(REWARD)
+    return TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100), sample_unit=unit, collate_fn=unit.relabel, batch_size=4, **parts
+    )
+
+
+def test_a_buffer_that_consumes_is_refused() -> None:
+    buffer = make_beside(consume_after_n_samples=1)
+    buffer.extend(flat([[5]]))
+    with pytest.raises(ValueError, match="HERSampleUnit cannot work in a buffer that consumes"):
+        buffer.sample()
+
+
+def test_writers_that_keep_no_order_are_refused() -> None:
+    buffer = make_beside(writer=TensorDictMaxValueWriter(rank_key=("next", "reward")))
+    buffer.extend(flat([[5]]))
+    with pytest.raises(ValueError, match="order of time, which TensorDictMaxValueWriter does not keep"):
+        buffer.sample()
+
+
+def test_a_writer_that_relabels_is_refused() -> None:
+    buffer = make_beside(writer=HERWriter(REWARD))
+    buffer.extend(flat([[5]]))
+    with pytest.raises(ValueError, match="but a HERWriter with k=4 relabels them: use one of the two"):
+        buffer.sample()
+
+
+def test_rows_over_several_steps_are_refused() -> None:
+    buffer = make_beside()
+    buffer.append_transform(MultiStepTransform(n_steps=2, gamma=0.9))
+    buffer.extend(make_batch([[5]]).squeeze(0))
+    with pytest.raises(ValueError, match="HERSampleUnit got transitions that span several steps"):
+        buffer.sample()
+
+
+def test_batches_in_a_storage_of_one_dimension_are_refused() -> None:
+    buffer = make_beside()
+    buffer.extend(make_batch([[5], [5]]))
+    with pytest.raises(ValueError, match=r"each item of this storage \(ndim=1\) holds 5: .*ndim=2"):
+        buffer.sample()

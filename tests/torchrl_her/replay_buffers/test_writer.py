@@ -789,7 +789,9 @@ def test_an_episode_that_does_not_terminate_for_its_goal_is_truncated() -> None:
 def test_goals_of_whole_episodes_follow_weights_and_filter() -> None:
     batch, path = make_batch([[4]]), torch.tensor([1.0, 1.0, 2.0, 1.0, 6.0])
     batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
-    buffer = make_buffer(per="episode", k=4_000, filter_achieved=True, weights=PreferFar(), seed=3, capacity=20_000)
+    buffer = make_buffer(
+        per="episode", k=4_000, filter_achieved=True, weights=PreferFar(), seed=3, capacity=20_000
+    )
     buffer.extend(batch)
     _, virtual = split(buffer)
     first = virtual[virtual["observation"][:, 0] == 0]
