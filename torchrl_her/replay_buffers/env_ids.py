@@ -47,7 +47,7 @@ class EnvIds(Transform):
             ids = torch.arange(torch.Size(shape).numel(), device=tensordict.device).view(shape)
             # 62 random bits: two processes draw overlapping ranges with a probability of about 1e-15
             self._ids, self._process = ids + secrets.randbits(62), os.getpid()
-        return self._ids.to(tensordict.device) if tensordict.device is not None else self._ids
+        return self._ids.clone()  # a collector writes into what it got, in place, when it is reset
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return tensordict_reset.set(self.out_keys[0], self._own_ids(tensordict_reset))

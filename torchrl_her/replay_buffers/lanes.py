@@ -90,18 +90,17 @@ def broken(
             whether this batch comes from other environments than the one before.
     """
     over = torch.zeros_like(lanes, dtype=torch.bool)
-    trajectory = None if kind == BY_TRAJECTORY else rows.get(keys.trajectory, None)
-    if trajectory is None and held == 0:
+    trajectory = rows.get(keys.trajectory, None)
+    if held == 0 and kind == BY_TRAJECTORY:
         return over
     last, new = order[:-1], order[1:]
     same = lanes[last] == lanes[new]
-    jumps = torch.zeros_like(same)
-    if trajectory is not None:
+    if trajectory is None:  # then goals have to tell, everywhere
+        over[last] = _jumps(rows, keys, last, new, same)
+    else:
         ids = trajectory.reshape(-1)[order]
-        jumps = same & (ids[1:] != ids[:-1])
-    if held > 0:
-        jumps |= _jumps(rows, keys, last, new, same & (last < held) & (new >= held))
-    over[last] = jumps
+        seam = same & (last < held) & (new >= held)
+        over[last] = (same & (ids[1:] != ids[:-1])) | _jumps(rows, keys, last, new, seam)
     over &= ~done
     if kind == BY_PLACE and not resumed and bool(over.any()):
         raise ValueError(
@@ -123,10 +122,10 @@ def ends_of_held(lanes: Tensor, order: Tensor, held: int) -> Tensor:
     return torch.zeros_like(lanes, dtype=torch.bool).index_fill_(0, own[last], True)
 
 
-def _jumps(rows: TensorDictBase, keys: TransitionKeys, last: Tensor, new: Tensor, seam: Tensor) -> Tensor:
-    """For neighbors [n - 1] at a seam between two batches: which of them do not fit together."""
-    at = seam.nonzero().squeeze(-1)
-    jumps = torch.zeros_like(seam)
+def _jumps(rows: TensorDictBase, keys: TransitionKeys, last: Tensor, new: Tensor, where: Tensor) -> Tensor:
+    """For neighbors [n - 1]: which of those that are asked for do not fit together, by their goals."""
+    at = where.nonzero().squeeze(-1)
+    jumps = torch.zeros_like(where)
     if len(at) == 0:
         return jumps
     for after, before in ((keys.next_achieved, keys.achieved), (keys.goals[1], keys.goals[0])):

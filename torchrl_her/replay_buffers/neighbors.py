@@ -18,6 +18,8 @@ SHARED = (
     "the buffer with what the collector yields"
 )
 
+MASK = ("collector", "mask")  # TorchRL's mark of what is not padding
+
 
 def samplers_of(storage: Storage) -> Iterator[Sampler]:
     """The samplers of all buffers that read a storage, those of ensembles one by one."""
@@ -48,6 +50,18 @@ def refuse_unordered(name: str, storage: Storage) -> None:
                 f"{name} needs transitions in the order of time, which {type(writer).__name__} does not "
                 "keep: use RoundRobinWriter"
             )
+
+
+def refuse_padded(name: str, transitions: TensorDictBase) -> None:
+    """Raises an error if trajectories were split and padded.
+
+    Raises:
+        ValueError: they were.
+    """
+    if MASK in transitions.keys(True):
+        raise ValueError(
+            f"{name} takes batches as they are collected, not split and padded: split_trajs=False"
+        )
 
 
 def refuse_priorities(name: str, storage: Storage, transitions: TensorDictBase) -> None:

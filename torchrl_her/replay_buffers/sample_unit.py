@@ -33,8 +33,15 @@ from torchrl_her.goals.weights import GoalWeights, checked_weights
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
 from torchrl_her.replay_buffers.keys import entry_of
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_return, windows
-from torchrl_her.replay_buffers.neighbors import refuse_consuming, refuse_n_steps, refuse_unordered
+from torchrl_her.replay_buffers.neighbors import (
+    MASK,
+    refuse_consuming,
+    refuse_n_steps,
+    refuse_padded,
+    refuse_unordered,
+)
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
+from torchrl_her.replay_buffers.slices import slice_positions
 
 # Likelihoods of goals [transitions, T] that are held in memory at once.
 _LIKELIHOODS = 1 << 17
@@ -64,7 +71,7 @@ class _Chosen(NamedTuple):
     size: int
     rows: Tensor  # [V], places in the batch
     goals: Tensor  # [V, g]
-    cut: Tensor | None  # [B, 1], where a sampler of slices ends them
+    ends: Tensor | None  # [B, 1], where a sampler of slices ends them
     ahead: _Ahead | None
 
 
@@ -181,29 +188,21 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             )
         stored = self._read(storage)
         row = _flat(index, storage.shape).to(stored.after.device)
-        sampler = self._slice_sampler(storage)
-        ends = None if sampler is None else info.get(sampler.truncated_key)
-        group = row.unsqueeze(-1) if sampler is None else self._slices(stored, row, info, ends)
+        sampler, ends = self._slice_sampler(storage), None
+        own = torch.arange(len(row), device=row.device).unsqueeze(-1)
+        if sampler is not None:
+            ends = self._ends(sampler, info)
+            place = stored.episodes.place(row)
+            inside = info.get(MASK)  # type: ignore[call-overload]  # TorchRL's keys may be nested
+            own = slice_positions(place, stored.episodes.episode(place)[0], ends, inside)
         generator = self.generator if self.generator is not None else storage._rng
-        coin = torch.rand(len(group), device=row.device, generator=generator)
-        own = (coin < self.k / (self.k + 1)).nonzero().squeeze(-1)
-        source, valid = self._draw(stored, row[group[own]] if sampler is not None else group[own], generator)
-        if valid is not None:
-            own, source = own[valid], source[valid]
-        if sampler is None:
-            rows, goals = own, stored.after[source]
-        else:
-            goal_of = torch.full_like(row, -1)
-            goal_of[group[own]] = source.unsqueeze(-1).expand(-1, group.shape[1])
-            rows = (goal_of >= 0).nonzero().squeeze(-1)
-            goals = stored.after[goal_of[rows]]
+        rows, source = self._choose(stored, row, own, generator)
+        goals = stored.after[source]
         if self.weights is not None:
             self.weights.update(goals)
         ahead = None if self.options.n_steps == 1 else self._look_ahead(stored, row, rows, goals)
-        own_ends = sampler is not None and unravel_key(sampler.truncated_key) == self._keys.truncated
-        cut = ends if own_ends else None
-        self._chosen[self._key()] = _Chosen(len(row), rows, goals, cut, ahead)
-        if cut is not None:
+        self._chosen[self._key()] = _Chosen(len(row), rows, goals, ends, ahead)
+        if ends is not None:
             hidden = {self._keys.terminated, self._keys.done}
             info = {key: value for key, value in info.items() if key not in hidden}
         return index, info
@@ -237,10 +236,10 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             after, returns = chosen.ahead
             out.set("next", after.exclude(*(key[1:] for key in self._exclude if isinstance(key, tuple))))
             out.set(self._keys.reward, returns.reward).set(STEPS_KEY, returns.steps)
-        if chosen.cut is not None:
+        if chosen.ends is not None:
             done = entry_of(out, self._keys.done)
-            out.set(self._keys.truncated, chosen.cut)
-            out.set(self._keys.done, done | chosen.cut.view_as(done))
+            out.set(self._keys.truncated, chosen.ends)
+            out.set(self._keys.done, done | chosen.ends.view_as(done))
         if len(rows) == 0:
             return out
         if chosen.ahead is not None:
@@ -278,22 +277,31 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             raise ValueError("HERSampleUnit(per='episode') needs a sampler of slices, such as SliceSampler")
         return None
 
-    def _slices(self, stored: _Stored, row: Tensor, info: dict[Any, Any], ends: Tensor | None) -> Tensor:
-        """Positions [S, L] in a batch of the transitions of each slice; short ones repeat their last one."""
-        place = stored.episodes.place(row)
-        begins = torch.ones_like(row, dtype=torch.bool)
-        begins[1:] = place[1:] != place[:-1] + 1
-        if ends is not None:
-            begins[1:] |= ends.flatten()[:-1]
-        mask = info.get(("collector", "mask"))  # False where a slice was padded by its last transition
-        if mask is not None:
-            begins &= mask.flatten()
-        episode, _ = stored.episodes.episode(place)
-        begins[1:] |= episode[1:] != episode[:-1]
-        first = begins.nonzero().squeeze(-1)
-        length = torch.diff(first, append=first.new_tensor([len(row)]))
-        steps = torch.arange(int(length.max()), device=row.device)
-        return first.unsqueeze(-1) + steps.minimum(length.unsqueeze(-1) - 1)
+    def _choose(
+        self, stored: _Stored, row: Tensor, own: Tensor, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """Places [V] in a batch of rows [B] that become virtual, and the rows [V] whose goals they take.
+
+        ``own``, [G, L], are the places in the batch that get the same goal: single ones, or those of a slice.
+        """
+        coin = torch.rand(len(own), device=row.device, generator=generator)
+        own = own[coin < self.k / (self.k + 1)]
+        source, valid = self._draw(stored, row[own], generator)
+        if valid is not None:
+            own, source = own[valid], source[valid]
+        source_of = torch.full_like(row, -1).index_put_((own,), source.unsqueeze(-1).expand_as(own))
+        rows = (source_of >= 0).nonzero().squeeze(-1)
+        return rows, source_of[rows]
+
+    def _ends(self, sampler: SliceSampler, info: dict[str, Any]) -> Tensor | None:
+        """Where a sampler of slices says that they end, [B, 1]; None if it does not."""
+        key = sampler.truncated_key
+        if key is not None and unravel_key(key) != self._keys.truncated:
+            raise ValueError(
+                f"the sampler marks ends of slices under {key!r}, and relabeling reads "
+                f"{self._keys.truncated!r}: make them the same (truncated_key)"
+            )
+        return info.get(key)
 
     def _look_ahead(self, stored: _Stored, row: Tensor, virtual: Tensor, goals: Tensor) -> _Ahead:
         """The steps that follow rows [B], some of which are virtual and have other goals."""
@@ -329,6 +337,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                     f"got a {type(storage).__name__} that gives a {type(rows).__name__}"
                 )
             refuse_n_steps("HERSampleUnit", rows)
+            refuse_padded("HERSampleUnit", rows)
             dims, shape = storage.ndim, rows.shape[: storage.ndim]
             grid = shape if dims == 1 else torch.Size([shape[0], shape[1:].numel()])
             ids, done = rows.get(self._keys.trajectory, None), entry_of(rows, self._keys.done)

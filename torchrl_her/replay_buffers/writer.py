@@ -33,13 +33,13 @@ from torchrl_her.replay_buffers.neighbors import (
     has_slices,
     refuse_consuming,
     refuse_n_steps,
+    refuse_padded,
     refuse_priorities,
 )
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 
 # Transitions written at once: larger pieces touch fresh memory each time, smaller ones need more calls.
 _ROWS = 1 << 17
-_MASK = ("collector", "mask")  # TorchRL's mark of trajectories that it split and padded
 _STATE_FILE = "her_writer.pt"
 
 
@@ -66,12 +66,19 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     in the root and under ``next``; its reward, terminated and done are computed again for that goal, and
     everything else stays as it was. Goals never come from another episode or another environment.
 
-    If an environment is reset before its episode ends (``reset_at_each_iter``), use batches [N, T] with
-    trajectory ids, which show where such an episode stops. In flat batches it would be held back forever.
+    Rows of the next batch that go on with an open episode are found by the ids of environments
+    (:class:`~torchrl_her.EnvIds`), if there are any; otherwise by their place in a batch [N, T], or by
+    trajectory ids in a flat one. What that cannot tell apart is refused: environments that are reset before
+    their episodes end, and batches of several collectors that share places, need ids of environments. If you
+    reset environments yourself, call :meth:`end_episodes`.
 
-    The writer works in any TorchRL replay buffer with a one-dimensional storage, under any sampler; the
-    capacity counts real and virtual transitions alike. Random numbers come from the buffer's generator
-    (``buffer.set_rng``).
+    With ``per="episode"``, whole virtual episodes are stored: up to k copies of each episode, each with one
+    goal, drawn for its first transition, and each with an id of its own under ``trajectory_key``. A copy ends
+    where its goal terminates it, or is truncated at its end. That is what samplers of slices need.
+
+    The writer works in any TorchRL replay buffer with a one-dimensional storage, under any sampler that does
+    not consume its transitions; the capacity counts real and virtual transitions alike. Random numbers come
+    from the buffer's generator (``buffer.set_rng``).
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated), for instance
@@ -89,9 +96,10 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         held_back: number of transitions of open episodes that wait for their end.
 
     Raises:
-        ValueError: a negative ``k`` or an unknown strategy.
+        ValueError: an option cannot be, or (when extending) the writer cannot work beside another part.
         TypeError: ``exclude`` is one key, not a list.
         KeyError: a batch lacks an entry (when extending).
+        RuntimeError: the buffer was copied to another process.
 
     Example:
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -264,10 +272,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         """Raises an error beside parts and batches that would be written wrongly."""
         if os.getpid() != self._process:
             raise RuntimeError(f"HERWriter writes only in the process that made its buffer: {SHARED}")
-        if _MASK in data.keys(True):
-            raise ValueError(
-                "HERWriter takes batches as they are collected, not split and padded: split_trajs=False"
-            )
+        refuse_padded("HERWriter", data)
         if self._storage.ndim > 1:
             raise ValueError(f"HERWriter needs a storage of 1 dimension, got one of {self._storage.ndim}")
         refuse_n_steps("HERWriter", data)

@@ -940,3 +940,20 @@ def test_batches_in_a_storage_of_one_dimension_are_refused() -> None:
     buffer.extend(make_batch([[5], [5]]))
     with pytest.raises(ValueError, match=r"each item of this storage \(ndim=1\) holds 5: .*ndim=2"):
         buffer.sample()
+
+
+def test_padded_trajectories_are_refused() -> None:
+    buffer = make_beside()
+    batch = flat([[5]])
+    batch["collector", "mask"] = torch.ones(5, dtype=torch.bool)
+    buffer.extend(batch)
+    with pytest.raises(ValueError, match="HERSampleUnit takes batches as they are collected, not split"):
+        buffer.sample()
+
+
+def test_ends_of_slices_under_another_key_are_refused() -> None:
+    sampler = SliceSampler(slice_len=4, traj_key=IDS, truncated_key=("next", "cut"))
+    buffer = make_buffer(sampler=sampler)
+    buffer.extend(flat([[5]]))
+    with pytest.raises(ValueError, match=r"under \('next', 'cut'\), and relabeling reads"):
+        buffer.sample(4)

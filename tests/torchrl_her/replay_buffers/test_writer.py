@@ -956,3 +956,8 @@ def test_priorities_in_a_batch_are_those_of_real_rows_if_it_is_flat() -> None:
     index = buffer.extend(batch.squeeze(0))
     assert index.tolist() == [12, 13, 14, -1, -1]
     assert not buffer.sample(100)["virtual"].any()
+
+
+def test_flat_rows_of_two_environments_without_ids_are_refused_at_once() -> None:
+    with pytest.raises(ValueError, match="1 episodes are not over"):
+        make_buffer().extend(make_batch([[9], [9]], steps=3).reshape(-1).exclude("collector"))
