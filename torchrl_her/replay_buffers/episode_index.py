@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 
@@ -60,7 +61,7 @@ def index_episodes(
     trajectory: Tensor | None = None,
     *,
     oldest: int = 0,
-    goals: tuple[Tensor, Tensor] | None = None,
+    seams: Sequence[tuple[Tensor, Tensor]] = (),
 ) -> EpisodeIndex:
     """Finds the episodes of a ring buffer.
 
@@ -73,9 +74,9 @@ def index_episodes(
         done: [T, N] of bool, time first, N environments; or flat, [T].
         trajectory: ids of the trajectories, integers of the same shape.
         oldest: slot of the oldest row: 0 until the ring is full, then the slot that is overwritten next.
-        goals: the goals achieved before and after each row's action, each [n, g] in the order of rows. An
-            episode ends where they do not fit together: where a second collector uses an id again, or
-            another environment's rows follow.
+        seams: pairs of entries, [n, g] each in the order of rows: what a row has after its action, and what
+            the next row of its episode must have before it. An episode ends where they differ: where a
+            second collector uses an id again, or another environment's rows follow.
 
     Returns:
         The index. An episode that was partly overwritten consists of the rows that are left.
@@ -92,8 +93,8 @@ def index_episodes(
     if trajectory is not None:
         new[1:] |= trajectory[1:] != trajectory[:-1]
         new[0] |= trajectory[0] != trajectory[-1]
-    if goals is not None:
-        before, after = (goal.view(*done.shape, -1) for goal in goals)
+    for pair in seams:
+        after, before = (entry.view(*done.shape, -1) for entry in pair)
         new[1:] |= _differ(after[:-1], before[1:])
         new[0] |= _differ(after[-1], before[0])
     new[oldest] = True
@@ -108,17 +109,17 @@ def index_episodes(
     ordered_begins, ordered_lengths = begins[order], lengths[order]
     ordered_places = ordered_lengths.cumsum(0) - ordered_lengths
     places = torch.empty_like(begins).index_copy_(0, order, ordered_places)
-    whole = done[(ordered_begins + ordered_lengths - 1 + oldest) % slots]
+    last = (ordered_begins + ordered_lengths - 1 + oldest) % slots
+    whole = done[last]
     opens = torch.ones_like(whole)
     opens[1:] = (own[1:] != own[:-1]) | whole[:-1]
-    if goals is not None:  # a run goes on in another one only if that begins where it ends
-        last = (ordered_begins + ordered_lengths - 1 + oldest) % slots
-        opens[1:] |= _differ(goals[1][last[:-1]], goals[0][(ordered_begins[1:] + oldest) % slots])
+    for after, before in seams:  # a run goes on in another one only if that begins where it ends
+        opens[1:] |= _differ(after[last[:-1]], before[(ordered_begins[1:] + oldest) % slots])
     first = torch.cat((ordered_places[opens], behind))
     return EpisodeIndex(slots, lanes, oldest, begins, places, ordered_begins, ordered_places, first)
 
 
 def _differ(one: Tensor, other: Tensor) -> Tensor:
-    """Where goals [..., g] differ, [...]; coordinate by coordinate, as torch is slow over few of them."""
+    """Where vectors [..., g] differ, [...]; coordinate by coordinate, as torch is slow over few of them."""
     pairs = zip(one.unbind(-1), other.unbind(-1), strict=True)
     return reduce(torch.logical_or, [a != b for a, b in pairs])

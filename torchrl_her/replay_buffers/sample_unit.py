@@ -347,15 +347,15 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                     f"holds {done.numel() // grid.numel()}: extend with batch.reshape(-1), or give the "
                     "storage ndim=2"
                 )
-            before, after = (
+            before, after, wanted, next_wanted = (
                 entry_of(rows, key).flatten(0, dims - 1)
-                for key in (self._keys.achieved, self._keys.next_achieved)
+                for key in (self._keys.achieved, self._keys.next_achieved, *self._keys.goals)
             )
             episodes = index_episodes(
                 done.reshape(grid),
                 None if ids is None else ids.reshape(grid),
                 oldest=state[1],
-                goals=(before, after),
+                seams=((after, before), (next_wanted, wanted)),
             )
             rows = rows if dims == 1 else rows.flatten(0, dims - 1)
             self._stored = stored = _Stored(storage, state, rows, before, after, episodes)

@@ -847,6 +847,24 @@ def test_steps_never_cross_episodes_in_a_ring() -> None:
 # Ids that are used again
 
 
+@pytest.mark.parametrize("ids", [True, False])
+def test_episodes_whose_goal_rests_are_told_apart_by_what_was_wanted(ids: bool) -> None:
+    """As a ball that lies at the same place at the start of each episode, until somebody touches it."""
+    one, other = make_batch([[9]], steps=3).squeeze(0), make_batch([[9, 4]], first=[(1, 0)]).squeeze(0)[:4]
+    for key in ("achieved_goal", ("next", "achieved_goal")):
+        one[key] = torch.zeros(3, 2)
+        other[key][:, 0] = torch.tensor([0.0, 0.0, 1.0, 2.0]) if key == "achieved_goal" else torch.arange(4.0)
+    for key in ("desired_goal", ("next", "desired_goal")):
+        other[key] = torch.full((4, 2), 99.0)
+    other["collector", "traj_ids"] = torch.zeros(4, dtype=torch.int64)
+    buffer = make_buffer(strategy="final", k=NEVER_REAL)
+    for batch in (one, other):
+        buffer.extend(batch if ids else batch.exclude("collector"))
+    rows = buffer.sample(200)
+    assert {g for o, g in pairs(rows) if o < 100} == {0.0}
+    assert {g for o, g in pairs(rows) if o >= 100} == {3.0}
+
+
 @pytest.mark.parametrize("ndim", [1, 2])
 def test_ids_that_are_used_again_join_no_episodes(ndim: int) -> None:
     first = make_batch([[9], [9]], steps=3)
