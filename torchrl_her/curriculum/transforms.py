@@ -54,6 +54,7 @@ class _LayerTransform(Transform):
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.curriculum, self.progress, self.run = curriculum, progress, run
         self._tables: tuple[Any, Any] = (None, None)  # what the tables were made for, and the tables
+        self._shown_in: tuple[int, ...] | None = None  # the layers that the last states were shown in
 
     def _layers(self) -> tuple[int, ...]:
         """The layer of each block of rows; a single one if all runs are in the same layer."""
@@ -72,7 +73,27 @@ class _LayerTransform(Transform):
             )
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if self._shown_in is None:  # later on, some environments may be left as they are
+            self._shown_in = self.progress.layers
         return self._call(tensordict_reset)
+
+    def _show_again(self, root: TensorDictBase) -> Tensor | None:
+        """If layers have changed, shows the state before a step in the present ones.
+
+        Returns:
+            [...] of bool, which rows were shown in another layer; None if layers are as they were.
+        """
+        layers = self.progress.layers
+        changed, self._shown_in = self._shown_in not in (None, layers), layers
+        if not changed or any(root.get(key, None) is None for key in self.out_keys):
+            return None
+        again = self._call(root.select(*self.in_keys, strict=False))
+        differs = torch.zeros(root.shape, dtype=torch.bool, device=root.device)
+        for key in self.out_keys:
+            shown, new = root.get(key), again.get(key)
+            differs |= (shown != new).any(-1)
+            shown.copy_(new)  # in place: the collector keeps this tensor, and not this TensorDict
+        return differs
 
     def _get(self, tensordict: TensorDictBase, key: NestedKey, width: int) -> Tensor:
         """An entry, which must have that width."""
@@ -101,12 +122,21 @@ class StateToObs(_LayerTransform):
     ``observation`` always has the width of the last layer: the entries of the present layer, then zeros.
     ``next`` also gets the layer's reward (0 if the goal is nearer than the layer's threshold, else -1),
     ``terminated``, and ``done``, which is ``terminated | truncated``. ``truncated`` stays as it was, so the
-    environment must set it at its time limit even if its own goal is achieved. Where the environment
-    terminates by its own goal, the episode goes on here: it must be possible to step it further.
+    environment must set it at its time limit even if its own goal is achieved.
+
+    Where the environment terminates an episode by itself, the layer's episode goes on if the environment can
+    be stepped further. If it cannot (``goes_on=False``, as with gymnasium's environments), the layer's
+    episode ends there, too: it is ``truncated`` unless the layer's goal was achieved in that step, so that
+    the critic goes on to estimate what would have come. The end says nothing about the layer's goal.
 
     The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
     Put the transform around a ParallelEnv and not inside of its workers: they hold copies of ``progress`` and
-    would stay in the layers in which they were started. Change layers only between episodes.
+    would stay in the layers in which they were started.
+
+    Change layers between episodes, and reset the collector. If a layer changes in mid-episode, the next step
+    is still shown as a whole in the new layer, and the episode is truncated there (done, without a
+    ``truncated_key``). The action of that step was chosen in the old layer. For this the environment must
+    work on the tensors that the collector keeps, so on the policy's device.
 
     GymWrapper shows an entry ``state`` of a dict as ``observation``: put a RenameTransform before this one.
 
@@ -123,10 +153,12 @@ class StateToObs(_LayerTransform):
             written.
         truncated_key: read; None if the environment below has no time limit (a StepCounter after this
             transform may add one).
+        goes_on: whether the environment can be stepped further after it terminated an episode; if not,
+            ``truncated`` is written, too.
 
     Raises:
-        ValueError: ``progress`` belongs to another curriculum; when used, the state has another width, or the
-            batch is not R equal blocks.
+        ValueError: ``progress`` belongs to another curriculum, or ``goes_on`` is False without a
+            ``truncated_key``; when used, the state has another width, or the batch is not R equal blocks.
         KeyError: when used, the environment has no such state or flags.
 
     Example:
@@ -161,12 +193,15 @@ class StateToObs(_LayerTransform):
         terminated_key: NestedKey = "terminated",
         truncated_key: NestedKey | None = "truncated",
         done_key: NestedKey = "done",
+        goes_on: bool = True,
     ) -> None:
+        if not goes_on and truncated_key is None:
+            raise ValueError("goes_on=False needs a truncated_key, to say where the environment ended")
         shown = [observation_key, achieved_goal_key, desired_goal_key]
         super().__init__(curriculum, progress, None, [state_key], shown)
         self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
         self.truncated_key = None if truncated_key is None else unravel_key(truncated_key)
-        self.done_key = unravel_key(done_key)
+        self.done_key, self.goes_on = unravel_key(done_key), goes_on
         goal = curriculum.goal_width
         self._widths = [curriculum.observation_width, goal, goal]
 
@@ -175,6 +210,7 @@ class StateToObs(_LayerTransform):
         return next_tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        cut = self._show_again(tensordict)
         achieved_goal, desired_goal, squares = self._observe(next_tensordict)
         # Coordinate by coordinate, as in goals.achieved; here each block of rows has its own threshold.
         pairs = zip(achieved_goal.unbind(-1), desired_goal.unbind(-1), strict=True)
@@ -183,7 +219,16 @@ class StateToObs(_LayerTransform):
         terminated = near.view(*distances.shape, 1)
         done = terminated.clone()
         if self.truncated_key is not None:
-            done |= next_tensordict.get(self.truncated_key)
+            truncated = next_tensordict.get(self.truncated_key)
+            if not self.goes_on:
+                truncated = truncated | (next_tensordict.get(self.terminated_key) & ~terminated)
+                next_tensordict.set(self.truncated_key, truncated)
+            done |= truncated
+        if cut is not None:
+            cut = cut.unsqueeze(-1) & ~done
+            done |= cut
+            if self.truncated_key is not None:
+                next_tensordict.set(self.truncated_key, truncated | cut)
         next_tensordict.set(self.reward_key, terminated.to(achieved_goal.dtype) - 1.0)
         next_tensordict.set(self.terminated_key, terminated)
         next_tensordict.set(self.done_key, done)
@@ -302,6 +347,10 @@ class ZeroPad(_LayerTransform):
         goal = self._get(next_tensordict, self.in_keys[1], self.curriculum.goal_width)
         next_tensordict.set(self.out_keys[0], self._pad(observation, goal))
         return next_tensordict
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._show_again(tensordict)
+        return self._call(next_tensordict)
 
     @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

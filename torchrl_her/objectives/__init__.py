@@ -1,5 +1,6 @@
 """TorchRL's losses of DDPG, TD3, SAC and DQN, with clamped targets; DDPG with an action L2 penalty."""
 
+from torchrl_her.objectives.critics import critic_value
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss, make_ddpg_loss
 from torchrl_her.objectives.dqn import make_dqn_loss
 from torchrl_her.objectives.sac import make_sac_loss
@@ -10,6 +11,7 @@ __all__ = [
     "ClampedTD0",
     "PenalizedDDPGLoss",
     "clamped_td0",
+    "critic_value",
     "make_ddpg_loss",
     "make_dqn_loss",
     "make_sac_loss",

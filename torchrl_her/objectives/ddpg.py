@@ -34,8 +34,10 @@ class PenalizedDDPGLoss(DDPGLoss):
         hook = self.actor_network.register_forward_hook(
             lambda _module, _inputs, output: actions.append(output.get(self.actor_network.out_keys[0]))
         )
-        loss, metadata = super().loss_actor(tensordict)
-        hook.remove()
+        try:
+            loss, metadata = super().loss_actor(tensordict)
+        finally:
+            hook.remove()
         penalty = self.action_penalty * actions[0].square().mean(-1)
         return loss + (penalty if loss.ndim else penalty.mean()), metadata
 

@@ -1,4 +1,4 @@
-"""Clamped one-step targets, and how target networks follow the online ones."""
+"""Clamped targets, and how target networks follow the online ones."""
 
 from __future__ import annotations
 
@@ -13,10 +13,15 @@ from torchrl.objectives.value import TD0Estimator
 
 
 class ClampedTD0(TD0Estimator):
-    """One-step targets, clamped to the values that are possible.
+    """Targets of one or several steps, clamped to the values that are possible.
 
     With rewards in [-1, 0], for example, no value is below -1 / (1 - gamma) or above 0. Andrychowicz et al.,
     Hindsight Experience Replay, 2017, appendix A.
+
+    A row may span several steps: its reward is then the discounted sum of their rewards, its ``next`` is that
+    of the last step, and the entry ``steps_to_next_obs`` [B, 1], int64, says how many they are. The next
+    state's value is discounted by ``gamma ** steps_to_next_obs``. Without the entry each row is one step.
+    The bounds are the same in both cases, since the value of a state does not depend on how it is estimated.
 
     Args:
         low: least target.
@@ -36,7 +41,7 @@ class ClampedTD0(TD0Estimator):
 def clamped_td0(
     gamma: float, reward_range: tuple[float, float], value_network: TensorDictModule | None = None
 ) -> ClampedTD0:
-    """One-step targets for ``loss.make_value_estimator``, clamped to the returns that are possible.
+    """Targets for ``loss.make_value_estimator``, clamped to the returns that are possible.
 
     Args:
         gamma: discount, in [0, 1).

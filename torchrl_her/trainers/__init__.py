@@ -11,7 +11,9 @@ from torchrl_her.trainers.checkpoint import (
     save_checkpoint,
 )
 from torchrl_her.trainers.compile import CompiledOnce
-from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner, can_fuse, is_plain_adam
+from torchrl_her.trainers.cut import cut_episodes
+from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner
+from torchrl_her.trainers.fusing import can_fuse, is_plain_adam, why_not_fused
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.metrics import discounted_return, final_distance, first_episode, q_bias, success
 from torchrl_her.trainers.runs import clip_by_run, keep_runs
@@ -29,6 +31,7 @@ __all__ = [
     "can_fuse",
     "clip_by_run",
     "collector_state_dict",
+    "cut_episodes",
     "discounted_return",
     "evaluate",
     "final_distance",
@@ -42,4 +45,5 @@ __all__ = [
     "q_bias",
     "save_checkpoint",
     "success",
+    "why_not_fused",
 ]

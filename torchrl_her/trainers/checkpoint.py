@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.utils.serialization import config
 from torchrl.collectors import BaseCollector
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler
+
+from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_state_dict
 
 _MAGIC = b"torchrl-her checkpoint 1\n"
 _PIECE = 1 << 26  # bytes that are written before they are synced to disk
@@ -224,10 +225,11 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
 
 
 def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> dict[str, Any]:
-    """The state of a replay buffer: stored transitions, writer, and priorities if there are any.
+    """The state of a replay buffer: stored transitions, writer and sampler.
 
-    TorchRL's own state has the size of the whole capacity, and with a prioritized sampler it holds objects
-    that a safe load refuses.
+    With it, the next batches are those of the unbroken buffer if the random numbers are, too. TorchRL's own
+    state has the size of the whole capacity, and with a prioritized sampler it holds objects that a safe load
+    refuses.
 
     Args:
         buffer: the buffer.
@@ -242,19 +244,10 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> d
         "shape": [] if rows is None else list(rows.batch_size),
         "size": n,
         "capacity": _capacity(buffer),
+        "cursor": getattr(buffer.storage, "_last_cursor_index", None),
         "writer": buffer.writer.state_dict(),
-        "sampler": None,
+        "sampler": sampler_state_dict(buffer.sampler, n),
     }
-    if isinstance(buffer.sampler, PrioritizedSampler):
-        sampler = buffer.sampler.state_dict()
-        filled = torch.arange(n)
-        state["sampler"] = {
-            "sum": torch.as_tensor(sampler["_sum_tree"][filled]) if n else None,
-            "min": torch.as_tensor(sampler["_min_tree"][filled]) if n else None,
-            "max_priority": [
-                None if value is None else torch.as_tensor(value) for value in sampler["_max_priority"]
-            ],
-        }
     return state
 
 
@@ -287,18 +280,10 @@ def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]
         raise ValueError(f"the buffer must be empty, it holds {len(buffer):,} rows")
     if capacity != state["capacity"]:
         raise ValueError(f"the state is that of a buffer of {state['capacity']:,} rows, not of {capacity:,}")
-    if isinstance(buffer.sampler, PrioritizedSampler) != (state["sampler"] is not None):
-        whose = "without priorities" if state["sampler"] is None else "with priorities"
-        raise ValueError(f"the state is that of a sampler {whose}, not of a {type(buffer.sampler).__name__}")
+    load_sampler_state_dict(buffer.sampler, state["sampler"])
     if n:
         rows = TensorDict.from_dict(state["rows"], batch_size=state["shape"])
         buffer.storage.set(torch.arange(len(rows)), rows)
+    if state["cursor"] is not None:  # where slice samplers see the oldest row follow the newest
+        buffer.storage._set_last_cursor(state["cursor"])
     buffer.writer.load_state_dict(state["writer"])
-    if state["sampler"] is not None:
-        sampler = buffer.sampler.state_dict()
-        filled = torch.arange(n)
-        if n:
-            sampler["_sum_tree"][filled] = state["sampler"]["sum"]
-            sampler["_min_tree"][filled] = state["sampler"]["min"]
-        sampler["_max_priority"] = tuple(state["sampler"]["max_priority"])
-        buffer.sampler.load_state_dict(sampler)

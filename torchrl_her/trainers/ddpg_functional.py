@@ -60,7 +60,8 @@ class Rows(NamedTuple):
     """The transitions that a step learns from, [R, B, width] each.
 
     ``seen`` and ``next_seen`` are the joined inputs of actor and critic; ``weight`` are importance weights
-    with any mean, None for all alike.
+    with any mean, None for all alike; ``discount`` [R, B, 1] is that of the next state's value where rows
+    span several steps, None for the discount of one step in all rows.
     """
 
     seen: Tensor
@@ -69,6 +70,7 @@ class Rows(NamedTuple):
     reward: Tensor
     terminated: Tensor
     weight: Tensor | None = None
+    discount: Tensor | None = None
 
 
 class Settings(NamedTuple):
@@ -164,11 +166,12 @@ def norms_of_runs(blocks: Sequence[Tensor], max_norm: float) -> tuple[Tensor, Te
 
 
 def clamped_targets(networks: Networks, rows: Rows, settings: Settings) -> Tensor:
-    """The one-step targets [R, B, 1] of :class:`~torchrl_her.objectives.ClampedTD0`."""
+    """The targets [R, B, 1] of :class:`~torchrl_her.objectives.ClampedTD0`."""
     action = run_actor(networks.target_actor, rows.next_seen)[-1]
     value = run_critic(networks.target_critic, rows.next_seen, action)[-1]
     value = value.masked_fill(rows.terminated, 0.0)
-    return (rows.reward + settings.gamma * value).clamp(settings.low, settings.high)
+    discount = settings.gamma if rows.discount is None else rows.discount
+    return (rows.reward + discount * value).clamp(settings.low, settings.high)
 
 
 def ddpg_gradients(networks: Networks, rows: Rows, settings: Settings) -> Step:

@@ -12,11 +12,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
-from torchrl.objectives.utils import TargetNetUpdater
+from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
-from torchrl_her.modules.networks import ActorNet, CriticNet
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss
-from torchrl_her.objectives.targets import ClampedTD0
 from torchrl_her.trainers.compile import CompiledOnce
 from torchrl_her.trainers.ddpg_functional import (
     Adam,
@@ -28,34 +26,9 @@ from torchrl_her.trainers.ddpg_functional import (
     ddpg_gradients,
     ddpg_update_,
 )
+from torchrl_her.trainers.fusing import is_plain_adam, why_not_fused
 from torchrl_her.trainers.learner import check_steps
 from torchrl_her.trainers.runs import keep_runs
-
-
-def can_fuse(loss: nn.Module, target: TargetNetUpdater | None) -> bool:
-    """Whether :class:`~torchrl_her.FusedDDPGLearner` knows a loss with its networks, targets and keys."""
-    if type(loss) is not PenalizedDDPGLoss or type(target) is not SoftUpdate:
-        return False
-    actor, critic = loss.actor_network, loss.value_network
-    keys = loss.tensor_keys
-    return (
-        type(actor.module) is ActorNet
-        and type(critic.module) is CriticNet
-        and not any(isinstance(module, nn.BatchNorm1d) for module in critic.modules())
-        and type(loss.value_estimator) is ClampedTD0
-        and loss.loss_function == "l2"
-        and list(critic.in_keys) == [*actor.in_keys, *actor.out_keys]
-        and (keys.reward, keys.terminated, keys.priority_weight)
-        == ("reward", "terminated", "priority_weight")
-    )
-
-
-def is_plain_adam(optimizer: torch.optim.Optimizer) -> bool:
-    """Whether an optimizer is Adam with one group of parameters and no extras."""
-    if type(optimizer) is not torch.optim.Adam or len(optimizer.param_groups) != 1:
-        return False
-    (group,) = optimizer.param_groups
-    return not (group["weight_decay"] or group["amsgrad"] or group["maximize"] or group["differentiable"])
 
 
 class FusedDDPGLearner:
@@ -73,13 +46,17 @@ class FusedDDPGLearner:
             :class:`~torchrl_her.trainers.CompiledOnce`.
 
     The learner keeps references to the weights' memory: make it after moving the loss to its device and type.
+    Entries of the rows are cast to that type, so rewards may be float64 beside networks in float32. Rows that
+    span several steps (``steps_to_next_obs``, see :class:`~torchrl_her.objectives.ClampedTD0`) have a program
+    of their own.
 
     Attributes:
         before_compiling: called before a step is compiled, which takes half a minute the first time.
 
     Raises:
-        ValueError: :func:`~torchrl_her.trainers.can_fuse` says no: use :class:`~torchrl_her.LossLearner`; or
-            the optimizer is not one that can be compiled.
+        ValueError: the loss or its targets are set to what the fused step does not do, see
+            :func:`~torchrl_her.trainers.can_fuse`: use :class:`~torchrl_her.LossLearner`; or the optimizer is
+            not one that can be compiled.
 
     Example:
         >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss
@@ -96,20 +73,17 @@ class FusedDDPGLearner:
         max_grad_norm: float = 3.0,
         compile_step: bool = False,
     ) -> None:
-        if not can_fuse(loss, target):
-            raise ValueError("only DDPG with the networks of make_actor and make_critic can be fused")
-        if compile_step and not is_plain_adam(optimizer):
-            raise ValueError(f"only a plain torch.optim.Adam can be compiled, got {optimizer}")
         self.loss, self.optimizer, self.compile_step = loss, optimizer, compile_step
-        self.tau = 1.0 - float(target.eps)
+        self.target, self.max_grad_norm = target, max_grad_norm
+        reason = why_not_fused(loss, target)
+        if reason is not None:
+            raise ValueError(
+                "only DDPG with the networks of make_actor and make_critic can be fused, and not with "
+                f"{reason}: use LossLearner"
+            )
+        if compile_step:
+            self._check_adam(loss)
         self.runs: int = loss.actor_network.module.runs
-        self._settings = Settings(
-            gamma=float(loss.value_estimator.gamma),
-            low=loss.value_estimator.low,
-            high=loss.value_estimator.high,
-            action_penalty=loss.action_penalty,
-            max_grad_norm=max_grad_norm,
-        )
         self.before_compiling: Callable[[], None] | None = None
         self._compiled: dict[tuple, CompiledOnce] = {}  # by all that a compiled form holds fixed
         self._keys = list(loss.actor_network.in_keys)
@@ -124,9 +98,20 @@ class FusedDDPGLearner:
             *_parameters(actor, loss.target_actor_network_params),
             *_parameters(critic, loss.target_value_network_params),
         ]
+        self._dtype = self._parameters[0].dtype
         self._weights = Weights([p.data for p in self._parameters], [p.data for p in targets])
         self._actor_layers = len(list(actor.parameters())) // 2
         self._networks = self._weights.networks(self._actor_layers)
+        self._settings = self._read_settings()
+
+    @property
+    def tau(self) -> float:
+        """The share of the online weights in a soft update."""
+        return 1.0 - float(self.target.eps)
+
+    @tau.setter
+    def tau(self, tau: float) -> None:
+        self.target.eps = 1.0 - tau
 
     @property
     def is_compiled(self) -> bool:
@@ -140,7 +125,14 @@ class FusedDDPGLearner:
 
     @torch.no_grad()
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
-        """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`."""
+        """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`.
+
+        Raises:
+            ValueError: the rows carry a mask of TorchRL's losses, or the loss or its optimizer were changed
+                to what this learner cannot do.
+        """
+        self._check(rows)
+        self._settings = self._read_settings()
         with keep_runs(self.loss, self.optimizer, idle, runs=self.runs):
             done = [self._step(part) for part in self._parts(rows, steps)]
         squares = torch.cat([step.squares for step in done], 1)
@@ -149,6 +141,40 @@ class FusedDDPGLearner:
             "loss_actor": torch.stack([step.loss_actor for step in done]),
             "loss_value": torch.stack([step.loss_value for step in done]),
         }
+
+    def _check(self, rows: TensorDictBase) -> None:
+        """What may change after the learner was made."""
+        if self.loss.reduction not in ("mean", "none"):
+            raise ValueError(f"reduction={self.loss.reduction!r} cannot be fused: use LossLearner")
+        if not all(parameter.requires_grad for parameter in self._parameters):
+            raise ValueError("parameters were frozen, but a fused step trains all of them: use LossLearner")
+        own = self.loss.loss_mask_key
+        for key in AUTO_LOSS_MASK_KEYS if own == "auto" else () if own is None else (own,):
+            if rows.get(key, None) is not None:
+                raise ValueError(
+                    f"a fused step learns from all rows, but {key!r} masks some: use LossLearner, or set "
+                    "loss.loss_mask_key = None"
+                )
+        if self.compile_step:
+            self._check_adam(None)
+
+    def _check_adam(self, loss: PenalizedDDPGLoss | None) -> None:
+        if not is_plain_adam(self.optimizer, loss):
+            raise ValueError(
+                "only a plain torch.optim.Adam can be compiled, with one group of exactly the loss's "
+                f"parameters and without hooks, got {self.optimizer}"
+            )
+
+    def _read_settings(self) -> Settings:
+        """The numbers of the loss, read anew for each update since they may be scheduled."""
+        estimator = self.loss.value_estimator
+        return Settings(
+            gamma=float(estimator.gamma),
+            low=estimator.low,
+            high=estimator.high,
+            action_penalty=self.loss.action_penalty,
+            max_grad_norm=self.max_grad_norm,
+        )
 
     def _step(self, rows: Rows) -> Step:
         if self.compile_step:
@@ -168,9 +194,11 @@ class FusedDDPGLearner:
             action.dtype,
             action.device,
             rows.weight is None,
+            rows.discount is None,
             adam.betas,
             adam.eps,
             self.tau,
+            self._settings,
         )
         if form not in self._compiled:
             if self.before_compiling is not None:
@@ -189,6 +217,8 @@ class FusedDDPGLearner:
         (group,) = self.optimizer.param_groups
         count = float(states[0]["step"]) + 1.0
         size, spread = bias_corrections(count, float(group["lr"]), group["betas"])
+        # As its step() would: schedulers of learning rates ask for it.
+        self.optimizer._opt_called = True  # type: ignore[attr-defined]
         number = self._weights.values[0].new_tensor
         return Adam(
             [state["exp_avg"] for state in states],
@@ -218,21 +248,45 @@ class FusedDDPGLearner:
         return [Rows(*own) for own in zip(*parts, strict=True)]
 
     def _rows(self, batch: TensorDictBase) -> Rows:
-        weight = batch.get("priority_weight", None)
+        terminated = batch.get(("next", "terminated"), None)
+        if terminated is None:  # as TorchRL's targets
+            terminated = batch.get(("next", "done"))
         return Rows(
             self._joined(batch, self._keys),
             self._joined(batch, [self._action_key]),
             self._joined(batch, self._next_keys),
             self._joined(batch, [("next", "reward")]),
-            self._joined(batch, [("next", "terminated")]),
-            None if weight is None else weight.view(self.runs, -1, 1).to(self._weights.values[0].dtype),
+            self._blocks(terminated),
+            self._importance(batch),
+            self._discount(batch),
         )
 
+    def _importance(self, batch: TensorDictBase) -> Tensor | None:
+        """Importance weights, if there are any and the loss uses them."""
+        if self.loss.use_prioritized_weights not in (True, "auto"):
+            return None
+        weight = batch.get("priority_weight", None)
+        return None if weight is None else self._blocks(weight.unsqueeze(-1)).to(self._dtype)
+
+    def _discount(self, batch: TensorDictBase) -> Tensor | None:
+        """What the next state's value is multiplied by, if rows say how many steps they span."""
+        estimator = self.loss.value_estimator
+        steps = batch.get(estimator.tensor_keys.steps_to_next_obs, None)
+        if steps is None:
+            return None
+        # not in the compiled step, and with the loss's own tensor: so powers are rounded as TorchRL's are
+        discount = estimator.gamma.to(steps.device) ** steps
+        return discount.reshape(self.runs, -1, 1).to(self._dtype)
+
     def _joined(self, batch: TensorDictBase, keys: list) -> Tensor:
-        """Entries, joined: [R, B, width]."""
+        """Entries, joined: [R, B, width], in the type of the weights."""
         values = [batch.get(key) for key in keys]
         joined = torch.cat(values, -1) if len(values) > 1 else values[0]
-        return joined.reshape(self.runs, -1, joined.shape[-1])
+        return self._blocks(joined).to(self._dtype)
+
+    def _blocks(self, entry: Tensor) -> Tensor:
+        """[..., width] to [R, B, width]."""
+        return entry.reshape(self.runs, -1, entry.shape[-1])
 
 
 def _parameters(net: nn.Module, weights: TensorDictBase) -> list[nn.Parameter]:

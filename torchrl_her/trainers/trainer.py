@@ -112,7 +112,6 @@ class Trainer:
         self.frames = self.updates = self.epochs = 0
         self._credit = 0.0  # gradient steps that the frames so far allow and that were not made yet
         self._measured: list[dict[str, Tensor]] | None = None  # in the epoch under way
-        self._open = False  # whether episodes go on that were written in part
 
     @property
     def in_epoch(self) -> bool:
@@ -138,7 +137,7 @@ class Trainer:
     def run(self, frames: int, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
         """Collects and learns for a number of frames of each run, rounded up to whole batches.
 
-        Episodes that are open at the end go on in the next call, also if that is an epoch.
+        Episodes that are open at the end go on in the next call, unless that is an epoch.
         """
         measured: list[dict[str, Tensor]] = []
         self._work(self.frames + frames, measured, on_batch, cut=False)
@@ -168,8 +167,8 @@ class Trainer:
             check_finite(batch)
             if ("collector", "traj_ids") not in batch.keys(True):
                 raise ValueError("the collector must mark trajectories: episodes are cut where epochs begin")
-            self._open = not (cut and self.frames + batch.numel() // len(self.buffers) >= end)
-            collected = self._write(batch if self._open else cut_episodes(batch))
+            is_last = self.frames + batch.numel() // len(self.buffers) >= end
+            collected = self._write(cut_episodes(batch) if cut and is_last else batch)
             self.frames += collected
             self._credit += collected / self.frames_per_update
             measured += self._learn()

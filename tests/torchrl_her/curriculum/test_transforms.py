@@ -209,6 +209,66 @@ def test_a_change_of_layer_is_seen_at_once() -> None:
     assert env.reset()["observation"].tolist() == [[10, 0, 0], [1010, 1020, 1030]]
 
 
+@pytest.mark.parametrize("device", [None, "cpu"])
+@pytest.mark.parametrize("changed", [(1, 1), (0, 2)])
+def test_a_change_in_mid_episode_leaves_no_row_of_two_layers(
+    changed: tuple[int, int], device: str | None
+) -> None:
+    env = wrap(TinyEnv((4,)), 0, 0, threshold=0.05)
+    progress = env.transform[0].progress
+    collector = Collector(
+        env,
+        lambda td: td.set("action", torch.ones(4, 1)),
+        frames_per_batch=12,
+        total_frames=-1,
+        device=device,
+        trust_policy=True,
+        auto_register_policy_transforms=False,
+    )
+    before = collector.next().clone()
+    assert not before["next", "done"].any()
+    kept = collector.next()
+    copy = kept.clone()
+    for run, layer in enumerate(changed):
+        progress.set_layer(run, layer)
+    after = collector.next().clone()
+    collector.shutdown()
+    assert (kept == copy).all()  # what was collected earlier stays as it is
+    expected = after.clone()
+    for part in (expected, expected["next"]):
+        shown = both(progress)
+        shown[0]._call(part)
+        shown[1]._call(part)
+    for key in ("observation", "achieved_goal", "desired_goal", "input"):
+        for name in (key, ("next", key)):
+            assert torch.equal(after[name], expected[name]), name
+    cut = torch.tensor(changed).repeat_interleave(2) > 0  # layers that changed
+    for flag in ("truncated", "done"):
+        assert after["next", flag][:, 0, 0].tolist() == cut.tolist()
+        assert not after["next", flag][:, 1:].any()
+    counts = after["state"][:, 0, 0] - env.base_env.start[:, 0]
+    assert counts.tolist() == [6.0] * 4  # steps before
+    fresh = after["state"][:, 1, 0] == env.base_env.start[:, 0]
+    assert fresh.tolist() == cut.tolist()
+
+
+def test_environments_that_were_reset_after_a_change_are_not_cut() -> None:
+    env = wrap(TinyEnv((4,)), 0, 0, threshold=0.05)
+    seen = env.reset()
+    env.transform[0].progress.set_layer(1, 2)
+    half = torch.tensor([[False], [False], [True], [False]])
+    seen = env.reset(seen.set("_reset", half))
+    assert seen["observation"][:, 1].tolist() == [0, 0, 2020, 0]
+    seen["action"] = torch.ones(4, 1)
+    after = env.step(seen)
+    assert after["observation"][:, 1].tolist() == [0, 0, 2020, 3020]
+    assert after["next", "truncated"].flatten().tolist() == [False, False, False, True]
+    env.transform[0].progress.set_layer(0, 1)
+    seen = env.reset()
+    seen["action"] = torch.ones(4, 1)
+    assert not env.step(seen)["next", "done"].any()
+
+
 # Reward and ends
 
 
@@ -709,3 +769,38 @@ def test_an_input_that_was_stored_is_replaced() -> None:
     sample = reach.sample()
     assert torch.equal(sample["input"][:, 5:7], sample["desired_goal"])
     assert torch.equal(sample["next", "input"][:, 5:7], sample["next", "desired_goal"])
+
+
+# Environments that cannot go on after an end of their own
+
+
+def wrap_ending(*layers: int, threshold: float = 0.5) -> TransformedEnv:
+    progress = at(make_three(threshold), *layers)
+    return TransformedEnv(TinyEnv((2,)), StateToObs(progress.curriculum, progress, goes_on=False))
+
+
+def test_an_end_of_the_environment_cuts_the_layer_s_episode_off() -> None:
+    """World 0 moves from 10 to 40, its own goal; the layer's goal is 20."""
+    after = act(wrap_ending(0), [30.0, 0.0])
+    assert after["terminated"].flatten().tolist() == [False, False]
+    assert after["truncated"].flatten().tolist() == [True, False]
+    assert after["done"].flatten().tolist() == [True, False]
+    assert after["reward"].flatten().tolist() == [-1.0, -1.0]
+
+
+def test_where_the_layer_s_goal_is_achieved_as_well_its_episode_is_terminated() -> None:
+    after = act(wrap_ending(0, threshold=21.0), [30.0, 0.0])  # 40 is 20 away from 20
+    assert after["terminated"].flatten().tolist() == [True, True]
+    assert after["truncated"].flatten().tolist() == [False, False]
+    assert after["reward"].flatten().tolist() == [0.0, 0.0]
+
+
+def test_where_the_environment_can_go_on_so_does_the_layer() -> None:
+    after = act(wrap(TinyEnv((2,)), 0), [30.0, 0.0])
+    assert after["done"].flatten().tolist() == [False, False]
+
+
+def test_an_end_needs_a_flag_to_be_noted_in() -> None:
+    progress = at(make_three(), 0)
+    with pytest.raises(ValueError, match="goes_on=False needs a truncated_key"):
+        StateToObs(progress.curriculum, progress, goes_on=False, truncated_key=None)

@@ -27,6 +27,9 @@ def test_dqn_targets_are_double_and_clamped() -> None:
     loss(batch)
     # -1 + 0.5 * -7 = -4.5 is below -1 / (1 - 0.5) = -2, and the value of action 0 is 0
     assert float(batch["td_error"]) == pytest.approx(4.0)
+    batch["steps_to_next_obs"] = torch.tensor([[4]])
+    loss(batch)
+    assert float(batch["td_error"]) == pytest.approx(1.4375**2)  # -1 - 7 / 2 ** 4
 
 
 @pytest.mark.parametrize("runs", [1, 2])

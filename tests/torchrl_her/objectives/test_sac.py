@@ -28,3 +28,22 @@ def test_a_discount_out_of_range_is_named(gamma: float) -> None:
     actor, critic = make_stochastic_actor((4, 2), SPEC), make_critic((4, 2), 3)
     with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):
         make_sac_loss(actor, critic, action_spec=SPEC, gamma=gamma)
+
+
+def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None:
+    """By hand: critics that say 0, with targets of -5 and -7, and a temperature so low that it is nothing."""
+    loss = make_sac_loss(
+        make_stochastic_actor((4, 2), SPEC), make_critic((4, 2), 3), action_spec=SPEC, gamma=0.5
+    )
+    SoftUpdate(loss, tau=0.1)
+    loss.log_alpha.data.fill_(-50.0)
+    for name, bias in (("qvalue_network_params", [0.0, 0.0]), ("target_qvalue_network_params", [-5.0, -7.0])):
+        params = getattr(loss, name)
+        for value in params.values(True, True):
+            value.data.zero_()
+        params["module", "rest", "2", "bias"].data.copy_(torch.tensor(bias).view(2, 1, 1, 1))
+    batch = rows(3, action=torch.rand(1, 3, 3))[0]
+    batch["steps_to_next_obs"] = torch.tensor([[1], [2], [3]])
+    loss(batch)
+    # -1 - 7 / 2, -1 - 7 / 4, -1 - 7 / 8, as distances from 0
+    assert batch["td_error"].tolist() == pytest.approx([4.5, 2.75, 1.875])

@@ -55,6 +55,21 @@ def test_bounds_of_targets(reward_range: tuple[float, float], low: float, high: 
         assert loss(rows([0.0]))["target_value"].item() == expected
 
 
+def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None:
+    data = rows([-1.0, -1.5, -1.75, -1.5], terminated=[0, 0, 0, 1])
+    data["steps_to_next_obs"] = torch.tensor([[1], [2], [3], [2]])
+    target = constant_loss(-6.0, gamma=0.5, reward_range=(-10.0, 0.0))(data)["target_value"]
+    assert target.tolist() == [-4.0, -3.0, -2.5, -1.5]  # -1 - 6 / 2, -1.5 - 6 / 4, -1.75 - 6 / 8
+
+
+def test_rows_of_several_steps_are_clamped_to_the_same_bounds() -> None:
+    data = rows([-1.5, -1.5])
+    data["steps_to_next_obs"] = torch.tensor([[2], [2]])
+    loss = constant_loss(-100.0, gamma=0.5)
+    assert loss(data)["target_value"].tolist() == [-2.0, -2.0]  # -1.5 - 100 / 4, and -1 / (1 - 0.5)
+    assert constant_loss(100.0, gamma=0.5)(data)["target_value"].tolist() == [0.0, 0.0]
+
+
 @pytest.mark.parametrize("gamma", [1.0, -0.1])
 def test_a_discount_out_of_range_is_named(gamma: float) -> None:
     with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):

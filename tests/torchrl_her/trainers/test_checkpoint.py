@@ -8,6 +8,7 @@ import io
 import os
 import tracemalloc
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,17 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
+from torchrl.data.replay_buffers.samplers import (
+    ConsumingSampler,
+    PrioritizedSampler,
+    PrioritizedSliceSampler,
+    RandomSampler,
+    Sampler,
+    SamplerEnsemble,
+    SamplerWithoutReplacement,
+    SliceSampler,
+    SliceSamplerWithoutReplacement,
+)
 
 from torchrl_her import GoalReward, HERSampleUnit, HERWriter, load_checkpoint, save_checkpoint
 from torchrl_her.trainers import (
@@ -30,6 +41,7 @@ from torchrl_her.trainers import (
     load_collector_state_dict,
     load_newest_checkpoint,
 )
+from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_state_dict
 from torchrl_her_envs import make_env
 
 from ..her_data import make_batch
@@ -270,11 +282,19 @@ def test_none_at_all_is_an_os_error(tmp_path: Path) -> None:
 # Replay buffers
 
 
+MAKE_SAMPLER: dict[str, Callable[[int], Sampler]] = {
+    "uniform": lambda capacity: RandomSampler(),
+    "prioritized": lambda capacity: PrioritizedSampler(capacity, 0.6, 0.4),
+    "without replacement": lambda capacity: SamplerWithoutReplacement(),
+    "in order": lambda capacity: SamplerWithoutReplacement(shuffle=False),
+}
+
+
 def make_buffer(sampler: str, capacity: int = 64) -> TensorDictReplayBuffer:
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity),
         writer=HERWriter(GoalReward(0.5), k=2),
-        sampler=RandomSampler() if sampler == "uniform" else PrioritizedSampler(capacity, 0.6, 0.4),
+        sampler=MAKE_SAMPLER[sampler](capacity),
         batch_size=16,
         priority_key="td_error",
     )
@@ -306,7 +326,7 @@ def resumed(buffer: TensorDictReplayBuffer, sampler: str, folder: Path) -> Tenso
     return other
 
 
-SAMPLERS = pytest.mark.parametrize("sampler", ["uniform", "prioritized"])
+SAMPLERS = pytest.mark.parametrize("sampler", list(MAKE_SAMPLER))
 
 
 @SAMPLERS
@@ -323,7 +343,7 @@ def test_a_resumed_buffer_goes_on_as_the_unbroken_one(
 ) -> None:
     buffer = make_buffer(sampler, capacity)
     for _ in range(batches):
-        buffer.extend(make_batch([[5, 5], [10], [3, 2]], steps=10))
+        buffer.extend(make_batch([[5, 5], [10], [3, 7]], steps=10))
         train(buffer)
     other = resumed(buffer, sampler, tmp_path)
     assert len(other) == len(buffer)
@@ -400,7 +420,7 @@ def test_rows_of_two_dimensions_go_on(sampler: str, tmp_path: Path) -> None:
         hindsight = HERSampleUnit(GoalReward(0.5))
         buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(40, ndim=2),
-            sampler=RandomSampler() if sampler == "uniform" else PrioritizedSampler(40, 0.6, 0.4),
+            sampler=MAKE_SAMPLER[sampler](40),
             sample_unit=hindsight,
             collate_fn=hindsight.relabel,
             batch_size=16,
@@ -414,12 +434,12 @@ def test_rows_of_two_dimensions_go_on(sampler: str, tmp_path: Path) -> None:
     save_checkpoint(buffer_state_dict(buffer), tmp_path / "buffer.pt")
     load_buffer_state_dict(other, load_checkpoint(tmp_path / "buffer.pt"))
     assert len(other) == len(buffer) == 14
-    assert same(other[:], buffer[:])
+    assert same(other.storage[:], buffer.storage[:])
     assert same(other.sample(), buffer.sample())
     more = make_batch([[4], [4]])
     for own in (buffer, other):
         own.extend(more)
-    assert same(other[:], buffer[:])
+    assert same(other.storage[:], buffer.storage[:])
 
 
 @pytest.mark.parametrize(
@@ -427,7 +447,8 @@ def test_rows_of_two_dimensions_go_on(sampler: str, tmp_path: Path) -> None:
     [
         ("uniform", 64, True, "the buffer must be empty, it holds 15 rows"),
         ("uniform", 65, False, "that of a buffer of 64 rows, not of 65"),
-        ("prioritized", 64, False, "that of a sampler without priorities, not of a PrioritizedSampler"),
+        ("in order", 64, False, "that of a RandomSampler, not of a SamplerWithoutReplacement"),
+        ("prioritized", 64, False, "that of a RandomSampler, not of a PrioritizedSampler"),
     ],
 )
 def test_buffers_of_another_make_are_refused(sampler: str, capacity: int, full: bool, message: str) -> None:
@@ -437,6 +458,107 @@ def test_buffers_of_another_make_are_refused(sampler: str, capacity: int, full: 
         other.extend(make_batch([[5]]))
     with pytest.raises(ValueError, match=message):
         load_buffer_state_dict(other, buffer_state_dict(buffer))
+
+
+# Samplers of sequences, and of rows that are used up
+
+
+def slices(kind: type[Sampler], *args: Any) -> Callable[[], Sampler]:
+    return lambda: kind(*args, slice_len=4, traj_key="episode", strict_length=False)
+
+
+def by_ends(kind: type[Sampler], *args: Any) -> Callable[[], Sampler]:
+    return lambda: kind(*args, slice_len=4, end_key=("next", "done"), strict_length=False)
+
+
+def make_steps(lengths: list[int], first: int) -> TensorDict:
+    """Rows of some episodes, one after the other."""
+    episode = torch.arange(first, first + len(lengths)).repeat_interleave(torch.tensor(lengths))
+    done = torch.zeros(sum(lengths), 1, dtype=torch.bool)
+    done[torch.tensor(lengths).cumsum(0) - 1] = True
+    return TensorDict(
+        {
+            "observation": torch.arange(len(episode)).unsqueeze(-1) + 1000.0 * first,
+            "episode": episode,
+            "next": {"done": done, "terminated": done.clone(), "truncated": torch.zeros_like(done)},
+        },
+        [len(episode)],
+    )
+
+
+def draw(buffer: TensorDictReplayBuffer) -> TensorDict:
+    rows = buffer.sample()
+    rows["td_error"] = rows["observation"][:, 0] % 7.0 + 0.1
+    buffer.update_tensordict_priority(rows)
+    return rows
+
+
+@pytest.mark.parametrize("emptied", [False, True])
+@pytest.mark.parametrize("over", [False, True], ids=["filled in part", "written over"])
+@pytest.mark.parametrize(
+    "make_sampler",
+    [
+        pytest.param(slices(SliceSampler), id="slice"),
+        pytest.param(by_ends(SliceSampler), id="slice, by ends"),
+        pytest.param(slices(SliceSamplerWithoutReplacement), id="slice without replacement"),
+        pytest.param(by_ends(SliceSamplerWithoutReplacement), id="slice without replacement, by ends"),
+        pytest.param(slices(PrioritizedSliceSampler, 100, 0.6, 0.4), id="prioritized slice"),
+        pytest.param(by_ends(PrioritizedSliceSampler, 100, 0.6, 0.4), id="prioritized slice, by ends"),
+        pytest.param(
+            lambda: SamplerWithoutReplacement(drop_last=True), id="whole batches without replacement"
+        ),
+        pytest.param(lambda: ConsumingSampler(max_sample_count=2), id="consuming"),
+    ],
+)
+def test_the_next_batches_are_those_of_the_unbroken_run(
+    make_sampler: Callable[[], Sampler], over: bool, emptied: bool, tmp_path: Path
+) -> None:
+    def make() -> TensorDictReplayBuffer:
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(100), sampler=make_sampler(), batch_size=16, priority_key="td_error"
+        )
+        buffer.set_rng(torch.Generator().manual_seed(3))
+        return buffer
+
+    buffer, other = make(), make()
+    for first in (0, 10, 20) if over else (0,):
+        buffer.extend(make_steps([5, 9, 3, 12, 7, 6], first))
+        for _ in range(2):
+            draw(buffer)
+    if emptied:
+        buffer.empty()
+        buffer.extend(make_steps([8, 11, 4], 40))
+        draw(buffer)
+    state = {"buffer": buffer_state_dict(buffer), "random": buffer.sampler._rng.get_state()}
+    save_checkpoint(state, tmp_path / "buffer.pt")
+    state = load_checkpoint(tmp_path / "buffer.pt")
+    load_buffer_state_dict(other, state["buffer"])
+    other.set_rng(torch.Generator())
+    other.sampler._rng.set_state(state["random"])
+    for _ in range(2):
+        assert same(draw(other), draw(buffer))
+        assert other.sampler.ran_out == buffer.sampler.ran_out
+        assert other.sampler._remaining_batches == buffer.sampler._remaining_batches
+    for own in (buffer, other):
+        own.extend(make_steps([6, 9], 60))
+    for _ in range(3):
+        assert same(draw(other), draw(buffer))
+
+
+def test_samplers_of_an_ensemble_go_on() -> None:
+    def make() -> SamplerEnsemble:
+        parts = [SamplerWithoutReplacement(), PrioritizedSampler(8, 0.6, 0.4)]
+        return SamplerEnsemble(*parts, sample_from_all=True)
+
+    first, second = make(), make()
+    first._samplers[0]._sample_list = torch.tensor([3, 1])
+    first._samplers[0].len_storage = 4
+    first._samplers[1].extend(torch.arange(8))
+    first._samplers[1].update_priority(torch.arange(8), torch.arange(1.0, 9.0))
+    load_sampler_state_dict(second, sampler_state_dict(first, 0))
+    assert second._samplers[0]._sample_list.tolist() == [3, 1]
+    trees = [own._samplers[1]._sum_tree[torch.arange(8)] for own in (first, second)]
+    torch.testing.assert_close(*trees)
 
 
 # Collectors

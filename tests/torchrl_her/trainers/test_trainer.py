@@ -36,23 +36,24 @@ N, STEPS = 8, 10
 class LineEnv(EnvBase):
     """A point on a line from -1 to 1 that moves by a tenth of the action; the goal is to be somewhere."""
 
-    def __init__(self, seed: int = 0) -> None:
-        super().__init__(device="cpu", batch_size=(N,))
+    def __init__(self, seed: int = 0, shape: tuple[int, ...] = (N,)) -> None:
+        super().__init__(device="cpu", batch_size=shape)
         self.reward = GoalReward(0.1)
+        self.entry = entry = (*shape, 1)
 
         def line() -> Unbounded:
-            return Unbounded(shape=(N, 1))
+            return Unbounded(shape=entry)
 
         def flag() -> Binary:
-            return Binary(n=1, shape=(N, 1), dtype=torch.bool)
+            return Binary(n=1, shape=entry, dtype=torch.bool)
 
         self.observation_spec = Composite(
-            observation=line(), achieved_goal=line(), desired_goal=line(), shape=(N,)
+            observation=line(), achieved_goal=line(), desired_goal=line(), shape=shape
         )
-        self.action_spec = Bounded(-1.0, 1.0, shape=(N, 1))
-        self.reward_spec = Unbounded(shape=(N, 1))
-        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(N,))
-        self.x, self.goal, self.t = torch.zeros(N, 1), torch.zeros(N, 1), torch.zeros(N, 1)
+        self.action_spec = Bounded(-1.0, 1.0, shape=entry)
+        self.reward_spec = Unbounded(shape=entry)
+        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=shape)
+        self.x, self.goal, self.t = torch.zeros(entry), torch.zeros(entry), torch.zeros(entry)
         self.set_seed(seed)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -66,12 +67,12 @@ class LineEnv(EnvBase):
         }
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = torch.ones(N, 1, dtype=torch.bool) if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones(N, 1, dtype=torch.bool) if mask is None else mask.view(N, 1)
-        start = torch.rand(2, N, 1, generator=self.rng) * 2 - 1
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = torch.ones(self.entry, dtype=torch.bool) if mask is None else mask.view(self.entry)
+        start = torch.rand(2, *self.entry, generator=self.rng) * 2 - 1
         self.x, self.goal = torch.where(mask, start[0], self.x), torch.where(mask, start[1], self.goal)
         self.t = self.t.masked_fill(mask, 0)
-        return TensorDict(self._shown(), batch_size=[N])
+        return TensorDict(self._shown(), batch_size=self.batch_size)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.x = (self.x + 0.25 * tensordict["action"]).clamp(-1, 1)
@@ -79,11 +80,16 @@ class LineEnv(EnvBase):
         reward, terminated = self.reward(self.x, self.goal)
         truncated = self.t >= STEPS
         flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-        return TensorDict({**self._shown(), "reward": reward, **flags}, batch_size=[N])
+        return TensorDict({**self._shown(), "reward": reward, **flags}, batch_size=self.batch_size)
 
 
 def make_trainer(
-    seed: int = 0, *, make_learner: Any = LossLearner, **options: Any
+    seed: int = 0,
+    *,
+    make_learner: Any = LossLearner,
+    shape: tuple[int, ...] = (N,),
+    frames_per_batch: int = N * STEPS,
+    **options: Any,
 ) -> tuple[Trainer, TensorDictSequential]:
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
@@ -97,9 +103,9 @@ def make_trainer(
     buffer.set_rng(generator)
     trainer = Trainer(
         collector=Collector(
-            LineEnv(seed),
+            LineEnv(seed, shape),
             policy,
-            frames_per_batch=N * STEPS,
+            frames_per_batch=frames_per_batch,
             total_frames=-1,
             auto_register_policy_transforms=False,
         ),
@@ -264,3 +270,32 @@ def test_trajectories_must_be_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trainer.collector, "next", lambda: collect().exclude(("collector", "traj_ids")))
     with pytest.raises(ValueError, match="must mark trajectories"):
         trainer.epoch()
+
+
+# Episodes that are open when an epoch ends
+
+
+@pytest.mark.parametrize(
+    ("shape", "frames_per_batch", "epoch_frames"), [((), 4, 26), ((), 7, 21), ((N,), 3 * N, 13 * N)]
+)
+def test_no_row_is_lost_where_epochs_end(
+    shape: tuple[int, ...], frames_per_batch: int, epoch_frames: int
+) -> None:
+    trainer, _ = make_trainer(
+        shape=shape, frames_per_batch=frames_per_batch, epoch_frames=epoch_frames, warmup_frames=10**6
+    )
+    writer = trainer.buffers[0].writer
+    for _ in range(4):
+        trainer.epoch()
+        assert (writer.held_back, writer.counts.real) == (0, trainer.frames)
+    assert trainer.frames >= 4 * epoch_frames
+
+
+def test_epochs_that_follow_a_run_lose_nothing_either() -> None:
+    trainer, _ = make_trainer(shape=(), frames_per_batch=4, epoch_frames=26, warmup_frames=10**6)
+    writer = trainer.buffers[0].writer
+    trainer.run(13)
+    assert writer.held_back > 0
+    assert writer.held_back + writer.counts.real == trainer.frames == 16
+    trainer.epoch()
+    assert (writer.held_back, writer.counts.real) == (0, trainer.frames)

@@ -1,0 +1,53 @@
+"""What the critics of a loss think: those that are trained, wherever the loss keeps them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import DDPGLoss, DQNLoss, LossModule
+
+
+@torch.no_grad()
+def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None:
+    """The value of actions, as the loss's own critics see it.
+
+    TD3 and SAC train several critics, which they make anew from the one they are given. Their value is the
+    least of these, as in their targets. That of DQN is the value of the best action.
+
+    Args:
+        loss: of TorchRL, for example from :func:`~torchrl_her.make_td3_loss`.
+        transitions: [...], with all that the critics read; for all but DQN that includes the action.
+
+    Returns:
+        [..., 1]; None if the loss has no critics of actions that are known here.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_her import make_actor, make_critic, make_td3_loss
+        >>> actor, critic = make_actor((9, 2), 3), make_critic((9, 2), 3)
+        >>> loss = make_td3_loss(actor, critic, action_spec=Bounded(-1.0, 1.0, (3,)))
+        >>> start = TensorDict({"observation": torch.zeros(4, 9), "desired_goal": torch.zeros(4, 2)}, [4])
+        >>> critic_value(loss, actor(start)).shape
+        torch.Size([4, 1])
+    """
+    keys: Any = loss.tensor_keys
+    if getattr(loss, "qvalue_network_params", None) is not None:
+        network, params, key = loss.qvalue_network, loss.qvalue_network_params, keys.state_action_value
+    elif isinstance(loss, DDPGLoss):
+        network, params, key = loss.value_network, loss.value_network_params, keys.state_action_value
+    elif isinstance(loss, DQNLoss):
+        network, params, key = loss.value_network, loss.value_network_params, keys.value
+    else:
+        return None
+    training = network.training
+    network.eval()  # neither uses nor changes the statistics of this batch
+    values = []
+    for own in params.data.unbind(0) if params.ndim else [params.data]:
+        with own.to_module(network, preserve_module_state=False):
+            values.append(network(transitions.select(*network.in_keys)).get(key))
+    network.train(training)
+    return torch.stack(values).amin(0)

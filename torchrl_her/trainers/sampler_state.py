@@ -1,0 +1,85 @@
+"""The state of a sampler as tensors and plain data: priorities, permutations, counts of what was drawn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler, SamplerEnsemble
+
+_REMAINING = "_remaining_batches"  # until a pass over the data is over; TorchRL's states leave it out
+
+
+def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
+    """All that decides, with the random numbers, what a sampler draws next.
+
+    Args:
+        sampler: of any of TorchRL's kinds.
+        size: how many rows its storage holds; a prioritized sampler's state is of these only.
+
+    Example:
+        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
+        >>> from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
+        >>> sampler = SamplerWithoutReplacement(shuffle=False)
+        >>> buffer = ReplayBuffer(storage=LazyTensorStorage(5), sampler=sampler, batch_size=2)
+        >>> _ = buffer.extend(torch.arange(5)), buffer.sample()
+        >>> sampler_state_dict(sampler, 5)["own"]["_sample_list"].tolist()  # what is left of this pass
+        [2, 3, 4]
+    """
+    if isinstance(sampler, SamplerEnsemble):
+        # Of parts with priorities the whole trees: how much each storage holds is not known here.
+        own: dict[str, Any] = {
+            str(i): sampler_state_dict(part, getattr(part, "_max_capacity", 0))
+            for i, part in enumerate(sampler._samplers)
+        }
+    elif isinstance(sampler, PrioritizedSampler):
+        own = _priorities(sampler, size)
+    else:
+        own = {key: _copy(value) for key, value in sampler.state_dict().items()}
+    return {"kind": type(sampler).__name__, "own": own, "remaining": vars(sampler).get(_REMAINING)}
+
+
+def load_sampler_state_dict(sampler: Sampler, state: dict[str, Any]) -> None:
+    """Puts back what :func:`sampler_state_dict` gave.
+
+    Raises:
+        ValueError: the state is that of another kind of sampler.
+    """
+    kind = type(sampler).__name__
+    if state["kind"] != kind:
+        raise ValueError(f"the state is that of a {state['kind']}, not of a {kind}")
+    if isinstance(sampler, SamplerEnsemble):
+        for i, part in enumerate(sampler._samplers):
+            load_sampler_state_dict(part, state["own"][str(i)])
+    elif isinstance(sampler, PrioritizedSampler):
+        _load_priorities(sampler, state["own"])
+    else:
+        sampler.load_state_dict(state["own"])
+    if state["remaining"] is not None:
+        setattr(sampler, _REMAINING, state["remaining"])
+
+
+def _copy(value: Any) -> Any:
+    return value.clone() if isinstance(value, torch.Tensor) else value
+
+
+def _priorities(sampler: PrioritizedSampler, size: int) -> dict[str, Any]:
+    """Of the filled part: TorchRL's state holds trees that a safe load refuses."""
+    state, filled = sampler.state_dict(), torch.arange(size)
+    return {
+        "sum": torch.as_tensor(state["_sum_tree"][filled]) if size else None,
+        "min": torch.as_tensor(state["_min_tree"][filled]) if size else None,
+        "max_priority": [
+            None if value is None else torch.as_tensor(value) for value in state["_max_priority"]
+        ],
+    }
+
+
+def _load_priorities(sampler: PrioritizedSampler, own: dict[str, Any]) -> None:
+    state = sampler.state_dict()
+    if own["sum"] is not None:
+        filled = torch.arange(len(own["sum"]))
+        state["_sum_tree"][filled] = own["sum"]
+        state["_min_tree"][filled] = own["min"]
+    state["_max_priority"] = tuple(own["max_priority"])
+    sampler.load_state_dict(state)
