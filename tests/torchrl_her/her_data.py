@@ -27,7 +27,7 @@ def make_batch(
     Args:
         lengths: of the episodes of each environment.
         steps: T; by default as many as the longest environment has. The last episode may be cut by it.
-        terminated: whether episodes end by termination; otherwise by truncation.
+        terminated: whether episodes end by termination, their goals achieved; otherwise by truncation.
         first: for each environment, the episode and state to begin with.
     """
     horizon = steps or max(sum(own) for own in lengths)
@@ -55,7 +55,7 @@ def make_batch(
                 "achieved_goal": _point(tag_of(env, episode, state + 1)),
                 "desired_goal": _point(torch.full((len(rows),), WANTED)),
                 "state": torch.full((len(rows), 3), WANTED),
-                "reward": torch.full((len(rows), 1), -1.0),
+                "reward": (last & terminated).float() - 1.0,
                 "terminated": last & terminated,
                 "truncated": last & (not terminated),
                 "done": last,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.replay_buffers.episodes import Episodes
-from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
+from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of, failed
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, n_step_return, windows
 
 
@@ -70,12 +70,14 @@ def virtual_copies(
     reward_fn: RewardFunction,
     keys: TransitionKeys,
     *,
+    achieved_reward: float,
     n_steps: int,
     gamma: float | None,
 ) -> Copies:
     """Some transitions for other goals, each for its own.
 
-    Over several steps, a transition ends where the reward function terminates.
+    Over several steps, a transition ends where it terminates: by the reward function, or because the episode
+    did so although its goal was not achieved.
 
     Args:
         rows: [n], collected transitions.
@@ -83,20 +85,22 @@ def virtual_copies(
         source: [V] int64, the transitions that are copied.
         goals: [V, g].
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
+        achieved_reward: the reward of an achieved goal.
         keys, n_steps, gamma: as for :func:`real_copies`.
     """
-    achieved = entry_of(rows, keys.next_achieved)
+    achieved, fallen = entry_of(rows, keys.next_achieved), failed(rows, keys, achieved_reward)
     if n_steps == 1 or gamma is None:
         reward, terminated = reward_fn(achieved.index_select(0, source), goals)
+        terminated = terminated.view(-1, 1) | fallen.index_select(0, source)
         truncated = entry_of(rows, keys.truncated).index_select(0, source)
         return Copies(source, source, keys.changes(goals, reward, terminated, truncated), reward.flatten())
     window, inside = _windows(rows, episodes, source, n_steps)
-    each = reward_fn(achieved[window], goals.unsqueeze(1).expand(-1, n_steps, -1))
-    out = n_step_return(*each, inside, gamma)
+    reward, terminated = reward_fn(achieved[window], goals.unsqueeze(1).expand(-1, n_steps, -1))
+    out = n_step_return(reward, terminated | fallen[window], inside, gamma)
     last = _at(window, out.last)
     truncated = entry_of(rows, keys.truncated).index_select(0, last)
     changes = keys.changes(goals, out.reward, out.terminated, truncated)
-    return Copies(source, last, {**changes, STEPS_KEY: out.steps}, _at(each[0].squeeze(-1), out.last))
+    return Copies(source, last, {**changes, STEPS_KEY: out.steps}, _at(reward.squeeze(-1), out.last))
 
 
 def virtual_episodes(
@@ -106,13 +110,15 @@ def virtual_episodes(
     goals: Tensor,
     reward_fn: RewardFunction,
     keys: TransitionKeys,
+    *,
+    achieved_reward: float,
 ) -> tuple[Copies, Tensor]:
     """Whole episodes for other goals, one for each copy, up to where the reward function terminates.
 
     An episode that does not terminate for its goal is truncated at its end.
 
     Args:
-        rows, reward_fn, keys: as for :func:`virtual_copies`.
+        rows, reward_fn, keys, achieved_reward: as for :func:`virtual_copies`.
         episodes: positions of the collected episodes.
         source: [V] int64, the first transition of the episode that is copied.
         goals: [V, g], of each copy.
@@ -124,6 +130,7 @@ def virtual_episodes(
     table, inside = episodes.rows[number], episodes.inside[number]
     wanted = goals.unsqueeze(1).expand(-1, table.shape[1], -1)
     reward, terminated = reward_fn(entry_of(rows, keys.next_achieved)[table], wanted)
+    terminated = terminated | failed(rows, keys, achieved_reward)[table]
     ended = terminated.squeeze(-1).cumsum(-1) - terminated.squeeze(-1).to(torch.int64)
     used = inside & (ended == 0)
     stop = used.clone()

@@ -48,6 +48,27 @@ class TransitionKeys:
         }
 
 
+def failed(transitions: TensorDictBase, keys: TransitionKeys, achieved_reward: float) -> Tensor:
+    """Where an episode terminated although its goal was not achieved, as by a fall: [n, 1] of bool.
+
+    It would have terminated there whatever the goal, so it does for virtual goals, too.
+
+    Args:
+        transitions: [n], as collected.
+        keys: where entries are.
+        achieved_reward: the reward of an achieved goal.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_her import HindsightOptions
+        >>> after = {"terminated": torch.tensor([[True], [True]]), "reward": torch.tensor([[0.0], [-1.0]])}
+        >>> failed(TensorDict({"next": after}, [2]), HindsightOptions().transition_keys(), 0.0).tolist()
+        [[False], [True]]
+    """
+    reward, terminated = entry_of(transitions, keys.reward), entry_of(transitions, keys.terminated)
+    return terminated.reshape(-1, 1) & (reward.reshape(-1, 1) < achieved_reward)
+
+
 def under_next(key: NestedKey) -> NestedKey:
     """The same key under ``next``.
 

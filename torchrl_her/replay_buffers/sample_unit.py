@@ -31,7 +31,7 @@ from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.strategies import candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
-from torchrl_her.replay_buffers.keys import entry_of
+from torchrl_her.replay_buffers.keys import entry_of, failed
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_return, windows
 from torchrl_her.replay_buffers.neighbors import (
     MASK,
@@ -246,6 +246,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             reward, terminated = chosen.ahead.returns.reward[rows], chosen.ahead.returns.terminated[rows]
         else:
             reward, terminated = self.reward_fn(entry_of(data, self._keys.next_achieved)[rows], chosen.goals)
+            terminated = terminated.view(-1, 1) | failed(data, self._keys, self.achieved_reward)[rows]
         truncated = entry_of(out, self._keys.truncated)[rows]
         for key, value in self._keys.changes(chosen.goals, reward, terminated, truncated).items():
             entry = entry_of(out, key)
@@ -314,7 +315,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         if len(virtual) > 0:
             wanted = goals.unsqueeze(1).expand(-1, self.options.n_steps, -1)
             own_reward, own_end = self.reward_fn(stored.after[window[virtual]], wanted)
-            reward[virtual], end[virtual] = own_reward.to(reward.dtype), own_end
+            fallen = failed(stored.rows, self._keys, self.achieved_reward)[window[virtual]]
+            reward[virtual], end[virtual] = own_reward.to(reward.dtype), own_end | fallen
         returns = n_step_return(reward, end, inside, gamma)
         last = window.gather(-1, returns.last.unsqueeze(-1)).squeeze(-1)
         return _Ahead(stored.rows.get("next")[last], returns)

@@ -63,8 +63,9 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     It takes a collector's batch: [N, T] with time last, or flat with trajectory ids. Episodes that are still
     open at the end of a batch are held back until they end. A virtual transition has another desired goal
-    in the root and under ``next``; its reward, terminated and done are computed again for that goal, and
-    everything else stays as it was. Goals never come from another episode or another environment.
+    in the root and under ``next``; its reward, terminated and done are computed again for that goal (but an
+    episode that terminated without achieving its goal, as by a fall, does so for any goal), and everything
+    else stays as it was. Goals never come from another episode or another environment.
 
     Rows of the next batch that go on with an open episode are found by the ids of environments
     (:class:`~torchrl_her.EnvIds`), if there are any; otherwise by their place in a batch [N, T], or by
@@ -318,7 +319,15 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         if len(source) > 0:
             goals = entry_of(rows, self._keys.next_achieved).index_select(0, goal_source)
             if self.options.per == "episode":
-                virtual, copy = virtual_episodes(rows, episodes, source, goals, self.reward_fn, self._keys)
+                virtual, copy = virtual_episodes(
+                    rows,
+                    episodes,
+                    source,
+                    goals,
+                    self.reward_fn,
+                    self._keys,
+                    achieved_reward=self.achieved_reward,
+                )
                 virtual = self._with_ids(virtual, copy, len(source))
             else:
                 virtual = virtual_copies(
@@ -328,6 +337,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
                     goals,
                     self.reward_fn,
                     self._keys,
+                    achieved_reward=self.achieved_reward,
                     n_steps=n_steps,
                     gamma=gamma,
                 )

@@ -975,3 +975,17 @@ def test_ends_of_slices_under_another_key_are_refused() -> None:
     buffer.extend(flat([[5]]))
     with pytest.raises(ValueError, match=r"under \('next', 'cut'\), and relabeling reads"):
         buffer.sample(4)
+
+
+@pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.5}])
+def test_a_fall_terminates_virtual_transitions_too(options: dict[str, Any]) -> None:
+    """An episode that terminated without success would have done so for any goal."""
+    never = EnvReward(lambda a, d: REWARD(a, d)[0] - 1.0, lambda a, d: torch.zeros_like(a[..., :1]).bool())
+    buffer = make_buffer(reward=never, k=NEVER_REAL, **options)
+    batch = flat([[4]], terminated=True)
+    batch["next", "reward"].fill_(-1.0)
+    buffer.extend(batch)
+    rows = buffer.sample(100)
+    at_end = rows["next", "observation"][:, 0] == 4
+    assert torch.equal(rows["next", "terminated"][:, 0], at_end)
+    assert torch.equal(rows["next", "done"][:, 0], at_end)

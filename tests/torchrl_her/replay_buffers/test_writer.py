@@ -961,3 +961,25 @@ def test_priorities_in_a_batch_are_those_of_real_rows_if_it_is_flat() -> None:
 def test_flat_rows_of_two_environments_without_ids_are_refused_at_once() -> None:
     with pytest.raises(ValueError, match="1 episodes are not over"):
         make_buffer().extend(make_batch([[9], [9]], steps=3).reshape(-1).exclude("collector"))
+
+
+# Ends that have nothing to do with the goal
+
+
+def fall(lengths: list[list[int]]) -> TensorDict:
+    """Episodes that terminate in their last step without success."""
+    batch = make_batch(lengths, terminated=True)
+    batch["next", "reward"].fill_(-1.0)
+    return batch
+
+
+@pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.5}, {"per": "episode"}])
+def test_a_fall_terminates_virtual_transitions_too(options: dict[str, Any]) -> None:
+    never = EnvReward(lambda a, d: REWARD(a, d)[0] - 1.0, lambda a, d: torch.zeros_like(a[..., :1]).bool())
+    buffer = make_buffer(reward=never, k=2, **options)
+    buffer.extend(fall([[4]]))
+    _, virtual = split(buffer)
+    at_end = virtual["next", "observation"][:, 0] == 4
+    assert at_end.any()
+    assert torch.equal(virtual["next", "terminated"][:, 0], at_end)
+    assert torch.equal(virtual["next", "done"][:, 0], at_end)
