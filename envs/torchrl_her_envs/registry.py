@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import SequenceMatcher
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from torchrl_her_envs.throwing.tasks import TASKS
 
@@ -14,7 +15,8 @@ if TYPE_CHECKING:  # loads torch
     from torchrl.envs import EnvBase
 
 GYM = "gym:"  # before the id of an environment of gymnasium's
-_GYM_FAMILY = "gym"
+_OWN = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")  # module:function
+_OTHERS = f"or {GYM}ID for one of gymnasium's, or my_module:make_env for a TorchRL environment of your own"
 _ALIKE = 0.6  # the least similarity, from 0 to 1, at which another name is suggested
 
 
@@ -30,6 +32,9 @@ class TaskSpec:
             it is first used. It takes ``num_envs``, ``seed``, the arguments and the options.
         arguments: what it is always given, beyond the options.
         options: all options that the task takes, with their defaults.
+        actions: which kind it has; None if only its environment tells.
+        takes_others: whether it may take further options, which are only known when it is made.
+        for_pictures: options that let its environments give pictures, if they do not always.
 
     Example:
         >>> get_task_spec("bit_flip").options
@@ -42,6 +47,9 @@ class TaskSpec:
     make: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
     options: Mapping[str, Any] = field(default_factory=dict)
+    actions: Literal["continuous", "discrete"] | None = None
+    takes_others: bool = False
+    for_pictures: Mapping[str, Any] = field(default_factory=dict)
 
 
 _SPECS: dict[str, TaskSpec] = {}
@@ -85,7 +93,8 @@ def get_task_spec(name: str) -> TaskSpec:
     """What is known of a task.
 
     Args:
-        name: one of :func:`task_names`, or ``gym:ID`` for an environment of gymnasium's.
+        name: one of :func:`task_names`, ``gym:ID`` for an environment of gymnasium's, or
+            ``module:function`` for a TorchRL environment of one's own.
 
     Raises:
         ValueError: there is no such task.
@@ -95,40 +104,57 @@ def get_task_spec(name: str) -> TaskSpec:
         ('throwing', 'gym')
     """
     check_task(name)
-    return _SPECS[name] if name in _SPECS else _gym_spec(name.removeprefix(GYM))
+    if name in _SPECS:
+        return _SPECS[name]
+    return _gym_spec(name.removeprefix(GYM)) if name.startswith(GYM) else _own_spec(name)
+
+
+def module_of(name: str) -> str:
+    """The module that the name of a task asks to import: of somebody else, or of one's own.
+
+    Returns:
+        Its name, or nothing for tasks of this package and for what gymnasium itself knows.
+
+    Example:
+        >>> module_of("my_module:make_env"), module_of("gym:my_module:MyEnv-v0"), module_of("hand_v0")
+        ('my_module', 'my_module', '')
+    """
+    module, colon, _ = name.removeprefix(GYM).partition(":")
+    return module if colon else ""
 
 
 def check_task(name: str) -> None:
     """Raises a ValueError for a name that is no task's; it lists the tasks and suggests the nearest name.
 
-    Whether gymnasium knows the ID of ``gym:ID`` is only found out when the environment is made.
+    Whether gymnasium knows the ID of ``gym:ID``, or a module its function, is only found out when the
+    environment is made.
 
     Example:
         >>> check_task("gym:FetchReach-v4")
         >>> check_task("hand_v9")
         Traceback (most recent call last):
         ValueError: unknown task 'hand_v9'; did you mean hand_v0? The tasks are ..., or gym:ID for one of
-        gymnasium's
+        gymnasium's, or my_module:make_env for a TorchRL environment of your own
     """
-    if name in _SPECS or (name.startswith(GYM) and name != GYM):
+    if name in _SPECS or (name.startswith(GYM) and name != GYM) or _OWN.fullmatch(name):
         return
     likeness = {known: SequenceMatcher(None, name, known).ratio() for known in _SPECS}
     nearest = max(_SPECS, key=likeness.__getitem__)
     hint = f"did you mean {nearest}? The" if likeness[nearest] >= _ALIKE else "the"
-    raise ValueError(
-        f"unknown task {name!r}; {hint} tasks are {', '.join(_SPECS)}, or {GYM}ID for one of gymnasium's"
-    )
+    raise ValueError(f"unknown task {name!r}; {hint} tasks are {', '.join(_SPECS)}, {_OTHERS}")
 
 
 def make_env(name: str, *, num_envs: int = 1, seed: int | Sequence[int] = 0, **options: Any) -> EnvBase:
     """Makes a batch of environments of a task.
 
     Args:
-        name: one of :func:`task_names`, or ``gym:ID`` for an environment of gymnasium's.
+        name: one of :func:`task_names`, ``gym:ID`` for an environment of gymnasium's, or
+            ``module:function`` for a TorchRL environment of one's own; the module is imported.
         num_envs: number of environments.
         seed: of all that is random; R seeds for R equal blocks of environments, each as if alone.
-        options: of the task (see :class:`TaskSpec`), or for ``gym:ID`` those of
-            :func:`~torchrl_her_envs.make_gym_env`.
+        options: of the task (see :class:`TaskSpec`), for ``gym:ID`` those of
+            :func:`~torchrl_her_envs.make_gym_env`, for ``module:function`` those of
+            :func:`~torchrl_her_envs.make_own_env`.
 
     Raises:
         ValueError: an unknown task, an option that it does not take, or a value out of its range.
@@ -141,8 +167,7 @@ def make_env(name: str, *, num_envs: int = 1, seed: int | Sequence[int] = 0, **o
         torch.Size([1, 4])
     """
     spec = get_task_spec(name)
-    if spec.family != _GYM_FAMILY:  # what those take depends on the environment, see make_gym_env
-        check_options(spec, options)
+    check_options(spec, options)
     module, _, function = spec.make.partition(":")
     maker = getattr(importlib.import_module(module), function)
     return maker(num_envs=num_envs, seed=seed, **{**spec.options, **options, **spec.arguments})
@@ -157,7 +182,7 @@ def check_options(spec: TaskSpec, options: Mapping[str, Any]) -> None:
         ValueError: treasure_hunt takes no option 'bits'; its options are step, max_steps
     """
     for option in options:
-        if option not in spec.options:
+        if option not in spec.options and not spec.takes_others:
             allowed = f"its options are {', '.join(spec.options)}" if spec.options else "it has none"
             raise ValueError(f"{spec.name} takes no option {option!r}; {allowed}")
 
@@ -166,10 +191,24 @@ def _gym_spec(id: str) -> TaskSpec:
     return TaskSpec(
         name=GYM + id,
         summary=f"gymnasium's {id}",
-        family=_GYM_FAMILY,
+        family="gym",
         make="torchrl_her_envs.gym.from_gym:make_gym_env",
         arguments={"id": id},
-        options={"max_steps": None, "parallel": False},
+        options={"max_steps": None, "parallel": False, "termination": "auto", "achieved_reward": None},
+        takes_others=True,
+        for_pictures={"pictures": True},
+    )
+
+
+def _own_spec(path: str) -> TaskSpec:
+    return TaskSpec(
+        name=path,
+        summary=f"{path}, of one's own",
+        family="own",
+        make="torchrl_her_envs.common.own_env:make_own_env",
+        arguments={"path": path},
+        options={"max_steps": None, "termination": "auto", "achieved_reward": None},
+        takes_others=True,
     )
 
 
@@ -184,6 +223,7 @@ for _task in TASKS.values():
             make="torchrl_her_envs.throwing.env:ThrowingEnv",
             arguments={"task": _task},
             options={"world": None, "num_links": 2, "threshold": None, "dtype": "float32"},
+            actions="continuous",
         )
     )
 
@@ -194,6 +234,7 @@ for _spec in (
         family="toy",
         make="torchrl_her_envs.toy.bit_flip:BitFlip",
         options={"bits": 15, "useless_action": False, "max_steps": None},
+        actions="discrete",
     ),
     TaskSpec(
         name="treasure_hunt",
@@ -201,6 +242,7 @@ for _spec in (
         family="toy",
         make="torchrl_her_envs.toy.treasure_hunt:TreasureHunt",
         options={"step": 1, "max_steps": None},
+        actions="discrete",
     ),
     TaskSpec(
         name="chain",
@@ -215,6 +257,7 @@ for _spec in (
             "reset_state": False,
             "max_steps": None,
         },
+        actions="discrete",
     ),
 ):
     register_task(_spec)

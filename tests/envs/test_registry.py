@@ -9,6 +9,7 @@ import sys
 
 import pytest
 import torch
+from torchrl.data import Categorical
 
 from torchrl_her_envs import (
     TASKS,
@@ -35,6 +36,7 @@ from .gym.walk import WALK
 TOYS = {"bit_flip": BitFlip, "treasure_hunt": TreasureHunt, "chain": Chain}
 NAMES = [*TASKS, *TOYS]
 LISTED = ", ".join(NAMES)
+OTHERS = "or gym:ID for one of gymnasium's, or my_module:make_env for a TorchRL environment of your own"
 
 
 @pytest.fixture
@@ -56,6 +58,8 @@ def test_every_name_makes_an_environment(name: str) -> None:
     kind = GymGoalEnv if name.startswith("gym:") else TOYS.get(name, ThrowingEnv)
     assert type(env) is kind
     assert reward_range(env)[1] == 0.0
+    discrete = isinstance(env.action_spec, Categorical)
+    assert get_task_spec(name).actions in (("discrete" if discrete else "continuous"), None)
     again = make_env(name, num_envs=1, seed=9)
     assert torch.equal(env.reset()["desired_goal"][1:], again.reset()["desired_goal"])
 
@@ -118,7 +122,12 @@ def test_options_reach_the_environment() -> None:
         ("bit_flip", "bit", "bits, useless_action, max_steps"),
         ("treasure_hunt", "threshold", "step, max_steps"),
         ("chain", "p", "length, forward_probability, layers, alternating, reset_state, max_steps"),
-        (f"gym:{WALK}", "speed", "max_steps, parallel, ends, form, without, actions, shown, render_mode"),
+        (
+            f"gym:{WALK}",
+            "speed",
+            "max_steps, parallel, termination, achieved_reward, pictures, "
+            "ends, form, without, actions, shown, render_mode",
+        ),
     ],
 )
 def test_options_that_a_task_does_not_take(name: str, option: str, allowed: str) -> None:
@@ -154,14 +163,14 @@ def test_options_out_of_their_range(name: str, options: dict[str, object], messa
     ],
 )
 def test_the_nearest_name_is_suggested(call, name: str, nearest: str) -> None:
-    tasks = f"The tasks are {LISTED}, or gym:ID for one of gymnasium's"
+    tasks = f"The tasks are {LISTED}, {OTHERS}"
     with pytest.raises(ValueError, match=f"^unknown task '{name}'; did you mean {nearest}\\? {tasks}$"):
         call(name)
 
 
 @pytest.mark.parametrize("name", ["", "gym:", "FetchReach-v4", "x"])
 def test_nothing_is_suggested_where_nothing_is_near(name: str) -> None:
-    tasks = f"the tasks are {LISTED}, or gym:ID for one of gymnasium's"
+    tasks = f"the tasks are {LISTED}, {OTHERS}"
     with pytest.raises(ValueError, match=f"^unknown task '{name}'; {tasks}$"):
         check_task(name)
 

@@ -7,6 +7,7 @@ import importlib.util
 import re
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -30,13 +31,29 @@ def conf() -> ModuleType:
     return module
 
 
-# The other guides have tests of their own: test_examples.py, test_extending.py, test_gym_guide.py.
-@pytest.mark.parametrize(("page", "number"), [("index.md", 1), ("own_script.md", 4), ("weights.md", 3)])
+# The other guides have tests of their own: below, test_examples.py, test_extending.py, test_gym_guide.py.
+@pytest.mark.parametrize(("page", "number"), [("index.md", 1), ("replay_buffers.md", 3), ("weights.md", 3)])
 def test_a_page_s_python_runs_from_top_to_bottom(page: str, number: int) -> None:
     assert len(blocks(page)) == number
     names: dict[str, object] = {"__name__": page}
     for block in blocks(page):
         exec(compile(block, page, "exec"), names)
+
+
+def test_the_own_script_trains_and_measures_what_it_has_learned() -> None:
+    text = "\n".join(blocks("own_script.md"))
+    assert len(blocks("own_script.md")) == 4
+    for long, short in (
+        ("seed, total_frames = 0, 200_000", "seed, total_frames = 0, 800"),
+        ("% 20_000", "% 800"),
+    ):
+        assert text.count(long) == 1
+        text = text.replace(long, short)
+    names: dict[str, Any] = {"__name__": "own_script.md"}
+    exec(compile(text, "own_script.md", "exec"), names)
+    ((frames, success),) = names["curve"]
+    assert frames == 800
+    assert 0.0 <= success <= 1.0
 
 
 def listed(package: str) -> dict[str, list[str]]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import yaml
 
+import torchrl_her_recipes
 from torchrl_her_recipes import cli
 from torchrl_her_recipes.config.shipped import CONF
 
@@ -51,6 +53,19 @@ def test_sweeps(capsys: pytest.CaptureFixture[str]) -> None:
         "hand_v0_her_s0_0",
         "hand_v0_no_hindsight_s0_1",
     ]
+    *_, last = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"the whole sweep: success \d+% in the median, .* of 2 runs stayed below 10%", last)
+
+
+def test_the_end_of_several_runs_hides_none_that_failed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [{"run": run, "epoch": 1, "success": success} for run, success in enumerate((0.9, 0.02, 0.95))]
+    result = torchrl_her_recipes.RunResult(rows=rows, folder=Path("out"))
+    monkeypatch.setattr(torchrl_her_recipes, "run", lambda components, folder: result)
+    assert cli.main(["train", "num_runs=3", *overrides(folder="out")]) == 0
+    said = "success 90% in the median, 2% in the worst; 1 of 3 runs stayed below 10%"
+    assert f"{said} in the last evaluation" in capsys.readouterr().out
 
 
 def test_list(capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,10 +116,16 @@ def test_every_preset_runs(preset: Path) -> None:
             ["train", "algo=cher", "layers=3"],
             "list of layers, each with its options by name, got 3",
         ),
+        (["train", "-m", "seed=0,0"], "the sweep has the same run twice: seed=0; give each value once"),
+        (["train", "-m", "seed=1,2,01", "k=2,3"], "same run twice: seed=1 k=2; give each value once"),
         (["train", "-m", "algo=her,"], "algo needs a value, got 'algo=her,'"),
         (["train", "task=3"], "task must be text, got 3"),
         (["train", "task=[hand_v0"], "[hand_v0 cannot be read as a value of YAML"),
-        (["train", "preset=thesis", "task=bit_flip"], "leave it out or write learner=dqn"),
+        (
+            ["train", "task_options.continuing_task=false"],
+            "written task.options.NAME=VALUE: task.options.continuing_task, not task_options.continuing_task",
+        ),
+        (["train", "task=bit_flip", "action_penalty=0"], "leave it out or write learner=dqn"),
         (
             ["--import", "no_such_module", "list"],
             "there is no module 'no_such_module', neither in this folder",
@@ -136,7 +157,10 @@ def test_every_preset_runs(preset: Path) -> None:
         (["train", "buffer_size=99999999999999"], "there is not enough memory: buffer_size"),
         (["train", "--resume", "nowhere"], "nowhere is no folder of a run"),
         (["train", "--resume=nowhere"], "nowhere is no folder of a run"),
-        (["play", "nowhere"], "nowhere is neither the folder of a run nor one of the trained"),
+        (
+            ["play", "nowhere"],
+            "nowhere is neither the folder of a run, nor the file of an exported policy, nor one",
+        ),
         (["fly"], "unknown command 'fly'; the commands are train, play, export, plot, study, report, list"),
     ],
 )

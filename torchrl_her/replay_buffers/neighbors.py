@@ -32,6 +32,16 @@ def samplers_of(storage: Storage) -> Iterator[Sampler]:
             yield sampler
 
 
+def refuse_shared(name: str, storage: Storage) -> None:
+    """Raises an error if several processes write into a storage.
+
+    Raises:
+        RuntimeError: a buffer of this storage is shared.
+    """
+    if any(getattr(buffer, "shared", False) for buffer in storage._attached_entities):
+        raise RuntimeError(f"{name} cannot work in a buffer that is shared between processes: {SHARED}")
+
+
 def refuse_unordered(name: str, storage: Storage) -> None:
     """Raises an error if a storage's transitions are not real ones in the order of time.
 

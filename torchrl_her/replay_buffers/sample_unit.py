@@ -38,6 +38,7 @@ from torchrl_her.replay_buffers.neighbors import (
     refuse_consuming,
     refuse_n_steps,
     refuse_padded,
+    refuse_shared,
     refuse_unordered,
 )
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
@@ -113,8 +114,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             work beside another part of the buffer.
         TypeError: an unknown option; when sampling, the storage holds no tensordicts.
         KeyError: when sampling, the storage lacks an entry.
-        RuntimeError: :meth:`relabel` was not handed to the buffer (at the second batch), or is given a batch
-            for which no goals were chosen.
+        RuntimeError: the buffer is shared between processes; :meth:`relabel` was not handed to the buffer (at
+            the second batch), or is given a batch for which no goals were chosen.
 
     Example:
         >>> from tensordict import TensorDict
@@ -332,6 +333,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         if stored is None or stored.storage is not storage or stored.state != state:
             refuse_consuming("HERSampleUnit", storage)
             refuse_unordered("HERSampleUnit", storage)
+            refuse_shared("HERSampleUnit", storage)
             rows = storage[:]  # a view
             if not is_tensor_collection(rows):
                 raise TypeError(

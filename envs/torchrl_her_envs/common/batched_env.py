@@ -43,6 +43,7 @@ class BatchedEnv(TaskTraits, EnvBase):
     worlds: Any
     max_steps: int
     dtype_shown: torch.dtype = torch.float32
+    goes_on = True
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(device="cpu", batch_size=(num_envs,))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, cast
 
@@ -45,9 +46,16 @@ class GoalEnv(Protocol):
     @property
     def can_render(self) -> bool: ...
 
+    @property
+    def goes_on(self) -> bool: ...
+
     def layers(self) -> list[dict[str, Any]]: ...
 
+    def state_names(self) -> dict[str, list[int]]: ...
+
     def goal_box(self) -> Box | None: ...
+
+    def picture_box(self) -> Box | None: ...
 
     def regions(self) -> dict[str, Box]: ...
 
@@ -93,6 +101,14 @@ class TaskTraits:
         """Whether :meth:`render` gives pictures."""
         return False
 
+    @property
+    def goes_on(self) -> bool:
+        """Whether it can be stepped further after it terminated an episode.
+
+        Layers of a curriculum have goals of their own, so their episodes then go on as well.
+        """
+        return False
+
     def layers(self) -> list[dict[str, Any]]:
         """The layers of the task's curriculum, in the order of training; the last one is the full task.
 
@@ -113,6 +129,20 @@ class TaskTraits:
         """
         raise ValueError(f"{self.task_name} has no curriculum: give its layers as curriculum=FILE.yaml")
 
+    def state_names(self) -> dict[str, list[int]]:
+        """Names for entries of the state, which is the observation with the desired goal behind it.
+
+        The layers of a curriculum may use them in place of indices.
+
+        Example:
+            >>> from torchrl_her_envs import make_env
+            >>> make_env("hand_v1").state_names()["hole"], make_env("bit_flip", bits=2).state_names()
+            ([9, 10], {'observation': [0, 1], 'desired_goal': [2, 3]})
+        """
+        spec = cast(Any, self).observation_spec
+        seen, goal = (spec[key].shape[-1] for key in ("observation", "desired_goal"))
+        return {"observation": list(range(seen)), "desired_goal": list(range(seen, seen + goal))}
+
     def goal_box(self) -> Box | None:
         """The least and greatest coordinates that achieved goals can have; None if the task does not say.
 
@@ -120,6 +150,19 @@ class TaskTraits:
             >>> from torchrl_her_envs import make_env
             >>> make_env("hand_v1").goal_box(), make_env("chain").goal_box()
             (([-1.0, -1.0], [1.0, 1.0]), None)
+        """
+        return None
+
+    def picture_box(self) -> Box | None:
+        """The coordinates of the edges of a picture, left and bottom, right and top; None without a scale.
+
+        Goals can be drawn on a picture only if this is known. It is larger than :meth:`goal_box` where
+        pictures have a margin.
+
+        Example:
+            >>> from torchrl_her_envs import make_env
+            >>> make_env("hand_v1").picture_box(), make_env("chain").picture_box()
+            (([-1.08, -1.08], [1.08, 1.08]), None)
         """
         return None
 
@@ -174,7 +217,7 @@ def goal_env(env: EnvBase) -> GoalEnv:
         >>> goal_env(TransformedEnv(make_env("hand_v1"), StepCounter())).max_steps
         50
     """
-    inner = first_below(env, _has_goals)
+    inner = first_below(env, is_goal_env)
     if inner is None:
         raise TypeError(f"expected an environment with goals, got {type(env).__name__}")
     return cast(GoalEnv, inner)
@@ -229,6 +272,17 @@ def reward_range(env: GoalEnv) -> tuple[float, float]:
     return getattr(env, "missed_reward", -1.0), getattr(env, "achieved_reward", 0.0)
 
 
-def _has_goals(env: object) -> bool:
+def reward_bounds(env: GoalEnv) -> tuple[float, float]:
+    """The least and the greatest reward there can be, for targets to be clamped; infinite if it is dense.
+
+    Example:
+        >>> from torchrl_her_envs import make_env
+        >>> reward_bounds(make_env("hand_v1"))
+        (-1.0, 0.0)
+    """
+    return (-math.inf, math.inf) if getattr(env, "dense_reward", False) else reward_range(env)
+
+
+def is_goal_env(env: object) -> bool:
     """Whether the class itself has what makes a GoalEnv: TransformedEnv passes on attributes it lacks."""
     return all(hasattr(type(env), name) for name in ("compute_reward", "compute_terminated", "set_seeds"))

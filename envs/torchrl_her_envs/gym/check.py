@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+from dataclasses import dataclass
 from typing import Any, cast
 
 import gymnasium
@@ -11,10 +12,16 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
+from torchrl_her_envs.gym.layout import Layout
+
 KEYS = ("observation", "achieved_goal", "desired_goal")
-METHODS = ("compute_reward", "compute_terminated")
-_OUR_OPTIONS = ("max_steps", "parallel")  # of make_gym_env, for every environment
+REWARD, TERMINATED = "compute_reward", "compute_terminated"
+SUCCESS = "is_success"
+# Of make_gym_env, for every environment.
+_OUR_OPTIONS = ("max_steps", "parallel", "termination", "achieved_reward", "pictures")
 _EPISODES = 8  # whose goals the environment's functions are tried with
+_TRIED_STEPS = 100
+_PICTURES = "rgb_array"
 
 
 def spec_of(env: gymnasium.Env) -> EnvSpec:
@@ -37,12 +44,31 @@ def make_one(id: str, options: dict[str, Any]) -> gymnasium.Env:
     hint = _register_robotics(id)
     try:
         return gymnasium.make(id, disable_env_checker=True, **options)
+    except ModuleNotFoundError as error:
+        module, cause = id.partition(":")[0], error.__cause__
+        if ":" in id and isinstance(cause, ModuleNotFoundError) and cause.name == module:
+            where = "neither in this folder nor among the installed packages"
+            error = ModuleNotFoundError(f"there is no module {module!r}, {where}")
+        raise ImportError(_cannot_make(id, error)) from error
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
         raise ImportError(_cannot_make(id, error)) from error
     except TypeError as error:
         raise ValueError(_wrong_options(id, options) or _cannot_make(id, error)) from error
+    except gymnasium.error.UnregisteredEnv as error:
+        raise ValueError(f"{_cannot_make(id, error)}{hint}; {_OWN_ID}") from error
     except gymnasium.error.Error as error:
         raise ValueError(_cannot_make(id, error) + hint) from error
+
+
+_OWN_ID = (
+    "an environment of your own is named module:ID, as in task=gym:my_module:MyEnv-v0, "
+    "where importing my_module registers MyEnv-v0"
+)
+
+
+def draws(env: gymnasium.Env) -> bool:
+    """Whether an environment gives pictures if it is made with ``render_mode="rgb_array"``."""
+    return _PICTURES in env.metadata.get("render_modes", [])
 
 
 def _wrong_options(id: str, options: dict[str, Any]) -> str:
@@ -76,15 +102,14 @@ def _register_robotics(id: str) -> str:
 
 
 def _line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
+    return str(error).splitlines()[0].rstrip(".") if str(error) else type(error).__name__
 
 
 def check_goal_env(id: str, env: gymnasium.Env) -> None:
     """Raises a ValueError that names what an environment lacks of GoalEnv or of what training needs."""
     _check_shown(id, env.observation_space)
-    for name in METHODS:
-        if not env.has_wrapper_attr(name):
-            raise ValueError(f"{id} lacks the method {name!r}, which tells what other goals would have given")
+    if not env.has_wrapper_attr(REWARD):
+        raise ValueError(f"{id} lacks the method {REWARD!r}, which tells what other goals would have given")
     if not isinstance(env.action_space, spaces.Box | spaces.Discrete):
         raise ValueError(f"{id}'s actions must be a Box or Discrete, got {env.action_space}")
     if isinstance(env.action_space, spaces.Box) and not env.action_space.is_bounded():
@@ -99,23 +124,80 @@ def _check_shown(id: str, shown: spaces.Space) -> None:
     for key in KEYS:
         if key not in shown.spaces:
             raise ValueError(f"{id} lacks {key!r} in what it shows: {', '.join(shown.spaces)}")
-        if len(shown[key].shape or ()) != 1:
-            raise ValueError(f"{id} must show {key!r} as a row of numbers, got {shown[key]}")
-    achieved, desired = (shown[key].shape for key in KEYS[1:])
+    achieved, desired = (Layout(shown[key], f"{id} must show {key!r}").shapes for key in KEYS[1:])
+    Layout(shown[KEYS[0]], f"{id} must show {KEYS[0]!r}")
     if achieved != desired:
-        raise ValueError(
-            f"{id}'s achieved and desired goals must have one shape, got {achieved} and {desired}"
-        )
+        one, other = (shown[key] if achieved[0][0] else shown[key].shape for key in KEYS[1:])
+        raise ValueError(f"{id}'s achieved and desired goals must have one shape, got {one} and {other}")
 
 
-def goals_to_try(env: gymnasium.Env) -> tuple[np.ndarray, np.ndarray]:
+def has_compute_terminated(env: gymnasium.Env, achieved: Any, desired: Any) -> bool:
+    """Whether an environment tells which goals end an episode; a base class may have the mere name of it."""
+    if not env.has_wrapper_attr(TERMINATED):
+        return False
+    try:
+        env.get_wrapper_attr(TERMINATED)(achieved, desired, {})
+    except NotImplementedError:
+        return False
+    except Exception:  # it says what is wrong when it is tried as a GoalFunction
+        return True
+    return True
+
+
+def goals_to_try(env: gymnasium.Env, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Achieved and desired goals [M, g] of real episodes: first a pair far apart, then some equal pairs."""
     shown = [env.reset(seed=seed)[0] for seed in range(_EPISODES)]
-    achieved, desired = (np.stack([own[key] for own in shown]) for key in KEYS[1:])
+    achieved, desired = (np.stack([layout.flatten(own[key]) for own in shown]) for key in KEYS[1:])
     gap = np.abs(achieved[:, None].astype(np.float64) - desired).sum(-1)
     here, there = np.unravel_index(gap.argmax(), gap.shape)
-    met = 3 if achieved.shape[1] == 3 else 2  # M must not be g, see GoalFunction
-    return (
-        np.concatenate([achieved[here, None], desired[:met]]),
-        np.concatenate([desired[there, None], desired[:met]]),
+    # M must be no dimension of a goal, see GoalFunction; there are always enough goals for one of these.
+    met = next(m for m in range(2, 2 + len(layout.sizes) + 1) if m + 1 not in layout.sizes)
+    equal = desired[np.arange(met) % len(desired)]
+    return np.concatenate([achieved[here, None], equal]), np.concatenate([desired[there, None], equal])
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What some steps of random actions showed.
+
+    Attributes:
+        achieved, desired: [n, g] goals after each step.
+        reward: [n] of each step.
+        terminated: [n] of bool, whether the environment ended the episode there.
+        success: [n] of bool, what ``info["is_success"]`` said; None if it was missing in a step.
+    """
+
+    achieved: np.ndarray
+    desired: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    success: np.ndarray | None
+
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Up to 8 of the achieved goals [m, g], each with each of up to 8 of the desired ones."""
+        chosen = np.unique(np.linspace(0, len(self.reward) - 1, _EPISODES).astype(int))
+        achieved, desired = self.achieved[chosen], self.desired[chosen]
+        return np.repeat(achieved, len(chosen), 0), np.tile(desired, (len(chosen), 1))
+
+
+def try_steps(env: gymnasium.Env, layout: Layout) -> Trial:
+    """Plays episodes of random actions, the same whenever it is called."""
+    env.action_space.seed(0)
+    rows: list[tuple[Any, ...]] = []
+    done = True
+    for step in range(_TRIED_STEPS):
+        if done:
+            env.reset(seed=step)
+        shown, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        done = terminated or truncated
+        goals = (layout.flatten(shown[key]) for key in KEYS[1:])
+        rows.append((*goals, float(reward), bool(terminated), info.get(SUCCESS)))
+    achieved, desired, rewards, ends, success = zip(*rows, strict=True)
+    known = all(own is not None for own in success)
+    return Trial(
+        achieved=np.stack(achieved),
+        desired=np.stack(desired),
+        reward=np.array(rewards),
+        terminated=np.array(ends),
+        success=np.array([bool(own) for own in success]) if known else None,
     )

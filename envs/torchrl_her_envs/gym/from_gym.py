@@ -18,18 +18,32 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import GymWrapper
 
 from torchrl_her_envs.common.goal_env import TaskTraits, choose_indices
+from torchrl_her_envs.common.goal_rules import (
+    Termination,
+    check_rewards,
+    check_same_rewards,
+    check_termination,
+    choose_ends,
+    warn_once,
+)
 from torchrl_her_envs.common.rendering.pictures import captioned, resized
 from torchrl_her_envs.common.seeding import as_seeds, block_keys
 from torchrl_her_envs.gym.check import (
     KEYS,
-    METHODS,
+    REWARD,
+    SUCCESS,
+    TERMINATED,
     check_goal_env,
+    draws,
     goals_to_try,
+    has_compute_terminated,
     make_one,
     shown_of,
     spec_of,
+    try_steps,
 )
 from torchrl_her_envs.gym.goal_functions import GoalFunction
+from torchrl_her_envs.gym.layout import Layout
 
 
 def make_gym_env(
@@ -39,6 +53,9 @@ def make_gym_env(
     seed: int | Sequence[int] = 0,
     max_steps: int | None = None,
     parallel: bool = False,
+    termination: str = "auto",
+    achieved_reward: float | None = None,
+    pictures: bool = False,
     **options: Any,
 ) -> GymGoalEnv:
     """Makes a batch of a gymnasium environment that follows GoalEnv.
@@ -51,11 +68,15 @@ def make_gym_env(
         max_steps: length of an episode; the environment's own if None.
         parallel: a process for each environment, which pays where a step takes milliseconds and there are
             several cores.
+        termination: what ends an episode at its goal, see :class:`GymGoalEnv`.
+        achieved_reward: the reward from which on a goal counts as achieved, for dense rewards.
+        pictures: whether to make it with ``render_mode="rgb_array"``, if it has that mode.
         options: for the environment, as ``gymnasium.make`` takes them (``render_mode``, for instance).
 
     Raises:
         ValueError: there is no such environment, it does not take an option, it lacks something that GoalEnv
-            asks for, it has no time limit, or environments cannot be shared out among the seeds.
+            asks for, it has no time limit, its reward is dense and ``achieved_reward`` is not given, or
+            environments cannot be shared out among the seeds.
         ImportError: a package that it needs is not installed.
 
     Example:
@@ -68,16 +89,22 @@ def make_gym_env(
         raise ValueError(f"num_envs must be at least 1, got {num_envs}")
     if max_steps is not None:
         options["max_episode_steps"] = max_steps
+    check_termination(termination)
     with ExitStack() as opened:
         reference_env = opened.enter_context(closing(make_one(id, options)))
         check_goal_env(id, reference_env)
+        if pictures and draws(reference_env) and "render_mode" not in options:
+            options["render_mode"] = "rgb_array"
+            reference_env = opened.enter_context(closing(make_one(id, options)))
         # By its spec rather than its id: new processes then need neither register it nor load TorchRL.
         make = partial(
             gymnasium.make, gymnasium.registry[spec_of(reference_env).id], disable_env_checker=True, **options
         )
         vector = AsyncVectorEnv if parallel else SyncVectorEnv
         envs = opened.enter_context(closing(vector([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)))
-        env = GymGoalEnv(envs, reference_env, seed=seed)
+        env = GymGoalEnv(
+            envs, reference_env, seed=seed, termination=termination, achieved_reward=achieved_reward
+        )
         opened.pop_all()  # from here on GymGoalEnv.close closes them
     return env
 
@@ -88,6 +115,22 @@ class GymGoalEnv(TaskTraits, GymWrapper):
     Keys: ``observation``, ``achieved_goal``, ``desired_goal`` and ``reward`` in float32, ``action``
     (float32 within the environment's bounds, or whole numbers [N]), ``terminated``, ``truncated``, ``done``.
     The environments are independent: environment k with a given seed does the same in every batch.
+    Observations and goals that are dictionaries become vectors, in the order that
+    :class:`~torchrl_her_envs.gym.layout.Layout` tells; the environment's own functions get goals in their
+    original form.
+
+    What ends an episode at its goal is the environment's ``compute_terminated``. If it has none,
+    ``termination`` says so:
+
+    - ``"success"``: a step whose ``info["is_success"]`` is true, and virtual goals whose reward is that of
+      an achieved goal, since they have no ``info``.
+    - ``"reward"``: a real or virtual goal whose reward is that of an achieved goal.
+    - ``"never"``: no goal. Where the environment ends an episode by itself, it is ``truncated``.
+    - ``"auto"``: what some steps of random actions show. If the environment went on after a goal was
+      achieved, ``"never"``; otherwise ``"success"``, or ``"reward"`` if it has no ``is_success``. The choice
+      is logged.
+
+    Given explicitly, they take the place of ``compute_terminated``.
 
     :func:`make_gym_env` makes them.
 
@@ -95,35 +138,71 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         envs: gymnasium's vector of them, which must not reset by itself (``AutoresetMode.DISABLED``).
         reference_env: one more of the same, whose functions give the rewards of goals.
         seed: of all environments; R seeds for R equal blocks of them, each as if alone.
+        termination: what ends an episode at its goal.
+        achieved_reward: the reward from which on a goal counts as achieved; that of equal goals if None.
 
     Attributes:
-        achieved_reward: the reward of an achieved goal.
-        missed_reward: the reward of a goal that is far away; a sparse reward is always one of these two.
+        ends: what ends an episode at its goal: ``"own"`` for ``compute_terminated``, ``"success"``,
+            ``"reward"`` or ``"never"``.
+        achieved_reward: the least reward of an achieved goal.
+        missed_reward: the least reward that was seen when the environment was tried; a sparse reward is
+            always one of these two.
+        dense_reward: whether there are many others.
 
     Raises:
-        ValueError: environments cannot be shared out among the seeds, or an achieved goal gives no more
-            reward than a missed one.
+        ValueError: environments cannot be shared out among the seeds, an achieved goal gives no more
+            reward than a missed one, the reward is dense and ``achieved_reward`` is None, or
+            ``termination`` is unknown or needs what the environment lacks.
     """
 
     def __init__(
-        self, envs: VectorEnv, reference_env: gymnasium.Env, *, seed: int | Sequence[int] = 0, **kwargs: Any
+        self,
+        envs: VectorEnv,
+        reference_env: gymnasium.Env,
+        *,
+        seed: int | Sequence[int] = 0,
+        termination: str = "auto",
+        achieved_reward: float | None = None,
+        **kwargs: Any,
     ) -> None:
+        shown = shown_of(reference_env.observation_space)
+        self._layouts = {key: Layout(shown[key], key) for key in KEYS}
         super().__init__(envs, device="cpu", **kwargs)  # TorchRL's metaclass adds some
         self._reference_env = reference_env
-        self._goal_dtype = shown_of(reference_env.observation_space)["achieved_goal"].dtype
         self._limit = spec_of(reference_env).max_episode_steps or 0
-        id, goals = spec_of(reference_env).id, goals_to_try(reference_env)
-        self._reward_of, self._terminated_of = (
-            GoalFunction(reference_env.get_wrapper_attr(name), *goals, name=f"{id}'s {name}")
-            for name in METHODS
-        )
-        self.missed_reward, self.achieved_reward = (self._reward_of.tried[:2] + 0.0).tolist()  # never -0.0
-        if not self.missed_reward < self.achieved_reward:
-            raise ValueError(
-                f"{id}: a goal that is met gives {self.achieved_reward}, one far away {self.missed_reward}; "
-                f"that must be less (are all goals met from the start?)"
-            )
+        self._try_out(check_termination(termination), achieved_reward)
         self.set_seeds(as_seeds(seed))
+
+    def _try_out(self, termination: Termination, achieved_reward: float | None) -> None:
+        """Finds out how the environment rewards and ends, with a few of its own goals and steps."""
+        env, layout, id = self._reference_env, self._layouts["achieved_goal"], spec_of(self._reference_env).id
+        goals = goals_to_try(env, layout)
+        self._reward_of = self._function(REWARD, goals)
+        trial = try_steps(env, layout)
+        far, equal = self._reward_of.tried[:2].tolist()
+        self.missed_reward, self.achieved_reward, self.dense_reward = check_rewards(
+            id, far, equal, self._reward_of(*trial.pairs()), achieved_reward
+        )
+        warn_once(check_same_rewards(id, trial.reward, self._reward_of(trial.achieved, trial.desired)))
+        has_own = has_compute_terminated(env, *(layout.unflatten(own[0]) for own in goals))
+        self.ends = choose_ends(
+            id,
+            termination,
+            has_own=has_own,
+            achieved=trial.reward >= self.achieved_reward if trial.success is None else trial.success,
+            terminated=trial.terminated,
+            tells_success=trial.success is not None,
+        )
+        self._terminated_of = self._function(TERMINATED, goals) if self.ends == "own" else None
+
+    def _function(self, name: str, goals: tuple[np.ndarray, np.ndarray]) -> GoalFunction:
+        """A function of the environment, for goals [B, g] that it gets in their original form."""
+        own, layout = self._reference_env.get_wrapper_attr(name), self._layouts["achieved_goal"]
+
+        def function(achieved: np.ndarray, desired: np.ndarray, info: dict[str, Any]) -> Any:
+            return own(layout.unflatten(achieved), layout.unflatten(desired), info)
+
+        return GoalFunction(function, *goals, name=f"{spec_of(self._reference_env).id}'s {name}")
 
     @property
     def task_name(self) -> str:
@@ -133,6 +212,18 @@ class GymGoalEnv(TaskTraits, GymWrapper):
     def can_render(self) -> bool:
         """Whether it was made with ``render_mode="rgb_array"``."""
         return self._reference_env.render_mode == "rgb_array"
+
+    def state_names(self) -> dict[str, list[int]]:
+        """Names for entries of the state: ``observation`` and ``desired_goal``, and what is nested in them.
+
+        That is named with dots between their keys, as in ``observation.arm.angles``.
+        """
+        names, first = super().state_names(), 0
+        for key in ("observation", "desired_goal"):
+            layout = self._layouts[key]
+            inner = {f"{key}.{name}": [first + at for at in own] for name, own in layout.places.items()}
+            names, first = names | inner, first + layout.width
+        return names
 
     @property
     def max_steps(self) -> int:
@@ -152,8 +243,11 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         return self._ask(self._reward_of, achieved_goal, desired_goal).float()
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Whether the environment ends an episode there: [..., 1] of bool."""
-        return self._ask(self._terminated_of, achieved_goal, desired_goal).bool()
+        """Whether an episode ends there: [..., 1] of bool."""
+        if self._terminated_of is not None:
+            return self._ask(self._terminated_of, achieved_goal, desired_goal).bool()
+        reward = self.compute_reward(achieved_goal, desired_goal)
+        return (reward >= self.achieved_reward) & (self.ends != "never")
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
         """Seeds R equal blocks of environments, each as if it were alone; from their next reset on.
@@ -217,14 +311,14 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         return answers.to(pair[0].device).view(*pair[0].shape[:-1], 1)
 
     def _rows(self, goals: Tensor) -> np.ndarray:
-        """Goals [..., g] as rows of the environment's type; copies, as its functions may write into them."""
-        return goals.detach().cpu().reshape(-1, goals.shape[-1]).numpy().astype(self._goal_dtype)
+        """Goals [..., g] as rows."""
+        return goals.detach().cpu().reshape(-1, goals.shape[-1]).numpy()
 
     # TorchRL's hooks
 
     def _make_specs(self, env: VectorEnv, batch_size: torch.Size | None = None) -> None:
-        n, space, shown = env.num_envs, env.single_action_space, shown_of(env.single_observation_space)
-        seen = {key: Unbounded(shape=(n, *(shown[key].shape or ())), dtype=torch.float32) for key in KEYS}
+        n, space = env.num_envs, env.single_action_space
+        seen = {key: Unbounded(shape=(n, self._layouts[key].width), dtype=torch.float32) for key in KEYS}
         self.observation_spec = Composite(seen, shape=(n,))
         if isinstance(space, spaces.Discrete):
             self.action_spec = Categorical(n=int(space.n), shape=(n,), dtype=torch.int64)
@@ -242,7 +336,18 @@ class GymGoalEnv(TaskTraits, GymWrapper):
 
     def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
         """Observation and goals, in float32; further keys that the environment may show are left out."""
-        return super().read_obs({key: observations[key] for key in KEYS})
+        return super().read_obs({key: self._layouts[key].flatten(observations[key]) for key in KEYS})
+
+    def _output_transform(self, step_outputs_tuple: tuple[Any, ...]) -> Any:
+        """The outputs of a step, with the ends of episodes that goals give."""
+        shown, reward, terminated, truncated, info = step_outputs_tuple
+        if self.ends == "never":
+            terminated, truncated = np.zeros_like(terminated), truncated | terminated
+        elif self.ends == "success":
+            terminated = terminated | np.asarray(info[SUCCESS]).astype(np.bool_)
+        elif self.ends == "reward":
+            terminated = terminated | (np.asarray(reward) >= self.achieved_reward)
+        return super()._output_transform((shown, reward, terminated, truncated, info))
 
     def _set_seed(self, seed: int | None) -> None:
         self.set_seeds([seed or 0])

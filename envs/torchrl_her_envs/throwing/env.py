@@ -19,6 +19,7 @@ from torchrl_her_envs.throwing.effector import Effector
 from torchrl_her_envs.throwing.goals import BoxGoals, GoalDistribution, SectorGoals
 from torchrl_her_envs.throwing.hand import Hand
 from torchrl_her_envs.throwing.physics import BallPhysics
+from torchrl_her_envs.throwing.rendering.canvas import MARGIN
 from torchrl_her_envs.throwing.rendering.render import render
 from torchrl_her_envs.throwing.state import WorldState
 from torchrl_her_envs.throwing.tasks import Task, WorldConfig
@@ -167,9 +168,27 @@ class ThrowingEnv(BatchedEnv):
             },
         ]
 
+    def state_names(self) -> dict[str, list[int]]:
+        """Names for entries of the state.
+
+        They are ``hand`` or ``arm`` (all that is seen of it), ``grip`` (where its end is), ``ball`` and, if
+        it is thrown, ``ball_speed`` and ``hole``; besides ``observation`` and ``desired_goal``.
+        """
+        seen = self.effector.observation_size
+        own = {self.task.effector: list(range(seen)), "grip": list(self.effector.grip_index)}
+        pairs = ("ball", "ball_speed", "hole") if self.task.throws else ("ball",)
+        for place, name in enumerate(pairs):
+            own[name] = [seen + 2 * place, seen + 2 * place + 1]
+        return own | super().state_names()
+
     def goal_box(self) -> Box:
         """The screen; a stretched arm's end goes less than 0.01 beyond its left side."""
         return [-1.0, -1.0], [1.0, 1.0]
+
+    def picture_box(self) -> Box:
+        """The screen with the margin that pictures have around it."""
+        edge = 1.0 + 2.0 * MARGIN  # the screen is two wide
+        return [-edge, -edge], [edge, edge]
 
     def regions(self) -> dict[str, Box]:
         """The boxes around where goals lie (``"goals"``) and what the hand or arm reaches (``"reach"``)."""

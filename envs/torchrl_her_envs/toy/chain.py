@@ -112,6 +112,13 @@ class Chain(ToyEnv):
             for end in range(links, self.length + 1, links)
         ]
 
+    def state_names(self) -> dict[str, list[int]]:
+        """Names for entries of the state: ``part_1``, ... besides ``observation`` and ``desired_goal``."""
+        links = self.length // self.num_layers
+        ends = range(links, self.length + 1, links)
+        parts = {f"part_{end // links}": list(range(end - links, end)) for end in ends}
+        return parts | super().state_names()
+
     def _start(self, which: Tensor) -> tuple[Tensor, Tensor]:
         links = torch.zeros(len(which), self.length, dtype=torch.int64)
         return links, links + 1

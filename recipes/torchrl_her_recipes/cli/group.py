@@ -13,7 +13,15 @@ import click
 from torchrl_her_recipes.cli.listing import listing
 from torchrl_her_recipes.cli.play import export, play
 from torchrl_her_recipes.cli.plot import plot
-from torchrl_her_recipes.cli.say import BAD_INPUT, BAD_INPUT_ERRORS, INTERRUPTED, fail, one_line, say_warning
+from torchrl_her_recipes.cli.say import (
+    BAD_INPUT,
+    BAD_INPUT_ERRORS,
+    INTERRUPTED,
+    fail,
+    one_line,
+    say_line,
+    say_warning,
+)
 from torchrl_her_recipes.cli.study import report, study
 from torchrl_her_recipes.cli.train import train
 from torchrl_her_recipes.config.imports import import_modules
@@ -71,10 +79,20 @@ for _command in (train, play, export, plot, study, report, listing):
     group.add_command(_command)
 
 
+class _Notices(logging.Handler):
+    """Shows what environments say about themselves, each in a line like a warning's."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say_line(record.getMessage())
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit code: 0, 2 for bad input, 130 for Ctrl-C."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # read by torchrl when it is imported
+    environments, notices = logging.getLogger("torchrl_her_envs"), _Notices()
+    environments.addHandler(notices)
+    environments.setLevel(logging.INFO)
     logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)  # it warns of missing CUDA
     try:
         with warnings.catch_warnings():
@@ -90,3 +108,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         return fail(error.format_message().rstrip("."))
     except BAD_INPUT_ERRORS as error:
         return fail(one_line(error))
+    finally:
+        environments.removeHandler(notices)

@@ -16,7 +16,8 @@ def listing() -> int:
     """List what there is."""
     sections = {
         "tasks": {name: get_task_spec(name).summary for name in task_names()}
-        | {f"{GYM}ID": "any gymnasium environment with goals, by its id"},
+        | {f"{GYM}ID": "any gymnasium environment with goals, by its id (gym:my_module:MyEnv-v0)"}
+        | {"my_module:make_env": "a TorchRL environment of your own, by its function or class"},
         "algorithms": {name: algorithm.summary for name, algorithm in ALGORITHMS.items()},
         "learners": {name: spec.summary for name, spec in LEARNERS.items()},
         "studies": {name: load_study(name).summary for name in study_names()},

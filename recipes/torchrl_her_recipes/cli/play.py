@@ -8,6 +8,7 @@ import click
 from click.shell_completion import CompletionItem
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `play`
+from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.shipped import policy_names
@@ -18,25 +19,32 @@ _RUN = click.Path(path_type=Path)
 
 def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     names = [CompletionItem(name) for name in policy_names() if name.startswith(incomplete)]
-    return [*names, CompletionItem(incomplete, type="dir")]
+    return [*names, CompletionItem(incomplete, type="file")]
 
 
-@click.command(short_help="a GIF of a run's policy, or of a trained one that comes with the package")
-@click.argument("source", metavar="RUN|TASK", shell_complete=_complete)
-@click.option("--out", type=_RUN, help="the .gif or .mp4 (default: RUN/play.gif, or TASK.gif)")
+@click.command(short_help="a GIF of a run's policy, an exported one, or one that comes with the package")
+@click.argument("source", metavar="RUN|FILE.pt|TASK", shell_complete=_complete)
+@click.option("--out", type=_RUN, help="the .gif or .mp4 (default: RUN/play.gif, FILE.gif or TASK.gif)")
 @click.option("--run", type=click.IntRange(0), default=0, help="which, of several side by side")
 @click.option("--goals", type=click.IntRange(1), default=6, show_default=True, help="how many, side by side")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of the goals and starts")
 @click.option(
     "--size", type=click.IntRange(32), default=240, show_default=True, help="pixels of one environment"
 )
+@allow_import
 def play(source: str, out: Path | None, run: int, goals: int, seed: int, size: int) -> int:
-    """Make a GIF of a policy: RUN is the folder of a run, TASK one of the trained policies."""
-    folder = Path(source)
-    if not folder.is_dir() and source not in policy_names():
+    """Make a GIF of a policy.
+
+    RUN is the folder of a run, FILE.pt what `torchrl-her export` wrote, TASK one of the trained policies.
+    """
+    path = Path(source)
+    if not path.exists() and source not in policy_names():
         known = what_there_is(source, policy_names(), "trained policies")
-        raise ValueError(f"{source} is neither the folder of a run nor one of the trained policies{known}")
-    film = out or (folder / "play.gif" if folder.is_dir() else Path(f"{source}.gif"))
+        raise ValueError(
+            f"{source} is neither the folder of a run, nor the file of an exported policy, nor one of the "
+            f"trained policies{known}"
+        )
+    film = out or _film_of(path)
     if film.suffix not in _SUFFIXES:
         raise ValueError(f"cannot write {film.name!r}: its suffix must be one of {', '.join(_SUFFIXES)}")
     achieved = recipes.play(source, film, run=run, goals=goals, seed=seed, size=size)
@@ -44,13 +52,21 @@ def play(source: str, out: Path | None, run: int, goals: int, seed: int, size: i
     return 0
 
 
+def _film_of(source: Path) -> Path:
+    """Where the film of a policy goes: in the folder of its run, or beside its file."""
+    if source.is_dir():
+        return source / "play.gif"
+    return source.with_suffix(".gif") if source.is_file() else Path(f"{source}.gif")
+
+
 @click.command(short_help="a run's policy as a small file of its own")
 @click.argument("run", metavar="RUN", type=_RUN)
 @click.option("--out", type=_RUN, help="the .pt file (default: RUN/TASK.pt)")
 @click.option("--run", "index", type=click.IntRange(0), help="which, of several (default: the median)")
 @click.option("--task", help="that it is for, if not the run's own")
+@allow_import
 def export(run: Path, out: Path | None, index: int | None, task: str | None) -> int:
-    """Write the policy of the run in the folder RUN as a file, for load_policy."""
+    """Write the policy of the run in the folder RUN as a file, for `torchrl-her play` and load_policy."""
     if not run.is_dir():
         raise ValueError(f"{run} is no folder of a run: it has no config.yaml")
     name = task or recipes.RunFolder(run).recipe().task.name

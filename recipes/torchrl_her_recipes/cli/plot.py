@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
+from torchrl_her_recipes.cli.permission import allow_import
 
 _PICTURES = {"goals": "virtual_goals.png", "values": "values.png", "times": "times.png"}
 
@@ -18,6 +19,7 @@ _PICTURES = {"goals": "virtual_goals.png", "values": "values.png", "times": "tim
 @click.option(
     "--out", type=click.Path(path_type=Path), help="the picture (default: in the folder of the first run)"
 )
+@allow_import
 def plot(what: Any, runs: tuple[Path, ...], out: Path | None) -> int:
     """Draw a picture of runs.
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import statistics
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import click
@@ -13,6 +15,8 @@ BAD_INPUT = 2
 BAD_INPUT_ERRORS = (OSError, ValueError, ImportError, MemoryError)
 INTERRUPTED = 130
 
+_HARDLY = 0.1  # below this success, a run has hardly learned anything
+
 
 def fail(message: str, code: int = BAD_INPUT) -> int:
     """Prints why a command failed, and returns its exit code."""
@@ -22,8 +26,12 @@ def fail(message: str, code: int = BAD_INPUT) -> int:
 
 def say_warning(message: Warning | str, *_where: Any, **_more: Any) -> None:
     """Prints a warning in one line, above a progress bar if there is one."""
-    stream = sys.stderr
-    tqdm.write(f"torchrl-her: warning: {' '.join(str(message).split())}", file=stream)
+    say_line(f"warning: {message}")
+
+
+def say_line(message: str) -> None:
+    """Prints a notice in one line, above a progress bar if there is one."""
+    tqdm.write(f"torchrl-her: {' '.join(message.split())}", file=sys.stderr)
 
 
 def one_line(error: BaseException) -> str:
@@ -33,6 +41,25 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, MemoryError):
         return "there is not enough memory: buffer_size, hidden or batch_size may be too large"
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def success_line(successes: Sequence[float]) -> str:
+    """How successful runs are: their median, the worst, and how many have hardly learned anything.
+
+    Example:
+        >>> success_line([0.9])
+        'success 90%'
+        >>> success_line([0.9, 0.02, 0.95])
+        'success 90% in the median, 2% in the worst; 1 of 3 runs stayed below 10%'
+    """
+    median, worst = statistics.median(successes), min(successes)
+    if len(successes) == 1:
+        return f"success {median:.0%}"
+    below = sum(success < _HARDLY for success in successes)
+    return (
+        f"success {median:.0%} in the median, {worst:.0%} in the worst; "
+        f"{below or 'none'} of {len(successes)} runs stayed below {_HARDLY:.0%}"
+    )
 
 
 def file_name(task: str) -> str:

@@ -9,7 +9,9 @@ import click
 from click.shell_completion import CompletionItem
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
-from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail
+from torchrl_her_recipes.cli.permission import allow_import
+from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, success_line
+from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.study import load_study, study_names
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 @click.option("--plan", is_flag=True, help="only say what is to do, and how long it takes")
 @click.option("--jobs", type=click.IntRange(1), help="batched runs at once (default: one for each core)")
 @click.option("--ray", metavar="ADDRESS", help="over a Ray cluster: auto, or HOST:PORT")
+@allow_import
 def study(
     name: str,
     seeds: int | None,
@@ -47,7 +50,8 @@ def study(
     if jobs is not None and ray is not None:
         raise click.UsageError("--jobs and --ray cannot be given together")
     own = load_study(name, seeds=seeds, frames=frames, quick=quick)
-    list(own.cells())  # each combination is checked before torch is imported
+    for _, recipe in own.cells():  # each combination is checked before torch is imported
+        check_permitted(recipe.task.name)
     home = folder or Path("runs") / (own.name + ("_quick" if quick else ""))
     to_do = recipes.plan_study(own, home)
     workers: Any = recipes.make_workers(jobs=jobs, ray=ray)
@@ -71,6 +75,8 @@ def _say_plan(name: str, folder: Path, plan: Plan, at_once: int) -> None:
 def _say_study(result: StudyResult) -> int:
     for label, reason in result.failed.items():
         fail(f"{label} failed: {reason}")
+    for label, successes in result.successes.items():
+        click.echo(f"{label}: {success_line(successes)}")
     if result.figure is not None:
         click.echo(result.figure)
         return 0

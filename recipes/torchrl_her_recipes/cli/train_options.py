@@ -17,7 +17,7 @@ from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
 from torchrl_her_recipes.config.learners import LEARNERS, options_of
 from torchrl_her_recipes.config.options import default_of
-from torchrl_her_recipes.config.recipe import Recipe, make_recipe
+from torchrl_her_recipes.config.recipe import Recipe, check_extending, make_recipe
 from torchrl_her_recipes.config.shipped import load_preset, preset_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, option_names
 
@@ -53,9 +53,32 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
         yield RunRequest(recipe, Path(folder or f"runs/{now}_{_label(recipe)}"))
         return
     root = Path(folder or f"runs/sweep_{now}")
+    before: list[Recipe] = []
     for number, values in enumerate(sweep(list(given.items()))):
         recipe = _recipe(values)
+        if recipe in before:
+            shown = " ".join(f"{name}={value}" for name, value in values.items())
+            raise ValueError(f"the sweep has the same run twice: {shown}; give each value once")
+        before.append(recipe)
         yield RunRequest(recipe, root / f"{_label(recipe)}_{number}")
+
+
+def extending(options: tuple[str, ...]) -> dict[str, Any]:
+    """The options that a run which goes on is given.
+
+    Args:
+        options: the arguments, ``NAME=VALUE`` each.
+
+    Raises:
+        ValueError: a mistake in an argument, or one that would change what the run has trained already.
+    """
+    pairs = [parse_override(text, ARGUMENTS) for text in options]
+    check_once(pairs, ARGUMENTS)
+    for name, text in pairs:
+        _check_single(name, text)
+    (values,) = sweep(pairs)
+    check_extending(values)
+    return values
 
 
 def _check_single(name: str, text: str) -> None:

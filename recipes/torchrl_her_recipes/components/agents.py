@@ -35,7 +35,7 @@ def make_agent(
         recipe: of the run, or of several.
         env: tells the widths of observations and actions.
         generators: of the exploration of each run.
-        rewards: of a missed goal and of an achieved one.
+        rewards: the least and the greatest that there can be.
         curriculum: whose layers the networks see, or None.
 
     Raises:

@@ -7,7 +7,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
-from torchrl_her_envs.common.goal_env import goal_env, reward_range
+from torchrl_her_envs.common.goal_env import goal_env, reward_bounds
 from torchrl_her_recipes.components.agents import make_agent
 from torchrl_her_recipes.components.buffers import make_buffer
 from torchrl_her_recipes.components.components import Components
@@ -16,25 +16,38 @@ from torchrl_her_recipes.components.curricula import (
     make_curriculum,
     make_curriculum_state,
     make_played_env,
+    played_rewards,
 )
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.components.goal_space import goal_space
+from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.recipe import Recipe
 
 # Evaluation has seeds of its own, far from those of training.
 _EVAL_SEED = 1 << 32
 
 
-def build(recipe: Recipe) -> Components:
-    """Makes the components that a recipe asks for."""
+def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
+    """Makes the components that a recipe asks for.
+
+    Args:
+        recipe: of the run.
+        allow_import: whether a module that the recipe's task names may be imported although only a file, and
+            not a call of :func:`make_recipe`, named it.
+
+    Raises:
+        ValueError: something in the recipe cannot work, or it names a module that must not be imported.
+    """
+    if allow_import:
+        permit_task(recipe.task.name)
     task = make_task_envs(recipe, recipe.collection.num_envs, recipe.seeds)
     curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
     state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
     env = task if state is None else in_layers(task, state.progress)
     generators = [torch.Generator().manual_seed(seed) for seed in recipe.seeds]
-    # A curriculum gives the rewards of its layers, whatever the environment's own are.
-    rewards = reward_range(goal_env(task)) if curriculum is None else (-1.0, 0.0)
-    agent = make_agent(recipe, env, generators, rewards=rewards, curriculum=curriculum)
+    rewards = played_rewards(recipe, task)
+    bounds = reward_bounds(goal_env(task)) if curriculum is None else rewards
+    agent = make_agent(recipe, env, generators, rewards=bounds, curriculum=curriculum)
     return Components(
         recipe=recipe,
         env=env,

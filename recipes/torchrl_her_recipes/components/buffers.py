@@ -15,6 +15,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.goal_space import GoalSpace, make_goal_weights
 from torchrl_her_recipes.config.algorithms import get_algorithm
+from torchrl_her_recipes.config.learners import priority_power
 from torchrl_her_recipes.config.recipe import Recipe
 
 # Entries of a collected batch that no loss reads: not stored.
@@ -40,6 +41,8 @@ def make_buffer(
             EnvReward(task.compute_reward, task.compute_terminated),
             k=recipe.hindsight.k if algorithm.hindsight else 0,
             strategy=recipe.hindsight.strategy,
+            n_steps=recipe.hindsight.n_steps,
+            gamma=recipe.learner.gamma,
             filter_achieved=algorithm.filter_achieved,
             achieved_reward=rewards[1],
             weights=weights,
@@ -58,7 +61,6 @@ def make_buffer(
 def _make_sampler(recipe: Recipe) -> Sampler:
     if recipe.replay.sampler == "uniform":
         return RandomSampler()
-    # TorchRL's losses give the square of the TD error, so half of alpha is Schaul's alpha.
-    return PrioritizedSampler(
-        recipe.replay.buffer_size, alpha=recipe.replay.priority_alpha / 2, beta=recipe.replay.priority_beta
-    )
+    # Alpha is Schaul's, for absolute TD errors; most of TorchRL's losses give their squares.
+    alpha = recipe.replay.priority_alpha / priority_power(recipe.learner.name)
+    return PrioritizedSampler(recipe.replay.buffer_size, alpha=alpha, beta=recipe.replay.priority_beta)

@@ -16,7 +16,8 @@ from torchrl.objectives.utils import TargetNetUpdater
 
 from torchrl_her.goals.ibs import Instructiveness
 from torchrl_her.modules.exploration import Exploration
-from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner, can_fuse, is_plain_adam
+from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner
+from torchrl_her.trainers.fusing import can_fuse, is_plain_adam
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_recipes.components.curricula import CurriculumState
@@ -36,7 +37,8 @@ class Components:
         env: batched training environments: R equal blocks.
         eval_env: batched environments for evaluation, likewise.
         actor: the greedy policy.
-        critic: values of (observation, goal, action); used to measure its bias, None if there is none.
+        critic: values of (observation, goal, action); what the loss's critics were made from, None if there
+            is none. TD3 and SAC train others like it, see :func:`~torchrl_her.objectives.critic_value`.
         exploration: turns greedy into exploring actions.
         policy: actor, then exploration.
         collector: runs the policy in the environments.
@@ -84,7 +86,7 @@ class Components:
         """Gradient steps on the loss: fused where that is possible, through the loss module elsewhere."""
         norm = self.recipe.learner.max_grad_norm
         fuses = can_fuse(self.loss, self.target)
-        compiles = fuses and is_plain_adam(self.optimizer)
+        compiles = fuses and is_plain_adam(self.optimizer, self.loss)
         if getattr(self.recipe.learner, "compile", "auto") == "always" and not compiles:
             warnings.warn(
                 "compile=always has no effect: only DDPG with this library's networks, without batch "

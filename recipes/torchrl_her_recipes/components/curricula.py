@@ -10,7 +10,7 @@ from torchrl.envs import CatTensors, Compose, EnvBase, TransformedEnv
 
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
-from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
+from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
@@ -57,7 +57,8 @@ def make_curriculum(recipe: Recipe, env: EnvBase) -> Curriculum | None:
 def read_curriculum(layers: object, env: GoalEnv) -> Curriculum:
     """A curriculum from plain values, for an environment whose state they index.
 
-    The state is the observation with the desired goal behind it.
+    The state is the observation with the desired goal behind it. Its entries may be given by the names that
+    the environment has for them (``env.state_names()``).
 
     Args:
         layers: a list of mappings with the options of :class:`~torchrl_her.CurriculumLayer`.
@@ -75,7 +76,7 @@ def read_curriculum(layers: object, env: GoalEnv) -> Curriculum:
     if not isinstance(layers, Sequence) or isinstance(layers, str):
         raise ValueError(f"curriculum must be a list of layers, got {type(layers).__name__}")
     width = sum(env.observation_spec[key].shape[-1] for key in _STATE)
-    return Curriculum([_read_layer(layer) for layer in layers], width)
+    return Curriculum([_read_layer(layer) for layer in layers], width, names=env.state_names())
 
 
 def _read_layer(options: Any) -> CurriculumLayer:
@@ -104,9 +105,11 @@ def make_curriculum_state(recipe: Recipe, curriculum: Curriculum, seeds: Sequenc
     return CurriculumState(progress, in_layers(layer_env, progress))
 
 
-def make_played_env(recipe: Recipe, num_envs: int, seeds: Sequence[int]) -> EnvBase:
+def make_played_env(
+    recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictures: bool = False
+) -> EnvBase:
     """Environments as a trained policy sees them: at the top of the curriculum, if there is one."""
-    env = make_task_envs(recipe, num_envs, seeds)
+    env = make_task_envs(recipe, num_envs, seeds, pictures=pictures)
     curriculum = make_curriculum(recipe, env)
     return env if curriculum is None else in_layers(env, at_the_top(curriculum, len(seeds)))
 
@@ -114,7 +117,8 @@ def make_played_env(recipe: Recipe, num_envs: int, seeds: Sequence[int]) -> EnvB
 def in_layers(env: EnvBase, progress: CurriculumProgress) -> TransformedEnv:
     """An environment as the layers of its runs see it, with the networks' input."""
     curriculum = progress.curriculum
-    transforms = [StateToObs(curriculum, progress), ZeroPad(curriculum, progress)]
+    shown = StateToObs(curriculum, progress, goes_on=goal_env(env).goes_on)
+    transforms = [shown, ZeroPad(curriculum, progress)]
     if "state" not in env.observation_spec:
         transforms.insert(0, CatTensors(_STATE, "state", del_keys=False, sort=False))
     return TransformedEnv(env, Compose(*transforms))
@@ -126,3 +130,11 @@ def at_the_top(curriculum: Curriculum, runs: int) -> CurriculumProgress:
     for run in range(runs):
         progress.set_layer(run, len(curriculum) - 1)
     return progress
+
+
+def played_rewards(recipe: Recipe, env: EnvBase) -> tuple[float, float]:
+    """The rewards of a missed and of an achieved goal in played environments.
+
+    A curriculum gives the rewards of its layers, whatever the environment's own are.
+    """
+    return (-1.0, 0.0) if get_algorithm(recipe.hindsight.algo).curriculum else reward_range(goal_env(env))

@@ -8,20 +8,37 @@ from typing import Any
 import torch
 from torchrl.envs import EnvBase
 
-from torchrl_her_envs.registry import make_env
+from torchrl_her_envs.registry import get_task_spec, make_env
+from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
 
 
-def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int]) -> EnvBase:
+def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictures: bool = False) -> EnvBase:
     """Environments of the recipe's task: ``num_envs`` for each seed.
 
+    All environments of recipes are made here, so this is also where modules that recipes name are imported,
+    or refused.
+
+    Args:
+        recipe: of a run.
+        num_envs: number of environments for each seed.
+        seeds: of the environments.
+
+    Keyword Args:
+        pictures: whether they are to give pictures, if they can.
+
     Raises:
-        ValueError: options that the task does not take.
+        ValueError: options that the task does not take, or a module that must not be imported.
     """
     task = recipe.task
+    if foreign_module(task.name):
+        check_permitted(task.name)
+        look_here()
     options: dict[str, Any] = dict(task.options or {})
     if task.threshold is not None:
         options["threshold"] = task.threshold
     if recipe.run.dtype != "float32":
         options["dtype"] = getattr(torch, recipe.run.dtype)
+    if pictures:
+        options = {**get_task_spec(task.name).for_pictures, **options}
     return make_env(task.name, num_envs=num_envs * len(seeds), seed=seeds, **options)

@@ -25,7 +25,7 @@ class Agent:
 
     Attributes:
         actor: the greedy policy.
-        critic: values of (observation, goal, action).
+        critic: values of (observation, goal, action); TD3 and SAC train others like it.
         exploration: turns greedy into exploring actions.
         policy: actor, then exploration.
         loss: of TorchRL.
@@ -82,7 +82,7 @@ class LearnerBuilder(ABC):
         Args:
             actor: from :meth:`networks`.
             critic: likewise.
-            rewards: of a missed goal and of an achieved one.
+            rewards: the least and the greatest that there can be; infinite if the task's is dense.
         """
 
     def exploration(self, generators: Sequence[torch.Generator]) -> Exploration:

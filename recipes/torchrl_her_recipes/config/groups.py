@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_her_envs.registry import GYM, check_task, get_task_spec
 from torchrl_her_envs.registry import check_options as check_task_options
+from torchrl_her_envs.registry import check_task, get_task_spec
 from torchrl_her_recipes.config.algorithms import check_strategy, get_algorithm
 from torchrl_her_recipes.config.options import check_options, option
 from torchrl_her_recipes.config.values import read_yaml
@@ -28,7 +28,8 @@ class TaskConfig(Group):
 
     name: str = option(
         "hand_v0",
-        "a task of `torchrl-her list`, or gym:ID for any gymnasium environment with goals",
+        "a task of `torchrl-her list`, gym:ID for any gymnasium environment with goals, or "
+        "my_module:make_env for a TorchRL environment of your own",
         shown_as="task",
     )
     options: Any = option(None, "options of the task or for gymnasium.make, as in task.options.bits=8")
@@ -44,8 +45,7 @@ class TaskConfig(Group):
         if not isinstance(self.options, Mapping) or not all(isinstance(name, str) for name in self.options):
             raise ValueError(f"task.options must be a mapping of options by name, got {self.options!r}")
         object.__setattr__(self, "options", dict(self.options))
-        if not self.name.startswith(GYM):  # gymnasium.make tells which options an environment takes
-            check_task_options(get_task_spec(self.name), self.options)
+        check_task_options(get_task_spec(self.name), self.options)
         if self.threshold is not None and "threshold" in self.options:
             raise ValueError("threshold and task.options.threshold are the same option: give one of them")
 
@@ -101,6 +101,7 @@ class HindsightConfig(Group):
     strategy: str = option(
         "future", "where virtual goals come from: future, final, episode, or a registered name"
     )
+    n_steps: int = option(1, "steps that a transition spans, at most (n-step returns)", at_least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()

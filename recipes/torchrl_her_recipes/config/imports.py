@@ -1,13 +1,27 @@
-"""Modules of users: they are imported so that the tasks, learners, ... that they register are known."""
+"""Modules of users: which are imported because the user said so, and which a recipe may name.
+
+A recipe can name code, as ``task=module:function`` or ``task=gym:module:ID``. Such a module is imported if
+the user named it (in :func:`~torchrl_her_recipes.make_recipe`, on the command line, by ``--import``), but not
+because a file says so: a run's folder, a policy, a preset or a study may come from somebody else. There it
+needs a permission, ``allow_import=True`` or ``--allow-import``.
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 
+from torchrl_her_envs.registry import GYM, module_of
+
+# Whose import is harmless. That holds for gymnasium's ids alone: a function could be any of the module's.
+_HARMLESS = ("gymnasium", "gymnasium_robotics", "torchrl_her_envs")
+
 _imported: list[str] = []  # worker processes of studies import them, too
+_permitted: set[str] = set()
+_everything: list[bool] = []  # not empty while all modules are permitted
 
 
 def import_modules(names: Sequence[str]) -> None:
@@ -24,9 +38,8 @@ def import_modules(names: Sequence[str]) -> None:
         Traceback (most recent call last):
         ValueError: there is no module 'point_tusk', neither in this folder nor among the installed packages
     """
-    here = str(Path.cwd())
-    if names and here not in sys.path:
-        sys.path.append(here)  # at the end, so that no file in this folder hides an installed package
+    if names:
+        look_here()
     for name in names:
         if name.endswith(".py") or not all(part.isidentifier() for part in name.split(".")):
             raise ValueError(f"a module is named as in an import statement, without .py; got {name!r}")
@@ -45,3 +58,59 @@ def import_modules(names: Sequence[str]) -> None:
 def imported_modules() -> list[str]:
     """The modules that :func:`import_modules` has imported, in this order."""
     return list(_imported)
+
+
+def look_here() -> None:
+    """Lets modules in the current folder be imported."""
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)  # at the end, so that no file in this folder hides an installed package
+
+
+def foreign_module(task: str) -> str:
+    """The module that a task imports and that is not known to be harmless; empty if there is none.
+
+    Example:
+        >>> foreign_module("gym:my_module:MyEnv-v0"), foreign_module("gym:FetchReach-v4")
+        ('my_module', '')
+    """
+    module = module_of(task)
+    return "" if task.startswith(GYM) and module in _HARMLESS else module
+
+
+def permit_task(task: str) -> None:
+    """Allows the module that a task names to be imported, from now on in this process."""
+    if module := foreign_module(task):
+        _permitted.add(module)
+
+
+@contextmanager
+def permit_everything() -> Iterator[None]:
+    """Allows all modules to be imported, as long as it lasts."""
+    _everything.append(True)
+    try:
+        yield
+    finally:
+        _everything.pop()
+
+
+def check_permitted(task: str) -> None:
+    """Refuses a task whose module must not be imported, since only a file named it.
+
+    Raises:
+        ValueError: nobody permitted it; the message says how.
+
+    Example:
+        >>> check_permitted("downloaded:make_env")
+        Traceback (most recent call last):
+        ValueError: task=downloaded:make_env would import the module 'downloaded', which a file names and not
+        you: if you trust it, give --allow-import (in Python allow_import=True)
+    """
+    module = foreign_module(task)
+    parts = module.split(".")
+    known = {".".join(parts[: count + 1]) for count in range(len(parts))}
+    if module and not _everything and not known & (_permitted | set(_imported)):
+        raise ValueError(
+            f"task={task} would import the module {module!r}, which a file names and not you: "
+            "if you trust it, give --allow-import (in Python allow_import=True)"
+        )

@@ -101,6 +101,7 @@ class LearnerSpec:
         options: its group of options, a subclass of :class:`LearnerConfig`.
         actions: which actions it can choose among.
         stacks: whether several runs can be trained side by side in one program.
+        priority_power: its loss gives this power of the absolute TD error as a priority.
     """
 
     name: str
@@ -109,6 +110,7 @@ class LearnerSpec:
     options: type[LearnerConfig]
     actions: Actions = "continuous"
     stacks: bool = True
+    priority_power: int = 2
 
 
 _BUILDERS = "torchrl_her_recipes.components.learners"
@@ -146,6 +148,7 @@ for _spec in (
         builder=f"{_BUILDERS}.sac:SACBuilder",
         options=SACConfig,
         stacks=False,
+        priority_power=1,
     ),
     LearnerSpec(
         name="dqn",
@@ -169,6 +172,17 @@ def check_learner(name: str) -> None:
     if name != "auto" and name not in LEARNERS:
         known = ["auto", *LEARNERS]
         raise ValueError(f"unknown learner {name!r}{what_there_is(name, known, 'learners')}")
+
+
+def priority_power(name: str) -> int:
+    """The power of the absolute TD error that a learner's loss gives as a priority.
+
+    Example:
+        >>> priority_power("ddpg"), priority_power("sac")
+        (2, 1)
+    """
+    check_learner(name)
+    return LEARNERS[AUTO["continuous"] if name == "auto" else name].priority_power
 
 
 def options_of(name: str) -> type[LearnerConfig]:

@@ -18,13 +18,15 @@ from torchrl_her_recipes.config.groups import (
     RunConfig,
     TaskConfig,
 )
-from torchrl_her_recipes.config.learners import DDPGConfig, LearnerConfig, options_of
+from torchrl_her_recipes.config.imports import permit_task
+from torchrl_her_recipes.config.learners import AUTO, DDPGConfig, LearnerConfig, options_of
 from torchrl_her_recipes.config.options import default_of, what_there_is
 from torchrl_her_recipes.config.shortcuts import GROUPS, Nested, over, place
 from torchrl_her_recipes.config.without_effect import without_effect
 
 # Compiling takes 15 s the first time and saves half a millisecond a step: from this many steps on it pays.
 _WORTH_COMPILING = 20_000
+EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints")  # they leave what was trained as it is
 _MOST_ROWS = 2_000  # transitions of a gradient step: with more, it is arithmetic that takes the time
 
 
@@ -92,7 +94,20 @@ class Recipe:
             >>> Recipe().replace(seed=7).run.seed
             7
         """
-        return make_recipe(self.to_dict(), **values)
+        return compose(self.to_dict(), values)
+
+    def extended(self, **values: Any) -> Recipe:
+        """The same recipe for a run that has begun, with some other values that leave what was trained alone.
+
+        Raises:
+            ValueError: another option than ``epochs``, ``checkpoint_interval`` and ``keep_checkpoints``.
+
+        Example:
+            >>> Recipe().extended(epochs=80).run.epochs
+            80
+        """
+        check_extending(values)
+        return self.replace(**values)
 
     def to_dict(self) -> Nested:
         """All values, by group and name."""
@@ -106,6 +121,27 @@ class Recipe:
             ValueError: a group or an option that does not exist, or a value that cannot work.
         """
         return _assemble(place(values))
+
+
+def check_extending(values: Mapping[str, Any]) -> None:
+    """Refuses options that would change what a run has trained already.
+
+    Raises:
+        ValueError: there is one; the message names it and those that may be given.
+
+    Example:
+        >>> check_extending({"epochs": 80})
+        >>> check_extending({"gamma": 0.9})
+        Traceback (most recent call last):
+        ValueError: a run that goes on takes epochs, checkpoint_interval, keep_checkpoints only; gamma=0.9
+        would change what it has trained: start a new run
+    """
+    for name, value in values.items():
+        if name.removeprefix("run.") not in EXTENDING:
+            raise ValueError(
+                f"a run that goes on takes {', '.join(EXTENDING)} only; {name}={value} would change what it "
+                "has trained: start a new run"
+            )
 
 
 def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Recipe:
@@ -122,13 +158,27 @@ def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Reci
     Raises:
         ValueError: an option that does not exist or that has no effect, or a value that cannot work.
 
+    A task that is named in ``values`` may import its module (``task="my_module:make_env"``); one that is
+    named in ``base`` needs a permission, see :func:`~torchrl_her_recipes.build`.
+
     Example:
         >>> make_recipe(task="hand_v1", algo="cher", window=5).curriculum.window
         5
     """
+    recipe = compose(base, values)
+    if "name" in place(values).get("task", {}):
+        permit_task(recipe.task.name)
+    return recipe
+
+
+def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe:
+    """The same recipe as :func:`make_recipe`, where no value was named by the user."""
     given = place(values)
     below = place(base or {})
     name = given.get("learner", {}).get("name") or below.get("learner", {}).get("name") or "auto"
+    if name == "auto":
+        task = given.get("task", {}).get("name") or below.get("task", {}).get("name") or TaskConfig.name
+        name = _learner_for(task)
     known = {own.name for own in fields(options_of(name))}
     below["learner"] = {key: value for key, value in below.get("learner", {}).items() if key in known}
     _drop_options_of_another_task(below, given)
@@ -137,6 +187,12 @@ def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Reci
         if own not in given.get(group, {}) and own in below.get(group, {}):
             del below[group][own]
     return _assemble(over(below, given))
+
+
+def _learner_for(task: object) -> str:
+    """What ``learner=auto`` stands for, as far as the name of the task tells."""
+    actions = get_task_spec(task).actions if isinstance(task, str) else None
+    return "auto" if actions is None else AUTO[actions]
 
 
 def _drop_options_of_another_task(below: Nested, given: Nested) -> None:

@@ -62,6 +62,9 @@ def locate(name: str) -> tuple[str, str]:
     """
     names = option_names()
     group, _, own = name.partition(".")
+    if group == "task_options" or (group == "options" and own):
+        meant = ".".join(["task.options", *([own] if own else [])])
+        raise ValueError(f"options of the task are written task.options.NAME=VALUE: {meant}, not {name}")
     if own:
         if group not in names:
             home = next((each for each, known in names.items() if group in known and group != "name"), None)

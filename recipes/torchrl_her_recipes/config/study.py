@@ -10,7 +10,7 @@ from typing import Any
 
 from torchrl_her_recipes.config.metrics import metric_names
 from torchrl_her_recipes.config.options import what_there_is
-from torchrl_her_recipes.config.recipe import Recipe, make_recipe
+from torchrl_her_recipes.config.recipe import Recipe, compose
 from torchrl_her_recipes.config.shipped import CONF, load_preset
 from torchrl_her_recipes.config.shortcuts import merge
 from torchrl_her_recipes.config.values import read_mapping
@@ -76,7 +76,7 @@ class Study:
             if label in labels:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
             labels.add(label)
-            recipe = make_recipe(self.recipe, **own)
+            recipe = compose(self.recipe, own)
             if self.figure == "times" and recipe.task.name != "chain":
                 task = recipe.task.name
                 raise ValueError(f"the figure times of {self.name} is for the task chain, not {task}")
@@ -87,7 +87,7 @@ def curve_label(label: str, recipe: Recipe) -> str:
     """The name of a combination without its task, as in the legend of a panel.
 
     Example:
-        >>> curve_label("hand_v1_her", make_recipe(task="hand_v1", algo="her"))
+        >>> curve_label("hand_v1_her", compose(None, {"task": "hand_v1", "algo": "her"}))
         'her'
     """
     return (
@@ -141,7 +141,7 @@ def load_study(
     if seeds is not None:
         recipe = merge(recipe, {"num_runs": seeds})
     if frames is not None:
-        epoch_frames = make_recipe(recipe, **_first(study)).collection.epoch_frames
+        epoch_frames = compose(recipe, _first(study)).collection.epoch_frames
         recipe = merge(recipe, {"epochs": -(-frames // epoch_frames)})
     return replace(study, recipe=recipe)
 

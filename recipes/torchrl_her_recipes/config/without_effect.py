@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-from torchrl_her_envs.registry import GYM, get_task_spec
+from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.algorithms import get_algorithm
 
 
@@ -25,7 +25,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
 
     task = groups.task.name
     for group, name in (("task", "threshold"), ("run", "dtype")):
-        if task.startswith(GYM) or name not in get_task_spec(task).options:
+        if name not in get_task_spec(task).options:
             idle[group, name] = f"with task={task}"
     with_algo = f"with algo={algorithm.name}"
     if not algorithm.hindsight:

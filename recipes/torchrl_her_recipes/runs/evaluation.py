@@ -7,22 +7,25 @@ from dataclasses import asdict
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_her.goals.ibs import GoalHistogram
+from torchrl_her.objectives.critics import critic_value
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.metrics import discounted_return, final_distance, q_bias, success
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.components import Components
+from torchrl_her_recipes.runs.saturation import saturation
 from torchrl_her_recipes.runs.toy_values import measure_values
-
-_SATURATED = 0.99
 
 
 @torch.no_grad()
 def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor]:
-    """What greedy episodes of each run show, [R] each."""
+    """What greedy episodes of each run show, [R] each.
+
+    ``q`` is the value of the first action as the loss's own critics see it, the least of them if there are
+    several, and ``q_bias`` is that minus the return. Both are missing if the loss has no such critics.
+    """
     recipe = components.recipe
     missed, achieved = components.rewards
     returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=missed)
@@ -32,22 +35,15 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
         "return": returns,
     }
     if rollout["action"].is_floating_point():
-        measured["saturation"] = (rollout["action"].abs() > _SATURATED).float().mean((1, 2))
-    if components.critic is not None:
-        value = _initial_value(components.actor, components.critic, rollout[:, 0])
-        measured |= {"q": value, "q_bias": q_bias(value, returns)}
+        spec = components.env.action_spec_unbatched
+        measured["saturation"] = saturation(rollout["action"], spec.low, spec.high).mean(1)
+    value = critic_value(components.loss, rollout[:, 0])
+    if value is not None:
+        measured |= {"q": value.squeeze(-1), "q_bias": q_bias(value, returns)}
     means = {name: value.view(recipe.run.num_runs, -1).mean(1) for name, value in measured.items()}
     if components.curriculum is None:
         means |= measure_values(components.actor, goal_env(components.eval_env), recipe.run.num_runs)
     return means | {"epsilon": components.exploration.epsilon}
-
-
-def _initial_value(actor: TensorDictModule, critic: TensorDictModule, start: TensorDictBase) -> Tensor:
-    """The critic's value [N] of first states [N]."""
-    critic.eval()
-    value = critic(actor(start.select(*actor.in_keys))).get(critic.out_keys[0])
-    critic.train()
-    return value.squeeze(-1)
 
 
 def written(components: Components, run: int) -> dict[str, float]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from torchrl_her_envs.common.goal_env import GoalEnv
+from torchrl_her_envs.common.goal_env import Box, GoalEnv
 from torchrl_her_recipes.config.metrics import AXES, PANELS
 from torchrl_her_recipes.runs.goal_map import GoalMap
 
@@ -179,27 +179,33 @@ def plot_goals(goals: GoalMap, env: GoalEnv, path: Path, *, title: str = "") -> 
 def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> None:
     """A heat map [n, n] over a picture of the environment, on given axes; its colors end at ``limit``.
 
-    The environment says in which box goals can lie, and which regions are worth drawing.
+    The environment says in which box goals can lie, where the edges of its picture are, and which regions
+    are worth drawing. Without a picture the heat map is on white.
 
     Raises:
-        ValueError: its goals do not lie in a box of two dimensions, or it cannot be drawn.
+        ValueError: its goals do not lie in a box of two dimensions.
     """
     box = env.goal_box()
-    if box is None or len(box[0]) != 2 or not env.can_render:
-        raise ValueError(
-            f"goals of {env.task_name} cannot be drawn: they need a picture and a box in a plane"
-        )
+    if box is None or len(box[0]) != 2:
+        raise ValueError(f"goals of {env.task_name} cannot be drawn: they need a box in a plane")
+    frame = env.picture_box()
+    if frame is not None:
+        axes.imshow(env.render(0, size=_SCREEN).numpy(), extent=_extent(frame))
     (left, bottom), (right, top) = box
-    extent = (left, right, bottom, top)
-    axes.imshow(env.render(0, size=_SCREEN).numpy(), extent=extent)
     heat = share.T
     alpha = (
         np.clip(heat / limit, 0.0, 1.0) ** 0.5
     )  # what is hardly ever written leaves the picture to be seen
-    axes.imshow(heat, origin="lower", cmap="magma", vmin=0.0, vmax=limit, alpha=alpha, extent=extent)
+    axes.imshow(heat, origin="lower", cmap="magma", vmin=0.0, vmax=limit, alpha=alpha, extent=_extent(box))
     for name, ((x, y), (x_end, y_end)) in env.regions().items():
         color = _REGIONS.get(name, "#718096")
         axes.add_patch(Rectangle((x, y), x_end - x, y_end - y, fill=False, edgecolor=color, linewidth=1.5))
     middle = [(left + right) / 2, (bottom + top) / 2]
     axes.set(xlim=(left, right), ylim=(bottom, top))
     axes.set(xticks=[left, middle[0], right], yticks=[bottom, middle[1], top])
+
+
+def _extent(box: Box) -> tuple[float, float, float, float]:
+    """A box as matplotlib takes it."""
+    (left, bottom), (right, top) = box
+    return left, right, bottom, top

@@ -14,9 +14,10 @@ from torchrl_her.modules.networks import ActorNet, make_actor, take_run
 from torchrl_her.trainers.checkpoint import load_checkpoint, save_checkpoint
 from torchrl_her.trainers.metrics import success
 from torchrl_her.trainers.trainer import evaluate
-from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_recipes.components.curricula import make_curriculum
 from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.shipped import TRAINED, policy_names
 from torchrl_her_recipes.runs.folder import RunFolder
@@ -44,23 +45,37 @@ class TrainedPolicy:
     frames: int
 
 
-def load_trained(name: str | Path) -> TrainedPolicy:
+def load_trained(name: str | Path, *, allow_import: bool = False) -> TrainedPolicy:
     """A policy that comes with the package, or one that was exported, with what made it.
+
+    Nothing is imported here. A policy's task may name a module, however, and its environments can only be
+    made where that module may be imported.
 
     Args:
         name: of a task, or the path of a .pt file.
+        allow_import: whether the module that the task may name may be imported, from now on.
 
     Raises:
-        ValueError: there is no such policy, or the file is damaged.
+        ValueError: there is no such policy, or the file is damaged or holds something else.
     """
     path = TRAINED / f"{name}.pt" if str(name) in policy_names() else Path(name)
     if not path.is_file():
         raise ValueError(f"there is no policy {str(name)!r}; there are {', '.join(policy_names())}")
-    return _policy_of(load_checkpoint(path))
+    state = load_checkpoint(path)
+    if not isinstance(state, dict) or "widths" not in state:
+        raise ValueError(
+            f"{path} is no exported policy: `torchrl-her export RUN` writes one of a run's folder"
+        )
+    policy = _policy_of(state)
+    if allow_import:
+        permit_task(policy.task)
+    return policy
 
 
 def load_policy(name: str | Path) -> TensorDictModule:
     """The greedy policy of a task, trained: reads ``observation`` and ``desired_goal``, writes ``action``.
+
+    Nothing is imported for it, whatever module the task of a file names: it is weights alone.
 
     Args:
         name: of a task, or the path of a .pt file that :func:`export_policy` wrote.
@@ -72,7 +87,12 @@ def load_policy(name: str | Path) -> TensorDictModule:
 
 
 def export_policy(
-    folder: str | Path, out: str | Path, *, run: int | None = None, task: str | None = None
+    folder: str | Path,
+    out: str | Path,
+    *,
+    run: int | None = None,
+    task: str | None = None,
+    allow_import: bool = False,
 ) -> TrainedPolicy:
     """Writes the policy of a finished run as a small file of its own.
 
@@ -81,13 +101,15 @@ def export_policy(
         out: the .pt file.
         run: which one, of several side by side; the median of them if None.
         task: that the policy is for, if not the run's own: one that shows and wants the same.
+        allow_import: whether the module that the run's task may name may be imported.
 
     Returns:
         What was written.
 
     Raises:
         ValueError: this is no folder of a run, it has no such run, its policy needs more than the
-            observation and the desired goal as they are, or the task is one that it cannot play.
+            observation and the desired goal as they are, the task is one that it cannot play, or the run's
+            names a module that must not be imported.
         OSError: the run has not saved a policy yet.
     """
     home = RunFolder(folder)
@@ -97,6 +119,9 @@ def export_policy(
     chosen = median_run(rows) if run is None else run
     if chosen not in range(recipe.run.num_runs):
         raise ValueError(f"there is no run {chosen} in {folder}; it has runs 0 to {recipe.run.num_runs - 1}")
+    for named in (task, recipe.task.name if allow_import else None):
+        if named is not None:
+            permit_task(named)
     played = recipe.replace(task=task or recipe.task.name)
     env = make_task_envs(recipe, 1, [0])
     _check_seen(recipe, env)
@@ -123,7 +148,10 @@ def export_policy(
 def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int = 1 << 41) -> float:
     """The share of greedy episodes in which a policy achieves its goal."""
     env = make_task_envs(policy.recipe.replace(task=policy.task), episodes, [seed])
-    return float(success(evaluate(env, policy.actor, max_steps=goal_env(env).max_steps)).float().mean())
+    rollout = evaluate(env, policy.actor, max_steps=goal_env(env).max_steps)
+    achieved = success(rollout, achieved_reward=reward_range(goal_env(env))[1])
+    env.close()
+    return float(achieved.float().mean())
 
 
 def _policy_of(state: dict[str, Any]) -> TrainedPolicy:

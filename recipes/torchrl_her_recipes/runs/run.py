@@ -5,10 +5,11 @@ from __future__ import annotations
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -17,20 +18,18 @@ from torchrl_her.trainers.checkpoint import load_newest_checkpoint, save_checkpo
 from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_envs.common.goal_env import goal_env
-from torchrl_her_envs.common.rendering.recording import record_episodes
-from torchrl_her_envs.common.rendering.video import write_video
 from torchrl_her_recipes.components.assembly import build
 from torchrl_her_recipes.components.components import Components
+from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.runs.curriculum import layer_success, move_on, play_greedily
 from torchrl_her_recipes.runs.evaluation import measure, written
+from torchrl_her_recipes.runs.film import film_policy
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap, goal_map
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.plots import plot_curves, plot_goals
+from torchrl_her_recipes.runs.saturation import saturation_notices
 from torchrl_her_recipes.runs.state import load_run_state, run_state
-
-FPS = 12  # of films: half the true speed, as a throw takes half a second
-_FILMED = 6  # environments in the GIF at the end of a run
 
 
 @dataclass(frozen=True)
@@ -48,9 +47,14 @@ class RunResult:
     interrupted: bool = False
 
     @property
+    def successes(self) -> list[float]:
+        """Success rate of each run in the last evaluation; empty if there was none."""
+        return last_success(self.rows) if self.rows else []
+
+    @property
     def success(self) -> float:
         """Success rate in the last evaluation, the median of the runs; 0 if there was none."""
-        return statistics.median(last_success(self.rows)) if self.rows else 0.0
+        return statistics.median(self.successes) if self.rows else 0.0
 
 
 def last_success(rows: list[dict[str, float]]) -> list[float]:
@@ -80,8 +84,15 @@ def run(components: Components, folder: str | Path | None = None, *, progress: b
         return _run(components, trainer, home, [], progress=progress)
 
 
-def resume(folder: str | Path, *, components: Components | None = None, progress: bool = True) -> RunResult:
-    """Continues a run from its newest complete checkpoint.
+def resume(
+    folder: str | Path,
+    *,
+    components: Components | None = None,
+    options: Mapping[str, Any] | None = None,
+    progress: bool = True,
+    allow_import: bool = False,
+) -> RunResult:
+    """Continues a run from its newest complete checkpoint, or extends one that has ended.
 
     With the tasks of this library the result is bit for bit that of a run that never stopped. So it is with
     an environment of your own if it keeps no state from one epoch to the next; after a stop in the middle
@@ -90,24 +101,53 @@ def resume(folder: str | Path, *, components: Components | None = None, progress
     Args:
         folder: of the run.
         components: newly made ones, if those of the run were not the ones of its recipe.
+        options: other values of ``epochs``, ``checkpoint_interval`` or ``keep_checkpoints``, which are
+            written into the folder's configuration.
         progress: whether to show a progress bar.
+        allow_import: whether the module that the run's task may name may be imported.
 
     Raises:
-        ValueError: there is no run in the folder, no checkpoint is complete, or the components differ
-            from those of the run.
-        OSError: there is no checkpoint.
+        ValueError: there is no run in the folder, no checkpoint is complete or none has the replay buffer,
+            an option would change what was trained, fewer epochs are asked for than were done, both
+            options and components are given, or the components differ from those of the run.
     """
     home = RunFolder(folder)
-    components = components or build(home.recipe())
+    recipe = home.recipe()
+    if options and components is not None:
+        raise ValueError("give resume() options, or components that were made with them, not both")
+    state = _newest_state(home, keep=recipe.run.keep_checkpoints)
+    if allow_import:
+        permit_task(recipe.task.name)
+    components = components or build(recipe.extended(**options) if options else recipe)
     trainer = components.trainer()
-    state = load_newest_checkpoint(home.checkpoint, keep=components.recipe.run.keep_checkpoints)
     with torch.random.fork_rng(devices=[]):
         load_run_state(components, trainer, state)
+        if options:
+            if trainer.epochs > components.recipe.run.epochs:
+                raise ValueError(
+                    f"epochs must be at least {trainer.epochs}, as many as the run in {folder} has done, "
+                    f"got {components.recipe.run.epochs}"
+                )
+            home.describe(components.recipe)
         home.policy.unlink(missing_ok=True)  # of an earlier stop: it comes last, when the run has ended
         rows = home.rows()[
             : trainer.epochs * components.recipe.run.num_runs
         ]  # without those that are newer than the checkpoint
         return _run(components, trainer, home, rows, progress=progress)
+
+
+def _newest_state(home: RunFolder, *, keep: int) -> dict[str, Any]:
+    """The newest checkpoint that is whole. Without the replay buffer a run cannot go on."""
+    try:
+        state = load_newest_checkpoint(home.checkpoint, keep=keep)
+    except FileNotFoundError:
+        state = {}
+    if not state.get("buffers"):
+        raise ValueError(
+            f"the run in {home.path} cannot go on: its replay buffer was not kept "
+            f"({home.checkpoint.name} {'has none' if state else 'is missing'})"
+        )
+    return state
 
 
 def _run(
@@ -132,6 +172,8 @@ def _run(
             while trainer.epochs < recipe.run.epochs:
                 new = _epoch(components, trainer, bar, check, rows[-1]["seconds"] if rows else 0.0)
                 rows += new
+                for line in saturation_notices(rows, recipe):
+                    _say(bar, line)
                 compiled = compiled or _say_compiled(trainer, bar)
                 if home is not None:
                     unlogged += len(new)
@@ -205,7 +247,8 @@ def _say_compiled(trainer: Trainer, bar: tqdm) -> bool:
     learner = trainer.learner
     if not (isinstance(learner, FusedDDPGLearner) and learner.is_compiled):
         return False
-    bar.start_t += learner.compile_seconds  # which would make the bar guess hours
+    if not bar.disable:
+        bar.start_t += learner.compile_seconds  # which would make the bar guess hours
     _say(bar, f"gradient step compiled in {learner.compile_seconds:.0f} s (kept for later runs)")
     return True
 
@@ -245,13 +288,10 @@ def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder)
         plot_curves(rows, home.curves, title=title)
     goals = _save_goals(components, home)
     task = goal_env(components.env)
-    if not task.can_render:
-        return
-    if goals is not None and goals.target.ndim == 2:
+    if goals is not None and goals.target.ndim == 2 and task.goal_box() is not None:
         plot_goals(goals, task, home.goals, title=f"virtual goals: {title}")
-    first = recipe.evaluation.episodes * (median_run(rows) if rows else 0)
-    worlds = range(first, first + min(_FILMED, recipe.evaluation.episodes))
-    write_video(record_episodes(components.eval_env, components.policy, worlds=worlds), home.video, fps=FPS)
+    run, epoch = (median_run(rows), int(rows[-1]["epoch"])) if rows else (0, 0)
+    film_policy(components, home.video, run=run, epoch=epoch)
 
 
 def median_run(rows: list[dict[str, float]]) -> int:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchrl_her_recipes.components.assembly import build
-from torchrl_her_recipes.config.imports import import_modules, imported_modules
+from torchrl_her_recipes.config.imports import import_modules, imported_modules, permit_task
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.run import RunResult, resume, run
@@ -49,6 +49,7 @@ class Job:
         """
         import_modules(values["modules"])
         recipe = Recipe.from_dict(values["recipe"])
+        permit_task(recipe.task.name)  # it was checked where the study began
         return cls(label=values["label"], recipe=recipe, folder=Path(values["folder"]))
 
 

@@ -8,6 +8,7 @@ from typing import Literal
 
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.runs.plots import plot_goals
 from torchrl_her_recipes.studies.chain_times import plot_times
 from torchrl_her_recipes.studies.seed_batches import Batches
@@ -16,21 +17,25 @@ from torchrl_her_recipes.studies.toy_plots import plot_values
 Kind = Literal["goals", "values", "times"]
 
 
-def plot_runs(what: Kind, folders: Sequence[Path], out: Path) -> None:
+def plot_runs(what: Kind, folders: Sequence[Path], out: Path, *, allow_import: bool = False) -> None:
     """Draws a picture of runs.
 
     Args:
         what: virtual goals beside q*, values in a toy environment, or times until chains were solved.
         folders: of runs, or of the batches of a study's combination.
         out: the picture.
+        allow_import: whether the module that the runs' task may name may be imported.
 
     Raises:
-        ValueError: a folder without a run, or runs that this picture is not for.
+        ValueError: a folder without a run, runs that this picture is not for, or a task that names a module
+            that must not be imported.
     """
     runs = [Batches(folder) for folder in folders]
     for own in runs:
         if not own.homes:
             raise ValueError(f"{own.path} is no folder of a run")
+        if allow_import:
+            permit_task(own.homes[0].recipe().task.name)
     if what == "values":
         plot_values(runs, out)
     elif what == "times":

@@ -7,8 +7,10 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from torchrl_her_recipes.config.imports import check_permitted, permit_task
 from torchrl_her_recipes.config.study import Study, curve_label
 from torchrl_her_recipes.runs.plots import plot_comparison
+from torchrl_her_recipes.runs.run import last_success
 from torchrl_her_recipes.studies.chain_times import plot_times
 from torchrl_her_recipes.studies.plan import Plan
 from torchrl_her_recipes.studies.schedule import run_jobs
@@ -24,11 +26,13 @@ class StudyResult:
         figure: the picture, if all runs are done.
         interrupted: whether somebody stopped it. It goes on if it is run again.
         failed: why, by the name of the batched run. The others are not held back by it.
+        successes: of the runs of each combination in their last evaluation, if all runs are done.
     """
 
     figure: Path | None
     interrupted: bool = False
     failed: dict[str, str] = field(default_factory=dict)
+    successes: dict[str, list[float]] = field(default_factory=dict)
 
 
 def plan_study(study: Study, folder: Path) -> Plan:
@@ -46,7 +50,12 @@ def plan_study(study: Study, folder: Path) -> Plan:
 
 
 def run_study(
-    study: Study, folder: Path, *, workers: Workers | None = None, progress: bool = True
+    study: Study,
+    folder: Path,
+    *,
+    workers: Workers | None = None,
+    progress: bool = True,
+    allow_import: bool = False,
 ) -> StudyResult:
     """Runs what is not done yet, several at once, and draws the figure.
 
@@ -57,12 +66,17 @@ def run_study(
         folder: a folder of each combination goes into it.
         workers: who does it; by default a process for each core. They are closed in the end.
         progress: whether to show a progress bar over all of it.
+        allow_import: whether modules that the study's tasks may name may be imported.
 
     Raises:
-        ValueError: the folder has a run of other options under the same name, or somebody is at work
-            in it.
+        ValueError: the folder has a run of other options under the same name, somebody is at work in it, or
+            a task names a module that must not be imported.
         KeyboardInterrupt: by a second Ctrl-C.
     """
+    for _, recipe in study.cells():
+        if allow_import:
+            permit_task(recipe.task.name)
+        check_permitted(recipe.task.name)
     workers = workers or LocalWorkers()
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -73,8 +87,12 @@ def run_study(
         raise ValueError(f"another process is running a study in {folder}") from error
     finally:
         workers.close()
+    done = not plan.to_go
     return StudyResult(
-        figure=None if plan.to_go else draw_study(study, folder),
+        figure=draw_study(study, folder) if done else None,
+        successes={label: last_success(Batches(folder / label).rows()) for label, _ in study.cells()}
+        if done
+        else {},
         interrupted=any(outcome.interrupted for outcome in outcomes.values()),
         failed={label: outcome.error for label, outcome in outcomes.items() if outcome.error},
     )

@@ -69,9 +69,12 @@ def _draw_bits(env: BitFlip, axes: Axes, actors: list[TensorDictModule], gamma: 
 @_draw.register
 def _draw_line(env: TreasureHunt, axes: Axes, actors: list[TensorDictModule], _gamma: float) -> None:
     values = torch.stack([values_on_the_line(actor, env) for actor in actors]).mean(0)
-    picture = axes.imshow(values.amax(-1).T, origin="lower", extent=(0, 100, 0, 100), cmap="viridis")
+    places = torch.linspace(0, 100, values.shape[0])
+    low, high = -float(places[1]) / 2, 100 + float(places[1]) / 2  # places are in the middle of their cells
+    picture = axes.imshow(values.amax(-1).T, origin="lower", extent=(low, high, low, high), cmap="viridis")
     axes.contour(
-        *(torch.linspace(0, 100, values.shape[0]) for _ in range(2)),
+        places,
+        places,
         (values[..., 1] - values[..., 0]).T,
         levels=[0.0],
         colors="white",

@@ -14,6 +14,7 @@ import signal
 import sys
 from queue import SimpleQueue
 from threading import Thread
+from types import FrameType
 from typing import Any, BinaryIO
 
 from torchrl_her_recipes.studies.jobs import Job, Outcome, run_job
@@ -27,15 +28,31 @@ def main() -> None:
         with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as answers:
             os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # nothing that is printed gets among them
             _serve(answers)
-    except (KeyboardInterrupt, BrokenPipeError):
-        pass  # told to stop between two jobs, or nobody is there to hear
+    except BrokenPipeError:
+        pass  # nobody is there to hear
 
 
 def _serve(answers: BinaryIO) -> None:
     jobs: SimpleQueue[dict[str, Any] | None] = SimpleQueue()
+    working = False
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        # Between jobs there is nothing to stop, and raised in the garbage collection or at exit it would only
+        # keep semaphores from being given back.
+        if working:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, stop)
     Thread(target=_listen, args=(jobs,), daemon=True).start()
     for values in iter(jobs.get, None):
-        pickle.dump(_run(values), answers)
+        try:
+            working = True
+            outcome = _run(values)
+            working = False
+        except KeyboardInterrupt:  # before the job began, or just after it ended
+            working = False
+            outcome = Outcome(interrupted=True)
+        pickle.dump(outcome, answers)
         answers.flush()
         gc.collect()  # the buffers of a run are gigabytes, and its components refer to each other
 
@@ -53,7 +70,7 @@ def _listen(jobs: SimpleQueue[dict[str, Any] | None]) -> None:
         while True:
             jobs.put(pickle.load(sys.stdin.buffer))
     except (EOFError, pickle.UnpicklingError):
-        os.kill(os.getpid(), signal.SIGINT)  # runs know how to stop at a good moment
+        os.kill(os.getpid(), signal.SIGINT)  # a run knows how to stop at a good moment
         jobs.put(None)
 
 

@@ -84,6 +84,39 @@ def test_layers_are_plain_data_that_index_the_state(name: str, options: dict[str
         assert len(layer["achieved_goal"]) == len(layer["desired_goal"])
 
 
+@pytest.mark.parametrize("name", EVERY)
+def test_names_of_entries_lie_in_the_state(name: str) -> None:
+    env = make_env(name)
+    seen, goal = (env.observation_spec[key].shape[-1] for key in ("observation", "desired_goal"))
+    names = env.state_names()
+    assert names["observation"] + names["desired_goal"] == list(range(seen + goal))
+    for places in names.values():
+        assert places == sorted(set(places))
+        assert set(places) <= set(range(seen + goal))
+
+
+@pytest.mark.parametrize("name", ["hand_v2", "robot_v1", "hand_reach", "robot_reach"])
+def test_entries_of_throwing_states_are_what_their_names_say(name: str) -> None:
+    env = make_env(name, num_envs=3)
+    state, names = env.reset()["state"], env.state_names()
+    assert torch.equal(state[:, names["grip"]], env._scale(env.worlds.grip).float())
+    assert torch.equal(state[:, names["ball"]], env._scale(env.worlds.ball).float())
+    assert env.task.effector in names
+    if env.task.throws:
+        assert torch.equal(state[:, names["hole"]], env.worlds.goal.float())
+        for layer, parts in zip(
+            env.layers(),
+            ([env.task.effector], [env.task.effector, "ball", "ball_speed"]),
+            strict=True,
+        ):
+            assert layer["observation"] == [place for part in parts for place in names[part]]
+
+
+def test_entries_of_a_chain_are_named_by_its_parts() -> None:
+    names = make_env("chain", length=6, layers=3).state_names()
+    assert (names["part_1"], names["part_3"], names["desired_goal"]) == ([0, 1], [4, 5], [6, 7])
+
+
 def test_defaults_of_an_environment_that_says_nothing() -> None:
     class Silent(TaskTraits):
         pass

@@ -22,7 +22,6 @@ TO_TARGET = spaces.Box(-1.0, 1.0, (2,), np.float64)
     [
         ({"without": "desired_goal"}, "lacks 'desired_goal' in what it shows: .*achieved_goal, observation"),
         ({"without": "compute_reward"}, "lacks the method 'compute_reward'"),
-        ({"without": "compute_terminated"}, "lacks the method 'compute_terminated'"),
         ({"shown": TO_TARGET}, "shows no dict of observation, achieved_goal, desired_goal, but a Box"),
         ({"shown": {"desired_goal": TO_TARGET}}, r"must have one shape, got \(1,\) and \(2,\)"),
         ({"shown": {"achieved_goal": spaces.Discrete(5)}}, "must show 'achieved_goal' as a row of numbers"),
@@ -65,7 +64,8 @@ def test_what_to_install_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_option_that_an_environment_does_not_take_is_named() -> None:
-    allowed = "max_steps, parallel, ends, form, without, actions, shown, render_mode"
+    ours = "max_steps, parallel, termination, achieved_reward, pictures"
+    allowed = f"{ours}, ends, form, without, actions, shown, render_mode"
     with pytest.raises(ValueError, match=f"^{WALK} takes no option 'color'; its options are {allowed}$"):
         walk(color="red")
     with pytest.raises(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import click
 import pytest
 import yaml
@@ -47,3 +50,19 @@ def test_requests_and_their_folders() -> None:
         "a,b/hand_v0_filtered_her_s3_0",
         "a,b/hand_v0_filtered_her_s4_1",
     ]
+
+
+def test_options_of_a_task_are_given_as_the_guide_says() -> None:
+    guide = (Path(__file__).parents[3] / "docs" / "gymnasium.md").read_text()
+    (written,) = set(re.findall(r"`(task.options.continuing_task=\w+)`", guide))
+    (one,) = requests(("task=gym:PointMaze_UMaze-v3", written), multirun=False)
+    assert one.recipe.task.options == {"continuing_task": False}
+    assert "task_options" not in guide
+
+
+def test_folders_have_names_that_every_file_system_takes() -> None:
+    tasks = ("task=gym:my.module:Mine/Walk-v0",)
+    (one,) = requests(tasks, multirun=False)
+    several = requests((*tasks, "seed=0,1"), multirun=True)
+    for folder in (one.folder, *(each.folder for each in several)):
+        assert re.fullmatch(r"[\w./-]+", str(folder))

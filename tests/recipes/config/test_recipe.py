@@ -10,12 +10,13 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
+from torchrl.objectives import DQNLoss, SACLoss, SoftUpdate, TD3Loss
 
 from torchrl_her import make_actor, make_critic
 from torchrl_her.modules import CriticNet
 from torchrl_her_recipes import ALGORITHMS, Recipe, build, make_recipe, run
 from torchrl_her_recipes.components.assembly import make_collector
+from torchrl_her_recipes.config.shipped import load_preset
 
 from ..small import small
 
@@ -53,6 +54,20 @@ def test_values_that_no_recipe_has_are_named() -> None:
         Recipe.from_dict({"speed": 3})
     with pytest.raises(ValueError, match="no option 'run.sed'; did you mean seed. The options of run"):
         Recipe.from_dict({"run": {"sed": 3}})
+
+
+@pytest.mark.parametrize("task", ["bit_flip", "treasure_hunt", "chain"])
+def test_a_preset_of_ddpg_serves_tasks_whose_actions_are_discrete(task: str) -> None:
+    preset = load_preset("thesis")
+    assert preset["learner"]["action_penalty"] == 0.0  # which DQN does not have
+    recipe = make_recipe(preset, task=task, epochs=1)
+    components = build(recipe)
+    assert isinstance(components.loss, DQNLoss)
+    assert recipe.learner.tau == preset["learner"]["tau"]
+    with pytest.raises(ValueError, match="action_penalty=0.1 has no effect with learner=dqn"):
+        build(make_recipe(preset, task=task, action_penalty=0.1))
+    with pytest.raises(ValueError, match=f"learner=ddpg must not be used on {task}, .*: choose dqn"):
+        build(make_recipe({**preset, "learner": {"name": "ddpg", **preset["learner"]}}, task=task))
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

@@ -27,6 +27,12 @@ def test_short_names_are_unique_except_for_the_names_of_groups() -> None:
         ("runs.seed", "no group 'runs'; did you mean run. The groups are task"),
         ("seed.x", "seed is an option of the group run: 'seed.x' has one name too many"),
         ("run", "run is a group of options: write run.seed="),
+        (
+            "task_options.continuing_task",
+            "are written task.options.NAME=VALUE: task.options.continuing_task, not task_options.continuing",
+        ),
+        ("task_options", "are written task.options.NAME=VALUE: task.options, not task_options$"),
+        ("options.bits", "are written task.options.NAME=VALUE: task.options.bits, not options.bits$"),
         ("name", "several groups have an option 'name': write task.name or learner.name or curriculum.name"),
     ],
 )

@@ -17,7 +17,7 @@ import pytest
 from torchrl_her_recipes import Recipe, build, cli
 from torchrl_her_recipes.runs import run as running
 
-_PICTURES = ("plot_curves", "plot_goals", "record_episodes", "write_video")
+_PICTURES = ("plot_curves", "plot_goals", "film_policy")
 _ROOT = Path(__file__).parents[3]
 
 

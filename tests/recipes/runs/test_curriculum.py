@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pandas as pd
@@ -13,10 +14,12 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl_her import Instructiveness, enter_layer
 from torchrl_her_envs import TASKS, Chain, base_env, make_env
 from torchrl_her_recipes import Components, Recipe, build, load_actor, play, resume, run
+from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.curricula import read_curriculum
 from torchrl_her_recipes.runs.curriculum import move_on
+from torchrl_her_recipes.runs.folder import RunFolder
 
-from ..small import small
+from ..small import overrides, small
 
 THROWS = [name for name, task in TASKS.items() if task.throws]
 
@@ -27,7 +30,7 @@ def climbing(**options: object) -> Recipe:
 
 def move(components: Components, *, run: int) -> list[str]:
     """Lets one run learn its layer."""
-    samples = torch.zeros(components.recipe.run.num_runs, 4)
+    samples = torch.zeros(components.recipe.run.num_runs, components.recipe.curriculum.window)
     samples[run] = 1.0
     assert components.curriculum is not None
     return move_on(components, components.curriculum, samples, 1_600)
@@ -62,6 +65,32 @@ def test_parts_of_the_chain_are_layers_that_end_at_the_next_one_s_start() -> Non
     for layer in (first, second, third):
         assert state[list(layer.desired_goal)].tolist() == [1.0, 1.0]
         assert layer.threshold < 2.0  # what a single open link is away
+
+
+def test_the_guide_s_file_of_layers_is_trained_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    guide = (Path(__file__).parents[3] / "docs" / "curriculum.md").read_text()
+    (layers,) = re.findall(r"```yaml\n(# near.yaml\n.*?)```", guide, re.DOTALL)
+    (command,) = re.findall(r"^torchrl-her (train .*curriculum=near.yaml.*)$", guide, re.MULTILINE)
+    monkeypatch.chdir(tmp_path)
+    Path("near.yaml").write_text(layers)
+    given = {word.partition("=")[0] for word in command.split()}
+    shrunk = [word for word in overrides(folder="out", epochs=1) if word.partition("=")[0] not in given]
+    assert main([*command.split(), *shrunk]) == 0
+    recipe, env = RunFolder("out").recipe(), make_env("hand_v1")
+    near, *own = read_curriculum(recipe.curriculum.layers, env).layers
+    assert own == list(read_curriculum(env.layers(), env).layers)
+    assert (near.name, near.achieved_goal, near.threshold) == ("come near", (0, 1), 0.3)
+    Path("near.yaml").unlink()  # the run has its layers
+    assert main(["train", "--resume", "out", "epochs=2"]) == 0
+    Path("near.yaml").write_text(layers.replace("observation: hand,", "observation: hands,"))
+    capsys.readouterr()
+    assert main(["train", "task=hand_v1", "algo=cher", "curriculum=near.yaml"]) == 2
+    assert capsys.readouterr().err == (
+        "torchrl-her: layer 'come near': observation has the unknown name 'hands'; known are 'hand', 'grip', "
+        "'ball', 'ball_speed', 'hole', 'observation', 'desired_goal'\n"
+    )
 
 
 def test_a_chain_is_climbed() -> None:
@@ -116,7 +145,7 @@ def test_inputs_that_the_reach_does_not_use_keep_their_weights() -> None:
 
 
 def test_a_change_of_layer_empties_and_restarts_one_run_alone() -> None:
-    components = build(climbing(num_runs=2, success_threshold=1.0))
+    components = build(climbing(num_runs=2, success_threshold=1.0, window=30))
     run(components, progress=False)
     networks = weights(components)
     steps = [float(state["step"]) for state in components.optimizer.state.values()]

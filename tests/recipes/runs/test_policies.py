@@ -85,4 +85,26 @@ def test_a_task_is_played_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert out.stat().st_size > 1_000
     assert "of 2 goals achieved" in capsys.readouterr().out
     assert main(["play", "hand_v9"]) == 2
-    assert "neither the folder of a run nor one of the trained policies" in capsys.readouterr().err
+    assert "nor the file of an exported policy, nor one of the trained policies" in capsys.readouterr().err
+
+
+def test_what_export_wrote_is_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run(build(small(task="hand_v0", epochs=1)), "run", progress=False)
+    assert main(["export", "run", "--out", "mine.pt"]) == 0
+    assert main(["play", "mine.pt", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
+    alone = capsys.readouterr().out.splitlines()[-1]
+    assert alone.endswith(" of 2 goals achieved: mine.gif")
+    assert main(["play", "run", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == alone.replace("mine.gif", "run/play.gif")
+    assert Path("mine.gif").read_bytes() == Path("run/play.gif").read_bytes()
+    for other in ("run/policy.pt", "run/checkpoint.pt"):
+        assert main(["play", other]) == 2
+        assert (
+            f"torchrl-her: {other} is no exported policy: `torchrl-her export RUN`" in capsys.readouterr().err
+        )
+    Path("notes.txt").write_text("not a policy")
+    assert main(["play", "notes.txt"]) == 2
+    assert "notes.txt is not a checkpoint of torchrl-her" in capsys.readouterr().err

@@ -16,7 +16,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchrl_her import load_checkpoint
+from torchrl_her import load_checkpoint, save_checkpoint
 from torchrl_her_recipes import Components, Recipe, build, cli, resume, run
 from torchrl_her_recipes.runs import state as run_state
 from torchrl_her_recipes.runs.folder import RunFolder
@@ -173,6 +173,76 @@ def test_a_finished_run_that_is_given_more_epochs(
     (tmp_path / "part" / "config.yaml").write_text((tmp_path / "whole" / "config.yaml").read_text())
     assert len(resume(tmp_path / "part", progress=False).rows) == 4 * recipe.run.num_runs
     assert_same_runs(tmp_path / "whole", tmp_path / "part")
+
+
+def test_epochs_extend_a_finished_run_and_an_interrupted_one(
+    no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe, whole = small(epochs=2, epoch_frames=800), tmp_path / "whole"
+    run(build(recipe.replace(epochs=4)), whole, progress=False)
+    run(build(recipe), tmp_path / "ended", progress=False)
+    run(press_ctrl_c(build(recipe), 12), tmp_path / "stopped", progress=False)
+    for name, folder in (("epochs", tmp_path / "ended"), ("run.epochs", tmp_path / "stopped")):
+        assert cli.main(["train", "--resume", str(folder), f"{name}=4"]) == 0
+        assert_same_runs(whole, folder)
+        assert RunFolder(folder).recipe() == recipe.replace(epochs=4)  # as a later --resume takes it
+    assert "success" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["seed=3"], "keep_checkpoints only; seed=3 would change what it has trained: start a new run"),
+        (["epochs=4", "learner.gamma=0.9"], "keep_checkpoints only; learner.gamma=0.9 would change what"),
+        (["preset=demo"], "keep_checkpoints only; preset=demo would change what it has trained"),
+        (["epoch=4"], "no option 'epoch'; did you mean epochs?"),
+        (["epochs=4", "run.epochs=5"], "epochs=4 and run.epochs=5 set the same option"),
+        (["epochs=4,5"], "epochs must be one value, got 4,5"),
+        (["epochs=1"], "epochs must be at least 2, as many as the run in run has done, got 1"),
+        (["--show"], "--resume cannot be given together with -m or --show"),
+    ],
+)
+def test_what_cannot_extend_a_run_is_named_and_changes_nothing(
+    arguments: list[str],
+    message: str,
+    ended: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(ended.parent)
+    before = {path: path.stat().st_mtime_ns for path in ended.rglob("*")}
+    assert cli.main(["train", "--resume", "run", *arguments]) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert len(said.splitlines()) == 1
+    assert {path: path.stat().st_mtime_ns for path in ended.rglob("*")} == before
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of two epochs."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    run(build(small(epochs=2, epoch_frames=480)), folder, progress=False)
+    return folder
+
+
+def test_without_its_buffer_a_run_cannot_go_on(
+    no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
+    for path in tmp_path.glob("checkpoint*.pt"):
+        save_checkpoint(load_checkpoint(path) | {"buffers": []}, path)
+    said = f"the run in {tmp_path} cannot go on: its replay buffer was not kept (checkpoint.pt"
+    for why in ("has none", "is missing"):
+        assert cli.main(["train", "--resume", str(tmp_path), "epochs=3"]) == 2
+        assert capsys.readouterr().err == f"torchrl-her: {said} {why})\n"
+        for path in tmp_path.glob("checkpoint*.pt"):
+            path.unlink()
+
+
+def test_options_and_components_are_not_given_together(ended: Path) -> None:
+    with pytest.raises(ValueError, match="give resume.. options, or components that were made with them"):
+        resume(ended, components=build(small()), options={"epochs": 3})
 
 
 def test_the_last_checkpoints_are_kept(no_pictures: None, tmp_path: Path) -> None:

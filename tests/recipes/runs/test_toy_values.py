@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor, nn
 from torchrl.data import Categorical
@@ -20,7 +21,7 @@ from torchrl_her_recipes.runs.toy_values import (
     values_on_the_line,
 )
 from torchrl_her_recipes.studies.seed_batches import Batches
-from torchrl_her_recipes.studies.toy_plots import plot_values
+from torchrl_her_recipes.studies.toy_plots import _draw, plot_values
 
 from ..small import small
 
@@ -89,6 +90,19 @@ def test_runs_are_drawn_beside_each_other(task: str, options: dict[str, object],
     plot_values(runs, tmp_path / "values.png")
     with Image.open(tmp_path / "values.png") as picture:
         assert picture.size[0] > 2 * picture.size[1]
+
+
+def test_values_are_drawn_over_their_own_places() -> None:
+    env, axes = TreasureHunt(25), Figure().subplots()
+    actor = QValueActor(KnowsTheWay(), spec=Categorical(2), in_keys=KEYS, action_space="categorical")
+    _draw(env, axes, [actor], 0.98)
+    (picture,) = axes.images
+    left, right, bottom, top = picture.get_extent()
+    cells = picture.get_size()[0]
+    middles = [left + (right - left) * (cell + 0.5) / cells for cell in range(cells)]
+    assert middles == pytest.approx([0.0, 25.0, 50.0, 75.0, 100.0])
+    assert (bottom, top) == (left, right)
+    assert picture.get_array()[0, 3] == pytest.approx(1.5)  # the treasure at 0, the pirate at 75
 
 
 def test_runs_of_other_tasks_are_refused(tmp_path: Path) -> None:

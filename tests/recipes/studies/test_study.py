@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -86,7 +87,9 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     # another process would take seconds to start
     monkeypatch.setattr(torchrl_her_recipes, "make_workers", lambda jobs, ray: Here())
     assert main(command) == 0
-    assert "1 batched runs to go, 3,200 environment steps in all" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "1 batched runs to go, 3,200 environment steps in all" in said
+    assert re.search(r"^her: success \d+%$", said, re.MULTILINE)
     with Image.open(folder / "mine.png") as picture:
         assert min(picture.size) > 200
 
@@ -95,6 +98,17 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     assert main(command) == 0
     assert "0 batched runs to go, 0 environment steps" in capsys.readouterr().out
     assert [file.stat().st_mtime_ns for file in metrics] == before
+
+
+@pytest.mark.full
+def test_a_whole_study_ends_without_a_word(tmp_path: Path) -> None:
+    values = {"recipe": {**SMALL, "task": "hand_v0", "epochs": 1}, "vary": {"algo": ["her", "no_hindsight"]}}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(values))
+    command = [sys.executable, "-P", "-m", "torchrl_her_recipes", "study", "mine.yaml", "--jobs", "2"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    said = [line for line in re.split(r"[\r\n]+", done.stderr) if line.strip()]
+    assert [line for line in said if not re.fullmatch(r" *\d+%\|.*/3\.20k steps \[.*\]", line)] == []
 
 
 def test_mappings_are_called_by_the_entries_that_differ() -> None:
@@ -156,7 +170,7 @@ def test_a_combination_that_was_cut_short_goes_on(tmp_path: Path) -> None:
     assert not Batches(tmp_path / "her").is_done
     whole = Study(name="cut", recipe={**SMALL, "epochs": 2}, vary={"algo": ["her"]})
     result = run_study(whole, tmp_path, workers=Here(), progress=False)
-    assert result == StudyResult(figure=tmp_path / "cut.png")
+    assert result == StudyResult(figure=tmp_path / "cut.png", successes={"her": [home.rows()[-1]["success"]]})
     assert Batches(tmp_path / "her").is_done
     assert [row["epoch"] for row in home.rows()] == [1, 2]
 

@@ -44,13 +44,13 @@ def job(folder: Path, **options: Any) -> Job:
     return Job(label=label, recipe=recipe, folder=folder / label)
 
 
-@pytest.mark.long
 def wait_until(happened: Callable[[], bool], *, during: Future[Outcome]) -> None:
     while not happened():
         assert not during.done()
         time.sleep(0.05)
 
 
+@pytest.mark.long
 def test_one_process_does_several_jobs_until_it_is_told_to_stop(
     tmp_path: Path, workers: LocalWorkers, submit: Callable[[Job], Future[Outcome]]
 ) -> None:

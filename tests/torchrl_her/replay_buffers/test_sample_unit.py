@@ -989,3 +989,10 @@ def test_a_fall_terminates_virtual_transitions_too(options: dict[str, Any]) -> N
     at_end = rows["next", "observation"][:, 0] == 4
     assert torch.equal(rows["next", "terminated"][:, 0], at_end)
     assert torch.equal(rows["next", "done"][:, 0], at_end)
+
+
+def test_a_buffer_that_is_shared_between_processes_is_refused() -> None:
+    buffer = make_beside(shared=True)
+    buffer.extend(flat([[5]]))
+    with pytest.raises(RuntimeError, match="shared between processes: workers send episodes"):
+        buffer.sample()

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_her_envs.common.goal_env import GoalEnv, choose_indices, goal_env
+from torchrl_her_envs.common.goal_env import GoalEnv, choose_indices, goal_env, reward_range
 from torchrl_her_envs.common.rendering.colors import FAILURE, SUCCESS
 from torchrl_her_envs.common.rendering.pictures import bordered, tile
 
@@ -28,12 +28,13 @@ def record_episodes(
     trail: bool = True,
     hold: int = 25,
     caption: str = "",
+    achieved_reward: float | None = None,
 ) -> list[Tensor]:
     """Plays one greedy episode in each of several environments and films them side by side.
 
     All environments are reset before. The picture of an environment whose episode is over stays as it was,
-    with a green border if it achieved its goal (was ``terminated``) and a red one if not. The environment
-    itself begins a new episode, which is not filmed, as long as others are.
+    with a green border if it achieved its goal in some step and a red one if not. The environment itself
+    begins a new episode, which is not filmed, as long as others are.
 
     Args:
         env: an environment with goals that gives pictures (``can_render``), transformed or not.
@@ -45,6 +46,7 @@ def record_episodes(
         trail: whether to draw where the balls were, in throwing tasks.
         hold: how many times the last frame is repeated: 25 are one second at 25 frames a second.
         caption: a line of text in each picture.
+        achieved_reward: the least reward of an achieved goal; the environment's own if None.
 
     Returns:
         Frames [height, width, 3] of uint8: the start, one for each step, and the last one repeated.
@@ -65,15 +67,18 @@ def record_episodes(
     if not base.can_render:
         raise ValueError(f"{base.task_name} cannot be filmed: it gives no pictures")
     chosen = choose_indices(env.batch_size[0], worlds)
+    achieved = reward_range(base)[1] if achieved_reward is None else achieved_reward
     film = _Film(base, chosen, size=size, columns=columns, trail=trail, caption=caption)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         tensordict = env.reset()
-        film.shoot(done=tensordict["done"], success=tensordict["terminated"])
+        success = torch.zeros_like(tensordict["done"])
+        film.shoot(done=tensordict["done"], success=success)
         for step in range(1, base.max_steps + 1):
             tensordict = env.step(policy(tensordict))
             after = tensordict["next"]
             out_of_time = step == base.max_steps  # whatever the transforms say
-            film.shoot(done=after["done"] | out_of_time, success=after["terminated"])
+            success = success | (after["reward"] >= achieved)
+            film.shoot(done=after["done"] | out_of_time, success=success)
             if not film.running:
                 break
             tensordict = env.maybe_reset(env.step_mdp(tensordict))

@@ -1,0 +1,468 @@
+"""A TorchRL environment of a user's own, named as ``module:function``, as an environment with goals."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_her_envs.common.goal_env import TaskTraits, choose_indices, is_goal_env
+from torchrl_her_envs.common.goal_rules import (
+    Ends,
+    Termination,
+    check_rewards,
+    check_same_rewards,
+    check_termination,
+    choose_ends,
+    warn_once,
+)
+from torchrl_her_envs.common.rendering.pictures import captioned, resized
+from torchrl_her_envs.common.seeding import as_seeds, block_keys
+
+KEYS = ("observation", "achieved_goal", "desired_goal")
+_GOALS = KEYS[1:]
+_SUCCESS = "is_success"
+_OURS = ("max_steps", "termination", "achieved_reward")  # options that every such environment takes
+_TRIED_STEPS = 100
+_PAIRED = 8  # goals of each kind whose pairs are tried
+
+
+def make_own_env(
+    path: str,
+    *,
+    num_envs: int = 1,
+    seed: int | Sequence[int] = 0,
+    max_steps: int | None = None,
+    termination: str = "auto",
+    achieved_reward: float | None = None,
+    **options: Any,
+) -> EnvBase:
+    """Makes a batch of an environment of the user's own.
+
+    Args:
+        path: ``"module:name"`` of a function or class that gives a TorchRL ``EnvBase``; the module is
+            imported. If it takes ``num_envs``, it is called once with it, and with ``seed`` and ``max_steps``
+            if it takes them, and must give environments of batch size ``[num_envs]``. If not, it is called
+            ``num_envs`` times, and must give environments without a batch size, which are stepped one after
+            the other.
+        num_envs: number of environments.
+        seed: of all environments; R seeds for R equal blocks of them.
+        max_steps: length of an episode; the environment's attribute ``max_steps`` if None.
+        termination: what ends an episode at its goal, see :class:`OwnGoalEnv`.
+        achieved_reward: the reward from which on a goal counts as achieved, for dense rewards.
+        options: for the function.
+
+    Returns:
+        The environments themselves if they offer all of :class:`~torchrl_her_envs.TaskTraits` and what
+        :class:`~torchrl_her_envs.GoalEnv` asks for; otherwise an :class:`OwnGoalEnv` around them.
+
+    Raises:
+        ValueError: there is no such module or name, it gives something else, or lacks what is needed.
+
+    Example:
+        >>> env = make_own_env("torchrl_her_envs:BitFlip", num_envs=2, bits=4)
+        >>> env.reset()["observation"].shape
+        torch.Size([2, 4])
+    """
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+    make = _load(path)
+    # A class is asked by its __init__: TorchRL's metaclass would show arguments of its own.
+    signed = make.__init__ if isinstance(make, type) else make  # type: ignore[misc]
+    taken = inspect.signature(signed).parameters
+    _check_options(path, taken, options)
+
+    def make_many(count: int) -> list[EnvBase]:
+        ours = {"num_envs": count, "seed": seed if count == num_envs else 0, "max_steps": max_steps}
+        given = {name: value for name, value in ours.items() if name in taken and value is not None}
+        calls = 1 if "num_envs" in taken else count
+        envs = [make(**given, **options) for _ in range(calls)]
+        for env in envs:
+            _check_made(path, env, [count] if "num_envs" in taken else [])
+        return envs
+
+    envs = make_many(num_envs)
+    if isinstance(envs[0], TaskTraits) and is_goal_env(envs[0]):
+        if termination != "auto" or achieved_reward is not None:
+            raise ValueError(f"{path} says itself how it ends and rewards: leave out {', '.join(_OURS[1:])}")
+        return envs[0]
+    # A single one is tried, so that what is found out does not depend on how many are asked for.
+    tried = OwnGoalEnv(
+        make_many(1),
+        name=path,
+        max_steps=max_steps,
+        termination=termination,
+        achieved_reward=achieved_reward,
+    )
+    tried.close()
+    return OwnGoalEnv(envs, name=path, seed=seed, max_steps=max_steps, rules=tried.rules)
+
+
+def _check_made(path: str, env: object, batch_size: list[int]) -> None:
+    if not isinstance(env, EnvBase):
+        raise ValueError(f"{path} must give a TorchRL EnvBase, got {type(env).__name__}")
+    if list(env.batch_size) != batch_size:
+        hint = "" if batch_size else ", or take num_envs"
+        got = list(env.batch_size)
+        raise ValueError(f"{path} must give environments of batch size {batch_size}, got {got}{hint}")
+
+
+def _load(path: str) -> Callable[..., Any]:
+    """The function or class of a path, whose module is imported."""
+    module, _, name = path.partition(":")
+    try:
+        make = getattr(importlib.import_module(module), name, None)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # a module that it needs
+        raise ValueError(
+            f"there is no module {module!r} for task={path}, neither in this folder nor among the installed "
+            "packages"
+        ) from error
+    if not callable(make):
+        raise ValueError(f"task={path} needs a function or class {name!r} in the module {module!r}")
+    return make
+
+
+def _check_options(path: str, taken: Any, options: dict[str, Any]) -> None:
+    kinds = inspect.Parameter
+    for name, own in taken.items():
+        needed = own.default is kinds.empty and own.kind not in (kinds.VAR_POSITIONAL, kinds.VAR_KEYWORD)
+        if needed and name not in ("self", "num_envs", "seed", *options):
+            raise ValueError(f"{path} needs the option {name!r}, as in task.options.{name}=...")
+    if any(own.kind is kinds.VAR_KEYWORD for own in taken.values()):
+        return
+    own = [name for name in taken if name not in ("self", "num_envs", "seed")]
+    allowed = list(dict.fromkeys([*_OURS, *own]))
+    for option in options:
+        if option not in allowed:
+            raise ValueError(f"{path} takes no option {option!r}; its options are {', '.join(allowed)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalRules:
+    """How an environment rewards goals and ends episodes.
+
+    Args:
+        ends: what ends an episode at its goal: ``"own"`` for ``compute_terminated``, ``"success"``,
+            ``"reward"`` or ``"never"``.
+        missed_reward: the least reward that was seen.
+        achieved_reward: the least reward of an achieved goal.
+        dense: whether there are many rewards besides these two.
+    """
+
+    ends: Ends
+    missed_reward: float
+    achieved_reward: float
+    dense: bool
+
+
+class OwnGoalEnv(TaskTraits, EnvBase):
+    """Environments of a user's own as one batch, with seeds, a time limit and ends at goals.
+
+    They show ``observation``, ``achieved_goal`` and ``desired_goal``, vectors each, take a bounded or
+    categorical ``action`` and have a method ``compute_reward(achieved_goal, desired_goal)``, which maps
+    goals [..., g] to rewards [..., 1]. What they may have besides:
+
+    - ``compute_terminated(achieved_goal, desired_goal)``, which maps goals [..., g] to bool [..., 1]. If it
+      is missing, ``termination`` says what ends an episode at its goal, as for
+      :class:`~torchrl_her_envs.GymGoalEnv`; an entry ``is_success`` of a step takes the place of its info.
+    - ``max_steps``, the length of an episode; the option of that name is needed if it is missing.
+    - ``layers()``, see :class:`~torchrl_her_envs.TaskTraits`.
+    - ``render()``, a picture [height, width, 3] of uint8, or [N, height, width, 3] of a batch.
+    - ``set_seeds(seeds)`` of a batch, which several runs side by side need.
+
+    Args:
+        envs: N environments without a batch size, or one with a batch size [N].
+        name: of the task.
+        seed: of all environments; R seeds for R equal blocks of them.
+        max_steps: length of an episode; the environment's attribute if None.
+        termination: what ends an episode at its goal.
+        achieved_reward: the reward from which on a goal counts as achieved; that of equal goals if None.
+        rules: what another such environment was found to do; some steps are tried if None.
+
+    Attributes:
+        rules: how it rewards and ends.
+
+    Raises:
+        ValueError: something is missing or cannot be used; the message names it.
+    """
+
+    def __init__(
+        self,
+        envs: Sequence[EnvBase],
+        *,
+        name: str,
+        seed: int | Sequence[int] = 0,
+        max_steps: int | None = None,
+        termination: str = "auto",
+        achieved_reward: float | None = None,
+        rules: GoalRules | None = None,
+    ) -> None:
+        first = envs[0]
+        self._whole = len(first.batch_size) == 1  # one environment that is a batch
+        count = first.batch_size[0] if self._whole else len(envs)
+        super().__init__(device="cpu", batch_size=(count,))
+        self._envs, self._name = list(envs), name
+        limit = max_steps if max_steps is not None else getattr(first, "max_steps", None)
+        if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
+            raise ValueError(f"{name} needs max_steps, a whole number of at least 1, got {limit!r}")
+        self.max_steps = limit
+        self._check(first)
+        self._make_specs(first)
+        self._latest: list[TensorDictBase] = []
+        self._steps = torch.zeros(count, 1, dtype=torch.int64)
+        self.rules = rules or GoalRules(ends="own", missed_reward=-1.0, achieved_reward=0.0, dense=False)
+        if rules is None:
+            self.rules = self._try_out(check_termination(termination), achieved_reward)
+        self.set_seeds(as_seeds(seed))
+
+    # What goal environments offer
+
+    @property
+    def task_name(self) -> str:
+        return self._name
+
+    @property
+    def can_render(self) -> bool:
+        """Whether the environment has a method ``render``."""
+        return callable(getattr(self._envs[0], "render", None))
+
+    @property
+    def missed_reward(self) -> float:
+        """The least reward that was seen when the environment was tried."""
+        return self.rules.missed_reward
+
+    @property
+    def achieved_reward(self) -> float:
+        """The least reward of an achieved goal."""
+        return self.rules.achieved_reward
+
+    @property
+    def dense_reward(self) -> bool:
+        """Whether there are many rewards besides these two."""
+        return self.rules.dense
+
+    def layers(self) -> list[dict[str, Any]]:
+        own = getattr(self._envs[0], "layers", None)
+        return own() if callable(own) else super().layers()
+
+    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """The reward of having achieved one goal when another was desired: [..., 1] of float32."""
+        return self._ask("compute_reward", achieved_goal, desired_goal).float()
+
+    def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """Whether an episode ends there: [..., 1] of bool."""
+        if self.rules.ends == "own":
+            return self._ask("compute_terminated", achieved_goal, desired_goal).bool()
+        reward = self.compute_reward(achieved_goal, desired_goal)
+        return (reward >= self.achieved_reward) & (self.rules.ends != "never")
+
+    def set_seeds(self, seeds: Sequence[int]) -> None:
+        """Seeds R equal blocks of environments.
+
+        Args:
+            seeds: R of them.
+
+        Raises:
+            ValueError: the environments cannot be shared out among R blocks, a seed is out of range, or R is
+                above 1 and the environment is a batch without ``set_seeds``.
+        """
+        keys = (block_keys(seeds, self.batch_size[0]) >> np.uint64(33)).tolist()
+        # Many environments seed torch's own generator, which is that of the run.
+        with torch.random.fork_rng(devices=[]):
+            if not self._whole:
+                for env, key in zip(self._envs, keys, strict=True):
+                    env.set_seed(key)
+            elif callable(own := getattr(self._envs[0], "set_seeds", None)):
+                own(seeds)
+            elif len(seeds) > 1:
+                raise ValueError(f"{self._name} needs a method set_seeds for {len(seeds)} runs side by side")
+            else:
+                self._envs[0].set_seed(keys[0])
+
+    def render(
+        self,
+        worlds: int | Sequence[int] | None = None,
+        *,
+        size: int | None = None,
+        trail: Sequence[Tensor] = (),
+        caption: str = "",
+    ) -> Tensor:
+        """Pictures of the environments; see :meth:`torchrl_her_envs.TaskTraits.render`."""
+        if not self.can_render:
+            return super().render(worlds)
+        chosen = choose_indices(self.batch_size[0], worlds)
+        if self._whole:
+            everything = self._envs[0].render()
+            drawn = [everything[index] for index in chosen]
+        else:
+            drawn = [self._envs[index].render() for index in chosen]
+        pictures = [torch.as_tensor(picture).clone() for picture in drawn]
+        if size is not None:
+            pictures = [resized(picture, size) for picture in pictures]
+        pictures = [captioned(picture, caption) for picture in pictures]
+        return pictures[0] if isinstance(worlds, int) else torch.stack(pictures)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Closes all environments."""
+        for env in self._envs:
+            env.close(raise_if_closed=False)
+        super().close(raise_if_closed=raise_if_closed)
+
+    # TorchRL's hooks
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.set_seeds([seed or 0])
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        which = torch.ones(*self.batch_size, 1, dtype=torch.bool) if mask is None else mask.view(-1, 1)
+        self._steps = self._steps.masked_fill(which, 0)
+        if not self._latest:
+            self._latest = [env.reset() for env in self._envs]
+        elif self._whole:
+            self._latest = [self._envs[0].reset(self._latest[0].set("_reset", which))]
+        else:
+            for index in which.flatten().nonzero().flatten().tolist():
+                self._latest[index] = self._envs[index].reset()
+        off = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+        ends = {"done": off, "terminated": off.clone(), "truncated": off.clone()}
+        return TensorDict({**self._shown(self._latest), **ends}, self.batch_size, device=self.device)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        actions = tensordict.get("action").to(self._envs[0].full_action_spec["action"].dtype)
+        taken = [actions] if self._whole else list(actions)
+        after = []
+        for index, (env, action) in enumerate(zip(self._envs, taken, strict=True)):
+            stepped = env.step(self._latest[index].clone(False).set("action", action))
+            self._latest[index] = env.step_mdp(stepped)
+            after.append(stepped["next"])
+        self._steps = self._steps + 1
+        reward = self._stack(after, "reward").float().view(-1, 1)
+        terminated = self._flag(after, "done" if after[0].get("terminated", None) is None else "terminated")
+        truncated = self._flag(after, "truncated") | (self._steps >= self.max_steps)
+        if self.rules.ends == "never":
+            terminated, truncated = torch.zeros_like(terminated), truncated | terminated
+        elif self.rules.ends == "success":
+            terminated = terminated | self._flag(after, _SUCCESS)
+        elif self.rules.ends == "reward":
+            terminated = terminated | (reward >= self.achieved_reward)
+        ends = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
+        return TensorDict(
+            {**self._shown(after), "reward": reward, **ends}, self.batch_size, device=self.device
+        )
+
+    # Helpers
+
+    def _stack(self, each: list[TensorDictBase], key: str) -> Tensor:
+        entries = [own.get(key) for own in each]
+        return entries[0] if self._whole else torch.stack(entries)
+
+    def _flag(self, each: list[TensorDictBase], key: str) -> Tensor:
+        """A flag [N, 1]; false where there is none."""
+        if each[0].get(key, None) is None:
+            return torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+        return self._stack(each, key).bool().view(-1, 1)
+
+    def _shown(self, each: list[TensorDictBase]) -> dict[str, Tensor]:
+        return {key: self._stack(each, key).float() for key in KEYS}
+
+    def _ask(self, method: str, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        achieved, desired = torch.broadcast_tensors(achieved_goal, desired_goal)
+        answer = getattr(self._envs[0], method)(achieved, desired)
+        shape = (*achieved.shape[:-1], 1)
+        if not isinstance(answer, Tensor) or answer.shape != shape:
+            got = list(answer.shape) if isinstance(answer, Tensor) else type(answer).__name__
+            raise ValueError(
+                f"{method} of {self._name} must give a tensor {list(shape)} for goals "
+                f"{list(achieved.shape)}, got {got}"
+            )
+        return answer
+
+    def _check(self, env: EnvBase) -> None:
+        """Raises a ValueError that names what the environment lacks."""
+        shown = env.full_observation_spec
+        for key in KEYS:
+            if key not in shown:
+                raise ValueError(f"{self._name} lacks {key!r} in what it shows: {', '.join(map(str, shown))}")
+            if len(shown[key].shape) != 1 + self._whole:
+                raise ValueError(f"{self._name} must show {key!r} as a vector, got {list(shown[key].shape)}")
+        achieved, desired = (shown[key].shape for key in _GOALS)
+        if achieved != desired:
+            raise ValueError(
+                f"{self._name}'s achieved and desired goals must have one shape, got {list(achieved)} and "
+                f"{list(desired)}"
+            )
+        if not callable(getattr(env, "compute_reward", None)):
+            raise ValueError(
+                f"{self._name} lacks the method 'compute_reward', which tells what other goals would have "
+                "given"
+            )
+        if list(env.action_keys) != ["action"] or list(env.reward_keys) != ["reward"]:
+            raise ValueError(
+                f"{self._name} must take one 'action' and give one 'reward', got {list(env.action_keys)} and "
+                f"{list(env.reward_keys)}"
+            )
+
+    def _make_specs(self, env: EnvBase) -> None:
+        (n,) = self.batch_size
+        shown, action = env.full_observation_spec, env.action_spec_unbatched
+
+        def flag() -> Binary:
+            return Binary(n=1, shape=(n, 1), dtype=torch.bool)
+
+        seen = {key: Unbounded(shape=(n, shown[key].shape[-1]), dtype=torch.float32) for key in KEYS}
+        self.observation_spec = Composite(seen, shape=(n,))
+        self.action_spec = self._action_spec(action)
+        self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32)
+        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
+
+    def _action_spec(self, action: TensorSpec) -> TensorSpec:
+        (n,) = self.batch_size
+        if type(action) is Categorical and not action.shape:
+            return Categorical(n=int(action.space.n), shape=(n,), dtype=torch.int64)
+        if isinstance(action, Bounded) and len(action.shape) == 1:
+            low, high = (side.float().expand(n, -1) for side in (action.space.low, action.space.high))
+            return Bounded(low=low, high=high, shape=low.shape, dtype=torch.float32)
+        raise ValueError(f"{self._name}'s actions must be a Bounded vector or Categorical, got {action}")
+
+    def _try_out(self, termination: Termination, achieved_reward: float | None) -> GoalRules:
+        """Finds out how the environment rewards and ends, with some steps of random actions."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            self.set_seeds([0])
+            rounds = -(-_TRIED_STEPS // self.batch_size[0])
+            steps = self.rollout(max(rounds, 2), break_when_any_done=False, auto_reset=True)
+        after = steps["next"].reshape(-1)
+        achieved, desired = (after[key] for key in _GOALS)
+        chosen = torch.linspace(0, len(achieved) - 1, min(_PAIRED, len(achieved))).long()
+        one, other = achieved[chosen], desired[chosen]
+        gap = (one.unsqueeze(1) - other).abs().sum(-1)
+        far = divmod(int(gap.argmax()), len(chosen))
+        rewards = self.compute_reward(one.unsqueeze(1), other).squeeze(-1)
+        equal = float(self.compute_reward(other[far[1]], other[far[1]]))
+        missed, met, dense = check_rewards(
+            self._name, float(rewards[far]), equal, rewards.flatten().numpy(), achieved_reward
+        )
+        stepped = after["reward"].flatten()
+        computed = self.compute_reward(achieved, desired).flatten()
+        warn_once(check_same_rewards(self._name, stepped.numpy(), computed.numpy()))
+        ends = choose_ends(
+            self._name,
+            termination,
+            has_own=callable(getattr(self._envs[0], "compute_terminated", None)),
+            achieved=(stepped >= met).numpy(),
+            terminated=after["terminated"].flatten().numpy(),
+            tells_success=_SUCCESS in self._envs[0].full_observation_spec,
+        )
+        return GoalRules(ends=ends, missed_reward=missed, achieved_reward=met, dense=dense)

@@ -1,0 +1,120 @@
+"""How observations and goals lie in a row of numbers, nested dictionaries included."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    """One array of a nested dictionary: the keys that lead to it, its shape and type."""
+
+    path: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def width(self) -> int:
+        return math.prod(self.shape)
+
+
+class Layout:
+    """The order of a space's numbers in a row of ``width`` numbers.
+
+    A vector stays as it is. The entries of a dictionary follow each other in the alphabetical order of
+    their keys, those of a dictionary within it likewise at its place, and each array is written row by row.
+    The order in which a space or an observation happens to list its keys makes no difference, so that an
+    achieved goal and a desired one always agree.
+
+    Args:
+        space: a vector, or a dictionary of arrays, whole numbers and further dictionaries.
+        name: of the space, for messages.
+
+    Raises:
+        ValueError: something in it is not an array of numbers.
+
+    Example:
+        >>> arm, ball = spaces.Box(-1, 1, (2,)), spaces.Dict(y=spaces.Box(0, 9), x=spaces.Box(0, 9))
+        >>> layout = Layout(spaces.Dict(ball=ball, arm=arm), "a goal")
+        >>> row = layout.flatten({"ball": {"y": [3.0], "x": [2.0]}, "arm": [0.5, 1.0]})
+        >>> row.tolist(), layout.entries
+        ([0.5, 1.0, 2.0, 3.0], ['arm', 'ball.x', 'ball.y'])
+        >>> layout.places
+        {'arm': [0, 1], 'ball.x': [2], 'ball.y': [3]}
+        >>> layout.unflatten(row)["ball"]["y"].tolist()
+        [3.0]
+    """
+
+    def __init__(self, space: spaces.Space, name: str) -> None:
+        self._leaves = _leaves(space, (), name)
+        self.width = sum(leaf.width for leaf in self._leaves)
+
+    @property
+    def entries(self) -> list[str]:
+        """The entries of a nested dictionary in their order, with dots between keys; empty for a vector."""
+        return [".".join(leaf.path) for leaf in self._leaves if leaf.path]
+
+    @property
+    def places(self) -> dict[str, list[int]]:
+        """The places in the row of each entry of a nested dictionary; empty for a vector."""
+        places, first = {}, 0
+        for leaf in self._leaves:
+            if leaf.path:
+                places[".".join(leaf.path)] = list(range(first, first + leaf.width))
+            first += leaf.width
+        return places
+
+    @property
+    def sizes(self) -> set[int]:
+        """The sizes of all dimensions."""
+        return {size for leaf in self._leaves for size in leaf.shape}
+
+    @property
+    def shapes(self) -> list[tuple[tuple[str, ...], tuple[int, ...]]]:
+        """The keys and the shape of each entry: equal for goals that can be compared."""
+        return [(leaf.path, leaf.shape) for leaf in self._leaves]
+
+    def flatten(self, values: Any) -> np.ndarray:
+        """Values of the space, each with the same leading dimensions [...], as rows [..., width]."""
+        arrays = []
+        for leaf in self._leaves:
+            own = values
+            for key in leaf.path:
+                own = own[key]
+            own = np.asarray(own)
+            arrays.append(own.reshape(*own.shape[: own.ndim - len(leaf.shape)], leaf.width))
+        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, -1)
+
+    def unflatten(self, rows: np.ndarray) -> Any:
+        """Rows [..., width] in the form of the space, in its types; all arrays are copies."""
+        nested: Any = {}
+        first = 0
+        for leaf in self._leaves:
+            own = rows[..., first : first + leaf.width].astype(leaf.dtype)
+            own = own.reshape((*rows.shape[:-1], *leaf.shape))
+            first += leaf.width
+            if not leaf.path:
+                return own
+            inner = nested
+            for key in leaf.path[:-1]:
+                inner = inner.setdefault(key, {})
+            inner[leaf.path[-1]] = own
+        return nested
+
+
+def _leaves(space: spaces.Space, path: tuple[str, ...], name: str) -> list[_Leaf]:
+    if isinstance(space, spaces.Dict):
+        parts = sorted(space.spaces.items())
+        if not parts:
+            raise ValueError(f"{name} has an empty dictionary")
+        return [leaf for key, own in parts for leaf in _leaves(own, (*path, key), name)]
+    numbers = space.shape is not None and space.dtype is not None and space.dtype.kind in "fiub"
+    if not numbers or (not path and len(space.shape or ()) != 1):
+        where = f" in {'.'.join(path)}" if path else ""
+        raise ValueError(f"{name} as a row of numbers or a dictionary of arrays, got {space}{where}")
+    return [_Leaf(path, space.shape or (), np.dtype(space.dtype))]

@@ -1,0 +1,93 @@
+"""TorchRL environments as users write them: a point with a goal, alone or as a batch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+NOT_CALLABLE = 3
+
+
+class Point(EnvBase):
+    """A point in a square; an episode ends at its goal.
+
+    Args:
+        size: of the batch, none if 0.
+        dense: whether the reward is the distance.
+        goes_on: whether goals do not end an episode.
+    """
+
+    max_steps = 8
+
+    def __init__(self, size: int = 0, *, dense: bool = False, goes_on: bool = False) -> None:
+        super().__init__(batch_size=[size] if size else [])
+        self.dense, self.goes_on_there = dense, goes_on
+        batch = self.batch_size
+        seen = {key: Unbounded(shape=(*batch, 2)) for key in ("observation", "achieved_goal", "desired_goal")}
+        self.observation_spec = Composite(seen, shape=batch)
+        self.action_spec = Bounded(-1.0, 1.0, (*batch, 2))
+        self.reward_spec = Unbounded(shape=(*batch, 1))
+        self.rng = torch.Generator()
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.rng.manual_seed(seed or 0)
+        torch.manual_seed(123)  # as many do; the run's own numbers must not notice
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        fresh = [torch.rand(*self.batch_size, 2, generator=self.rng) * 2 - 1 for _ in range(2)]
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is not None:
+            fresh = [
+                torch.where(mask, new, old) for new, old in zip(fresh, (self.at, self.goal), strict=True)
+            ]
+        self.at, self.goal = fresh
+        return TensorDict(self._shown(), self.batch_size)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.at = (self.at + 0.5 * tensordict["action"]).clamp(-1, 1)
+        reward = self.compute_reward(self.at, self.goal)
+        met = (self.at - self.goal).norm(dim=-1, keepdim=True) < 0.5
+        ends = met & (not self.goes_on_there)
+        return TensorDict(
+            {**self._shown(), "reward": reward, "done": ends, "terminated": ends}, self.batch_size
+        )
+
+    def _shown(self) -> dict[str, Tensor]:
+        return {"observation": self.at, "achieved_goal": self.at.clone(), "desired_goal": self.goal}
+
+    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        gap = (achieved_goal - desired_goal).norm(dim=-1, keepdim=True)
+        return -gap if self.dense else -(gap >= 0.5).float()
+
+    def render(self) -> Tensor:
+        place = ((self.at + 1) * 100).to(torch.uint8)
+        return place[..., None, None, :1].expand(*self.batch_size, 4, 6, 3)
+
+
+def make_points(num_envs: int, *, dense: bool = False) -> Point:
+    return Point(num_envs, dense=dense)
+
+
+def make_number() -> int:
+    return 3
+
+
+class Bare(Point):
+    compute_reward = None  # type: ignore[assignment]
+
+    def __init__(self) -> None:
+        super().__init__()
+
+
+class Endless(Point):
+    max_steps = None  # type: ignore[assignment]
+
+
+class Wide(Point):
+    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        return super().compute_reward(achieved_goal, desired_goal).squeeze(-1)

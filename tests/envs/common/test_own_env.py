@@ -1,0 +1,119 @@
+"""TorchRL environments of a user's own, named as module:function."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_her_envs import BitFlip, OwnGoalEnv, goal_env, make_env, make_own_env, reward_range
+
+HERE = "tests.envs.common.own_point"
+KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+def rollout(env: Any, steps: int = 40) -> Any:
+    torch.manual_seed(0)
+    return env.rollout(steps, break_when_any_done=False)
+
+
+@pytest.mark.parametrize("name", ["Point", "make_points"])
+def test_it_is_made_by_its_name_alone_or_as_a_batch(name: str) -> None:
+    env = make_env(f"{HERE}:{name}", num_envs=3, seed=5)
+    assert isinstance(env, OwnGoalEnv)
+    check_env_specs(env)
+    assert (env.batch_size, env.max_steps, env.task_name) == ((3,), 8, f"{HERE}:{name}")
+    assert goal_env(env) is env
+    assert reward_range(env) == (-1.0, 0.0)
+    steps = rollout(env)
+    after = steps["next"]
+    goals = after["achieved_goal"], after["desired_goal"]
+    met = after["reward"] == 0
+    assert met.any()
+    assert torch.equal(env.compute_reward(*goals), after["reward"])
+    assert torch.equal(after["terminated"], met)
+    assert torch.equal(env.compute_terminated(*goals), after["terminated"])
+    assert after["truncated"].any()
+    goes_on = ~after["done"].squeeze(-1)[:, :-1]
+    for key in KEYS:
+        assert torch.equal(steps[key][:, 1:][goes_on], after[key][:, :-1][goes_on])
+
+
+def test_the_time_limit_counts_each_episode_from_its_own_start() -> None:
+    after = rollout(make_own_env(f"{HERE}:Point", num_envs=4, max_steps=3, termination="never"))["next"]
+    assert not after["terminated"].any()
+    length = torch.zeros(4, dtype=torch.int64)
+    for t in range(40):
+        length += 1
+        done, met = (after[key][:, t].squeeze(-1) for key in ("done", "reward"))
+        assert torch.equal(done, (length == 3) | (met == 0))
+        length[done] = 0
+
+
+def test_seeds_give_each_environment_the_same_in_every_batch_and_leave_torch_alone() -> None:
+    both, alone = (make_own_env(f"{HERE}:Point", num_envs=n, seed=s) for n, s in ((4, [7, 8]), (2, 8)))
+    for _ in range(3):
+        assert torch.equal(both.reset()["observation"][2:], alone.reset()["observation"])
+    torch.manual_seed(4)
+    expected = torch.rand(1)
+    torch.manual_seed(4)
+    both.set_seeds([1, 2])
+    assert torch.equal(torch.rand(1), expected)
+
+
+def test_a_batch_serves_several_runs_only_if_it_can_seed_them() -> None:
+    with pytest.raises(ValueError, match="needs a method set_seeds for 2 runs side by side"):
+        make_own_env(f"{HERE}:make_points", num_envs=4, seed=[1, 2])
+
+
+def test_what_it_does_at_a_goal_does_not_depend_on_how_many_there_are() -> None:
+    found = {
+        make_own_env(f"{HERE}:Point", num_envs=n, goes_on=goes_on).rules.ends
+        for n in (1, 5, 40)
+        for goes_on in (True,)
+    }
+    assert found == {"never"}
+
+
+def test_a_complete_goal_environment_is_taken_as_it_is() -> None:
+    env = make_own_env("torchrl_her_envs:BitFlip", num_envs=2, bits=4)
+    assert type(env) is BitFlip
+    with pytest.raises(ValueError, match="says itself how it ends and rewards"):
+        make_own_env("torchrl_her_envs:BitFlip", bits=4, termination="never")
+    with pytest.raises(ValueError, match="BitFlip needs the option 'bits', as in task.options.bits=..."):
+        make_own_env("torchrl_her_envs:BitFlip")
+
+
+@pytest.mark.parametrize("name", ["Point", "make_points"])
+def test_pictures(name: str) -> None:
+    env = make_own_env(f"{HERE}:{name}", num_envs=3)
+    places = env.reset()["observation"][:, 0]
+    frames = env.render()
+    assert env.can_render
+    assert (frames.shape, frames.dtype) == ((3, 4, 6, 3), torch.uint8)
+    assert torch.equal(frames[:, 0, 0, 0], ((places + 1) * 100).to(torch.uint8))
+    assert torch.equal(env.render(1), frames[1])
+
+
+@pytest.mark.parametrize(
+    ("path", "options", "message"),
+    [
+        ("no_such_module:make", {}, "there is no module 'no_such_module' for task=no_such_module:make"),
+        (f"{HERE}:Nothing", {}, "needs a function or class 'Nothing' in the module"),
+        (f"{HERE}:NOT_CALLABLE", {}, "needs a function or class 'NOT_CALLABLE'"),
+        (f"{HERE}:make_number", {}, "must give a TorchRL EnvBase, got int"),
+        (f"{HERE}:Bare", {}, "lacks the method 'compute_reward'"),
+        (f"{HERE}:Endless", {}, "needs max_steps, a whole number of at least 1, got None"),
+        (f"{HERE}:Wide", {}, r"compute_reward .* must give a tensor \[.*1\] for goals"),
+        (f"{HERE}:Point", {"size": 2}, r"must give environments of batch size \[\], got \[2\], or take"),
+        (f"{HERE}:Point", {"speed": 2}, "takes no option 'speed'; its options are max_steps, .* dense"),
+        (f"{HERE}:Point", {"dense": True}, "has a dense reward"),
+        (f"{HERE}:Point", {"termination": "success"}, r"needs info\['is_success'\]"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(path: str, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as raised:
+        make_own_env(path, **options)
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,205 @@
+"""Environments that do not say which goals end an episode, that end by themselves, or have dense rewards."""
+
+from __future__ import annotations
+
+import logging
+import re
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_her_envs import GymGoalEnv, make_gym_env, reward_bounds, reward_range
+from torchrl_her_envs.common import goal_rules
+
+from .walk import Walk
+
+
+class Plain(Walk):
+    """A walk with nothing but compute_reward.
+
+    Args:
+        stops: whether a step at the goal terminates the episode.
+        tells: whether info has is_success.
+        far: how far goals are away: from 10 on, no random walk gets there.
+        falls: whether the episode terminates in place 0.
+        dense: whether the reward is the distance.
+    """
+
+    def __init__(
+        self,
+        *,
+        stops: bool = True,
+        tells: bool = True,
+        unseen: bool = False,
+        falls: bool = False,
+        dense: bool = False,
+        form: str = "batch",
+        render_mode: str | None = None,
+    ) -> None:
+        super().__init__(without="compute_terminated", form=form, render_mode=render_mode)
+        self.stops, self.tells, self.falls, self.dense, self.unseen = stops, tells, falls, dense, unseen
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        if self.unseen:
+            self.goal = 9.0
+        if self.falls:
+            self.place, self.goal = 2.0, 4.0
+        return self._show(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.place = float(np.clip(self.place + (1 if np.ravel(action)[0] > 0 else -1), 0, 4))
+        met = self.place == self.goal
+        reward = self.compute_reward(np.array([self.place]), np.array([self.goal]), {})
+        ends = (self.stops and met) or (self.falls and self.place == 0)
+        return self._show(), float(reward), ends, False, {"is_success": met} if self.tells else {}
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        if self.dense:
+            return -np.abs(achieved - desired).sum(-1)
+        return super().compute_reward(achieved, desired, info)
+
+
+gymnasium.register("tests/Plain-v0", Plain, max_episode_steps=6)
+
+
+@pytest.fixture
+def said(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> pytest.LogCaptureFixture:
+    monkeypatch.setattr(goal_rules, "_said", set())
+    caplog.set_level(logging.INFO, "torchrl_her_envs")
+    return caplog
+
+
+def plain(num_envs: int = 1, **options: Any) -> GymGoalEnv:
+    return make_gym_env("tests/Plain-v0", num_envs=num_envs, **options)
+
+
+def steps(env: GymGoalEnv, count: int = 60) -> Any:
+    torch.manual_seed(0)
+    return env.rollout(count, break_when_any_done=False)["next"]
+
+
+@pytest.mark.parametrize(
+    ("options", "ends", "why"),
+    [
+        ({}, "success", r"ended where a goal was achieved, .* where info\['is_success'\] is true"),
+        ({"tells": False}, "reward", "ended where .* where the reward is that of an achieved goal"),
+        ({"stops": False}, "never", "it went on after a goal was achieved, so goals never end an episode"),
+        ({"unseen": True}, "success", "goals are taken to end .*; if it goes on, choose termination=never"),
+        ({"unseen": True, "tells": False}, "reward", "goals are taken to end an episode"),
+    ],
+)
+def test_what_ends_an_episode_is_found_by_trying_and_said_once(
+    options: dict[str, Any], ends: str, why: str, said: pytest.LogCaptureFixture
+) -> None:
+    for _ in range(2):
+        assert plain(**options).ends == ends
+    (record,) = said.records
+    assert record.getMessage().startswith("tests/Plain-v0 has no compute_terminated: ")
+    assert record.getMessage().endswith(f"(termination={ends})")
+    assert re.search(why, record.getMessage()), record.getMessage()
+
+
+@pytest.mark.parametrize("form", ["batch", "single"])
+@pytest.mark.parametrize("ends", ["success", "reward", "never"])
+@pytest.mark.parametrize("stops", [True, False])
+def test_real_and_virtual_goals_end_by_one_rule(ends: str, stops: bool, form: str) -> None:
+    """Whatever the environment itself does at a goal, and however it takes goals."""
+    env = plain(4, termination=ends, stops=stops, form=form)
+    assert env._reward_of.answers == ("batch" if form == "batch" else "loop")
+    check_env_specs(env)
+    after = steps(env)
+    goals = after["achieved_goal"], after["desired_goal"]
+    met = goals[0] == goals[1]
+    assert met.any()
+    assert torch.equal(after["terminated"], met & (ends != "never"))
+    assert torch.equal(env.compute_terminated(*goals), after["terminated"])
+    assert torch.equal(env.compute_reward(*goals), after["reward"])
+    if ends == "never" and stops:
+        assert torch.equal(after["truncated"] & met, met)  # it cannot go on there
+
+
+def test_an_end_of_another_reason_terminates_or_is_cut_off_where_nothing_terminates() -> None:
+    after = steps(plain(4, falls=True, termination="success"))
+    fallen = after["achieved_goal"] == 0
+    assert fallen.any()
+    assert after["terminated"][fallen].all()
+    after = steps(plain(4, falls=True, termination="never"))
+    assert not after["terminated"].any()
+    assert after["truncated"][after["achieved_goal"] == 0].all()
+
+
+def test_a_base_class_that_has_the_mere_name_of_the_method_lacks_it() -> None:
+    class Core(Plain):
+        def __getattribute__(self, name: str) -> Any:
+            if name == "compute_terminated":
+                return self._missing
+            return super().__getattribute__(name)
+
+        def _missing(self, *goals: Any) -> Any:
+            raise NotImplementedError
+
+    gymnasium.register("tests/Core-v0", Core, max_episode_steps=6)
+    assert make_gym_env("tests/Core-v0").ends == "success"
+
+
+def test_what_was_asked_for_takes_the_place_of_the_method() -> None:
+    env = make_gym_env("tests/Walk-v0", num_envs=4, termination="never")
+    assert make_gym_env("tests/Walk-v0").ends == "own"
+    after = steps(env)
+    assert (after["reward"] == 0).any()
+    assert not after["terminated"].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"termination": "sometimes"}, "must be one of auto, success, reward, never, got 'sometimes'"),
+        ({"termination": "success", "tells": False}, r"termination=success needs info\['is_success'\]"),
+        (
+            {"dense": True},
+            "Plain-v0 has a dense reward: .* give -4, .*, -1 and more, equal ones 0",
+        ),
+        (
+            {"dense": True, "achieved_reward": 1},
+            "must be above -4, .* at most 0, .* got 1",
+        ),
+        ({"dense": True, "achieved_reward": -5}, "must be above -4, .* got -5"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as raised:
+        plain(**options)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_dense_reward_says_what_is_needed() -> None:
+    with pytest.raises(ValueError, match="as in task.options.achieved_reward=-0.2, or choose a"):
+        plain(dense=True)
+
+
+def test_with_an_achieved_reward_a_dense_reward_is_as_good_as_another() -> None:
+    env = plain(2, dense=True, achieved_reward=-1.5, termination="reward")
+    assert env.dense_reward
+    assert (env.missed_reward, env.achieved_reward) == (-4.0, -1.5)
+    assert reward_range(env) == (-4.0, -1.5)
+    assert reward_bounds(env) == (-np.inf, np.inf)  # so that no target is cut off at a guess
+    near = torch.tensor([[0.0], [1.0], [2.0]])
+    assert env.compute_terminated(near, torch.zeros(1)).tolist() == [[True], [True], [False]]
+    assert not plain().dense_reward
+    assert reward_bounds(plain())[1] == 0.0
+
+
+def test_rewards_of_steps_that_goals_do_not_explain_are_noticed(said: pytest.LogCaptureFixture) -> None:
+    class Costly(Plain):
+        def step(self, action: Any) -> Any:
+            shown, reward, *rest = super().step(action)
+            return shown, reward - 0.25, *rest
+
+    gymnasium.register("tests/Costly-v0", Costly, max_episode_steps=6)
+    with pytest.warns(UserWarning, match="a step gave the reward -.*25, and compute_reward .* for the same"):
+        make_gym_env("tests/Costly-v0")

@@ -1,0 +1,33 @@
+"""The buffer of a run is made as its recipe says."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from torchrl_her_recipes import build
+
+from ..small import small
+
+
+@pytest.mark.parametrize("learner", ["ddpg", "td3", "sac"])
+def test_priorities_are_schaul_s_power_of_the_absolute_td_error(learner: str) -> None:
+    """The loss gives the error or its square: alpha makes up for that."""
+    components = build(small(learner=learner, priority_alpha=0.8))
+    (buffer,), loss = components.buffers, components.loss
+    for _ in range(6):  # until episodes end
+        buffer.extend(components.collector.next())
+    rows = buffer.sample(32)
+    rows["next", "terminated"].fill_(True)
+    rows["next", "reward"].fill_(-40.0)  # then the error is about 40
+    loss(rows)
+    power = (rows["td_error"].mean().log() / math.log(40.0)).round().item()
+    assert buffer.sampler.alpha * power == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_steps_and_their_discount_are_the_recipe_s(n_steps: int) -> None:
+    components = build(small(n_steps=n_steps, gamma=0.9))
+    options = components.buffers[0].writer.options
+    assert (options.n_steps, options.gamma) == (n_steps, 0.9)

@@ -1,0 +1,158 @@
+"""Environments of users: trained, filmed, played and resumed by name, and imported only if they say so."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+import yaml
+
+from torchrl_her_recipes import (
+    build,
+    export_policy,
+    load_policy,
+    load_trained,
+    make_recipe,
+    play,
+    resume,
+    run,
+)
+from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.config import imports
+from torchrl_her_recipes.config.imports import check_permitted, permit_everything, permit_task
+
+from .foreign_task import write_module
+from .small import overrides, small
+
+TINY: dict[str, Any] = {"epochs": 1, "epoch_frames": 320, "num_envs": 4, "warmup_frames": 80, "episodes": 3}
+REFUSED = "would import the module '{}', which a file names and not you: if you trust it, give --allow-import"
+
+
+@pytest.fixture
+def stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The task of a module in the current folder, which nobody has permitted yet."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(imports, "_permitted", set())
+    name = f"maze_of_{tmp_path.name.replace('-', '_')}"
+    task = write_module(tmp_path, name)
+    yield task
+    unload(task)
+
+
+def forget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a new process."""
+    monkeypatch.setattr(imports, "_permitted", set())
+
+
+def unload(task: str) -> None:
+    sys.modules.pop(module_of(task), None)
+    gymnasium.registry.pop("Maze-v0", None)
+
+
+def module_of(task: str) -> str:
+    return task.split(":")[1]
+
+
+@pytest.mark.long
+def test_an_environment_of_one_s_own_end_to_end(
+    stranger: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Trained because it was typed; everything that reads the folder afterwards asks."""
+    assert main(["train", *overrides(task=stranger, folder="run", **TINY)]) == 0
+    assert "has no compute_terminated" in capsys.readouterr().err
+    assert Path("run/policy.gif").stat().st_size > 500
+    module, refused = module_of(stranger), REFUSED.format(module_of(stranger))
+    unload(stranger)
+    forget(monkeypatch)
+    for command in (["play", "run"], ["export", "run"], ["train", "--resume", "run"]):
+        assert main(command) == 2
+        assert refused in capsys.readouterr().err
+        assert module not in sys.modules
+    for call in (play, export_policy):
+        with pytest.raises(ValueError, match=refused):
+            call("run", "out.gif")
+    with pytest.raises(ValueError, match=refused):
+        resume("run", progress=False)
+    assert main(["play", "run", "--goals", "2", "--allow-import"]) == 0
+    said = capsys.readouterr().out
+    assert "of 2 goals achieved: run/play.gif" in said
+    with pytest.raises(ValueError, match=refused):  # the permission ended with its command
+        check_permitted(stranger)
+    policy = export_policy("run", "maze.pt", allow_import=True)
+    assert 0.0 <= policy.success < 1.0  # goals that are missed give 0, which is no success
+    forget(monkeypatch)
+    assert load_policy("maze.pt").in_keys == ["observation", "desired_goal"]
+    assert load_trained("maze.pt").task == stranger
+    assert imports._permitted == set()
+    assert load_trained("maze.pt", allow_import=True).task == stranger
+    check_permitted(stranger)
+
+
+def test_presets_and_studies_are_files_of_somebody_too(
+    stranger: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("theirs.yaml").write_text(yaml.safe_dump({"task": stranger}))
+    Path("study.yaml").write_text(yaml.safe_dump({"vary": {"task": [stranger], "algo": ["her"]}}))
+    for command in (["train", "preset=theirs.yaml"], ["study", "study.yaml"]):
+        assert main(command) == 2
+        assert REFUSED.format(module_of(stranger)) in capsys.readouterr().err
+    assert module_of(stranger) not in sys.modules
+
+
+def test_who_names_a_module_has_permitted_it(stranger: str) -> None:
+    for recipe in (make_recipe({"task": stranger}), small().replace(task=stranger)):
+        with pytest.raises(ValueError, match=REFUSED.format(module_of(stranger))):
+            build(recipe)
+    make_recipe(task=stranger)
+    check_permitted(stranger)
+
+
+def test_import_on_the_command_line_permits_a_module_and_what_is_in_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(imports, "_imported", ["mine"])
+    for task in ("mine:make", "mine.parts:make", "gym:mine:My-v0", "gym:FetchReach-v4", "hand_v0"):
+        check_permitted(task)
+    for task in ("mined:make", "gym:other:My-v0", "gymnasium:make", "torchrl_her_envs.registry:make_env"):
+        with pytest.raises(ValueError, match="would import the module"):
+            check_permitted(task)
+    check_permitted("gym:gymnasium_robotics:FetchReach-v4")
+    with permit_everything():
+        check_permitted("mined:make")
+    permit_task("mined:make")
+    check_permitted("mined:make")
+
+
+def test_a_torchrl_environment_of_one_s_own_trains_by_its_name(tmp_path: Path) -> None:
+    task = "tests.envs.common.own_point:Point"
+    recipe = small(task=task, algo="filtered_her", **TINY)
+    result = run(build(recipe), tmp_path / "run", progress=False)
+    assert result.rows[-1]["rows_virtual"] > 0
+    assert (tmp_path / "run" / "policy.gif").exists()
+    play(tmp_path / "run", tmp_path / "film.gif", goals=2, size=32)
+    resume(tmp_path / "run", progress=False)
+
+
+@pytest.mark.parametrize(
+    "task", ["gym:torchrl_her_envs:torchrl_her/HandReach-v0", "tests.envs.common.own_point:Point"]
+)
+def test_environments_that_end_by_themselves_work_with_a_curriculum(task: str) -> None:
+    """Their own goals are easy to meet by chance, and none of the layers' is."""
+    width = 2 if "Point" in task else 5
+    seen = {"observation": list(range(width)), "achieved_goal": [0, 1], "desired_goal": [width, width + 1]}
+    layers = [{**seen, "name": name, "threshold": far} for name, far in (("far", 1e-6), ("near", 1e-7))]
+    easy: dict[str, Any] = {} if "Point" in task else {"task.options": {"threshold": 0.5}}
+    recipe = make_recipe(small(**TINY).to_dict(), task=task, algo="cher", curriculum=layers, **easy)
+    components = build(recipe)
+    rows = run(components, progress=False).rows
+    assert rows[-1]["layer_success"] == 0.0
+    lengths = components.env.rollout(30, break_when_any_done=False)["next"]
+    ended = lengths["truncated"] & ~lengths["terminated"]
+    assert ended.any()
+    assert not lengths["terminated"].any()
+    assert (lengths["reward"] == -1).all()
