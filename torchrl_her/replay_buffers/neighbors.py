@@ -6,8 +6,14 @@ from collections.abc import Iterator
 from typing import Any
 
 from tensordict import TensorDictBase
-from torchrl.data.replay_buffers.samplers import ConsumingSampler, Sampler, SamplerEnsemble, SliceSampler
-from torchrl.data.replay_buffers.storages import Storage
+from torchrl.data.replay_buffers.samplers import (
+    ConsumingSampler,
+    PrioritizedSliceSampler,
+    Sampler,
+    SamplerEnsemble,
+    SliceSampler,
+)
+from torchrl.data.replay_buffers.storages import ListStorage, Storage
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, RoundRobinWriter, Writer
 
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY
@@ -92,6 +98,26 @@ def refuse_priorities(name: str, storage: Storage, transitions: TensorDictBase) 
 def has_slices(storage: Storage) -> bool:
     """Whether sequences are sampled from a storage."""
     return any(isinstance(sampler, SliceSampler) for sampler in samplers_of(storage))
+
+
+def refuse_slices(name: str, storage: Storage) -> None:
+    """Raises an error if TorchRL's sequences from this storage are wrong by themselves.
+
+    Raises:
+        ValueError: a sampler writes its marks into a storage of lists, or its sequences from a full storage of
+            several dimensions are none.
+    """
+    if isinstance(storage, ListStorage) and has_slices(storage):
+        raise ValueError(
+            f"{name} cannot work with slices of a {type(storage).__name__}, into which the sampler would "
+            "write where they end: use a LazyTensorStorage"
+        )
+    by_priority = any(isinstance(sampler, PrioritizedSliceSampler) for sampler in samplers_of(storage))
+    if storage.ndim > 1 and by_priority:
+        raise ValueError(
+            f"{name} cannot work with a PrioritizedSliceSampler over a storage of {storage.ndim} dimensions: "
+            "it finds no sequences once that is full; use ndim=1"
+        )
 
 
 def refuse_consuming(name: str, storage: Storage) -> None:

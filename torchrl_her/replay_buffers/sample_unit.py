@@ -39,6 +39,7 @@ from torchrl_her.replay_buffers.neighbors import (
     refuse_n_steps,
     refuse_padded,
     refuse_shared,
+    refuse_slices,
     refuse_unordered,
 )
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
@@ -334,6 +335,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             refuse_consuming("HERSampleUnit", storage)
             refuse_unordered("HERSampleUnit", storage)
             refuse_shared("HERSampleUnit", storage)
+            if storage.ndim > 1:  # relabeling copies, so marks are not written into lists
+                refuse_slices("HERSampleUnit", storage)
             rows = storage[:]  # a view
             if not is_tensor_collection(rows):
                 raise TypeError(

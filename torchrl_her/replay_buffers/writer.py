@@ -35,6 +35,7 @@ from torchrl_her.replay_buffers.neighbors import (
     refuse_n_steps,
     refuse_padded,
     refuse_priorities,
+    refuse_slices,
 )
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 
@@ -278,6 +279,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             raise ValueError(f"HERWriter needs a storage of 1 dimension, got one of {self._storage.ndim}")
         refuse_n_steps("HERWriter", data)
         refuse_consuming("HERWriter", self._storage)
+        refuse_slices("HERWriter", self._storage)
         refuse_priorities("HERWriter", self._storage, data)
         if has_slices(self._storage) and self.k > 0 and self.options.per == "transition":
             raise ValueError(

@@ -996,3 +996,11 @@ def test_a_buffer_that_is_shared_between_processes_is_refused() -> None:
     buffer.extend(flat([[5]]))
     with pytest.raises(RuntimeError, match="shared between processes: workers send episodes"):
         buffer.sample()
+
+
+def test_prioritized_slices_of_two_dimensions_are_refused() -> None:
+    sampler = PrioritizedSliceSampler(100, 0.7, 0.5, slice_len=2, traj_key=IDS)
+    buffer = make_buffer(100, ndim=2, sampler=sampler)
+    buffer.extend(make_batch([[5], [5]]))
+    with pytest.raises(ValueError, match="PrioritizedSliceSampler over a storage of 2 dimensions"):
+        buffer.sample(4)

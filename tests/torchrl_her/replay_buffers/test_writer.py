@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyStackStorage, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, SliceSampler
 from torchrl.envs.transforms import MultiStepTransform
 
@@ -983,3 +983,15 @@ def test_a_fall_terminates_virtual_transitions_too(options: dict[str, Any]) -> N
     assert at_end.any()
     assert torch.equal(virtual["next", "terminated"][:, 0], at_end)
     assert torch.equal(virtual["next", "done"][:, 0], at_end)
+
+
+def test_slices_of_a_list_are_refused() -> None:
+    """TorchRL writes its marks into the list."""
+    buffer = TensorDictReplayBuffer(
+        storage=LazyStackStorage(100),
+        writer=HERWriter(REWARD, per="episode"),
+        sampler=SliceSampler(slice_len=2, traj_key=("collector", "traj_ids")),
+        batch_size=4,
+    )
+    with pytest.raises(ValueError, match="slices of a LazyStackStorage, .* use a LazyTensorStorage"):
+        buffer.extend(make_batch([[5]]))
