@@ -104,8 +104,8 @@ def refuse_slices(name: str, storage: Storage) -> None:
     """Raises an error if TorchRL's sequences from this storage are wrong by themselves.
 
     Raises:
-        ValueError: a sampler writes its marks into a storage of lists, or its sequences from a full storage of
-            several dimensions are none.
+        ValueError: a sampler writes its marks into a storage of lists, or what it takes for sequences in a
+            full storage of several dimensions are none.
     """
     if isinstance(storage, ListStorage) and has_slices(storage):
         raise ValueError(
@@ -115,8 +115,8 @@ def refuse_slices(name: str, storage: Storage) -> None:
     by_priority = any(isinstance(sampler, PrioritizedSliceSampler) for sampler in samplers_of(storage))
     if storage.ndim > 1 and by_priority:
         raise ValueError(
-            f"{name} cannot work with a PrioritizedSliceSampler over a storage of {storage.ndim} dimensions: "
-            "it finds no sequences once that is full; use ndim=1"
+            f"{name} cannot work with a PrioritizedSliceSampler over a storage of {storage.ndim} "
+            "dimensions: it finds no sequences once that is full; use ndim=1"
         )
 
 
