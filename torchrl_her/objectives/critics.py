@@ -35,7 +35,8 @@ def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None
         torch.Size([4, 1])
     """
     keys: Any = loss.tensor_keys
-    if getattr(loss, "qvalue_network_params", None) is not None:
+    has_actions = hasattr(keys, "state_action_value")
+    if getattr(loss, "qvalue_network_params", None) is not None and has_actions:
         network, params, key = loss.qvalue_network, loss.qvalue_network_params, keys.state_action_value
     elif isinstance(loss, DDPGLoss):
         network, params, key = loss.value_network, loss.value_network_params, keys.state_action_value

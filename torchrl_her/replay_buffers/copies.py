@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -37,7 +37,11 @@ class Copies:
             order = self.last if isinstance(key, tuple) and key[0] == "next" else self.root
             return entry_of(rows, key).index_select(0, order)
         value, entry = self.changes[key], rows.get(key, None)
-        return value if entry is None else value.to(entry.dtype).view(-1, *entry.shape[1:])
+        if entry is None:
+            return value
+        # The discounted sum of whole numbers is none.
+        dtype = value.dtype if STEPS_KEY in self.changes and value.is_floating_point() else entry.dtype
+        return value.to(dtype).view(-1, *entry.shape[1:])
 
 
 def real_copies(
@@ -88,7 +92,7 @@ def virtual_copies(
         achieved_reward: the reward of an achieved goal.
         keys, n_steps, gamma: as for :func:`real_copies`.
     """
-    achieved, fallen = entry_of(rows, keys.next_achieved), failed(rows, keys, achieved_reward)
+    achieved, fallen = entry_of(rows, keys.next_achieved), failed(rows, keys, reward_fn, achieved_reward)
     if n_steps == 1 or gamma is None:
         reward, terminated = reward_fn(achieved.index_select(0, source), goals)
         terminated = terminated.view(-1, 1) | fallen.index_select(0, source)
@@ -96,6 +100,7 @@ def virtual_copies(
         return Copies(source, source, keys.changes(goals, reward, terminated, truncated), reward.flatten())
     window, inside = _windows(rows, episodes, source, n_steps)
     reward, terminated = reward_fn(achieved[window], goals.unsqueeze(1).expand(-1, n_steps, -1))
+    reward, terminated = reward.view(*window.shape, 1), terminated.view(*window.shape, 1)
     out = n_step_return(reward, terminated | fallen[window], inside, gamma)
     last = _at(window, out.last)
     truncated = entry_of(rows, keys.truncated).index_select(0, last)
@@ -130,7 +135,8 @@ def virtual_episodes(
     table, inside = episodes.rows[number], episodes.inside[number]
     wanted = goals.unsqueeze(1).expand(-1, table.shape[1], -1)
     reward, terminated = reward_fn(entry_of(rows, keys.next_achieved)[table], wanted)
-    terminated = terminated | failed(rows, keys, achieved_reward)[table]
+    reward, terminated = reward.view(*table.shape, 1), terminated.view(*table.shape, 1)
+    terminated = terminated | failed(rows, keys, reward_fn, achieved_reward)[table]
     ended = terminated.squeeze(-1).cumsum(-1) - terminated.squeeze(-1).to(torch.int64)
     used = inside & (ended == 0)
     stop = used.clone()
@@ -141,6 +147,18 @@ def virtual_episodes(
     changes = keys.changes(wanted[used], reward[used].view(-1, 1), own_terminated, truncated)
     copy = torch.arange(len(source), device=root.device).unsqueeze(-1).expand_as(table)
     return Copies(root, root, {**changes, keys.truncated: truncated}, reward[used].flatten()), copy[used]
+
+
+def with_ends(real: Copies, rows: TensorDictBase, episodes: Episodes, keys: TransitionKeys) -> Copies:
+    """The same; episodes that were ended from outside are truncated, so that samplers of slices see that.
+
+    Args:
+        real: of :func:`real_copies`, over single steps.
+        rows, episodes, keys: as there.
+    """
+    done, truncated = (entry_of(rows, key)[real.root].view(-1, 1) for key in (keys.done, keys.truncated))
+    cut = torch.zeros_like(done).index_fill_(0, episodes.lengths.cumsum(0) - 1, True) & ~done
+    return replace(real, changes={**real.changes, keys.truncated: truncated | cut, keys.done: done | cut})
 
 
 def episode_numbers(episodes: Episodes) -> Tensor:

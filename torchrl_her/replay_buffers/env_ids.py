@@ -63,5 +63,11 @@ class EnvIds(Transform):
         )
         return observation_spec
 
+    def clone(self) -> EnvIds:
+        """Another transform, with ids of its own."""
+        out: EnvIds = super().clone()
+        out._ids = None
+        return out
+
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_ids": None}  # a copy is another environment

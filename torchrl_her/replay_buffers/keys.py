@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
+from torchrl_her.goals.rewards import RewardFunction
+
 
 @dataclass(frozen=True)
 class TransitionKeys:
@@ -48,7 +50,9 @@ class TransitionKeys:
         }
 
 
-def failed(transitions: TensorDictBase, keys: TransitionKeys, achieved_reward: float) -> Tensor:
+def failed(
+    transitions: TensorDictBase, keys: TransitionKeys, reward_fn: RewardFunction, achieved_reward: float
+) -> Tensor:
     """Where an episode terminated although its goal was not achieved, as by a fall: [n, 1] of bool.
 
     It would have terminated there whatever the goal, so it does for virtual goals, too.
@@ -56,17 +60,25 @@ def failed(transitions: TensorDictBase, keys: TransitionKeys, achieved_reward: f
     Args:
         transitions: [n], as collected.
         keys: where entries are.
+        reward_fn: maps (achieved, desired) goals to (reward, terminated).
         achieved_reward: the reward of an achieved goal.
 
     Example:
         >>> from tensordict import TensorDict
-        >>> from torchrl_her import HindsightOptions
-        >>> after = {"terminated": torch.tensor([[True], [True]]), "reward": torch.tensor([[0.0], [-1.0]])}
-        >>> failed(TensorDict({"next": after}, [2]), HindsightOptions().transition_keys(), 0.0).tolist()
+        >>> from torchrl_her import GoalReward, HindsightOptions
+        >>> goals = {"achieved_goal": torch.tensor([[0.0], [5.0]]), "desired_goal": torch.zeros(2, 1)}
+        >>> after = {"terminated": torch.ones(2, 1).bool(), "reward": torch.tensor([[0.0], [-1.0]]), **goals}
+        >>> keys = HindsightOptions().transition_keys()
+        >>> failed(TensorDict({"next": after}, [2]), keys, GoalReward(0.1), 0.0).tolist()
         [[False], [True]]
     """
-    reward, terminated = entry_of(transitions, keys.reward), entry_of(transitions, keys.terminated)
-    return terminated.reshape(-1, 1) & (reward.reshape(-1, 1) < achieved_reward)
+    reward, terminated = (entry_of(transitions, key).reshape(-1) for key in (keys.reward, keys.terminated))
+    out = terminated & (reward < achieved_reward)
+    at = out.nonzero().squeeze(-1)
+    if len(at) > 0:  # what the reward function terminates was a success, though with another reward
+        goals = (entry_of(transitions, key)[at] for key in (keys.next_achieved, keys.goals[1]))
+        out[at] = ~reward_fn(*goals)[1].reshape(-1)
+    return out.unsqueeze(-1)
 
 
 def under_next(key: NestedKey) -> NestedKey:

@@ -91,11 +91,9 @@ def broken(
     """
     over = torch.zeros_like(lanes, dtype=torch.bool)
     trajectory = rows.get(keys.trajectory, None)
-    if held == 0 and kind == BY_TRAJECTORY:
-        return over
     last, new = order[:-1], order[1:]
     same = lanes[last] == lanes[new]
-    if trajectory is None:  # then goals have to tell, everywhere
+    if trajectory is None or kind == BY_TRAJECTORY:  # then goals have to tell, everywhere
         over[last] = _jumps(rows, keys, last, new, same)
     else:
         ids = trajectory.reshape(-1)[order]

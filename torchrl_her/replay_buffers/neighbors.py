@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from tensordict import TensorDictBase
+from torchrl.data.replay_buffers.sample_units import Sequence
 from torchrl.data.replay_buffers.samplers import (
     ConsumingSampler,
     PrioritizedSliceSampler,
@@ -97,7 +98,10 @@ def refuse_priorities(name: str, storage: Storage, transitions: TensorDictBase) 
 
 def has_slices(storage: Storage) -> bool:
     """Whether sequences are sampled from a storage."""
-    return any(isinstance(sampler, SliceSampler) for sampler in samplers_of(storage))
+    units = (getattr(buffer, "_sample_unit", None) for buffer in storage._attached_entities)
+    return any(isinstance(sampler, SliceSampler) for sampler in samplers_of(storage)) or any(
+        isinstance(unit, Sequence) for unit in units
+    )
 
 
 def refuse_slices(name: str, storage: Storage) -> None:

@@ -193,9 +193,9 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         sampler, ends = self._slice_sampler(storage), None
         own = torch.arange(len(row), device=row.device).unsqueeze(-1)
         if sampler is not None:
-            ends = self._ends(sampler, info)
+            ends = self._ends(sampler, info, row.device)
             place = stored.episodes.place(row)
-            inside = info.get(MASK)  # type: ignore[call-overload]  # TorchRL's keys may be nested
+            inside = _moved(info.get(MASK), row.device)  # type: ignore[call-overload]  # TorchRL's keys may be nested
             own = slice_positions(place, stored.episodes.episode(place)[0], ends, inside)
         generator = self.generator if self.generator is not None else storage._rng
         rows, source = self._choose(stored, row, own, generator)
@@ -236,7 +236,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             out.set(self.options.virtual_key, marks.index_fill_(0, rows, True))
         if chosen.ahead is not None:
             after, returns = chosen.ahead
-            out.set("next", after.exclude(*(key[1:] for key in self._exclude if isinstance(key, tuple))))
+            out = out.set("next", after).exclude(*self._exclude)
             out.set(self._keys.reward, returns.reward).set(STEPS_KEY, returns.steps)
         if chosen.ends is not None:
             done = entry_of(out, self._keys.done)
@@ -248,7 +248,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             reward, terminated = chosen.ahead.returns.reward[rows], chosen.ahead.returns.terminated[rows]
         else:
             reward, terminated = self.reward_fn(entry_of(data, self._keys.next_achieved)[rows], chosen.goals)
-            terminated = terminated.view(-1, 1) | failed(data, self._keys, self.achieved_reward)[rows]
+            fallen = failed(data, self._keys, self.reward_fn, self.achieved_reward)
+            terminated = terminated.view(-1, 1) | fallen[rows]
         truncated = entry_of(out, self._keys.truncated)[rows]
         for key, value in self._keys.changes(chosen.goals, reward, terminated, truncated).items():
             entry = entry_of(out, key)
@@ -296,7 +297,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         rows = (source_of >= 0).nonzero().squeeze(-1)
         return rows, source_of[rows]
 
-    def _ends(self, sampler: SliceSampler, info: dict[str, Any]) -> Tensor | None:
+    def _ends(self, sampler: SliceSampler, info: dict[str, Any], device: torch.device) -> Tensor | None:
         """Where a sampler of slices says that they end, [B, 1]; None if it does not."""
         key = sampler.truncated_key
         if key is not None and unravel_key(key) != self._keys.truncated:
@@ -304,11 +305,11 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                 f"the sampler marks ends of slices under {key!r}, and relabeling reads "
                 f"{self._keys.truncated!r}: make them the same (truncated_key)"
             )
-        return info.get(key)
+        return _moved(info.get(key), device)
 
     def _look_ahead(self, stored: _Stored, row: Tensor, virtual: Tensor, goals: Tensor) -> _Ahead:
         """The steps that follow rows [B], some of which are virtual and have other goals."""
-        gamma = self.options.gamma or 1.0
+        gamma = self.options.gamma or 1.0  # there is one with several steps
         place = stored.episodes.place(row)
         places, inside = windows(place, stored.episodes.episode(place)[1], self.options.n_steps)
         window = stored.episodes.row(places)
@@ -317,8 +318,9 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         if len(virtual) > 0:
             wanted = goals.unsqueeze(1).expand(-1, self.options.n_steps, -1)
             own_reward, own_end = self.reward_fn(stored.after[window[virtual]], wanted)
-            fallen = failed(stored.rows, self._keys, self.achieved_reward)[window[virtual]]
-            reward[virtual], end[virtual] = own_reward.to(reward.dtype), own_end | fallen
+            fallen = failed(stored.rows, self._keys, self.reward_fn, self.achieved_reward)[window[virtual]]
+            reward[virtual] = own_reward.to(reward.dtype).view(*fallen.shape)
+            end[virtual] = own_end.view(*fallen.shape) | fallen
         returns = n_step_return(reward, end, inside, gamma)
         last = window.gather(-1, returns.last.unsqueeze(-1)).squeeze(-1)
         return _Ahead(stored.rows.get("next")[last], returns)
@@ -417,6 +419,10 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             drawn, valid[part] = draw(combine(steps < width, weight, keep), 1, generator=generator)
             source[part] = candidate.gather(1, drawn).squeeze(-1)
         return source, valid
+
+
+def _moved(entry: Tensor | None, device: torch.device) -> Tensor | None:
+    return None if entry is None else entry.to(device)
 
 
 def _oldest(storage: Storage) -> int:

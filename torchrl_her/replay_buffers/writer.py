@@ -23,6 +23,7 @@ from torchrl_her.replay_buffers.copies import (
     real_copies,
     virtual_copies,
     virtual_episodes,
+    with_ends,
 )
 from torchrl_her.replay_buffers.draw import draw_goals
 from torchrl_her.replay_buffers.episodes import Episodes, find_episodes, time_order
@@ -79,8 +80,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     where its goal terminates it, or is truncated at its end. That is what samplers of slices need.
 
     The writer works in any TorchRL replay buffer with a one-dimensional storage, under any sampler that does
-    not consume its transitions; the capacity counts real and virtual transitions alike. Random numbers come
-    from the buffer's generator (``buffer.set_rng``).
+    not consume its transitions (those of slices need ``per="episode"``); the capacity counts real and virtual
+    transitions alike. Random numbers come from the buffer's generator (``buffer.set_rng``).
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated), for instance
@@ -182,6 +183,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             RuntimeError: the buffer was made by another process.
         """
         self._refuse(data)
+        if data.batch_size.numel() == 0:
+            return torch.empty(data.shape, dtype=torch.int64, device=data.device)
         held = self.held_back
         rows, kind, ids = self._with_held(data)
         lanes = in_order(ids) if kind == BY_ENV else ids
@@ -255,7 +258,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     def _empty(self, empty_write_count: bool = True) -> None:
         super()._empty(empty_write_count)
-        self._held, self._held_lanes, self._all_over = None, self._held_lanes[:0], False
+        self._held, self._held_lanes = None, self._held_lanes[:0]
+        self._loaded = self._all_over = False
         self.counts = WriterCounts()
         if self.weights is not None:
             self.weights.clear()
@@ -346,6 +350,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             self._note(rows, virtual)
             parts = [virtual, real]
         if self.options.per == "episode":
+            real = with_ends(real, rows, episodes, self._keys)
             parts[-1] = self._with_ids(real, episode_numbers(episodes), len(episodes.lengths))
         out = self._build(rows, parts)
         behind = len(out) - len(real.root)

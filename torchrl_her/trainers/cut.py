@@ -16,7 +16,8 @@ def cut_episodes(batch: TensorDictBase) -> TensorDictBase:
     episodes would never see the end of those that were open.
 
     Args:
-        batch: [N, T] with time last; or flat [n], with ``("collector", "traj_ids")``.
+        batch: [N, T] with time last; or flat [n], with ``("collector", "traj_ids")``, without which it is one
+            environment's.
 
     Returns:
         The same transitions; ``truncated`` and ``done`` under ``next`` are set in the last one of each
@@ -44,10 +45,11 @@ def cut_episodes(batch: TensorDictBase) -> TensorDictBase:
 def _last(batch: TensorDictBase) -> Tensor:
     """Which transitions are the last ones, in the shape of the batch."""
     last = torch.zeros(batch.shape, dtype=torch.bool, device=batch.device)
-    if batch.ndim > 1:
-        last[..., -1] = True
+    ids = batch.get(_TRAJECTORY, None)
+    if batch.ndim > 1 or ids is None:
+        last[..., -1:] = True
         return last
-    ids = batch.get(_TRAJECTORY).reshape(-1)
+    ids = ids.reshape(-1)
     order = ids.argsort(stable=True)
     ends = torch.ones_like(last)
     ends[:-1] = ids[order][1:] != ids[order][:-1]

@@ -102,6 +102,8 @@ class FusedDDPGLearner:
         self._weights = Weights([p.data for p in self._parameters], [p.data for p in targets])
         self._actor_layers = len(list(actor.parameters())) // 2
         self._networks = self._weights.networks(self._actor_layers)
+        self._gamma = 0.0
+        self._gamma_version: object = None
         self._settings = self._read_settings()
 
     @property
@@ -168,8 +170,12 @@ class FusedDDPGLearner:
     def _read_settings(self) -> Settings:
         """The numbers of the loss, read anew for each update since they may be scheduled."""
         estimator = self.loss.value_estimator
+        gamma = estimator.gamma
+        version = (id(gamma), gamma._version) if isinstance(gamma, Tensor) else gamma
+        if version != self._gamma_version:  # reading a number from a device waits for it
+            self._gamma, self._gamma_version = float(gamma), version
         return Settings(
-            gamma=float(estimator.gamma),
+            gamma=self._gamma,
             low=estimator.low,
             high=estimator.high,
             action_penalty=self.loss.action_penalty,

@@ -72,6 +72,8 @@ def _priorities(sampler: PrioritizedSampler, size: int) -> dict[str, Any]:
         "max_priority": [
             None if value is None else torch.as_tensor(value) for value in state["_max_priority"]
         ],
+        "alpha": float(sampler._alpha),
+        "beta": float(sampler._beta),
     }
 
 
@@ -83,3 +85,4 @@ def _load_priorities(sampler: PrioritizedSampler, own: dict[str, Any]) -> None:
         state["_min_tree"][filled] = own["min"]
     state["_max_priority"] = tuple(own["max_priority"])
     sampler.load_state_dict(state)
+    sampler._alpha, sampler._beta = own["alpha"], own["beta"]

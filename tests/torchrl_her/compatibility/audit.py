@@ -71,6 +71,7 @@ class Rows:
         rows: of a storage, or of a sampled batch; any shape.
         log: what was collected.
         cut: [n] of bool, rows that a sampler of slices may have marked as truncated; None for no row.
+        marked: whether episodes that were not collected any further must be truncated where they stop.
 
     Attributes:
         key: [n], of the transition.
@@ -81,7 +82,9 @@ class Rows:
         AssertionError: a row is wrong.
     """
 
-    def __init__(self, rows: TensorDictBase, log: Log, cut: Tensor | None = None) -> None:
+    def __init__(
+        self, rows: TensorDictBase, log: Log, cut: Tensor | None = None, *, marked: bool = False
+    ) -> None:
         rows = rows.reshape(-1)
         self.rows, next_rows = rows, rows["next"]
         before, after, goal = rows["observation"], next_rows["observation"], rows["desired_goal"]
@@ -112,6 +115,9 @@ class Rows:
         ends = {key: next_rows[key].view(-1, 1) for key in ENDS}
         _all(ends["terminated"] == terminated, "terminated does not fit the goal")
         truncated = real["next", "truncated"]
+        if marked:
+            stops = ~log.find(self.key + 1)[1].view_as(truncated) & ~terminated
+            truncated = truncated | stops
         if cut is not None:  # a sampler may mark the ends of slices
             truncated = truncated | (cut.view_as(truncated) & ends["truncated"])
         _all(ends["truncated"] == truncated, "truncated is not the real row's")

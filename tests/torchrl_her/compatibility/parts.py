@@ -67,13 +67,14 @@ def audit(part: str, buffer: Any, log: Log, *, samples: int = 8) -> None:
     Raises:
         AssertionError: a row is wrong, one was lost or doubled, or there are no virtual ones.
     """
-    stored = buffer.storage[:]
+    stored, marked = buffer.storage[:], False
     if is_writer(part):
-        rows = Rows(stored, log)
+        marked = buffer.writer.options.per == "episode"
+        rows = Rows(stored, log, marked=marked)
         check_written(rows, log, held_back=buffer.writer.held_back, k=K, per=buffer.writer.options.per)
     else:
         check_stored(stored, log)
     for _ in range(samples):
-        virtual = Rows(buffer.sample(), log).virtual
+        virtual = Rows(buffer.sample(), log, marked=marked).virtual
         assert virtual.any(), "no virtual row was sampled"
         assert not virtual.all(), "no real row was sampled"

@@ -55,3 +55,10 @@ def test_a_collector_that_is_reset_does_not_overwrite_them() -> None:
     collector.reset()
     assert torch.equal(next(batches)["env_ids"], first)
     collector.shutdown()
+
+
+def test_a_clone_has_ids_of_its_own() -> None:
+    env = make()
+    own = ids_of(env)
+    other = TransformedEnv(make_env("bit_flip", num_envs=3), env.transform.clone())
+    assert not torch.isin(ids_of(other), own).any()

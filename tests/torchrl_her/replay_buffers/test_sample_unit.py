@@ -1004,3 +1004,14 @@ def test_prioritized_slices_of_two_dimensions_are_refused() -> None:
     buffer.extend(make_batch([[5], [5]]))
     with pytest.raises(ValueError, match="PrioritizedSliceSampler over a storage of 2 dimensions"):
         buffer.sample(4)
+
+
+def test_excluding_a_nested_entry_excludes_no_other_one() -> None:
+    buffer = make_buffer(n_steps=2, gamma=0.5, exclude=[("agent", "observation")])
+    batch = flat([[5]])
+    batch["agent", "observation"] = batch["observation"]
+    batch["next", "agent", "observation"] = batch["observation"]
+    buffer.extend(batch)
+    keys = set(buffer.sample(4).keys(True, True))
+    assert ("next", "observation") in keys
+    assert not {("agent", "observation"), ("next", "agent", "observation")} & keys

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import LazyStackStorage, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.sample_units import Sequence
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, SliceSampler
 from torchrl.envs.transforms import MultiStepTransform
 
@@ -995,3 +996,86 @@ def test_slices_of_a_list_are_refused() -> None:
     )
     with pytest.raises(ValueError, match="slices of a LazyStackStorage, .* use a LazyTensorStorage"):
         buffer.extend(make_batch([[5]]))
+
+
+def test_a_success_with_another_reward_is_no_fall() -> None:
+    """As with dense rewards: the reward function's end is that of the goal."""
+    dense = EnvReward(lambda a, d: REWARD(a, d)[0] - 0.1, lambda a, d: REWARD(a, d)[1])
+    batch = make_batch([[4]], terminated=True)
+    batch["next", "reward"] -= 0.1
+    batch["next", "desired_goal"][0, 3] = batch["next", "achieved_goal"][0, 3]
+    buffer = make_buffer(reward=dense, k=50)
+    buffer.extend(batch)
+    _, virtual = split(buffer)
+    reached = virtual["next", "achieved_goal"][:, 0] == virtual["desired_goal"][:, 0]
+    assert torch.equal(virtual["next", "terminated"][:, 0], reached)
+
+
+# Found by a reviewer
+
+
+def test_sequences_of_a_sample_unit_are_slices_too() -> None:
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100),
+        writer=HERWriter(REWARD),
+        sample_unit=Sequence(length=2),
+        batch_size=4,
+    )
+    with pytest.raises(ValueError, match="under a sampler of slices, HERWriter needs per='episode'"):
+        buffer.extend(make_batch([[5]]))
+
+
+def test_real_episodes_that_are_ended_from_outside_are_truncated_for_slices() -> None:
+    buffer = make_buffer(per="episode", k=1)
+    buffer.extend(make_batch([[9]], steps=3))
+    buffer.writer.end_episodes()
+    buffer.extend(make_batch([[4]], first=[(0, 0)]))
+    real, _ = split(buffer)
+    ends = [False, False, True, False, False, False, True]
+    assert real["next", "truncated"].flatten().tolist() == ends
+    assert real["next", "done"].flatten().tolist() == ends
+
+
+def test_an_id_that_is_used_twice_in_a_flat_batch_joins_no_episodes() -> None:
+    one, other = make_batch([[9]], steps=3).squeeze(0), make_batch([[9, 4]], first=[(1, 0)]).squeeze(0)[:4]
+    other["collector", "traj_ids"] = torch.zeros(4, dtype=torch.int64)
+    buffer = make_buffer(strategy="final", k=1)
+    buffer.extend(torch.cat((one, other)))
+    _, virtual = split(buffer)
+    goals = zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True)
+    assert {(o >= 100, g) for o, g in goals} == {(False, 3.0), (True, 104.0)}
+
+
+def test_sums_of_whole_numbers_keep_their_fractions() -> None:
+    batch = make_batch([[4]])
+    batch["next", "reward"] = batch["next", "reward"].long()
+    buffer = make_buffer(strategy="final", k=1, n_steps=2, gamma=0.5)
+    buffer.extend(batch)
+    assert buffer[:]["next", "reward"].unique().tolist() == [-1.5, -1.0, 0.0]
+
+
+def test_a_reward_function_may_leave_out_the_last_dimension() -> None:
+    flat = EnvReward(lambda a, d: REWARD(a, d)[0].squeeze(-1), lambda a, d: REWARD(a, d)[1].squeeze(-1))
+    for options in ({"n_steps": 2, "gamma": 0.5}, {"per": "episode"}):
+        one, other = make_buffer(reward=flat, **options), make_buffer(**options)
+        for buffer in (one, other):
+            buffer.extend(make_batch([[5, 3]]))
+        assert all(torch.equal(one[:][key], other[:][key]) for key in one[:].keys(True, True))
+
+
+def test_nothing_to_write_is_nothing() -> None:
+    buffer = make_buffer()
+    buffer.extend(make_batch([[9]], steps=3))
+    writer = buffer.writer
+    assert writer.extend(make_batch([[9]], steps=3)[:, :0]).shape == (1, 0)
+    assert writer.held_back == 3
+
+
+def test_an_emptied_writer_is_as_new() -> None:
+    buffer = make_buffer()
+    buffer.extend(make_batch([[9]], steps=3))
+    buffer.writer.load_state_dict(buffer.writer.state_dict())
+    buffer.empty()
+    buffer.extend(make_batch([[9]], steps=3))
+    with pytest.raises(ValueError, match="1 episodes are not over"):
+        buffer.extend(make_batch([[9], [9]], steps=3)[1:])

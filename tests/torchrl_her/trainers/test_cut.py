@@ -37,3 +37,10 @@ def test_ends_that_are_there_stay() -> None:
     batch["next", "terminated"][0, 2] = True  # what ended by itself was not cut
     batch["next", "done"][0, 2] = True
     assert not cut_episodes(batch)["next", "truncated"].any()
+
+
+def test_flat_transitions_without_ids_are_one_environment_s() -> None:
+    flags = {"truncated": torch.zeros(3, 1).bool(), "done": torch.zeros(3, 1).bool()}
+    batch = TensorDict({"next": flags}, [3])
+    assert cut_episodes(batch)["next", "truncated"].flatten().tolist() == [False, False, True]
+    assert cut_episodes(batch[:0]).shape == (0,)
