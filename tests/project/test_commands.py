@@ -36,6 +36,9 @@ def _nothing_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(torchrl_her_recipes, "build", build)
     monkeypatch.chdir(tmp_path)
     Path("docs").symlink_to(ROOT / "docs")
+    for page in PAGES:  # files that the commands name
+        for name, text in re.findall(r"```yaml\n# (\S+\.yaml)\n(.*?)```", page.read_text(), re.DOTALL):
+            Path(name).write_text(text)
 
 
 @pytest.mark.parametrize("command", [own for own in commands("train") if own != "train -h"])
@@ -46,9 +49,6 @@ def test_train(command: str) -> None:
 
 @pytest.mark.parametrize("command", [own for own in commands("study") if "--ray" not in own])
 def test_study(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    for page in PAGES:
-        for name, text in re.findall(r"```yaml\n# (\S+\.yaml)\n(.*?)```", page.read_text(), re.DOTALL):
-            Path(name).write_text(text)
     arguments = shlex.split(command)
     assert cli.main([*arguments, *([] if "--plan" in arguments else ["--plan"])]) == 0
     assert " batched runs to go, " in capsys.readouterr().out
