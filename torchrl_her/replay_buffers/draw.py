@@ -14,7 +14,7 @@ from torchrl_her.replay_buffers.episodes import Episodes
 from torchrl_her.replay_buffers.options import Per
 
 # Likelihoods of goals [transitions, T] that are held in memory at once.
-_LIKELIHOODS = 1 << 17
+LIKELIHOODS = 1 << 17
 
 Keep = Callable[[Tensor, Tensor], Tensor]
 
@@ -129,7 +129,7 @@ def _likelihoods(
     first, end = candidate_range(strategy, time, episodes.lengths[episode])
     goals = after[episodes.rows]
     horizon = goals.shape[1]
-    for part in torch.arange(len(time), device=time.device).split(max(1, _LIKELIHOODS // horizon)):
+    for part in torch.arange(len(time), device=time.device).split(max(1, LIKELIHOODS // horizon)):
         own = episode[part]
         yield combine(
             between(first[part], end[part], horizon),

@@ -30,6 +30,7 @@ from torchrl_her.goals.factors import combine, draw, draw_alike
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.strategies import candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
+from torchrl_her.replay_buffers.draw import LIKELIHOODS
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
 from torchrl_her.replay_buffers.keys import entry_of, failed
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_return, windows
@@ -44,9 +45,6 @@ from torchrl_her.replay_buffers.neighbors import (
 )
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.slices import slice_positions
-
-# Likelihoods of goals [transitions, T] that are held in memory at once.
-_LIKELIHOODS = 1 << 17
 
 
 class _Stored(NamedTuple):
@@ -93,6 +91,9 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     trajectory ids. Under samplers of slices, all transitions of a slice get the same goal: one that its last
     transition may take and, with the filter, that was not achieved before. A priority belongs to the real
     transition, whatever goal it had when the priority was computed.
+
+    After each write, the next batch looks through all that is stored for the ends of episodes: about 1 ms for
+    200,000 transitions on one core.
 
     Read stored transitions from the storage (``buffer.storage[:]``), not from the buffer. In a
     ``ReplayBufferEnsemble``, which samples without its members' units, this raises an error, too.
@@ -406,7 +407,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             return source, valid
         widest = int((end - first).max())
         steps = torch.arange(widest, device=first.device)
-        at_once = max(1, _LIKELIHOODS // (widest * group.shape[1]))
+        at_once = max(1, LIKELIHOODS // (widest * group.shape[1]))
         for part in torch.arange(len(group), device=first.device).split(at_once):
             width = (end - first)[part].unsqueeze(-1)
             candidate = stored.episodes.row(first[part].unsqueeze(-1) + steps.minimum(width - 1))
@@ -428,8 +429,8 @@ def _moved(entry: Tensor | None, device: torch.device) -> Tensor | None:
 def _oldest(storage: Storage) -> int:
     """The slot of a storage's oldest rows.
 
-    The writer's cursor tells: the storage's own last cursor is not restored with a checkpoint. If several
-    buffers share a storage, it is the cursor of the one that has written most.
+    The writer's cursor tells; TorchRL does not restore that of the storage. If several buffers share a
+    storage, it is the cursor of the one that has written most.
     """
     if not storage._is_full:
         return 0
