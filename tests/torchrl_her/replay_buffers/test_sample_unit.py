@@ -432,7 +432,7 @@ def test_goals_that_pass_the_filter_are_drawn_in_proportion(weighted: bool) -> N
 
 
 def test_many_rows_are_drawn_piece_by_piece(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchrl_her.replay_buffers.sample_unit._LIKELIHOODS", 64)
+    monkeypatch.setattr("torchrl_her.replay_buffers.sample_unit.LIKELIHOODS", 64)
     buffer = make_buffer(weights=PreferFar(), strategy="episode", k=NEVER_REAL)
     buffer.extend(along([5, 0, 1, 3]))
     rows = buffer.sample(3_000)
