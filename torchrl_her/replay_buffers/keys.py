@@ -64,6 +64,7 @@ def failed(
         achieved_reward: the reward of an achieved goal.
 
     Example:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_her import GoalReward, HindsightOptions
         >>> goals = {"achieved_goal": torch.tensor([[0.0], [5.0]]), "desired_goal": torch.zeros(2, 1)}
