@@ -52,6 +52,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(collections|pathlib|torch|tensordict|torchrl|numpy|gymnasium)\..*"),
     ("py:class", r"[^.]*"),  # types that are written as text
+    ("py:obj", r"typing\.Literal\[.*"),
     # Types that appear in signatures and that nobody has to name.
     ("py:class", r"torchrl_her\.replay_buffers\.keys\.TransitionKeys"),
     ("py:class", r"torchrl_her_envs\.throwing\.rendering\.render\.Scene"),

@@ -51,7 +51,7 @@ def find_episodes(lanes: Tensor, end: Tensor, order: Tensor | None = None) -> tu
         lanes: [n] int64, the environment or trajectory that each row is of. Rows of one lane are in the order
             of time, one episode after the other.
         end: [n] of bool, the last rows of episodes.
-        order: [n], from :func:`time_order`, if it is known already.
+        order: [n], from ``time_order``, if it is known already.
 
     Returns:
         ``(episodes, left)``: the whole episodes, and the positions [m] of all other rows, in order.

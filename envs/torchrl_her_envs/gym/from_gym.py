@@ -116,7 +116,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
     (float32 within the environment's bounds, or whole numbers [N]), ``terminated``, ``truncated``, ``done``.
     The environments are independent: environment k with a given seed does the same in every batch.
     Observations and goals that are dictionaries become vectors, in the order that
-    :class:`~torchrl_her_envs.gym.layout.Layout` tells; the environment's own functions get goals in their
+    ``torchrl_her_envs.gym.layout.Layout`` tells; the environment's own functions get goals in their
     original form.
 
     What ends an episode at its goal is the environment's ``compute_terminated``. If it has none,
