@@ -92,8 +92,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     transition may take and, with the filter, that was not achieved before. A priority belongs to the real
     transition, whatever goal it had when the priority was computed.
 
-    After each write, the next batch looks through all that is stored for the ends of episodes: about 1 ms for
-    200,000 transitions on one core.
+    After each write, the next batch looks through all that is stored for the ends of episodes.
 
     Read stored transitions from the storage (``buffer.storage[:]``), not from the buffer. In a
     ``ReplayBufferEnsemble``, which samples without its members' units, this raises an error, too.

@@ -285,12 +285,14 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         refuse_consuming("HERWriter", self._storage)
         refuse_slices("HERWriter", self._storage)
         refuse_priorities("HERWriter", self._storage, data)
-        if has_slices(self._storage) and self.k > 0 and self.options.per == "transition":
+        if not has_slices(self._storage):
+            return
+        if self.k > 0 and self.options.per == "transition":
             raise ValueError(
                 "under a sampler of slices, HERWriter needs per='episode': with per='transition' a slice "
                 "would hold copies of one transition for several goals, and no sequence"
             )
-        if has_slices(self._storage) and self.options.n_steps > 1:
+        if self.options.n_steps > 1:
             raise ValueError(
                 f"under a sampler of slices, HERWriter needs n_steps=1, got {self.options.n_steps}: "
                 "the steps of a slice follow each other already"

@@ -8,7 +8,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_her import LossLearner, make_critic, make_sac_loss, make_stochastic_actor
 
-from ..lost_game import SPEC, rows
+from ..lost_game import SPEC, rows, say
 
 
 def test_two_critics_learn_the_value_of_a_lost_game() -> None:
@@ -37,11 +37,7 @@ def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None
     )
     SoftUpdate(loss, tau=0.1)
     loss.log_alpha.data.fill_(-50.0)
-    for name, bias in (("qvalue_network_params", [0.0, 0.0]), ("target_qvalue_network_params", [-5.0, -7.0])):
-        params = getattr(loss, name)
-        for value in params.values(True, True):
-            value.data.zero_()
-        params["module", "rest", "2", "bias"].data.copy_(torch.tensor(bias).view(2, 1, 1, 1))
+    say(loss, [0.0, 0.0], [-5.0, -7.0])
     batch = rows(3, action=torch.rand(1, 3, 3))[0]
     batch["steps_to_next_obs"] = torch.tensor([[1], [2], [3]])
     loss(batch)
