@@ -2,19 +2,20 @@
 
     python benchmarks/env_speed.py --out env_speed.md
 
-All of them run in one process with one thread, take random actions that were drawn before, and reset worlds
-whose episode ends. The peer (``peer_env.py``) has a pymunk space for each world. It is timed as gymnasium
+All of them run in one process on one core, take random actions that were drawn before, and reset worlds
+whose episode ends. The peer (``peers/env.py``) has a pymunk space for each world. It is timed as gymnasium
 makes it, by ``gymnasium.make_vec``; where it is fastest, bare and without copies in a ``SyncVectorEnv``; and
-as TorchRL batches such environments, in a ``SerialEnv`` of ``GymWrapper``. Before anything is timed, paths
-of both are compared.
+as TorchRL batches such environments, in a ``SerialEnv`` of ``GymWrapper``. Our tasks are timed in TorchRL's
+form (``make_env``) and in gymnasium's (``make_vec``). A second table has single environments in gymnasium's
+form. Before anything is timed, paths of both are compared.
 """
 
 from __future__ import annotations
 
 import argparse
-import statistics
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,16 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import SyncVectorEnv, VectorEnv
-from machine import describe
-from peer_env import PeerEnv
+from machine import CLOCKS, describe, medians, one_core, publish, table
+from peers.env import PeerEnv
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, GymWrapper, SerialEnv
 
-from torchrl_her_envs import TASKS, ThrowingEnv, get_task, make_env
+from torchrl_her_envs import TASKS, ThrowingEnv, get_task, gym_id, make_env
 
 OURS, MADE, BARE, SERIAL = "this", "gymnasium.make_vec", "bare SyncVectorEnv", "SerialEnv"
+OURS_VECTOR = "this, make_vec"
+OURS_SINGLE, SINGLE, BARE_SINGLE = "this", "gymnasium.make", "bare"
 PACKAGES = ("torch", "torchrl", "pymunk", "gymnasium")
 PEER_ID = "torchrl_her_benchmarks/Peer-v0"
 HAND_TASKS = [name for name, task in TASKS.items() if task.effector == "hand" and task.throws]
@@ -64,6 +67,10 @@ def serial_peer(task: str, worlds: int) -> Step:
     return stepper(SerialEnv(worlds, lambda: GymWrapper(PeerEnv(get_task(task)))))
 
 
+def our_vector(task: str, worlds: int) -> Step:
+    return vector_stepper(gymnasium.make_vec(gym_id(get_task(task)), worlds))
+
+
 def made_peer(task: str, worlds: int) -> Step:
     return vector_stepper(gymnasium.make_vec(PEER_ID, worlds, vectorization_mode="sync", task=get_task(task)))
 
@@ -89,15 +96,35 @@ def vector_stepper(env: VectorEnv) -> Step:
     return step
 
 
+def single_stepper(env: gymnasium.Env) -> Step:
+    """Steps and resets of a single gymnasium environment."""
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (ACTIONS, 3)).astype(np.float32)
+    env.reset(seed=0)
+    count = 0
+
+    def step() -> None:
+        nonlocal count
+        _, _, terminated, truncated, _ = env.step(actions[count % ACTIONS])
+        if terminated or truncated:
+            env.reset()
+        count += 1
+
+    return step
+
+
 CONTENDERS: dict[str, Callable[[str, int], Step]] = {
     OURS: ours,
+    OURS_VECTOR: our_vector,
     MADE: made_peer,
     BARE: bare_peer,
     SERIAL: serial_peer,
 }
-
-
-PEERS = [name for name in CONTENDERS if name != OURS]
+SINGLES: dict[str, Callable[[str], gymnasium.Env]] = {
+    OURS_SINGLE: lambda task: gymnasium.make(gym_id(get_task(task))),
+    SINGLE: lambda task: gymnasium.make(PEER_ID, task=get_task(task)),
+    BARE_SINGLE: lambda task: PeerEnv(get_task(task)),
+}
+PEERS = [MADE, BARE, SERIAL]
 gymnasium.register(PEER_ID, entry_point=PeerEnv)
 
 
@@ -162,58 +189,89 @@ def steps_per_second(step: Step, worlds: int, seconds: float) -> float:
     return worlds * taken / (time.perf_counter() - start)
 
 
-def measure(task: str, worlds: int, *, repeats: int, seconds: float) -> dict[str, float]:
+def measure(
+    steps: dict[str, Step], worlds: int, *, repeats: int, seconds: float, clock: str
+) -> dict[str, float]:
     """The median speed of each contender, taken in turns so that a busy machine slows all of them alike."""
-    steps = {name: make(task, worlds) for name, make in CONTENDERS.items()}
-    for step in steps.values():
-        steps_per_second(step, worlds, seconds / 2)  # warms up, and spreads the ends of the episodes
-    speeds: dict[str, list[float]] = {name: [] for name in steps}
-    for _ in range(repeats):
-        for name, step in steps.items():
-            speeds[name].append(steps_per_second(step, worlds, seconds))
-    return {name: statistics.median(values) for name, values in speeds.items()}
+    # Half a second of steps warms up, spreads the ends of the episodes, and tells how many steps a run has.
+    counts = {name: steps_per_second(step, 1, 0.5) * seconds for name, step in steps.items()}
+
+    def run(step: Step, count: int) -> int:
+        for _ in range(count):
+            step()
+        return count * worlds
+
+    work = {name: partial(run, step, max(1, int(counts[name]))) for name, step in steps.items()}
+    return {name: 1.0 / each for name, each in medians(work, repeats=repeats, clock=clock).items()}
 
 
 # Report
 
 
-def report(task: str, rows: dict[int, dict[str, float]], difference: float, repeats: int) -> str:
+def batches(rows: dict[int, dict[str, float]]) -> str:
+    header = ["environments", *(f"over {name}" for name in PEERS), "make_vec over make_env", "this, steps/s"]
     lines = [
-        f"Environment steps a second of `{task}` with random actions and automatic resets; medians of "
-        f"{repeats} runs taken in turns. Same starts and actions gave paths at most {difference:.0e} apart.",
-        "",
-        f"{describe(*PACKAGES)}.",
-        "",
-        "| worlds | " + " | ".join(f"over {name}" for name in PEERS) + " | this, steps/s |",
-        "| ---: |" + " ---: |" * (len(PEERS) + 1),
+        [
+            f"{worlds:,}",
+            *(f"{speed[OURS] / speed[name]:.2f}x" for name in PEERS),
+            f"{speed[OURS_VECTOR] / speed[OURS]:.2f}x",
+            f"{speed[OURS]:,.0f}",
+        ]
+        for worlds, speed in rows.items()
     ]
-    for worlds, speed in rows.items():
-        ratios = " | ".join(f"{speed[OURS] / speed[name]:.1f}x" for name in PEERS)
-        lines.append(f"| {worlds:,} | {ratios} | {speed[OURS]:,.0f} |")
-    return "\n".join(lines)
+    return table(header, lines)
+
+
+def singles(speed: dict[str, float]) -> str:
+    peers = [SINGLE, BARE_SINGLE]
+    line = [*(f"{speed[OURS_SINGLE] / speed[name]:.2f}x" for name in peers), f"{speed[OURS_SINGLE]:,.0f}"]
+    return table([*(f"over the peer, {name}" for name in peers), "this, steps/s"], [line])
+
+
+def report(task: str, parts: Sequence[str], difference: float, *, repeats: int, clock: str) -> str:
+    timed = "" if clock == "wall" else " Times are those that the process had the core."
+    return "\n\n".join(
+        [
+            f"Environment steps a second of `{task}` with random actions and automatic resets; medians of "
+            f"{repeats} runs taken in turns. Same starts and actions gave paths at most {difference:.0e} "
+            f"apart.{timed}",
+            f"{describe(*PACKAGES)}.",
+            *parts,
+        ]
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--task", default="hand_v1", choices=HAND_TASKS)
-    parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS, help="numbers of worlds")
+    parser.add_argument("--worlds", type=int, nargs="*", default=WORLDS, help="numbers of worlds")
     parser.add_argument("--repeats", type=int, default=7, help="timed runs of each")
     parser.add_argument("--seconds", type=float, default=0.3, help="length of a timed run")
+    parser.add_argument(
+        "--clock", choices=CLOCKS, default="wall", help="cpu leaves out what other work takes"
+    )
     parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
     options = parser.parse_args(arguments)
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    difference = largest_difference(options.task)
-    if difference > SAME:
-        raise RuntimeError(f"the peer is another world: paths of {options.task} differ by {difference:.1e}")
-    rows = {
-        worlds: measure(options.task, worlds, repeats=options.repeats, seconds=options.seconds)
-        for worlds in options.worlds
-    }
-    table = report(options.task, rows, difference, options.repeats)
-    print(table)
-    if options.out is not None:
-        options.out.write_text(table + "\n")
+    timing = {"repeats": options.repeats, "seconds": options.seconds, "clock": options.clock}
+    with one_core():
+        torch.set_num_threads(1)
+        torch.manual_seed(0)
+        difference = largest_difference(options.task)
+        if difference > SAME:
+            raise RuntimeError(
+                f"the peer is another world: paths of {options.task} differ by {difference:.1e}"
+            )
+        rows = {
+            worlds: measure(
+                {name: make(options.task, worlds) for name, make in CONTENDERS.items()}, worlds, **timing
+            )
+            for worlds in options.worlds
+        }
+        single = {name: single_stepper(make(options.task)) for name, make in SINGLES.items()}
+        parts = [batches(rows), "A single environment:", singles(measure(single, 1, **timing))]
+    publish(
+        report(options.task, parts, difference, repeats=options.repeats, clock=options.clock), options.out
+    )
 
 
 if __name__ == "__main__":

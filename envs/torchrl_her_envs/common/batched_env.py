@@ -17,6 +17,8 @@ from torchrl.envs import EnvBase
 from torchrl_her_envs.common.goal_env import TaskTraits
 from torchrl_her_envs.common.seeding import block_keys
 
+_ENDS = ("done", "terminated", "truncated")
+
 
 class BatchedEnv(TaskTraits, EnvBase):
     """N environments whose state is a dataclass of tensors with N rows, and a random key for each of them.
@@ -47,6 +49,7 @@ class BatchedEnv(TaskTraits, EnvBase):
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(device="cpu", batch_size=(num_envs,))
+        self._packed = False  # whether what is shown was checked
 
     # What subclasses say
 
@@ -93,7 +96,10 @@ class BatchedEnv(TaskTraits, EnvBase):
 
     def world_state_dict(self) -> dict[str, Tensor]:
         """A copy of the whole state, row by row; loading it resumes exactly from here."""
-        state = {field.name: getattr(self.worlds, field.name).clone() for field in fields(self.worlds)}
+        state: dict[str, Tensor] = {
+            field.name: getattr(self.worlds, field.name).clone(memory_format=torch.contiguous_format)
+            for field in fields(self.worlds)
+        }
         return state | {"key": torch.from_numpy(self._keys.view(np.int64).copy())}
 
     def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -122,18 +128,25 @@ class BatchedEnv(TaskTraits, EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         which = torch.arange(self.batch_size[0]) if mask is None else mask.view(-1).nonzero().squeeze(-1)
-        self.worlds.episode[which] += 1
-        self.worlds.step[which] = 0
-        self._start_episodes(which)
-        shown = self._show()
-        off = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
-        shown.update({"done": off, "terminated": off.clone(), "truncated": off.clone()})
-        # With the device that it has anyway: otherwise TorchRL copies every entry.
-        return TensorDict(shown, batch_size=self.batch_size, device=self.device)
+        shown = self._begin(which)
+        return self._pack(
+            {**shown, **{key: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for key in _ENDS}}
+        )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
         self._check_action(action)
+        return self._pack(self._take(action))
+
+    def _begin(self, which: Tensor) -> dict[str, Tensor]:
+        """Begins the next episodes of the given environments [M]; returns what all N of them show."""
+        self.worlds.episode[which] += 1
+        self.worlds.step[which] = 0
+        self._start_episodes(which)
+        return self._show()
+
+    def _take(self, action: Tensor) -> dict[str, Tensor]:
+        """Takes a step with checked actions; returns all that the environments show and say after it."""
         self.worlds.step = self.worlds.step + 1
         cut = self._advance(action)
         shown = self._show()
@@ -142,8 +155,41 @@ class BatchedEnv(TaskTraits, EnvBase):
         if cut is not None:
             truncated = truncated | cut.unsqueeze(-1)
         shown["reward"] = terminated.to(self.dtype_shown) - 1.0
-        shown.update({"terminated": terminated, "truncated": truncated, "done": terminated | truncated})
-        return TensorDict(shown, batch_size=self.batch_size, device=self.device)
+        return {**shown, "terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+
+    def _pack(self, entries: dict[str, Tensor]) -> TensorDictBase:
+        # With the device that it has anyway: otherwise TorchRL copies every entry.
+        made = {"batch_size": self.batch_size, "device": self.device}
+        if not self._packed:
+            self._packed = True
+            return TensorDict(entries, **made)
+        # TensorDict's checks take longer than a step does, and once is enough: shapes do not change.
+        return TensorDict._new_unsafe(entries, **made)
+
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        """TorchRL completes here what a step left out, and brings it into shape: there is nothing to do."""
+        if self.run_type_checks:
+            return super()._step_proc_data(next_tensordict_out)
+        return next_tensordict_out
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Begins new episodes where the old ones are over, as :meth:`EnvBase.maybe_reset` does.
+
+        TorchRL's own takes longer than a step of a hundred environments, and with many of them there is an
+        end in nearly every step. This one writes the new rows and checks nothing: they are known to be right.
+        """
+        done = tensordict.get("done", None)
+        if done is None or not all(type(own) in (Tensor, TensorDict) for own in tensordict.values()):
+            return super().maybe_reset(tensordict)
+        if not bool(done.any()):
+            return tensordict
+        entries: dict[str, Any] = self._begin(done.view(-1).nonzero().squeeze(-1))
+        for key, own in tensordict.items():
+            if key in entries:
+                entries[key] = torch.where(done, entries[key], own)
+            else:  # what is over: an action, the ends, or the memory of a policy
+                entries[key] = _cleared(own, done)
+        return self._pack(entries)
 
     def _make_specs(
         self, observed: int, goals: int, *, seen: Callable[[tuple[int, int]], TensorSpec], action: TensorSpec
@@ -171,3 +217,10 @@ class BatchedEnv(TaskTraits, EnvBase):
         self.action_spec = action
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype_shown)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
+
+
+def _cleared(entry: Tensor | TensorDictBase, rows: Tensor) -> Any:
+    """An entry [N, ...] with zeros in some rows [N, 1]."""
+    if isinstance(entry, Tensor):
+        return entry.masked_fill(rows.view(-1, *[1] * (entry.ndim - 1)), 0)
+    return entry.apply(lambda own: _cleared(own, rows))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from numbers import Integral
+from typing import overload
 
 import numpy as np
 import torch
@@ -73,7 +74,15 @@ def as_seeds(seed: int | Sequence[int]) -> list[int]:
     return [int(seed)] if isinstance(seed, int | Integral) else [int(own) for own in seed]
 
 
-def uniform(keys: np.ndarray, episodes: Tensor, count: int) -> Tensor:
+@overload
+def uniform(keys: np.ndarray, episodes: np.ndarray, count: int) -> np.ndarray: ...
+
+
+@overload
+def uniform(keys: np.ndarray, episodes: Tensor, count: int) -> Tensor: ...
+
+
+def uniform(keys: np.ndarray, episodes: np.ndarray | Tensor, count: int) -> np.ndarray | Tensor:
     """Uniform numbers in [0, 1) for given episodes of given environments.
 
     Args:
@@ -82,14 +91,16 @@ def uniform(keys: np.ndarray, episodes: Tensor, count: int) -> Tensor:
         count: how many numbers an episode needs, at most 256.
 
     Returns:
-        Tensor [M, count] of float64.
+        [M, count] of float64: an array for an array, a tensor for a tensor.
 
     Example:
         >>> u = uniform(env_keys(0, 2), torch.tensor([0, 0]), 3)
         >>> u.shape, bool(((u >= 0) & (u < 1)).all())
         (torch.Size([2, 3]), True)
     """
-    first = episodes.numpy().astype(np.uint64) * np.uint64(256)
+    if isinstance(episodes, Tensor):
+        return torch.from_numpy(uniform(keys, episodes.numpy(), count))
+    first = episodes.astype(np.uint64) * np.uint64(256)
     counter = first[:, None] + np.arange(1, count + 1, dtype=np.uint64)
     bits = _mix(keys[:, None] + counter * _GOLDEN)
-    return torch.from_numpy((bits >> np.uint64(11)).astype(np.float64) * 2.0**-53)
+    return (bits >> np.uint64(11)).astype(np.float64) * 2.0**-53

@@ -7,26 +7,26 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 
-from torchrl_her_envs.throwing.env import ThrowingEnv
+from torchrl_her_envs.throwing.core import ThrowingCore
 from torchrl_her_envs.throwing.rendering.canvas import check_size
+from torchrl_her_envs.throwing.rendering.render import render
+from torchrl_her_envs.throwing.rules import reward_of
 from torchrl_her_envs.throwing.tasks import WorldConfig, get_task
 
 Observation = dict[str, Any]  # arrays
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
 FPS = 25
+_FIRST = np.zeros(1, np.int64)  # the index of the only environment
 _NO_LIMIT = 1 << 60  # steps: gymnasium's TimeLimit truncates
 
 
 class GoalRules:
     """The functions of goals that gymnasium's GoalEnv asks for, for one pair of goals or many."""
 
-    _env: ThrowingEnv
+    _core: ThrowingCore
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
         """The reward of having achieved one goal when another was desired.
@@ -39,15 +39,19 @@ class GoalRules:
         Returns:
             [...] of float: 0 where they are nearer than the task's threshold, -1 elsewhere.
         """
-        return _plain(self._env.compute_reward(_tensor(achieved_goal), _tensor(desired_goal)))
+        rewards = reward_of(self._achieved(achieved_goal, desired_goal))
+        return rewards.astype(np.result_type(achieved_goal, np.float16))[()]
 
     def compute_terminated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
         """Whether the goal is achieved, which ends an episode: [...] of bool."""
-        return _plain(self._env.compute_terminated(_tensor(achieved_goal), _tensor(desired_goal)))
+        return self._achieved(achieved_goal, desired_goal)[()]
 
     def compute_truncated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
         """Never, whatever the goals: the time limit alone cuts episodes off. [...] of bool."""
         return np.zeros(np.shape(achieved_goal)[:-1], np.bool_)[()]
+
+    def _achieved(self, achieved_goal: Any, desired_goal: Any) -> np.ndarray:
+        return self._core.achieved(np.asarray(achieved_goal), np.asarray(desired_goal))
 
 
 class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
@@ -91,8 +95,8 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         threshold: float | None = None,
     ) -> None:
         check_pictures(render_mode, self.metadata["render_modes"], size)
-        self._env = make_batch(task, 1, _NO_LIMIT, world=world, num_links=num_links, threshold=threshold)
-        self.observation_space, self.action_space = spaces_of(self._env)
+        self._core = make_core(task, 1, _NO_LIMIT, world=world, num_links=num_links, threshold=threshold)
+        self.observation_space, self.action_space = spaces_of(self._core)
         self.render_mode = render_mode
         self._size = size
         self._window: Any = None
@@ -109,11 +113,11 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         """
         super().reset(seed=seed, options=options)
         if seed is not None or not self._seeded:
-            self._env.set_seeds([as_seed(self.np_random_seed)])
+            self._core.set_seeds([as_seed(self.np_random_seed)])
             self._seeded = True
-        shown = self._env.reset()
+        self._core.begin(_FIRST)
         self._show()
-        return self._first(shown), {}
+        return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One step of 0.04 s.
@@ -121,11 +125,14 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         Raises:
             ValueError: an action that is not finite.
         """
-        taken = TensorDict({"action": _tensor(action).float().unsqueeze(0)}, batch_size=[1])
-        after = self._env.step(taken)["next"]
-        self._show()
-        terminated = bool(after["terminated"])
-        return self._first(after), float(after["reward"]), terminated, False, {"is_success": terminated}
+        core = self._core
+        core.advance(np.asarray(action, np.float32)[None])
+        shown = self._observation()
+        achieved = core.achieved(shown["achieved_goal"], shown["desired_goal"])
+        terminated = bool(achieved)
+        if self.render_mode == "human":
+            self._show()
+        return shown, reward_of(terminated), terminated, False, {"is_success": terminated}
 
     def render(self) -> np.ndarray | None:
         """A picture [size, size, 3] of uint8; None where a window shows it, or without a render mode."""
@@ -137,11 +144,16 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
             self._window.close()
             self._window = None
 
-    def _first(self, shown: TensorDictBase) -> Observation:
-        return {key: shown[key][0].numpy() for key in KEYS}
+    def _observation(self) -> Observation:
+        (state,) = self._core.show_state()  # a new array: nobody else has it
+        return {
+            "observation": state[:-2],
+            "achieved_goal": state[self._core.achieved_index].copy(),  # it is in the observation, too
+            "desired_goal": state[-2:],
+        }
 
     def _picture(self) -> np.ndarray:
-        return self._env.render(0, size=self._size).numpy()
+        return render(self._core, 0, size=self._size).numpy()
 
     def _show(self) -> None:
         """Shows the present picture in the window, if one was asked for."""
@@ -152,17 +164,17 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
                 Window,
             )
 
-            self._window = Window(self._env.task.summary, fps=1 / self._env.world.time_step)
+            self._window = Window(self._core.task.summary, fps=1 / self._core.world.time_step)
         self._window.show(self._picture())
 
 
-def make_batch(
+def make_core(
     task: str, num_envs: int, max_steps: int, *, world: WorldConfig | None = None, **options: Any
-) -> ThrowingEnv:
-    """A batch of environments whose episodes have a given length."""
-    return ThrowingEnv(
+) -> ThrowingCore:
+    """A batch of worlds whose episodes have a given length."""
+    return ThrowingCore(
         get_task(task),
-        num_envs=num_envs,
+        num_envs,
         world=replace(world or WorldConfig(), max_steps=max_steps),
         **options,
     )
@@ -185,30 +197,22 @@ def as_seed(seed: int | None) -> int:
     return (seed or 0) % (1 << 64)
 
 
-def spaces_of(env: ThrowingEnv) -> tuple[spaces.Dict, spaces.Box]:
+def spaces_of(core: ThrowingCore) -> tuple[spaces.Dict, spaces.Box]:
     """The spaces of observations and actions of a single environment."""
-    limit = _largest(env)
+    limit = _largest(core)
+    widths = dict(zip(KEYS, (core.observation_size, 2, 2), strict=True))
     shown: dict[str, spaces.Space] = {
-        key: spaces.Box(-limit, limit, env.observation_spec[key].shape[1:], np.float32) for key in KEYS
+        key: spaces.Box(-limit, limit, (width,), np.float32) for key, width in widths.items()
     }
-    return spaces.Dict(shown), spaces.Box(-1.0, 1.0, env.action_spec.shape[1:], np.float32)
+    return spaces.Dict(shown), spaces.Box(-1.0, 1.0, (core.effector.num_joints + 1,), np.float32)
 
 
-def _largest(env: ThrowingEnv) -> float:
+def _largest(core: ThrowingCore) -> float:
     """A bound on all numbers that are shown: positions are about [-1, 1], but falling balls are fast."""
-    world, effector = env.world, env.effector
+    world, effector = core.world, core.effector
     fastest = 2**0.5 * world.hand_speed
-    if env.task.effector == "arm":  # each joint turns all links behind it
+    if core.task.effector == "arm":  # each joint turns all links behind it
         fastest = world.joint_speed * world.arm_length * (effector.num_joints + 1) / 2
     falling = (fastest**2 + 2 * world.gravity * world.size) ** 0.5
     places = max(abs(2 * side - 1) for side in (0.0, 1.0, *effector.reach))
     return 1.01 * max(places, falling / world.hand_speed)
-
-
-def _tensor(values: Any) -> Tensor:
-    return torch.tensor(np.asarray(values))  # a copy: torch warns of arrays that must not be written
-
-
-def _plain(values: Tensor) -> Any:
-    """[..., 1] as an array [...], or as a number if that is all there is."""
-    return values.squeeze(-1).numpy()[()]

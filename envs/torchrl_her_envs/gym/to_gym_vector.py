@@ -6,25 +6,23 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from tensordict import TensorDict, TensorDictBase
 
 from torchrl_her_envs.gym.to_gym import (
     FPS,
-    KEYS,
     GoalRules,
     Observation,
     as_seed,
     check_pictures,
-    make_batch,
+    make_core,
     spaces_of,
 )
+from torchrl_her_envs.throwing.core import Shown
+from torchrl_her_envs.throwing.rendering.render import render
+from torchrl_her_envs.throwing.rules import reward_of
 from torchrl_her_envs.throwing.tasks import WorldConfig
-
-_OUTCOME = ("reward", "terminated", "truncated")
 
 Step = tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 
@@ -75,9 +73,9 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         **options: Any,
     ) -> None:
         check_pictures(render_mode, self.metadata["render_modes"], size)
-        self._env = make_batch(task, num_envs, max_episode_steps, **options)
+        self._core = make_core(task, num_envs, max_episode_steps, **options)
         self.num_envs = num_envs
-        self.single_observation_space, self.single_action_space = spaces_of(self._env)
+        self.single_observation_space, self.single_action_space = spaces_of(self._core)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -85,7 +83,6 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self._size = size
         self._over = np.zeros(num_envs, np.bool_)  # whose episode is over
-        self._shown: TensorDictBase | None = None  # by the last step or reset
         self._seeded = False
 
     def reset(
@@ -110,7 +107,8 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
             raise ValueError("seed and reset_mask must not be given together")
         if seed is not None or not self._seeded:
             self._set_seeds(seed)
-        return _arrays(self._begin(mask)), {}
+        self._begin(mask)
+        return _dict(self._core.show()), {}
 
     def step(self, actions: np.ndarray) -> Step:
         """One step of 0.04 s in all environments.
@@ -122,26 +120,29 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         before = self._over
         if not self._seeded or (self.autoreset_mode is AutoresetMode.DISABLED and before.any()):
             raise ResetNeeded("reset must be called before step, for each environment whose episode is over")
-        taken = torch.tensor(np.asarray(actions, np.float32))
-        after = self._env.step(TensorDict({"action": taken}, batch_size=[self.num_envs]))["next"]
-        self._shown = after
-        reward, terminated, truncated = (after[key].squeeze(-1).numpy() for key in _OUTCOME)
+        core = self._core
+        core.advance(np.asarray(actions, np.float32))
+        shown = core.show()
+        terminated, truncated = core.achieved(shown.achieved_goal, shown.desired_goal), core.out_of_time()
+        reward = reward_of(terminated).astype(np.float32)
         info = {"is_success": terminated, "_is_success": np.ones_like(terminated)}
         self._over = terminated | truncated
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any():
-            after = self._begin(before)
+            self._begin(before)
+            shown = core.show()
             for entry in (reward, terminated, truncated, info["_is_success"]):
                 entry[before] = 0
         elif self.autoreset_mode is AutoresetMode.SAME_STEP and self._over.any():
-            info = _ended(_arrays(after), terminated, self._over)
-            after = self._begin(self._over)
-        return _arrays(after), reward, terminated, truncated, info
+            info = _ended(_dict(shown), terminated, self._over)
+            self._begin(self._over)
+            shown = core.show()
+        return _dict(shown), reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture [size, size, 3] of uint8 for each environment; None without a render mode."""
         if self.render_mode is None:
             return None
-        return tuple(self._env.render(None, size=self._size).numpy())
+        return tuple(render(self._core, None, size=self._size).numpy())
 
     def _set_seeds(self, seed: int | Sequence[int] | None) -> None:
         if seed is None or isinstance(seed, int | np.integer):
@@ -154,22 +155,18 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
                 raise ValueError(
                     f"{len(seeds)} seeds for {self.num_envs} environments: give one, or one for each"
                 )
-        self._env.set_seeds(seeds)
+        self._core.set_seeds(seeds)
         self._seeded = True
 
-    def _begin(self, mask: np.ndarray) -> TensorDictBase:
-        """Begins new episodes in some environments, and gives what all of them show."""
+    def _begin(self, mask: np.ndarray) -> None:
+        """Begins new episodes in some environments."""
         self._over = self._over & ~mask
-        if self._shown is None or mask.all():
-            self._shown = self._env.reset()
-        else:  # TorchRL writes into what it is given, and that was handed out
-            chosen = torch.from_numpy(mask).unsqueeze(-1)
-            self._shown = self._env.reset(self._shown.select(*KEYS).clone().set("_reset", chosen))
-        return self._shown
+        self._core.begin(mask.nonzero()[0])
 
 
-def _arrays(shown: TensorDictBase) -> Observation:
-    return {key: shown[key].numpy() for key in KEYS}
+def _dict(shown: Shown) -> Observation:
+    _, observation, achieved_goal, desired_goal = shown
+    return {"observation": observation, "achieved_goal": achieved_goal, "desired_goal": desired_goal}
 
 
 def _ended(shown: Observation, terminated: np.ndarray, over: np.ndarray) -> dict[str, Any]:

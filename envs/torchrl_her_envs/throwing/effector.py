@@ -4,42 +4,49 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from torch import Tensor
+from torchrl_her_envs.throwing.arrays import Array
 
 
 class Effector(Protocol):
     """A hand or an arm: pure functions of its joints (for a hand, its position), in meters.
 
+    They take NumPy arrays or tensors and give the same; ``move_one`` and ``grip_one`` do it for the joints
+    of a single one as plain numbers, which is several times as fast as arrays of one.
+
     ``num_joints`` is the number of joints, ``action_speed`` the speed that an action of 1 asks for,
-    ``observation_size`` the number of entries that :meth:`observe` gives, ``grip_index`` the two of them
-    that are the grip's position, and ``reach`` the box around what the grip can reach: left, bottom,
-    right and top, in fractions of the screen.
+    ``reach`` the box around what the grip can reach: left, bottom, right and top, in fractions of the
+    screen. ``shown`` names what the agent sees of it, in that order: ``cosines`` and ``sines`` (of all
+    joints), ``grip``, ``joint_velocity``, ``grip_velocity``, ``closed``; ``observation_size`` is the number
+    of entries that makes, and ``grip_index`` the two of them that are the grip's position.
     """
 
     num_joints: int
     action_speed: float
+    shown: tuple[str, ...]
     observation_size: int
     reach: tuple[float, float, float, float]
     grip_index: tuple[int, int]
 
-    def sample(self, u: Tensor) -> Tensor:
+    def sample(self, u: Array) -> Array:
         """Start positions of the joints, [..., num_joints], from as many numbers in [0, 1)."""
         ...
 
-    def move(self, joints: Tensor, change: Tensor) -> Tensor:
+    def move(self, joints: Array, change: Array) -> Array:
         """The joints after a change of [..., num_joints], kept within their limits."""
         ...
 
-    def grip(self, joints: Tensor) -> Tensor:
+    def move_one(self, joints: list[float], change: list[float]) -> list[float]:
+        """The same of one."""
+        ...
+
+    def grip(self, joints: Array) -> Array:
         """Position [..., 2] of what grips."""
         ...
 
-    def observe(
-        self, joints: Tensor, speed: Tensor, grip: Tensor, grip_speed: Tensor, closed: Tensor
-    ) -> Tensor:
-        """The entries [..., observation_size] that the agent sees of it, from scaled quantities."""
+    def grip_one(self, joints: list[float]) -> list[float]:
+        """The same of one."""
         ...
 
-    def skeleton(self, joints: Tensor) -> Tensor:
+    def skeleton(self, joints: Array) -> Array:
         """Points [..., n, 2] to draw lines between, the grip last."""
         ...

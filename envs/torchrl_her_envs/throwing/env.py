@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torchrl.data import Bounded, Unbounded
@@ -13,18 +15,22 @@ from torchrl.envs import EnvBase
 
 from torchrl_her_envs.common.batched_env import BatchedEnv
 from torchrl_her_envs.common.goal_env import Box, first_below
-from torchrl_her_envs.common.seeding import as_seeds, uniform
-from torchrl_her_envs.throwing.arm import Arm
-from torchrl_her_envs.throwing.effector import Effector
-from torchrl_her_envs.throwing.goals import BoxGoals, GoalDistribution, SectorGoals
-from torchrl_her_envs.throwing.hand import Hand
-from torchrl_her_envs.throwing.physics import BallPhysics
+from torchrl_her_envs.common.seeding import as_seeds
+from torchrl_her_envs.throwing.arrays import within
+from torchrl_her_envs.throwing.core import ThrowingCore
+from torchrl_her_envs.throwing.goals import GoalDistribution
 from torchrl_her_envs.throwing.rendering.canvas import MARGIN
 from torchrl_her_envs.throwing.rendering.render import render
+from torchrl_her_envs.throwing.rules import reward_of
 from torchrl_her_envs.throwing.state import WorldState
 from torchrl_her_envs.throwing.tasks import Task, WorldConfig
 
 _PICTURE = 300  # pixels of a side, unless told otherwise
+_OF_NUMPY: dict[torch.dtype, type[np.floating]] = {  # types that NumPy has too
+    torch.float16: np.float16,
+    torch.float32: np.float32,
+    torch.float64: np.float64,
+}
 
 
 class ThrowingEnv(BatchedEnv):
@@ -52,7 +58,7 @@ class ThrowingEnv(BatchedEnv):
         world: the constants of the physics.
         effector: the hand or the arm.
         threshold: how near to the goal is achieved, in shown coordinates.
-        worlds: the state of all environments.
+        worlds: the state of all environments, which every step writes to: clone what you want to keep.
 
     Raises:
         ValueError: ``num_envs`` or ``num_links`` is below 1, ``threshold`` is not positive, or ``dtype`` is
@@ -76,34 +82,28 @@ class ThrowingEnv(BatchedEnv):
         threshold: float | None = None,
         dtype: torch.dtype | str = "float32",
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        if threshold is not None and not threshold > 0:
-            raise ValueError(f"threshold must be positive, got {threshold}")
-        super().__init__(num_envs)
-        self.task = task
-        self.world = world or WorldConfig()
-        self.max_steps = self.world.max_steps
-        self.dtype_shown = _as_dtype(dtype)
-        self.effector: Effector = (
-            Hand(self.world, wall=task.wall)
-            if task.effector == "hand"
-            else Arm(self.world, num_links=num_links)
+        shown = _as_dtype(dtype)
+        core = ThrowingCore(
+            task,
+            num_envs,
+            world=world,
+            num_links=num_links,
+            threshold=threshold,
+            dtype=_OF_NUMPY.get(shown, np.float64),
         )
-        own = self.world.hole_radius if task.throws else self.world.ball_radius
-        self.threshold = self.world.shown(own) if threshold is None else threshold
-        self._catch = self.world.ball_radius * self.world.size
-        self._ball_starts = self._make_ball_starts()
-        self._goals: GoalDistribution = self._make_goals()
-        self.worlds = WorldState.zeros(num_envs, self.effector.num_joints)
+        super().__init__(num_envs)
+        self.dtype_shown, self._native = shown, shown in _OF_NUMPY
+        self._core = core
+        self.task, self.world, self.effector, self.threshold = task, core.world, core.effector, core.threshold
+        self.max_steps = self.world.max_steps
+        self.worlds: WorldState = core.worlds
         shape = (num_envs, self.effector.num_joints + 1)
         self._make_specs(
-            self.effector.observation_size + (4 if task.throws else 0),
+            core.observation_size,
             2,
             seen=partial(Unbounded, dtype=self.dtype_shown),
             action=Bounded(low=-1.0, high=1.0, shape=shape, dtype=self.dtype_shown),
         )
-        self._physics: list[BallPhysics] = []
         self.set_seeds(as_seeds(seed))
 
     # What the task is
@@ -115,7 +115,7 @@ class ThrowingEnv(BatchedEnv):
     @property
     def goal_distribution(self) -> GoalDistribution:
         """The distribution of desired goals, in the coordinates that the agent sees."""
-        return self._goals
+        return self._core.goal_distribution
 
     @property
     def goal_sigma(self) -> float:
@@ -132,7 +132,8 @@ class ThrowingEnv(BatchedEnv):
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """Whether goals [..., 2] are nearer to each other than the threshold: [..., 1] of bool."""
-        return _near(achieved_goal, desired_goal, self.threshold).unsqueeze(-1)
+        (x, y), (other_x, other_y) = achieved_goal.unbind(-1), desired_goal.unbind(-1)
+        return within(x - other_x, y - other_y, self.threshold).unsqueeze(-1)
 
     def layers(self) -> list[dict[str, Any]]:
         """Two layers: reach the ball; then throw it into the black hole.
@@ -194,7 +195,7 @@ class ThrowingEnv(BatchedEnv):
         """The boxes around where goals lie (``"goals"``) and what the hand or arm reaches (``"reach"``)."""
         left, bottom, right, top = (2.0 * side - 1.0 for side in self.effector.reach)
         return {
-            "goals": (self._goals.low.tolist(), self._goals.high.tolist()),
+            "goals": (self.goal_distribution.low.tolist(), self.goal_distribution.high.tolist()),
             "reach": ([left, bottom], [right, top]),
         }
 
@@ -226,126 +227,58 @@ class ThrowingEnv(BatchedEnv):
         """
         return render(self, worlds, size=_PICTURE if size is None else size, trail=trail, caption=caption)
 
-    def set_seeds(self, seeds: Sequence[int]) -> None:
-        super().set_seeds(seeds)
-        if len(self._physics) != len(seeds):
-            # A space for each block: the last bits of a ball's path depend on where its world lies in it.
-            size = self.batch_size[0] // len(seeds)
-            self._physics = [BallPhysics(size, self.world, wall=self.task.wall) for _ in seeds]
+    # The state
+
+    @property
+    def _keys(self) -> np.ndarray:
+        return self._core.keys
+
+    @_keys.setter
+    def _keys(self, keys: np.ndarray) -> None:
+        self._core.keys = keys
+
+    def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
+        for field in fields(self.worlds):  # in place: the core has the same memory
+            getattr(self.worlds, field.name).copy_(state[field.name])
+        self._keys = state["key"].numpy().copy().view(np.uint64)
 
     # One step, and the start of an episode
 
     def _check_action(self, action: Tensor) -> None:
-        if action.shape != self.action_spec.shape:
-            expected = list(self.action_spec.shape)
-            raise ValueError(f"actions must be of shape {expected}, got {list(action.shape)}")
-        if not bool(action.isfinite().all()):
-            bad = (~action.isfinite()).any(-1).nonzero().flatten().tolist()
-            raise ValueError(f"actions must be finite, got {action[bad[0]].tolist()} in environment {bad[0]}")
-
-    def _advance(self, action: Tensor) -> None:
-        """Opens or closes the grip, moves, lets the free balls fly, and catches."""
-        action = action.to(torch.float64).clamp(-1.0, 1.0)
-        w, dt = self.worlds, self.world.time_step
-        closed = action[:, -1] > 0
-        released = w.held & ~closed
-        # A released ball keeps the velocity that the hand had in the step before.
-        ball_velocity = torch.where(released.unsqueeze(-1), w.grip_velocity, w.ball_velocity)
-        held, free = w.held & closed, w.free | released
-
-        joints = self.effector.move(w.joints, action[:, :-1] * (self.effector.action_speed * dt))
-        grip = self.effector.grip(joints)
-        grip_velocity = (grip - w.grip) / dt
-        flown, flown_velocity = self._fly(w.ball, ball_velocity, free)
-
-        held = held | (closed & _near(flown, grip, self._catch))
-        held_ = held.unsqueeze(-1)
-        w.joint_velocity = (joints - w.joints) / dt
-        w.joints, w.grip, w.grip_velocity = joints, grip, grip_velocity
-        w.ball = torch.where(held_, grip, flown)
-        w.ball_velocity = torch.where(held_, grip_velocity, flown_velocity)
-        w.closed, w.held, w.free = closed, held, free & ~held
-
-    def _fly(self, ball: Tensor, velocity: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
-        """One time step of the balls that are free; the others stay as they are."""
-        if len(self._physics) == 1:
-            return self._physics[0].step(ball, velocity, free)
-        blocks = zip(*(entry.chunk(len(self._physics)) for entry in (ball, velocity, free)), strict=True)
-        flown = [physics.step(*block) for physics, block in zip(self._physics, blocks, strict=True)]
-        balls, velocities = zip(*flown, strict=True)
-        return torch.cat(balls), torch.cat(velocities)
+        """The core checks actions when it takes them, before anything moves."""
 
     def _start_episodes(self, which: Tensor) -> None:
-        w, n = self.worlds, self.effector.num_joints
-        u = uniform(self._keys[which.numpy()], w.episode[which] - 1, n + 5)
-        joints = self.effector.sample(u[:, :n])
-        grip = self.effector.grip(joints)
-        start = self.task.start
-        held = u[:, -1] < {"held": 1.0, "away": 0.0, "mixed": 0.5}[start]
-        away = self._ball_starts.from_uniform(u[:, n : n + 2])
-        ball = torch.where(held.unsqueeze(-1), grip, away)
-        goal = self._goals.from_uniform(u[:, n + 2 : n + 4]) if self.task.throws else self._scale(ball)
-        for name, value in {
-            "joints": joints,
-            "joint_velocity": 0.0,
-            "grip": grip,
-            "grip_velocity": 0.0,
-            "ball": ball,
-            "ball_velocity": 0.0,
-            "goal": goal,
-            "closed": held,
-            "held": held,
-            "free": ~held & (self.task.effector == "hand"),  # the robot's ball waits in the air
-        }.items():
-            getattr(w, name)[which] = value
+        self._core.draw_starts(which.numpy())
 
-    def _scale(self, meters: Tensor) -> Tensor:
-        return meters * (2.0 / self.world.size) - 1.0
+    def _advance(self, action: Tensor) -> None:
+        own = action.detach() if action.dtype in _OF_NUMPY else action.detach().double()
+        self._core.advance(own.numpy())
 
     def _show(self) -> dict[str, Tensor]:
-        w, config = self.worlds, self.world
-        grip, ball = self._scale(w.grip), self._scale(w.ball)
-        parts = [
-            self.effector.observe(
-                w.joints,
-                w.joint_velocity / self.effector.action_speed,
-                grip,
-                w.grip_velocity / config.hand_speed,
-                w.closed.unsqueeze(-1).to(torch.float64),
-            )
-        ]
-        if self.task.throws:
-            parts += [ball, w.ball_velocity / config.hand_speed]
-        state = torch.cat([*parts, w.goal], -1).to(self.dtype_shown)
-        achieved = (ball if self.task.throws else grip).to(self.dtype_shown)
+        return self._tensors(**self._core.show()._asdict())
+
+    def _take(self, action: Tensor) -> dict[str, Tensor]:
+        self._advance(action)
+        core = self._core
+        arrays = core.show()
+        shown = self._tensors(**arrays._asdict())
+        # Goals are compared as they are shown, so that rewards are those of compute_reward.
+        if self._native:
+            achieved = core.achieved(arrays.achieved_goal, arrays.desired_goal)[:, None]
+        else:
+            achieved = self._is_achieved(shown).numpy()
+        truncated = core.out_of_time()[:, None]
+        ends = {"terminated": achieved, "truncated": truncated, "done": achieved | truncated}
         return {
-            "state": state,
-            "observation": state[:, :-2].clone(),
-            "achieved_goal": achieved,
-            "desired_goal": state[:, -2:].clone(),
+            **shown,
+            **self._tensors(reward=reward_of(achieved).astype(core.dtype)),
+            **{key: torch.from_numpy(own) for key, own in ends.items()},
         }
 
-    # Made once
-
-    def _make_ball_starts(self) -> GoalDistribution:
-        """Where a ball that is not held starts, in meters."""
-        config = self.world
-        if self.task.effector == "hand":
-            left, _, right, _ = (side * config.size for side in self.effector.reach)
-            floor = config.ball_radius * config.size
-            return BoxGoals((left, floor), (right, floor))
-        base = (config.arm_base[0] * config.size, config.arm_base[1] * config.size)
-        shortest, longest = (share * config.arm_length for share in config.arm_ball_radius)
-        return SectorGoals(base, angle=config.arm_ball_angle, radius=(shortest, longest))
-
-    def _make_goals(self) -> GoalDistribution:
-        """Where goals start, as the agent sees them."""
-        config = self.world
-        if self.task.throws:
-            box = config.hand_goals if self.task.effector == "hand" else config.arm_goals
-            left, bottom, right, top = (2.0 * side - 1.0 for side in box)
-            return BoxGoals((left, bottom), (right, top))
-        return self._ball_starts.scaled(2.0 / config.size, -1.0)
+    def _tensors(self, **arrays: np.ndarray) -> dict[str, Tensor]:
+        """Arrays as tensors of the type that is shown."""
+        tensors = {key: torch.from_numpy(own) for key, own in arrays.items()}
+        return tensors if self._native else {key: own.to(self.dtype_shown) for key, own in tensors.items()}
 
 
 def base_env(env: EnvBase) -> ThrowingEnv:
@@ -372,10 +305,3 @@ def _as_dtype(dtype: torch.dtype | str) -> torch.dtype:
     if not isinstance(named, torch.dtype) or not named.is_floating_point:
         raise ValueError(f"dtype must be a floating-point type such as float32 or float64, got {dtype!r}")
     return named
-
-
-def _near(point: Tensor, other: Tensor, distance: float) -> Tensor:
-    """Whether points [..., 2] are nearer to each other than a distance: [...] of bool."""
-    # One coordinate after the other: torch takes several times as long to sum over two numbers.
-    (x, y), (other_x, other_y) = point.unbind(-1), other.unbind(-1)
-    return (x - other_x).square() + (y - other_y).square() < distance**2

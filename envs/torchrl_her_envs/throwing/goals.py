@@ -6,8 +6,11 @@ import math
 from itertools import product
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from torchrl_her_envs.throwing.arrays import Array, functions_of
 
 
 class GoalDistribution(Protocol):
@@ -15,15 +18,15 @@ class GoalDistribution(Protocol):
 
     ``low`` and ``high`` are the corners of the (smallest) box around it, ``is_box`` tells whether
     the distribution is uniform over that box, ``from_uniform`` maps [..., 2] numbers in [0, 1) to
-    points, ``sample`` draws [n, 2] points, and ``scaled`` is the same distribution in coordinates
-    ``factor * x + shift``.
+    points (an array to an array, a tensor to a tensor), ``sample`` draws [n, 2] points, and ``scaled`` is
+    the same distribution in coordinates ``factor * x + shift``.
     """
 
     low: Tensor
     high: Tensor
     is_box: bool
 
-    def from_uniform(self, u: Tensor) -> Tensor: ...
+    def from_uniform(self, u: Array) -> Array: ...
 
     def sample(self, n: int, *, generator: torch.Generator | None = None) -> Tensor: ...
 
@@ -31,7 +34,7 @@ class GoalDistribution(Protocol):
 
 
 class _Sampled:
-    def from_uniform(self, u: Tensor) -> Tensor:
+    def from_uniform(self, u: Array) -> Array:
         raise NotImplementedError
 
     def sample(self, n: int, *, generator: torch.Generator | None = None) -> Tensor:
@@ -62,9 +65,10 @@ class BoxGoals(_Sampled):
         self.high = torch.tensor(high, dtype=torch.float64)
         if (self.high < self.low).any():
             raise ValueError(f"a box needs low <= high, got low={low}, high={high}")
+        self._extent = self.high - self.low
 
-    def from_uniform(self, u: Tensor) -> Tensor:
-        return self.low + u * (self.high - self.low)
+    def from_uniform(self, u: Array) -> Array:
+        return _beside(u, self.low) + u * _beside(u, self._extent)
 
     def scaled(self, factor: float, shift: float) -> BoxGoals:
         low, high = (self.low * factor + shift).tolist(), (self.high * factor + shift).tolist()
@@ -94,16 +98,22 @@ class SectorGoals(_Sampled):
         edge = self._point(touching[:, :1], touching[:, 1:])
         self.low, self.high = edge.amin(0), edge.amax(0)
 
-    def from_uniform(self, u: Tensor) -> Tensor:
+    def from_uniform(self, u: Array) -> Array:
         angle = self.angle[0] + u[..., :1] * (self.angle[1] - self.angle[0])
         return self._point(angle, self.radius[0] + u[..., 1:] * (self.radius[1] - self.radius[0]))
 
-    def _point(self, angle: Tensor, radius: Tensor) -> Tensor:
-        turn = torch.deg2rad(angle)
-        return self.center + radius * torch.cat((turn.cos(), turn.sin()), -1)
+    def _point(self, angle: Array, radius: Array) -> Array:
+        own = functions_of(angle)
+        turn = own.deg2rad(angle)
+        return _beside(angle, self.center) + radius * own.concatenate((own.cos(turn), own.sin(turn)), -1)
 
     def scaled(self, factor: float, shift: float) -> SectorGoals:
         x, y = (self.center * factor + shift).tolist()
         return SectorGoals(
             (x, y), angle=self.angle, radius=(self.radius[0] * factor, self.radius[1] * factor)
         )
+
+
+def _beside(u: Array, constant: Tensor) -> Array:
+    """A constant of float64 as an array, if that is what it is to be used with."""
+    return constant.numpy() if isinstance(u, np.ndarray) else constant

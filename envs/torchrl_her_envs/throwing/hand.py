@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from torchrl_her_envs.throwing.arrays import Array, confined, like
 from torchrl_her_envs.throwing.tasks import WorldConfig
 
 
@@ -16,6 +16,7 @@ class Hand:
         wall: whether there is a wall, which a held ball must not enter.
 
     Example:
+        >>> import torch
         >>> hand = Hand(WorldConfig(), wall=False)
         >>> at, change = torch.tensor([[1.0, 1.0], [9.0, 0.5]], dtype=torch.float64)
         >>> hand.move(at, change).tolist()  # stays in its half
@@ -23,6 +24,7 @@ class Hand:
     """
 
     num_joints = 2
+    shown: tuple[str, ...] = ("grip", "grip_velocity", "closed")  # its joints are its grip: shown once
     observation_size = 5
     grip_index = (0, 1)
 
@@ -31,22 +33,24 @@ class Hand:
         right = world.wall_x - margin - (world.wall_thickness / 2 if wall else 0.0)
         self.reach = (margin, margin, right, 1.0 - margin)
         self.action_speed = world.hand_speed
-        self._low = torch.tensor(self.reach[:2], dtype=torch.float64) * world.size
-        self._high = torch.tensor(self.reach[2:], dtype=torch.float64) * world.size
+        self._low = np.array(self.reach[:2]) * world.size
+        self._high = np.array(self.reach[2:]) * world.size
+        self._ends = list(zip(self._low.tolist(), self._high.tolist(), strict=True))
 
-    def sample(self, u: Tensor) -> Tensor:
-        return self._low + u * (self._high - self._low)
+    def sample(self, u: Array) -> Array:
+        return like(self._low, u) + u * like(self._high - self._low, u)
 
-    def move(self, joints: Tensor, change: Tensor) -> Tensor:
-        return torch.clamp(joints + change, self._low.to(joints), self._high.to(joints))
+    def move(self, joints: Array, change: Array) -> Array:
+        return confined(joints + change, like(self._low, joints), like(self._high, joints))
 
-    def grip(self, joints: Tensor) -> Tensor:
+    def move_one(self, joints: list[float], change: list[float]) -> list[float]:
+        return [confined(at + by, *ends) for at, by, ends in zip(joints, change, self._ends, strict=True)]
+
+    def grip(self, joints: Array) -> Array:
         return joints
 
-    def observe(
-        self, joints: Tensor, speed: Tensor, grip: Tensor, grip_speed: Tensor, closed: Tensor
-    ) -> Tensor:
-        return torch.cat((grip, grip_speed, closed), -1)
+    def grip_one(self, joints: list[float]) -> list[float]:
+        return joints
 
-    def skeleton(self, joints: Tensor) -> Tensor:
-        return joints.unsqueeze(-2)
+    def skeleton(self, joints: Array) -> Array:
+        return joints[..., None, :]

@@ -2,16 +2,43 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from torchrl_her_envs.throwing.arrays import Array, functions_of
 
 
-def chain(angles: Tensor, base: Tensor, length: float) -> Tensor:
+def walk(angles: Sequence[Any], base: Sequence[Any], link: float) -> Iterator[tuple[Any, Any]]:
+    """The end of each link in turn.
+
+    Args:
+        angles: n numbers, arrays or tensors in radians, each relative to the link before,
+            counter-clockwise, the first counted from the x axis.
+        base: x and y of the first joint.
+        link: length of a link.
+
+    Yields:
+        n times x and y.
+
+    Example:
+        >>> import math
+        >>> [(round(x, 4), round(y, 4)) for x, y in walk([0.0, math.pi / 2], (0.0, 0.0), 1.0)]
+        [(1.0, 0.0), (1.0, 1.0)]
+    """
+    x, y = base
+    heading: Any = 0.0
+    own = functions_of(angles[0])
+    for angle in angles:
+        heading = heading + angle
+        x, y = x + own.cos(heading) * link, y + own.sin(heading) * link
+        yield x, y
+
+
+def chain(angles: Array, base: Array, length: float) -> Array:
     """Positions of all joints and of the end of a chain.
 
     Args:
-        angles: [..., n] in radians, each relative to the link before, counter-clockwise, the first
-            counted from the x axis.
+        angles: [..., n] in radians, see :func:`walk`.
         base: [2], position of the first joint.
         length: total length; each link has ``length / n``.
 
@@ -20,10 +47,30 @@ def chain(angles: Tensor, base: Tensor, length: float) -> Tensor:
 
     Example:
         >>> import math
+        >>> import torch
         >>> angles = torch.tensor([0.0, math.pi / 2])  # right, then up
         >>> chain(angles, torch.zeros(2), 2.0).round(decimals=4).tolist()
         [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]
     """
-    heading = angles.cumsum(-1)
-    links = torch.stack((heading.cos(), heading.sin()), -1) * (length / angles.shape[-1])
-    return torch.cat((base.expand(*angles.shape[:-1], 1, 2), base + links.cumsum(-2)), -2)
+    own, parts = functions_of(angles), _parts(angles)
+    ends: list[Array] = [own.stack(end, -1) for end in walk(parts, _parts(base), length / len(parts))]
+    return own.stack([own.broadcast_to(base, ends[0].shape), *ends], -2)
+
+
+def chain_end(angles: Array, base: Array, length: float) -> Array:
+    """The position [..., 2] of the end of a chain alone; see :func:`chain`.
+
+    Example:
+        >>> import math
+        >>> import torch
+        >>> chain_end(torch.tensor([0.0, math.pi / 2]), torch.zeros(2), 2.0).round(decimals=4).tolist()
+        [1.0, 1.0]
+    """
+    parts = _parts(angles)
+    *_, end = walk(parts, _parts(base), length / len(parts))
+    return functions_of(angles).stack(end, -1)
+
+
+def _parts(values: Array) -> list[Array]:
+    """The entries [...] of values [..., n]."""
+    return [values[..., k] for k in range(values.shape[-1])]

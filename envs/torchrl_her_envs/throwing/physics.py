@@ -1,11 +1,11 @@
-"""Free balls in many worlds at once: one Chipmunk space in which world k stands at an offset.
+"""Free balls in many worlds at once: flight in closed form, and one Chipmunk space for all that may bounce.
 
 This is the only file that knows pymunk. What is held, caught or thrown is decided elsewhere.
 """
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 import numpy as np
 import pymunk
@@ -17,10 +17,15 @@ from torchrl_her_envs.throwing.tasks import WorldConfig
 
 _FIELDS = pymunk.batch.BodyFields.POSITION | pymunk.batch.BodyFields.VELOCITY
 _BORDER = 0.5  # meters: half the thickness of the screen's sides, which lie outside of it
-_CELL = 4.0  # meters, of the spatial hash: measured best from 1 to 1024 worlds
+_CELL = 1.0  # meters, of the spatial hash; with larger cells more balls are compared with each other
+_CELLS = 100  # of the spatial hash
 _SLOP = 1e-3  # meters that a ball may sink into a surface; Chipmunk's default, 0.1, is meant for pixels
 _SKIN = _SLOP / 2  # surfaces stand out by this: a ball put against one touches it, whatever the rounding
 _ITERATIONS = 4  # of the solver: a ball touches at most a side and a corner at once
+_MOST = 64  # balls in the space at once: each is compared with all that are near it
+_APART = 4.0  # meters between parked balls
+_PATIENCE = 64  # steps after which balls that none of them needed are removed
+_FEW = 12  # balls up to which numbers are quicker than arrays
 
 
 class BallPhysics:
@@ -28,6 +33,10 @@ class BallPhysics:
 
     A bounce keeps ``world.bounce`` of the normal speed; along the surface friction slows the ball,
     which slides and never rolls (its moment of inertia is infinite).
+
+    All worlds lie in one place of one space, where balls do not collide with each other. So a ball's path
+    depends on nothing but its own position and velocity, to the last bit, whichever worlds are beside it.
+    Balls that touch nothing within a step need no space: a few sums give what Chipmunk would.
 
     Args:
         num_worlds: number of worlds, at least 1.
@@ -45,18 +54,11 @@ class BallPhysics:
     def __init__(self, num_worlds: int, world: WorldConfig, *, wall: bool) -> None:
         self._substep = world.time_step / world.substeps
         self._substeps = world.substeps
-        pitch = world.size + 4 * _BORDER
-        columns = math.ceil(math.sqrt(num_worlds))  # a square keeps the offsets, and their rounding, small
-        index = np.arange(num_worlds)
-        self._offset = np.stack((index % columns, index // columns), -1) * pitch
-        self._space = self._build(num_worlds, world, wall)
-        # pymunk lists the space's static body behind the balls: the last row is that one's, and stays 0
-        self._state = np.zeros((num_worlds + 1, 4))
-        self._buffer = pymunk.batch.Buffer()
-        self._parked = self._park(world)
-        self._parked_buffer = pymunk.batch.Buffer()
-        self._parked_buffer.set_float_buf(self._parked)
-        self._settled = np.full((num_worlds, 4), np.nan)  # a state of each ball that a step leaves unchanged
+        self._step = world.time_step
+        self._pull = world.gravity * self._substep
+        self._limits = _Limits(world, wall=wall)
+        self._settled = np.full((4, num_worlds), np.nan)  # a state of each ball that a step leaves unchanged
+        self._space = _Space(world, wall=wall)
 
     def step(self, position: Tensor, velocity: Tensor, free: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Lets balls move for one time step.
@@ -69,79 +71,195 @@ class BallPhysics:
         Returns:
             The new positions and velocities; those of the other balls as they were.
         """
-        before = np.concatenate((position.numpy(), velocity.numpy()), -1)
+        balls = np.concatenate((position.numpy().T, velocity.numpy().T))
+        self.advance(balls, np.ones(len(position), np.bool_) if free is None else free.numpy())
+        after = torch.from_numpy(balls.T.copy())
+        return after[:, :2], after[:, 2:]
+
+    def advance(self, balls: np.ndarray, free: np.ndarray) -> None:
+        """Lets balls move for one time step, in place.
+
+        Args:
+            balls: [4, num_worlds] float64: x, y and their velocities, in meters within the world.
+            free: [num_worlds] of bool, which of them move.
+        """
         # A step depends on nothing but the state: if it left a ball unchanged once, it will do so again.
-        moving = (before != self._settled).any(-1, keepdims=True)
-        if free is not None:
-            moving &= free.numpy()[:, None]
-        if not moving.any():
-            return position.clone(), velocity.clone()
-        after = np.where(moving, self._simulate(before, moving), before)
-        np.copyto(
-            self._settled, np.where((after == before).all(-1, keepdims=True), before, np.nan), where=moving
-        )
-        return torch.from_numpy(after[:, :2]), torch.from_numpy(after[:, 2:])
+        moves = np.logical_or.reduce(balls != self._settled, 0)
+        moves &= free
+        index = moves.nonzero()[0]
+        if not len(index):
+            return
+        before = balls[:, index]
+        if len(index) <= _FEW:
+            flights = [self._fly(*ball) for ball in before.T.tolist()]
+            *after, touches = (np.array(entry) for entry in zip(*flights, strict=True))
+        else:
+            *after, touches = self._fly(*before)
+        balls[:, index] = after
+        if touches.any():
+            near = touches.nonzero()[0]
+            balls[:, index[near]] = self._bounce(index[near], before[:, near])
 
-    def _simulate(self, before: np.ndarray, moving: np.ndarray) -> np.ndarray:
-        """The states [num_worlds, 4] after a time step; balls that do not move are parked meanwhile."""
-        pymunk.batch.set_space_bodies(self._space, _FIELDS, self._parked_buffer)
-        self._space.step(self._substep)  # forgets the step before, see _park
-        balls = self._state[:-1]
-        balls[:] = before
-        balls[:, :2] += self._offset
-        np.copyto(balls, self._parked[:-1], where=~moving)
-        self._buffer.set_float_buf(self._state)
-        pymunk.batch.set_space_bodies(self._space, _FIELDS, self._buffer)
+    def advance_one(self, world: int, ball: list[float]) -> list[float]:
+        """Lets one ball move for one time step, as :meth:`advance` does.
+
+        Args:
+            world: the index of its world.
+            ball: x, y and their velocities.
+        """
+        if ball == self._settled[:, world].tolist():
+            return ball
+        *after, touches = self._fly(*ball)
+        if touches:
+            return self._bounce(np.array([world]), np.array(ball)[:, None])[:, 0].tolist()
+        return after
+
+    def _fly(self, x: Any, y: Any, speed_x: Any, speed_y: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """A time step without contacts, in numbers or in arrays: the sums that Chipmunk makes, in its order.
+
+        Returns:
+            x, y, their velocities, and whether the ball may touch something on its way.
+        """
+        to_x, to_y, falls, across = x, y, speed_y, speed_x * self._substep
         for _ in range(self._substeps):
-            self._space.step(self._substep)
-        result = pymunk.batch.Buffer()
-        pymunk.batch.get_space_bodies(self._space, _FIELDS, result)
-        state = np.frombuffer(result.float_buf()).reshape(-1, 4)[:-1].copy()
-        state[:, :2] -= self._offset
-        return state
+            to_x = to_x + across
+            to_y = to_y + falls * self._substep
+            falls = falls - self._pull
+        # Contacts are looked for at the end of each substep. Without gravity the ball would come to here;
+        # its true way lies between that line and the one to its end.
+        straight = y + speed_y * self._step
+        low, high = (to_y, straight) if self._pull >= 0 else (straight, to_y)
+        return to_x, to_y, speed_x, falls, self._limits.reached((x, to_x), (y, low), (y, high))
 
-    def _park(self, world: WorldConfig) -> np.ndarray:
-        """All balls at rest where they touch nothing, between the left side and the wall.
+    def _bounce(self, worlds: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """A time step in the space of the balls of some worlds [K], from states [4, K] to states [4, K]."""
+        after = np.empty_like(before)
+        for start in range(0, len(worlds), _MOST):
+            part = slice(start, start + _MOST)
+            after[:, part] = self._space.simulate(before[:, part], self._substep, self._substeps)
+        rests = np.logical_and.reduce(after == before, 0)
+        if rests.any():
+            self._settled[:, worlds[rests]] = before[:, rests]
+        return after
+
+
+class _Limits:
+    """Where a ball may touch something: beyond these coordinates, or around the wall."""
+
+    def __init__(self, world: WorldConfig, *, wall: bool) -> None:
+        reach = world.ball_radius * world.size + 2 * _SKIN  # one skin more than needed, whatever the rounding
+        self._least, self._most = reach, world.size - reach
+        self._wall: tuple[float, float, float] | None = None
+        if wall:
+            middle, half = world.wall_x * world.size, world.wall_thickness / 2 * world.size + reach
+            self._wall = (middle - half, middle + half, world.wall_height * world.size + reach)
+
+    def reached(self, xs: tuple[Any, Any], lows: tuple[Any, Any], highs: tuple[Any, Any]) -> Any:
+        """Whether a box, in numbers or in arrays, is not clear of everything.
+
+        Args:
+            xs: its left and right sides, in any order.
+            lows: two heights, the lower of which is its bottom.
+            highs: two heights, the higher of which is its top.
+        """
+        (x, to_x), (y, low), (_, high) = xs, lows, highs
+        least, most = self._least, self._most
+        touches = (x < least) | (to_x < least) | (y < least) | (low < least)
+        touches = touches | (x > most) | (to_x > most) | (y > most) | (high > most)
+        if self._wall is not None:
+            left, right, top = self._wall
+            beside = ((x > left) | (to_x > left)) & ((x < right) | (to_x < right))
+            touches = touches | (beside & ((y < top) | (low < top)))
+        return touches
+
+
+class _Space:
+    """One Chipmunk space with the sides and the wall of one world, and as many balls as were needed at once.
+
+    Args:
+        world: the constants of the world.
+        wall: whether a wall stands in the middle.
+    """
+
+    def __init__(self, world: WorldConfig, *, wall: bool) -> None:
+        self._world = world
+        self._space = pymunk.Space()
+        self._space.gravity = (0.0, -world.gravity)
+        self._space.iterations = _ITERATIONS
+        self._space.collision_slop = _SLOP
+        self._space.collision_persistence = 1  # with 0, contacts are dropped before they act
+        self._space.use_spatial_hash(_CELL, _CELLS)
+        self._space.add(*_sides(self._space.static_body, world, wall))
+        self._result, self._buffer, self._parked_buffer = (pymunk.batch.Buffer() for _ in range(3))
+        self._balls: list[tuple[pymunk.Body, pymunk.Shape]] = []
+        self._calls = self._needed = 0
+        self._resize(1)
+
+    def simulate(self, before: np.ndarray, substep: float, substeps: int) -> np.ndarray:
+        """The states [4, K] after some substeps of balls in states [4, K]."""
+        count = before.shape[1]
+        self._make_room(count)
+        space, state = self._space, self._state
+        pymunk.batch.set_space_bodies(space, _FIELDS, self._parked_buffer)
+        space.step(substep)  # forgets the step before, see _resize
+        state[:count] = before.T
+        state[count:] = self._parked[count:]
+        pymunk.batch.set_space_bodies(space, _FIELDS, self._buffer)
+        for _ in range(substeps):
+            space.step(substep)
+        self._result.clear()
+        pymunk.batch.get_space_bodies(space, _FIELDS, self._result)
+        return np.frombuffer(self._result.float_buf()).reshape(-1, 4)[:count].T.copy()
+
+    def _make_room(self, count: int) -> None:
+        """Sees to it that there are enough balls, and now and then that there are not many more."""
+        self._calls += 1
+        self._needed = max(self._needed, count)
+        if count > len(self._balls):
+            self._resize(count)
+        elif self._calls >= _PATIENCE:
+            if self._needed < len(self._balls):
+                self._resize(self._needed)
+            self._calls = self._needed = 0
+
+    def _resize(self, count: int) -> None:
+        """Adds or removes balls until there are so many, and says where they are parked.
 
         A body keeps its old contacts, and the push that still moves it out of a surface, for one substep
-        more. Nobody can read or write these, so all balls spend a substep here before each step: then
-        position and velocity are the whole state of a ball.
+        more. Nobody can read or write these, so all balls spend a substep parked, each by itself and far
+        from everything, before each step: then position and velocity are the whole state of a ball.
         """
-        parked = np.zeros_like(self._state)
-        middle = (world.wall_x - world.wall_thickness / 2) / 2
-        parked[:-1, :2] = self._offset + np.array([middle, 0.5]) * world.size
-        return parked
-
-    def _build(self, num_worlds: int, world: WorldConfig, wall: bool) -> pymunk.Space:
-        space = pymunk.Space()
-        space.gravity = (0.0, -world.gravity)
-        space.iterations = _ITERATIONS
-        space.collision_slop = _SLOP
-        space.collision_persistence = 1  # with 0, contacts are dropped before they act: nothing collides
-        space.use_spatial_hash(_CELL, 10 * num_worlds)
-        for offset in self._offset:
-            space.add(*self._sides(space.static_body, offset, world, wall))
-        for _ in range(num_worlds):
+        world = self._world
+        while len(self._balls) > count:
+            self._space.remove(*self._balls.pop())
+        while len(self._balls) < count:
             body = pymunk.Body(world.ball_mass, float("inf"))
             ball = pymunk.Circle(body, world.ball_radius * world.size)
             ball.elasticity, ball.friction = world.bounce, world.friction
-            space.add(body, ball)
-        return space
+            ball.filter = pymunk.ShapeFilter(group=1)  # balls of different worlds do not collide
+            self._space.add(body, ball)
+            self._balls.append((body, ball))
+        # pymunk lists the space's static body behind the balls: the last row is that one's, and stays 0
+        self._parked = np.zeros((count + 1, 4))
+        self._parked[:-1, 0] = 2 * world.size + _APART * np.arange(count)
+        self._state = self._parked.copy()
+        self._parked_buffer.set_float_buf(self._parked)
+        self._buffer.set_float_buf(self._state)
 
-    @staticmethod
-    def _sides(body: pymunk.Body, offset: np.ndarray, world: WorldConfig, wall: bool) -> list[pymunk.Shape]:
-        """The four sides of one world, and its wall."""
-        low, high = offset - _BORDER, offset + world.size + _BORDER
-        corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
-        shapes: list[pymunk.Shape] = [
-            pymunk.Segment(body, corners[i], corners[(i + 1) % 4], _BORDER + _SKIN) for i in range(4)
-        ]
-        if wall:
-            left = offset[0] + (world.wall_x - world.wall_thickness / 2) * world.size
-            right = left + world.wall_thickness * world.size
-            top = offset[1] + world.wall_height * world.size
-            outline = [(left, offset[1]), (right, offset[1]), (right, top), (left, top)]
-            shapes.append(pymunk.Poly(body, outline, radius=_SKIN))
-        for shape in shapes:
-            shape.elasticity = shape.friction = 1.0  # Chipmunk multiplies the two surfaces' values
-        return shapes
+
+def _sides(body: pymunk.Body, world: WorldConfig, wall: bool) -> list[pymunk.Shape]:
+    """The four sides of the screen, and the wall."""
+    low, high = -_BORDER, world.size + _BORDER
+    corners = [(low, low), (high, low), (high, high), (low, high)]
+    shapes: list[pymunk.Shape] = [
+        pymunk.Segment(body, corners[i], corners[(i + 1) % 4], _BORDER + _SKIN) for i in range(4)
+    ]
+    if wall:
+        left = (world.wall_x - world.wall_thickness / 2) * world.size
+        right = left + world.wall_thickness * world.size
+        top = world.wall_height * world.size
+        outline = [(left, 0.0), (right, 0.0), (right, top), (left, top)]
+        shapes.append(pymunk.Poly(body, outline, radius=_SKIN))
+    for shape in shapes:
+        shape.elasticity = shape.friction = 1.0  # Chipmunk multiplies the two surfaces' values
+    return shapes

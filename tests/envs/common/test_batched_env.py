@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Categorical, Unbounded
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_her_envs import BatchedEnv
@@ -116,6 +117,44 @@ def test_a_reset_with_a_mask_starts_those_alone() -> None:
     assert not shown["done"][mask].any()
 
 
+def test_maybe_reset_gives_what_torchrls_own_gives() -> None:
+    ours, theirs = Counting(4, seed=(3,)), Counting(4, seed=(3,))
+    outs = []
+    for env, maybe_reset in ((ours, ours.maybe_reset), (theirs, partial(EnvBase.maybe_reset, theirs))):
+        env.reset()
+        act(env, 1, 1, 1, 0)
+        after = act(env, 1, 2, 0, 2).exclude("reward")
+        after.update({"action": torch.arange(4) + 1, "memory": TensorDict({"hidden": torch.ones(4, 3)}, [4])})
+        outs.append(maybe_reset(after))
+    mine, other = outs
+    assert set(mine.keys(True, True)) == set(other.keys(True, True))
+    for key in mine.keys(True, True):
+        assert torch.equal(mine[key], other[key]), key
+    assert mine["action"].tolist().count(0) >= 2  # those that gave up
+    assert not mine["done"].any()
+    assert (ours.started, ours.worlds.step.tolist()) == (theirs.started, theirs.worlds.step.tolist())
+
+
+def test_maybe_reset_leaves_what_it_was_given() -> None:
+    env = Counting(3)
+    env.reset()
+    env.worlds.goal[:] = 3
+    after = act(env, 2, 1, 1)
+    kept = after.clone()
+    begun = env.maybe_reset(after)
+    assert (after == kept).all()
+    assert begun["observation"].flatten().tolist() == [0.0, 1.0, 1.0]
+
+
+def test_maybe_reset_does_nothing_before_an_end() -> None:
+    env = Counting(2)
+    env.reset()
+    env.worlds.goal[:] = 3
+    after = act(env, 1, 0)
+    assert env.maybe_reset(after) is after
+    assert env.started == [[0, 1]]
+
+
 def test_resuming_and_seeding() -> None:
     env, other = Counting(6, seed=(3, 5)), Counting(6, seed=(9,))
     env.reset()
@@ -145,3 +184,12 @@ def test_what_a_subclass_must_say() -> None:
 
     with pytest.raises(TypeError, match="abstract"):
         Empty(1)
+
+
+def test_what_is_shown_must_have_a_row_for_each_environment() -> None:
+    class Odd(Counting):
+        def _show(self) -> dict[str, Tensor]:
+            return {key: own[:1] for key, own in super()._show().items()}
+
+    with pytest.raises(RuntimeError, match="batch"):
+        Odd(3).reset()

@@ -99,8 +99,9 @@ def test_names_of_entries_lie_in_the_state(name: str) -> None:
 def test_entries_of_throwing_states_are_what_their_names_say(name: str) -> None:
     env = make_env(name, num_envs=3)
     state, names = env.reset()["state"], env.state_names()
-    assert torch.equal(state[:, names["grip"]], env._scale(env.worlds.grip).float())
-    assert torch.equal(state[:, names["ball"]], env._scale(env.worlds.ball).float())
+    for own in ("grip", "ball"):
+        meters = getattr(env.worlds, own)
+        assert torch.equal(state[:, names[own]], (meters * (2.0 / env.world.size) - 1.0).float())
     assert env.task.effector in names
     if env.task.throws:
         assert torch.equal(state[:, names["hole"]], env.worlds.goal.float())

@@ -87,3 +87,10 @@ def test_every_64_bit_seed_works(seed: int) -> None:
 
 def test_no_environment_draws_nothing() -> None:
     assert uniform(env_keys(0, 4)[[]], torch.zeros(0, dtype=torch.int64), 3).shape == (0, 3)
+
+
+def test_arrays_give_the_numbers_that_tensors_give() -> None:
+    keys, episodes = env_keys(3, 4), np.array([0, 5, 5, 2**40])
+    u = uniform(keys, episodes, 7)
+    assert isinstance(u, np.ndarray)
+    assert np.array_equal(u, uniform(keys, torch.from_numpy(episodes), 7).numpy())

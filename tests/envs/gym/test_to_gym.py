@@ -54,6 +54,20 @@ def test_a_environment_does_what_ours_does(task: str) -> None:
                 break
 
 
+def test_what_was_returned_stays_as_it_is() -> None:
+    env = make("hand_v2")
+    kept = [env.reset(seed=0)[0]]
+    env.action_space.seed(0)
+    kept += [env.step(env.action_space.sample())[0] for _ in range(10)]
+    copies = [{key: value.copy() for key, value in shown.items()} for shown in kept]
+    kept[3]["observation"][:] = 7.0  # its goals are in arrays of their own
+    for _ in range(10):
+        env.step(env.action_space.sample())
+    for index, (shown, copy) in enumerate(zip(kept, copies, strict=True)):
+        for key in KEYS[index == 3 :]:
+            assert np.array_equal(shown[key], copy[key])
+
+
 def test_functions_of_goals_take_one_pair_or_many() -> None:
     env = make("hand_v0").unwrapped
     goal = np.zeros(2, np.float32)

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -51,13 +52,24 @@ def test_joints_turn_without_limit() -> None:
 @pytest.mark.parametrize(("links", "size"), [(1, 8), (2, 11), (3, 14)])
 def test_shows_cosines_then_sines_then_grip_and_velocities(links: int, size: int) -> None:
     arm = Arm(WorldConfig(), num_links=links)
-    joints = points([0.0, math.pi / 2, math.pi][:links])
-    speed = points([0.1, 0.2, 0.3][:links])
-    seen = arm.observe(joints, speed, points([0.4, 0.5]), points([0.6, 0.7]), points([1.0]))
-    cosines, sines = [1.0, 0.0, -1.0][:links], [0.0, 1.0, 0.0][:links]
-    expected = [*cosines, *sines, 0.4, 0.5, *speed[0].tolist(), 0.6, 0.7, 1.0]
-    torch.testing.assert_close(seen, points(expected))
-    assert (arm.num_joints, arm.observation_size, seen.shape[-1]) == (links, size, size)
+    widths = {"cosines": links, "sines": links, "grip": 2, "joint_velocity": links, "grip_velocity": 2}
+    assert arm.shown == (*widths, "closed")
+    assert sum(widths.values()) + 1 == size
+    assert (arm.num_joints, arm.observation_size) == (links, size)
+    assert arm.grip_index == (2 * links, 2 * links + 1)
+
+
+@pytest.mark.parametrize("links", [1, 2, 5])
+def test_arrays_and_numbers_move_as_tensors_do(links: int) -> None:
+    arm, rng = Arm(WorldConfig(), num_links=links), np.random.default_rng(0)
+    joints, change = 6.0 * rng.random((2, 4, links))
+    moved = arm.move(torch.from_numpy(joints), torch.from_numpy(change))
+    assert np.array_equal(arm.move(joints, change), moved.numpy())
+    assert arm.move_one(joints[0].tolist(), change[0].tolist()) == moved[0].tolist()
+    grip = arm.grip(moved)
+    assert arm.grip(moved.numpy()) == pytest.approx(grip.numpy(), abs=1e-14)
+    assert arm.grip_one(moved[0].tolist()) == pytest.approx(grip[0].tolist(), abs=1e-14)
+    assert arm.skeleton(moved.numpy()) == pytest.approx(arm.skeleton(moved).numpy(), abs=1e-14)
 
 
 def test_reach_is_a_box_around_the_circle() -> None:

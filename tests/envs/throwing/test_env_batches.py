@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -259,8 +261,70 @@ def test_a_environments_episodes_do_not_depend_on_when_it_is_reset() -> None:
     assert all(equal(env.world_state_dict(), plain.world_state_dict()).values())
 
 
+# Blocks of several seeds
+
+
+@pytest.mark.parametrize("name", ["hand_v0", "hand_wall_v2", "robot_v2"])
+@pytest.mark.parametrize("num_envs", [2, 5, 16])
+def test_a_block_of_a_batch_of_several_seeds_is_that_seed_alone(name: str, num_envs: int) -> None:
+    seeds = (3, 11, 3, 2**63)
+    every = make_env(name, num_envs=4 * num_envs, seed=seeds, dtype=torch.float64)
+    actions = random_actions(every, 130)
+    together = collect(every, actions)
+    assert together["next", "done"].sum() >= 2 * 4 * num_envs  # whole episodes, and more of them
+    for block, seed in enumerate(seeds):
+        part = slice(block * num_envs, (block + 1) * num_envs)
+        alone = make_env(name, num_envs=num_envs, seed=seed, dtype=torch.float64)
+        own = collect(alone, actions[:, part])
+        for key in ("state", ("next", "state"), ("next", "reward"), ("next", "done"), "achieved_goal"):
+            pair = (together[key][part].double(), own[key].double())
+            torch.testing.assert_close(*pair, rtol=0, atol=1e-9)
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    name=st.sampled_from(["hand_v0", "hand_wall_v1", "robot_v0"]),
+    seeds=st.lists(st.integers(0, 2**64 - 1), min_size=1, max_size=6),
+    size=st.integers(1, 4),
+    data=st.data(),
+)
+def test_an_environment_of_a_seed_does_the_same_in_every_batch(
+    name: str, seeds: list[int], size: int, data: st.DataObject
+) -> None:
+    block, own = data.draw(st.integers(0, len(seeds) - 1)), data.draw(st.integers(0, size - 1))
+    every = make_env(name, num_envs=size * len(seeds), seed=seeds, dtype=torch.float64)
+    alone = make_env(name, num_envs=own + 1, seed=seeds[block], dtype=torch.float64)
+    for env in (every, alone):
+        env.reset()
+        state = env.world_state_dict()  # balls that bounce: the same in all of them
+        state["ball"][:] = torch.tensor([1.0, 1.5])
+        state["ball_velocity"][:] = torch.tensor([5.0, -4.0])
+        state["free"].fill_(True)
+        for flag in ("held", "closed"):
+            state[flag].fill_(False)
+        env.load_world_state_dict(state)
+    place = block * size + own
+    actions = random_actions(every, 60, seed=data.draw(st.integers(0, 99)))
+    actions[:, place, -1] = -1.0
+    path = follow(every, actions)[:, place]
+    assert bounces(path) > 0
+    mine = actions[:, :1].expand(-1, own + 1, -1).clone()
+    mine[:, own] = actions[:, place]
+    torch.testing.assert_close(path, follow(alone, mine)[:, own], rtol=0, atol=1e-9)
+
+
+def test_all_seeds_share_one_space() -> None:
+    env = make("hand_v0", 30)
+    env.set_seeds(range(15))
+    env.reset()
+    physics = env._core._arrays._physics
+    assert physics is env._core._numbers._physics
+    assert physics._settled.shape == (4, 30)
+    follow(env, random_actions(env, 60))
+    assert len(physics._space._space.static_body.shapes) == 4  # the sides of one screen
+
+
 def test_new_seeds_may_be_more_than_before() -> None:
-    """The last bits of a ball's path depend on where its world lies in its space: blocks have one each."""
     alone, both = make("hand_v0", 4, seed=4), make("hand_v0", 8)
     both.set_seeds([3, 4])
     both.reset()

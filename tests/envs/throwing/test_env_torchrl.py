@@ -23,6 +23,18 @@ def test_specs(name: str, num_envs: int, dtype: torch.dtype) -> None:
         assert steps[key].dtype == dtype
 
 
+def test_types_that_numpy_lacks() -> None:
+    env = make_env("hand_v0", num_envs=5, dtype=torch.bfloat16)
+    check_env_specs(env, seed=0)
+    env.set_seed(0)
+    torch.manual_seed(0)
+    after = env.rollout(60, break_when_any_done=False)["next"]
+    goals = after["achieved_goal"], after["desired_goal"]
+    assert after["reward"].dtype == torch.bfloat16
+    assert torch.equal(after["reward"], env.compute_reward(*goals))
+    assert torch.equal(after["terminated"], env.compute_terminated(*goals))
+
+
 @pytest.mark.parametrize("name", ["hand_v1", "hand_wall_v2", "robot_v2"])
 def test_specs_of_many_environments(name: str) -> None:
     check_env_specs(make_env(name, num_envs=64), seed=0)

@@ -1,5 +1,6 @@
 """Distributions of goals: boxes and sectors."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -106,3 +107,11 @@ def test_a_box_may_be_flat() -> None:
 def test_a_box_upside_down_is_refused(low: tuple[float, float], high: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match=r"low <= high, got low=\(.*\), high=\(.*\)"):
         BoxGoals(low, high)
+
+
+@pytest.mark.parametrize("goals", [BOX, SECTOR])
+def test_arrays_are_mapped_as_tensors_are(goals: GoalDistribution) -> None:
+    u = np.random.default_rng(0).random((5, 3, 2))
+    points = goals.from_uniform(u)
+    assert isinstance(points, np.ndarray)
+    np.testing.assert_allclose(points, goals.from_uniform(torch.from_numpy(u)).numpy(), rtol=0, atol=1e-14)

@@ -1,5 +1,6 @@
 """The hand: where it starts, how it moves, what is seen of it."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -47,7 +48,15 @@ def test_is_its_own_grip() -> None:
 
 def test_shows_position_velocity_and_grip() -> None:
     hand = Hand(WorldConfig(), wall=False)
-    nothing = points([9.0, 9.0])  # its joints are its position: they are not shown twice
-    seen = hand.observe(nothing, nothing, points([0.1, 0.2]), points([0.3, 0.4]), points([1.0]))
-    assert seen.tolist() == [[0.1, 0.2, 0.3, 0.4, 1.0]]
+    assert hand.shown == ("grip", "grip_velocity", "closed")  # its joints are its position: not shown twice
     assert (hand.num_joints, hand.observation_size, hand.action_speed) == (2, 5, 8.0)
+    assert hand.grip_index == (0, 1)
+
+
+@pytest.mark.parametrize("change", [[0.1, -0.2], [9.0, 0.0], [-9.0, 9.0], [0.3, -9.0]])
+def test_arrays_and_numbers_move_as_tensors_do(change: list[float]) -> None:
+    hand, at = Hand(WorldConfig(), wall=True), [1.0, 3.0]
+    expected = hand.move(points(at), points(change))
+    assert np.array_equal(hand.move(np.array([at]), np.array([change])), expected.numpy())
+    assert [hand.move_one(at, change)] == expected.tolist()
+    assert hand.grip_one(at) == at

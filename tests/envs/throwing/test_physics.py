@@ -7,6 +7,8 @@ world is 6 m wide and high, the ball's radius 0.18 m; the wall stands from x = 2
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -277,3 +279,74 @@ def test_balls_that_are_not_free_stay_and_the_others_do_not_care() -> None:
     for before, both, one in zip((position, velocity), all_moved, moved, strict=True):
         assert torch.equal(one[0], both[0])
         assert torch.equal(one[1], before[1])
+
+
+# Flight without the space
+
+
+def anywhere(n: int, *, seed: int, speed: float) -> np.ndarray:
+    """[4, n] states of balls anywhere, most of which touch nothing within a step."""
+    position, velocity = thrown_balls(n, seed=seed, speed=speed)
+    return np.concatenate((position.numpy().T, velocity.numpy().T))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0.0, 12.0), st.booleans(), st.sampled_from([10.0, 0.0, -3.0]))
+def test_flight_in_closed_form_is_chipmunks(seed: int, speed: float, wall: bool, gravity: float) -> None:
+    physics = BallPhysics(64, WorldConfig(gravity=gravity), wall=wall)
+    before = anywhere(64, seed=seed, speed=speed)
+    *flown, touches = physics._fly(*before)
+    simulated = physics._space.simulate(before, 0.01, 4)
+    clear = ~touches
+    np.testing.assert_allclose(np.stack(flown)[:, clear], simulated[:, clear], rtol=0, atol=1e-12)
+    assert [physics._fly(*ball)[-1] for ball in before.T.tolist()] == touches.tolist()
+
+
+@pytest.mark.parametrize("wall", [False, True])
+def test_whole_paths_are_those_of_balls_that_are_always_simulated(
+    wall: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flying, simulated = (BallPhysics(100, WorldConfig(), wall=wall) for _ in range(2))
+    always = SimpleNamespace(reached=lambda xs, *_: np.ones_like(xs[0], bool))
+    monkeypatch.setattr(simulated, "_limits", always)
+    state = other = thrown_balls(100, speed=7.0)
+    skipped = 0
+    for _ in range(200):
+        skipped += int((~flying._fly(*np.concatenate([own.numpy().T for own in state]))[-1]).sum())
+        state, other = flying.step(*state), simulated.step(*other)
+        for one, two in zip(state, other, strict=True):
+            assert_close(one, two, atol=1e-9)
+    assert 1_000 < skipped < 19_000  # both kinds of steps are many
+
+
+def test_a_path_is_the_same_to_the_last_bit_whichever_worlds_are_beside_it() -> None:
+    start = thrown_balls(300, speed=7.0)  # more than the space takes at once
+    start[0][:, 1] *= 0.3  # and they bounce together
+    together, path, state = BallPhysics(300, WorldConfig(), wall=True), [], start
+    for _ in range(120):
+        state = together.step(*state)
+        path.append(torch.cat(state, -1))
+    for k in (0, 177, 299):
+        alone = BallPhysics(1, WorldConfig(), wall=True)
+        ball = torch.cat(start, -1)[k].tolist()
+        for seen in path:
+            ball = alone.advance_one(0, ball)
+            assert ball == seen[k].tolist()
+
+
+def test_the_space_has_the_surfaces_of_one_world_and_a_ball_for_each_that_bounces() -> None:
+    physics = BallPhysics(500, WorldConfig(), wall=True)
+    space = physics._space._space
+    assert len(space.static_body.shapes) == 5
+    state = thrown_balls(500, speed=3.0)
+    most = 0
+    for _ in range(150):
+        state = physics.step(*state)
+        most = max(most, len(space.bodies))
+    assert 10 < most <= 64
+    few = torch.zeros(500, dtype=torch.bool)
+    few[:3] = True
+    for _ in range(300):
+        state = physics.step(*state, few)
+        state[1][:3] = torch.tensor([1.0, -3.0])  # they never come to rest
+    assert len(space.bodies) <= 3  # what was not needed for long is gone

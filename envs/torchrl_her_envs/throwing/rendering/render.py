@@ -21,9 +21,8 @@ _TEXT = 0.045  # of the screen: height of a caption
 
 
 class Scene(Protocol):
-    """What a picture shows of a :class:`~torchrl_her_envs.ThrowingEnv`."""
+    """What a picture shows of a :class:`~torchrl_her_envs.ThrowingEnv`, or of its core."""
 
-    batch_size: torch.Size
     task: Task
     world: WorldConfig
     effector: Effector
@@ -69,7 +68,7 @@ def render(
         >>> render(env, 3, size=64).shape
         torch.Size([64, 64, 3])
     """
-    chosen = choose_indices(env.batch_size[0], worlds)
+    chosen = choose_indices(len(env.worlds.step), worlds)
     stage = _draw_stage(env, size)
     stage.text((0.98, 0.985), caption, height=_TEXT, fill=palette.INK)
     pictures = []

@@ -1,0 +1,63 @@
+"""What lets one rule serve numbers, NumPy arrays and tensors: functions and constants of their kind."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Array = TypeVar("Array", np.ndarray, Tensor)
+
+_OF_NUMBERS = SimpleNamespace(cos=math.cos, sin=math.sin, __name__="numbers")
+
+
+def functions_of(values: Any) -> Any:
+    """What has the functions for such values: ``numpy``, ``torch``, or for a number a few of ``math``'s.
+
+    Use only functions that all have by one name, with positional arguments.
+
+    Example:
+        >>> [functions_of(value).__name__ for value in (np.zeros(2), torch.zeros(2), 0.5)]
+        ['numpy', 'torch', 'numbers']
+    """
+    if isinstance(values, float):
+        return _OF_NUMBERS
+    return np if isinstance(values, np.ndarray) else torch
+
+
+def like(constant: np.ndarray, values: Array) -> Array:
+    """A constant as an array, or as a tensor with the type and on the device of others.
+
+    Example:
+        >>> like(np.array([0.5]), torch.zeros(2)).dtype
+        torch.float32
+    """
+    return constant if isinstance(values, np.ndarray) else torch.as_tensor(constant).to(values)
+
+
+def confined(value: Any, low: Any, high: Any) -> Any:
+    """A value, or each of an array's, or the bound that it goes beyond.
+
+    Example:
+        >>> confined(3.5, -1.0, 1.0)
+        1.0
+    """
+    if isinstance(value, float):
+        return low if value < low else high if value > high else value
+    own = functions_of(value)
+    return own.minimum(own.maximum(value, low), high)
+
+
+def within(dx: Any, dy: Any, distance: float) -> Any:
+    """Whether offsets are shorter than a distance: of numbers a bool, of arrays [...] an array of bool.
+
+    Example:
+        >>> within(0.3, 0.4, 0.5), within(0.3, 0.4, 0.51)
+        (False, True)
+    """
+    # One coordinate beside the other: summing over a dimension of two takes several times as long.
+    return dx * dx + dy * dy < distance**2
