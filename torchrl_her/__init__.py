@@ -28,7 +28,7 @@ from torchrl_her.replay_buffers.options import HindsightOptions
 from torchrl_her.replay_buffers.sample_unit import HERSampleUnit
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.checkpoint import load_checkpoint, save_checkpoint
-from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner
+from torchrl_her.trainers.fused import FusedLearner
 from torchrl_her.trainers.learner import LossLearner
 from torchrl_her.trainers.metrics import success
 from torchrl_her.trainers.trainer import Trainer, evaluate
@@ -41,7 +41,7 @@ __all__ = [
     "DecayingEpsilonGreedy",
     "EnvIds",
     "EnvReward",
-    "FusedDDPGLearner",
+    "FusedLearner",
     "GoalGrid",
     "GoalReward",
     "GoalWeights",

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import Compose, EnvBase, GymWrapper, RenameTransform, SerialEnv, TransformedEnv
 
 from torchrl_her import (
@@ -24,7 +24,7 @@ from torchrl_her import (
     CurriculumLayer,
     CurriculumProgress,
     DecayingEpsilon,
-    FusedDDPGLearner,
+    FusedLearner,
     GoalReward,
     HERWriter,
     StateToObs,
@@ -40,6 +40,7 @@ from torchrl_her import (
 )
 from torchrl_her.curriculum import zero_unused_inputs
 from torchrl_her.modules import StackedLinear
+from torchrl_her.replay_buffers import PackedStorage, RunsSampler
 
 STEPS = 75  # of an episode
 NAMES = {"car": [0, 1], "position": [0], "parcel": [2], "place": [3]}  # [position, speed | parcel | place]
@@ -102,13 +103,22 @@ def make_network(
     return network
 
 
-def make_buffer(progress: CurriculumProgress, run: int, generator: torch.Generator) -> TensorDictReplayBuffer:
-    """The replay buffer of one run: it relabels when written to, and makes ``input`` when sampled."""
-    reward = GoalReward(progress.layer_of(run).threshold)
-    writer = HERWriter(reward, filter_achieved=True, exclude=("state", "input"))
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(300_000), writer=writer)
-    buffer.append_transform(ZeroPad(progress.curriculum, progress, run=run))
-    buffer.set_rng(generator)
+def make_buffer(
+    progress: CurriculumProgress, generators: Sequence[torch.Generator], *, capacity: int = 300_000
+) -> TensorDictReplayBuffer:
+    """The replay buffer of all runs: it relabels when written to, and makes ``input`` when sampled."""
+    runs = {"runs": len(generators), "generators": generators}
+    buffer = TensorDictReplayBuffer(
+        storage=PackedStorage(len(generators) * capacity),  # a block of rows for each run
+        writer=HERWriter(
+            GoalReward(progress.layer_of(0).threshold),  # all runs begin in the first layer
+            filter_achieved=True,
+            exclude=("state", "input"),
+            **runs,
+        ),
+        sampler=RunsSampler(capacity, **runs),
+    )
+    buffer.append_transform(ZeroPad(progress.curriculum, progress))
     return buffer
 
 
@@ -138,7 +148,7 @@ def train(
     loss = make_ddpg_loss(actor, critic, action_penalty=0.03, reduction="none")
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     target = make_target_updater(loss, tau=0.02, hard_interval=0)
-    buffers = [make_buffer(progress, run, generator) for run, generator in enumerate(generators)]
+    buffer = make_buffer(progress, generators)
     trainer = Trainer(
         collector=Collector(
             env,
@@ -147,9 +157,10 @@ def train(
             total_frames=-1,
             auto_register_policy_transforms=False,
         ),
-        buffers=buffers,
-        learner=FusedDDPGLearner(loss, optimizer, target),
+        buffer=buffer,
+        learner=FusedLearner(loss, optimizer, target),
         schedules=[exploration],
+        runs=runs,
         epoch_frames=epoch_frames,
         frames_per_update=4.0,
         warmup_frames=STEPS * num_envs,  # one episode of each environment
@@ -160,7 +171,7 @@ def train(
         names = [progress.layer_of(run).name for run in range(runs)]
         yield trainer.frames, names, samples.mean(1).tolist()
         for run in progress.record(samples).nonzero().flatten().tolist():
-            enter_layer(buffers[run], progress.layer_of(run), exploration, run=run)
+            enter_layer(buffer, progress.layer_of(run), exploration, run=run)
     trainer.collector.shutdown()
     eval_env.close()
 

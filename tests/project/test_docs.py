@@ -13,7 +13,7 @@ import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 PACKAGES = ("torchrl_her", "torchrl_her_envs", "torchrl_her_recipes")
-LIBRARY = ("goals", "replay_buffers", "modules", "objectives", "curriculum", "trainers")
+LIBRARY = ("goals", "replay_buffers", "modules", "objectives", "curriculum", "trainers", "native")
 PAGES = sorted(path.name for path in DOCS.glob("*.md"))
 
 
@@ -32,7 +32,7 @@ def conf() -> ModuleType:
 
 
 # The other guides have tests of their own: below, test_examples.py, test_extending.py, test_gym_guide.py.
-@pytest.mark.parametrize(("page", "number"), [("index.md", 1), ("replay_buffers.md", 3), ("weights.md", 3)])
+@pytest.mark.parametrize(("page", "number"), [("index.md", 1), ("replay_buffers.md", 4), ("weights.md", 3)])
 def test_a_page_s_python_runs_from_top_to_bottom(page: str, number: int) -> None:
     assert len(blocks(page)) == number
     names: dict[str, object] = {"__name__": page}

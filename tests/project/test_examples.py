@@ -18,6 +18,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 from torchrl.envs import SerialEnv, TransformedEnv
 
 from torchrl_her import Curriculum, CurriculumLayer, CurriculumProgress, StateToObs, ZeroPad, make_actor
+from torchrl_her.replay_buffers import rows_of_run, sizes_of
 
 DOCS = Path(__file__).parents[2] / "docs"
 GUIDE = (DOCS / "curriculum.md").read_text()
@@ -82,13 +83,14 @@ def test_the_example_trains_each_run_in_its_layer_and_moves_on(
     example: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ended: list[tuple[TensorDict, CurriculumLayer]] = []  # stored transitions, and the next layer
-    buffers: list[ReplayBuffer] = []
+    moved: list[tuple[ReplayBuffer, int]] = []  # the buffer of all runs, and a run that began a layer
     enter_layer = example.enter_layer
 
-    def spy(buffer: ReplayBuffer, layer: CurriculumLayer, *args: object, **kwargs: object) -> None:
-        ended.append((buffer[:].clone(), layer))
-        enter_layer(buffer, layer, *args, **kwargs)
-        buffers.append(buffer)
+    def spy(buffer: ReplayBuffer, layer: CurriculumLayer, *args: object, run: int) -> None:
+        ended.append((rows_of_run(buffer, run).clone(), layer))
+        enter_layer(buffer, layer, *args, run=run)
+        assert sizes_of(buffer)[run] == 0
+        moved.append((buffer, run))
 
     monkeypatch.setattr(example, "enter_layer", spy)
     easy = replace(example.DRIVE, threshold=0.6)  # the parcel is 0.27 to 0.84 away
@@ -99,14 +101,15 @@ def test_the_example_trains_each_run_in_its_layer_and_moves_on(
     first = {run: [names[run] for _, names, _ in rows] for run in range(2)}
     assert [names[0] for names in first.values()] == ["drive", "drive"]
     assert "deliver" in [names[-1] for names in first.values()]
-    assert len(ended) == len(buffers) >= 1
+    assert len(ended) == len(moved) >= 1
     for stored, layer in ended:
         assert layer.name == "deliver"
         check_rows(stored, easy.threshold, low=-0.95, high=-0.6)
-    begun = [buffer for buffer in buffers if len(buffer) > 0]  # the others changed layer after the last epoch
+    # The others changed layer after the last epoch.
+    begun = [rows_of_run(buffer, run) for buffer, run in moved if sizes_of(buffer)[run] > 0]
     assert begun
-    for buffer in begun:
-        check_rows(buffer[:], example.DELIVER.threshold, low=0.4, high=0.8)
+    for rows_of_layer in begun:
+        check_rows(rows_of_layer, example.DELIVER.threshold, low=0.4, high=0.8)
 
 
 def check_rows(rows: TensorDict, threshold: float, *, low: float, high: float) -> None:

@@ -136,7 +136,7 @@ def test_every_preset_runs(preset: Path) -> None:
         (["train", "hand_v0"], "got 'hand_v0'; did you mean task=hand_v0?"),
         (["train", "ibs.flor=3"], "no option 'ibs.flor'; did you mean floor?"),
         (["train", "seed=1,2"], "several are a sweep: torchrl-her train -m"),
-        (["train", "learner=td3", "action_penalty=50"], "learner=td3 has no option action_penalty"),
+        (["train", "learner=ddpg", "critics=5"], "learner=ddpg has no option critics"),
         (
             ["train", "task=bit_flip", "action_penalty=50"],
             "action_penalty=50.0 has no effect with learner=dqn",

@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 from torchrl.data import ReplayBuffer, Writer
 
 from torchrl_her.curriculum.layers import CurriculumLayer
 from torchrl_her.goals.ibs import Instructiveness
 from torchrl_her.goals.rewards import GoalReward
 from torchrl_her.modules.exploration import DecayingEpsilon
+from torchrl_her.replay_buffers.runs.buffer import empty_run, runs_of
 from torchrl_her.replay_buffers.writer import HERWriter
 
+# The same function for all runs in a layer, so that a writer can relabel them at once.
+_reward = cache(GoalReward)
 
-def set_layer_goals(writer: Writer, layer: CurriculumLayer) -> None:
-    """Lets a writer relabel with a layer's reward, and use its IBS weights only if the layer says so.
+
+def set_layer_goals(writer: Writer, layer: CurriculumLayer, *, run: int = 0) -> None:
+    """Lets a writer relabel a run with a layer's reward, and use its IBS weights only if the layer says so.
+
+    Args:
+        writer: of one run or several.
+        layer: the layer that the run is in.
+
+    Keyword Args:
+        run: which of the writer's runs.
 
     Raises:
         TypeError: the writer does not relabel.
     """
     if not isinstance(writer, HERWriter):
         raise TypeError(f"a curriculum needs a buffer with a HERWriter, got a {type(writer).__name__}")
-    writer.reward_fn = GoalReward(layer.threshold)
-    if isinstance(writer.weights, Instructiveness):
-        writer.weights.alike = not layer.instructive
+    writer.set_reward(_reward(layer.threshold), run=run)
+    weights = writer.goal_weights[run] if writer.goal_weights else None
+    if isinstance(weights, Instructiveness):
+        weights.alike = not layer.instructive
 
 
 def enter_layer(
@@ -32,24 +46,25 @@ def enter_layer(
     epsilon: float | None = None,
     run: int = 0,
 ) -> None:
-    """Begins a layer: the buffer, its priorities and q are emptied, exploration and sigma start anew.
+    """Begins a run's layer: its rows, priorities and q are emptied, its exploration and sigma start anew.
 
     Networks and optimizer are not touched, since the next layer builds on what was learned.
 
     Args:
-        buffer: of the run, with a :class:`~torchrl_her.HERWriter`. It must not prefetch, since it would then
-            still return old transitions.
+        buffer: of the run, or of all runs, with a :class:`~torchrl_her.HERWriter`. It must not prefetch,
+            since it would then still return old transitions.
         layer: the layer that begins.
         exploration: of all runs; None to leave exploration as it is.
 
     Keyword Args:
         epsilon: where exploration starts again; None for where it started first.
-        run: which run the buffer is of.
+        run: which run begins the layer, for exploration and in a buffer of several runs.
     """
-    buffer.empty()
+    place = run if runs_of(buffer) > 1 else 0
+    empty_run(buffer, place)
     writer = buffer.writer
-    set_layer_goals(writer, layer)
-    if isinstance(writer.weights, Instructiveness):
-        writer.weights.restart()
+    set_layer_goals(writer, layer, run=place)
+    if writer.goal_weights and isinstance(weights := writer.goal_weights[place], Instructiveness):
+        weights.restart()
     if exploration is not None:
         exploration.restart(epsilon, run=run)

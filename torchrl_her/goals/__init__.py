@@ -13,7 +13,7 @@ from torchrl_her.goals.strategies import (
     register_strategy,
     strategy_name,
 )
-from torchrl_her.goals.weights import GoalWeights
+from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 
 __all__ = [
     "STRATEGIES",
@@ -26,6 +26,7 @@ __all__ = [
     "RewardFunction",
     "Strategy",
     "StrategyFunction",
+    "WeightsOfRuns",
     "achieved",
     "box_target",
     "candidate_range",

@@ -8,12 +8,15 @@ episodes padded to a common horizon T and take any leading batch shape.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from torchrl_her.goals.strategies import Strategy, candidate_range
 
-_NARROW = 1e3  # greatest weight over the least one for which float32 draws them to a thousandth
+# A generator, or a function that gives uniform numbers in [0, 1) of a shape, type and device.
+Randomness = torch.Generator | Callable[[tuple[int, ...], torch.dtype, torch.device], Tensor] | None
 
 
 def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
@@ -67,7 +70,13 @@ def combine(candidate: Tensor, weight: Tensor | None = None, keep: Tensor | None
     return candidate * weight
 
 
-def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: torch.Generator | None = None) -> Tensor:
+def _uniform(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device, source: Randomness) -> Tensor:
+    if source is None or isinstance(source, torch.Generator):
+        return torch.rand(*shape, dtype=dtype, device=device, generator=source)
+    return source(shape, dtype, device)
+
+
+def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: Randomness = None) -> Tensor:
     """Draws k goals, with replacement, for each transition; all its candidates are equally likely.
 
     The result is that of :func:`~torchrl_her.goals.draw` from a table of candidates. No table is made, as it
@@ -77,7 +86,7 @@ def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: torch.Generator
         first: [...] int64, the first candidate.
         end: [...] int64, one more than the last candidate; above ``first``.
         k: number of draws.
-        generator: source of the random numbers.
+        generator: source of the random numbers; or a function that gives them, of a shape, type and device.
 
     Returns:
         [..., k] of int64, the transition that achieved the goal.
@@ -86,12 +95,12 @@ def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: torch.Generator
         >>> draw_alike(torch.tensor([5, 7]), torch.tensor([6, 8]), 3).tolist()
         [[5, 5, 5], [7, 7, 7]]
     """
-    u = torch.rand(*first.shape, k, device=first.device, generator=generator)
+    u = _uniform((*first.shape, k), torch.get_default_dtype(), first.device, generator)
     return first.unsqueeze(-1) + (u * (end - first).unsqueeze(-1)).long()
 
 
 def draw_weighted(
-    weight: Tensor, first: Tensor, end: Tensor, k: int, *, generator: torch.Generator | None = None
+    weight: Tensor, first: Tensor, end: Tensor, k: int, *, generator: Randomness = None
 ) -> Tensor:
     """Draws k goals, with replacement, for each transition, in proportion to the goals' weights.
 
@@ -103,7 +112,7 @@ def draw_weighted(
         first: [..., n] int64, the first candidate of each transition.
         end: [..., n] int64, one more than the last candidate; above ``first``.
         k: number of draws.
-        generator: source of the random numbers.
+        generator: source of the random numbers; or a function that gives them, of a shape, type and device.
 
     Returns:
         [..., n, k] of int64, the transition that achieved the goal. Where all candidates have weight 0
@@ -115,10 +124,9 @@ def draw_weighted(
         [[2, 2], [3, 3]]
     """
     # In float32, differences of a running sum would lose weights that are far below the greatest.
-    wide = weight.numel() > 0 and bool(weight.max() > _NARROW * weight.min())
-    cumulative = torch.nn.functional.pad((weight.double() if wide else weight).cumsum(-1), (1, 0))
+    cumulative = torch.nn.functional.pad(weight.double().cumsum(-1), (1, 0))
     low, high = cumulative.gather(-1, first), cumulative.gather(-1, end)
-    u = torch.rand(*first.shape, k, dtype=cumulative.dtype, device=first.device, generator=generator)
+    u = _uniform((*first.shape, k), cumulative.dtype, first.device, generator)
     mass = low.unsqueeze(-1) + u * (high - low).unsqueeze(-1)
     # 32 bits are enough, and take half the time
     index = torch.searchsorted(cumulative, mass.flatten(-2), right=True, out_int32=True).view_as(mass)
@@ -127,13 +135,13 @@ def draw_weighted(
     return index.clamp_(low, high).long() - 1
 
 
-def draw(likelihood: Tensor, k: int, *, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+def draw(likelihood: Tensor, k: int, *, generator: Randomness = None) -> tuple[Tensor, Tensor]:
     """Draws k goals, with replacement, for each transition.
 
     Args:
         likelihood: [..., T], at least 0, from :func:`~torchrl_her.goals.combine`.
         k: number of draws.
-        generator: source of the random numbers.
+        generator: source of the random numbers; or a function that gives them, of a shape, type and device.
 
     Returns:
         ``(index, valid)``: [..., k] of int64, the transition that achieved the goal, and [...] of
@@ -147,7 +155,7 @@ def draw(likelihood: Tensor, k: int, *, generator: torch.Generator | None = None
     """
     cumulative = likelihood.cumsum(-1)
     total = cumulative[..., -1:]
-    u = torch.rand(*total.shape[:-1], k, dtype=total.dtype, device=total.device, generator=generator)
+    u = _uniform((*total.shape[:-1], k), total.dtype, total.device, generator)
     # u * total can round up to total itself, which lies beyond the last goal that may be drawn
     mass = torch.minimum(u * total, torch.nextafter(total, torch.zeros_like(total)))
     index = torch.searchsorted(cumulative, mass, right=True)

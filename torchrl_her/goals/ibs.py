@@ -6,14 +6,14 @@ Equations are those of chapter 4 (Instructional Based Strategy) of the thesis th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_her.goals.grid import GoalGrid, kl_divergence
-from torchrl_her.goals.weights import GoalWeights
+from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 
 
 class GoalHistogram(GoalWeights):
@@ -54,6 +54,10 @@ class GoalHistogram(GoalWeights):
 
     def clear(self) -> None:
         self.counts = torch.zeros_like(self.counts)
+
+    @classmethod
+    def of_runs(cls, own: Sequence[GoalWeights]) -> WeightsOfRuns:
+        return HistogramsOfRuns(own) if HistogramsOfRuns.fits(own) else WeightsOfRuns(own)
 
     def state_dict(self) -> dict[str, Any]:
         return {"counts": self.counts.clone()}
@@ -100,6 +104,7 @@ class Instructiveness(GoalHistogram):
     """
 
     alike = False
+    q_star: Tensor
 
     def __init__(
         self,
@@ -132,6 +137,15 @@ class Instructiveness(GoalHistogram):
         """KL(q || q*) in nats, with q* at the final and not the present sigma; NaN before the first write."""
         return self.divergence_to(self.final_q_star)
 
+    @property
+    def table(self) -> Tensor:
+        """The weights [cells] of float64."""
+        q_star = self.q_star = self.q_star.to(self.counts.device)
+        if not self.subtract:
+            return q_star
+        floor = self.floor * q_star.max() if self.floor_is_relative else self.floor
+        return (q_star - self.q).clamp_min(floor)
+
     def step(self) -> None:
         """Shrinks sigma; to be called at the end of each epoch."""
         self._set_sigma(max(self.final_sigma, self.sigma * math.sqrt(self.decay)))
@@ -141,17 +155,7 @@ class Instructiveness(GoalHistogram):
         self._set_sigma(self.final_sigma * self.start_factor)
 
     def __call__(self, goals: Tensor) -> Tensor:
-        cells = self.grid.cell(goals)
-        dtype = goals.dtype if goals.is_floating_point() else None  # weights are not integers
-        return self._weights.to(goals.device, dtype).index_select(0, cells.flatten()).view(cells.shape)
-
-    def update(self, goals: Tensor) -> None:
-        super().update(goals)
-        self._refresh()
-
-    def clear(self) -> None:
-        super().clear()
-        self._refresh()
+        return _look_up(self.table, self.grid.cell(goals), goals)
 
     def state_dict(self) -> dict[str, Any]:
         return {**super().state_dict(), "sigma": self.sigma}
@@ -162,7 +166,6 @@ class Instructiveness(GoalHistogram):
 
     def _set_sigma(self, sigma: float) -> None:
         self.sigma, self.q_star = sigma, self._target(sigma)
-        self._refresh()
 
     def _target(self, sigma: float) -> Tensor:
         q_star = self.target(sigma)
@@ -174,11 +177,53 @@ class Instructiveness(GoalHistogram):
             )
         return q_star.double()
 
-    def _refresh(self) -> None:
-        """The table [cells] that weights are looked up in."""
-        q_star = self.q_star = self.q_star.to(self.counts.device)
-        if self.subtract:
-            floor = self.floor * q_star.max() if self.floor_is_relative else self.floor
-            self._weights = (q_star - self.q).clamp_min(floor)
-        else:
-            self._weights = q_star
+
+class HistogramsOfRuns(WeightsOfRuns):
+    """The histograms of several runs over one grid, counted and looked up for all runs at once.
+
+    Args:
+        own: R, of each run: all :class:`GoalHistogram`, or all :class:`Instructiveness`, over the same grid.
+
+    Example:
+        >>> grid = GoalGrid(0.0, 1.0, [2])
+        >>> first, second = GoalHistogram(grid), GoalHistogram(grid)
+        >>> HistogramsOfRuns([first, second]).update(torch.tensor([[0.1], [0.2], [0.8]]), [0, 1], [1, 2])
+        >>> first.counts.tolist(), second.counts.tolist()
+        ([1, 0], [1, 1])
+    """
+
+    own: Sequence[GoalHistogram]
+
+    @staticmethod
+    def fits(own: Sequence[GoalWeights]) -> bool:
+        """Whether these are histograms over one grid. Subclasses may do anything, so they do not count."""
+        first = own[0]
+        return type(first) in (GoalHistogram, Instructiveness) and all(
+            type(weights) is type(first) and weights.grid is first.grid  # type: ignore[attr-defined]
+            for weights in own
+        )
+
+    def __call__(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> Tensor:
+        tables = [own.table for run in runs if isinstance(own := self.own[run], Instructiveness)]
+        if not tables:
+            return goals.new_ones(goals.shape[:-1])
+        return _look_up(torch.cat(tables), self._cells(goals, counts), goals)
+
+    def update(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> None:
+        size = self.own[0].grid.num_cells
+        added = self._cells(goals, counts).bincount(minlength=len(runs) * size).view(len(runs), size)
+        for run, own in zip(runs, added, strict=True):
+            self.own[run].counts = self.own[run].counts.to(own.device) + own
+
+    def _cells(self, goals: Tensor, counts: Sequence[int]) -> Tensor:
+        """The cell [n, ...] of each goal in the joined tables of some runs."""
+        cells, size = self.own[0].grid.cell(goals), self.own[0].grid.num_cells
+        for position, part in enumerate(cells.split(list(counts))):
+            part += position * size
+        return cells
+
+
+def _look_up(table: Tensor, cells: Tensor, goals: Tensor) -> Tensor:
+    """Weights [...] of goals [..., g] in cells [...]; of their type, unless that is whole numbers."""
+    dtype = goals.dtype if goals.is_floating_point() else None
+    return table.to(goals.device, dtype).index_select(0, cells.flatten()).view(cells.shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -42,6 +43,50 @@ class GoalWeights:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Puts back what :meth:`state_dict` gave."""
+
+    @classmethod
+    def of_runs(cls, own: Sequence[GoalWeights]) -> WeightsOfRuns:
+        """The weights of several runs, all of this class, to be asked and told about all runs at once."""
+        return WeightsOfRuns(own)
+
+
+class WeightsOfRuns:
+    """The weights of goals of several runs, each with weights of its own. They are asked one after the other.
+
+    Args:
+        own: R, of each run.
+
+    Example:
+        >>> class Times(GoalWeights):
+        ...     def __init__(self, factor):
+        ...         self.factor = factor
+        ...
+        ...     def __call__(self, goals):
+        ...         return self.factor * goals[..., 0]
+        >>> both = WeightsOfRuns([Times(1.0), Times(10.0)])
+        >>> both(torch.tensor([[3.0], [4.0], [5.0]]), [0, 1], [1, 2]).tolist()
+        [3.0, 40.0, 50.0]
+    """
+
+    def __init__(self, own: Sequence[GoalWeights]) -> None:
+        self.own = own
+
+    def __call__(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> Tensor:
+        """The weights [n, ...] of goals of some runs.
+
+        Args:
+            goals: [n, ..., g], those of one run after those of the other.
+            runs: m numbers of runs.
+            counts: m numbers of goals, of each of these runs; they sum to n.
+        """
+        parts = goals.split(list(counts))
+        return torch.cat([self.own[run](part) for run, part in zip(runs, parts, strict=True)])
+
+    def update(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> None:
+        """Tells which goals [n, g] were written; the rest is as for a call."""
+        for run, part in zip(runs, goals.split(list(counts)), strict=True):
+            if len(part):
+                self.own[run].update(part)
 
 
 def checked_weights(weight: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torchrl_her.modules.exploration import (
 from torchrl_her.modules.networks import (
     ActorNet,
     CriticNet,
+    StackedLayerNorm,
     StackedLinear,
     make_actor,
     make_critic,
@@ -26,6 +27,7 @@ __all__ = [
     "DecayingEpsilonGreedy",
     "Exploration",
     "QNet",
+    "StackedLayerNorm",
     "StackedLinear",
     "StochasticActorNet",
     "explore",

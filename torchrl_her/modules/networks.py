@@ -1,4 +1,4 @@
-"""Actor and critic: three hidden layers each; the critic takes the action in after its first layer.
+"""Actor and critic: multilayer perceptrons; the critic takes the action in after its first layer.
 
 A network holds the weights of one run, or of R independent runs ("stacked"): every weight then has a
 leading dimension R, and one batched product serves all runs. Inputs [..., width] are R equal blocks, one for
@@ -8,14 +8,20 @@ each run in order.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
+ActivationName = Literal["relu", "tanh", "elu"]
+Norm = Literal["none", "layer", "batch"]
+
+ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU}
 _LAST_LAYER = 3e-3  # small last layers keep early actions off the ends of tanh: Lillicrap et al., 2016
+_LEAST_DEPTH = 2  # the critic takes the action in after its first hidden layer, and something must follow
 
 
 class StackedLinear(nn.Module):
@@ -65,10 +71,76 @@ class StackedBatchNorm(nn.Module):
         return self.norm(flat).view(rows, runs, width).transpose(0, 1)
 
 
-def hidden_layer(inputs: int, outputs: int, *, runs: int = 1, normalize: bool = False) -> nn.Sequential:
-    """A stacked linear layer and a ReLU; ``normalize`` puts batch normalization between them."""
-    norm = [StackedBatchNorm(outputs, runs=runs)] if normalize else []
-    return nn.Sequential(StackedLinear(inputs, outputs, runs=runs), *norm, nn.ReLU())
+class StackedLayerNorm(nn.Module):
+    """Layer normalization in which each run has its own scale and shift.
+
+    Ba et al., Layer normalization, 2016.
+
+    Args:
+        width: of the input.
+        runs: R.
+
+    Example:
+        >>> StackedLayerNorm(2)(torch.tensor([[[1.0, 3.0]]])).round(decimals=3).tolist()
+        [[[-1.0, 1.0]]]
+    """
+
+    def __init__(self, width: int, *, runs: int = 1) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(runs, 1, width))
+        self.bias = nn.Parameter(torch.zeros(runs, 1, width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[R, rows, width] to the same."""
+        return torch.nn.functional.layer_norm(x, x.shape[-1:]) * self.weight + self.bias
+
+
+def hidden_layer(
+    inputs: int, outputs: int, *, runs: int = 1, norm: Norm = "none", activation: ActivationName = "relu"
+) -> nn.Sequential:
+    """A stacked linear layer, a normalization if there is one, and an activation."""
+    norms: dict[str, Any] = {"layer": StackedLayerNorm, "batch": StackedBatchNorm}
+    between = [norms[norm](outputs, runs=runs)] if norm in norms else []
+    return nn.Sequential(StackedLinear(inputs, outputs, runs=runs), *between, ACTIVATIONS[activation]())
+
+
+def hidden_layers(
+    inputs: int,
+    hidden: int,
+    depth: int,
+    *,
+    joined: int = 0,
+    runs: int = 1,
+    norm: Norm = "none",
+    activation: ActivationName = "relu",
+) -> list[nn.Module]:
+    """Hidden layers of one width, one after the other.
+
+    Args:
+        inputs: width of the input.
+        hidden: width of each layer.
+        depth: how many there are, at least 2.
+        joined: width of what the second one takes in besides the outputs of the first.
+        runs: R.
+        norm: normalization of each layer.
+        activation: behind each layer.
+
+    Raises:
+        ValueError: the width or the depth is too small, or a word is not one of those that there are.
+
+    Example:
+        >>> len(hidden_layers(4, 64, 3))
+        3
+    """
+    if hidden < 1:
+        raise ValueError(f"hidden must be at least 1, got {hidden}")
+    if depth < _LEAST_DEPTH:
+        raise ValueError(f"depth must be at least {_LEAST_DEPTH}, got {depth}")
+    for name, word, known in (("norm", norm, get_args(Norm)), ("activation", activation, tuple(ACTIVATIONS))):
+        if word not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {word!r}")
+    widths = [inputs, hidden + joined, *[hidden] * (depth - 2)]
+    return [hidden_layer(own, hidden, runs=runs, norm=norm, activation=activation) for own in widths]
 
 
 class ActorNet(nn.Module):
@@ -77,21 +149,39 @@ class ActorNet(nn.Module):
     Args:
         inputs: width of all inputs together.
         actions: width of the action.
-        hidden: width of each of the three hidden layers.
+        hidden: width of the hidden layers.
+        depth: how many hidden layers there are, at least 2.
+        activation: behind each of them: ``"relu"``, ``"tanh"`` or ``"elu"``.
+        norm: ``"layer"`` for layer normalization before each activation, ``"none"`` without.
         runs: R, how many independent actors.
+
+    Raises:
+        ValueError: an option cannot be; batch normalization, among others, is for critics only.
 
     Example:
         >>> ActorNet(11, 3)(torch.zeros(2, 9), torch.zeros(2, 2)).shape
         torch.Size([2, 3])
     """
 
-    def __init__(self, inputs: int, actions: int, *, hidden: int = 64, runs: int = 1) -> None:
+    def __init__(
+        self,
+        inputs: int,
+        actions: int,
+        *,
+        hidden: int = 64,
+        depth: int = 3,
+        activation: ActivationName = "relu",
+        norm: Norm = "none",
+        runs: int = 1,
+    ) -> None:
         super().__init__()
+        if norm == "batch":
+            raise ValueError("norm must be none or layer in an actor, got 'batch'")
         self.runs = runs
-        widths = [inputs, hidden, hidden, hidden]
-        layers = [hidden_layer(widths[i], widths[i + 1], runs=runs) for i in range(3)]
         self.layers = nn.Sequential(
-            *layers, StackedLinear(hidden, actions, runs=runs, bound=_LAST_LAYER), nn.Tanh()
+            *hidden_layers(inputs, hidden, depth, runs=runs, norm=norm, activation=activation),
+            StackedLinear(hidden, actions, runs=runs, bound=_LAST_LAYER),
+            nn.Tanh(),
         )
 
     def forward(self, *inputs: Tensor) -> Tensor:
@@ -106,9 +196,15 @@ class CriticNet(nn.Module):
     Args:
         inputs: width of all inputs together, without the action.
         actions: width of the action, the last input.
-        hidden: width of each of the three hidden layers.
-        normalize: batch normalization of the input and of the hidden layers.
+        hidden: width of the hidden layers.
+        depth: how many hidden layers there are, at least 2.
+        activation: behind each of them: ``"relu"``, ``"tanh"`` or ``"elu"``.
+        norm: ``"layer"`` for layer normalization of the hidden layers, ``"batch"`` for batch normalization of
+            the input and the hidden layers, ``"none"`` without.
         runs: R, how many independent critics.
+
+    Raises:
+        ValueError: an option cannot be.
 
     Example:
         >>> CriticNet(11, 3)(torch.zeros(2, 9), torch.zeros(2, 2), torch.zeros(2, 3)).shape
@@ -116,17 +212,24 @@ class CriticNet(nn.Module):
     """
 
     def __init__(
-        self, inputs: int, actions: int, *, hidden: int = 64, normalize: bool = False, runs: int = 1
+        self,
+        inputs: int,
+        actions: int,
+        *,
+        hidden: int = 64,
+        depth: int = 3,
+        activation: ActivationName = "relu",
+        norm: Norm = "none",
+        runs: int = 1,
     ) -> None:
         super().__init__()
         self.runs = runs
-        norm = [StackedBatchNorm(inputs, runs=runs)] if normalize else []
-        self.first = nn.Sequential(*norm, hidden_layer(inputs, hidden, runs=runs, normalize=normalize))
-        self.rest = nn.Sequential(
-            hidden_layer(hidden + actions, hidden, runs=runs, normalize=normalize),
-            hidden_layer(hidden, hidden, runs=runs, normalize=normalize),
-            StackedLinear(hidden, 1, runs=runs, bound=_LAST_LAYER),
+        first, *rest = hidden_layers(
+            inputs, hidden, depth, joined=actions, runs=runs, norm=norm, activation=activation
         )
+        own = [StackedBatchNorm(inputs, runs=runs)] if norm == "batch" else []
+        self.first = nn.Sequential(*own, first)
+        self.rest = nn.Sequential(*rest, StackedLinear(hidden, 1, runs=runs, bound=_LAST_LAYER))
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """[..., widths] of the inputs, the action last, to [..., 1]."""
@@ -176,6 +279,9 @@ def make_actor(
     actions: int,
     *,
     hidden: int = 64,
+    depth: int = 3,
+    activation: ActivationName = "relu",
+    norm: Norm = "none",
     runs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     action_key: NestedKey = "action",
@@ -185,7 +291,7 @@ def make_actor(
     Args:
         widths: of the inputs, one for each of ``in_keys``.
         actions: width of the action, which is within [-1, 1].
-        hidden: width of the hidden layers.
+        hidden, depth, activation, norm: see :class:`ActorNet`.
         runs: R, how many independent actors.
         in_keys: what it sees; the goal must be among them.
         action_key: where it writes the action.
@@ -197,7 +303,9 @@ def make_actor(
         >>> actor(TensorDict(seen, [4]))["action"].shape
         torch.Size([4, 3])
     """
-    net = ActorNet(sum(widths), actions, hidden=hidden, runs=runs)
+    net = ActorNet(
+        sum(widths), actions, hidden=hidden, depth=depth, activation=activation, norm=norm, runs=runs
+    )
     return TensorDictModule(net, in_keys=list(in_keys), out_keys=[action_key])
 
 
@@ -206,7 +314,9 @@ def make_critic(
     actions: int,
     *,
     hidden: int = 64,
-    normalize: bool = False,
+    depth: int = 3,
+    activation: ActivationName = "relu",
+    norm: Norm = "none",
     runs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     action_key: NestedKey = "action",
@@ -217,8 +327,7 @@ def make_critic(
     Args:
         widths: of the inputs, one for each of ``in_keys``.
         actions: width of the action.
-        hidden: width of the hidden layers.
-        normalize: whether to normalize the input and the hidden layers over the batch.
+        hidden, depth, activation, norm: see :class:`CriticNet`.
         runs: R, how many independent critics.
         in_keys: what it sees besides the action; the goal must be among them.
         action_key: where it reads the action.
@@ -231,5 +340,7 @@ def make_critic(
         >>> critic(TensorDict({**seen, "action": torch.zeros(4, 3)}, [4]))["state_action_value"].shape
         torch.Size([4, 1])
     """
-    net = CriticNet(sum(widths), actions, hidden=hidden, normalize=normalize, runs=runs)
+    net = CriticNet(
+        sum(widths), actions, hidden=hidden, depth=depth, activation=activation, norm=norm, runs=runs
+    )
     return TensorDictModule(net, in_keys=[*in_keys, action_key], out_keys=[value_key])

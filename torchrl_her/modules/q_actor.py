@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
 
-from torchrl_her.modules.networks import StackedLinear, by_run, hidden_layer
+from torchrl_her.modules.networks import ActivationName, Norm, StackedLinear, by_run, hidden_layers
 
 
 class QNet(nn.Module):
@@ -20,7 +20,7 @@ class QNet(nn.Module):
     Args:
         inputs: width of all inputs together.
         actions: how many actions there are.
-        hidden: width of each of the three hidden layers.
+        hidden, depth, activation, norm: as for :class:`~torchrl_her.modules.ActorNet`.
         runs: R, how many independent networks.
 
     Example:
@@ -28,11 +28,20 @@ class QNet(nn.Module):
         torch.Size([2, 4])
     """
 
-    def __init__(self, inputs: int, actions: int, *, hidden: int = 64, runs: int = 1) -> None:
+    def __init__(
+        self,
+        inputs: int,
+        actions: int,
+        *,
+        hidden: int = 64,
+        depth: int = 3,
+        activation: ActivationName = "relu",
+        norm: Norm = "none",
+        runs: int = 1,
+    ) -> None:
         super().__init__()
         self.runs = runs
-        widths = [inputs, hidden, hidden, hidden]
-        layers = [hidden_layer(widths[i], widths[i + 1], runs=runs) for i in range(3)]
+        layers = hidden_layers(inputs, hidden, depth, runs=runs, norm=norm, activation=activation)
         self.layers = nn.Sequential(*layers, StackedLinear(hidden, actions, runs=runs))
 
     def forward(self, *inputs: Tensor) -> Tensor:
@@ -58,6 +67,9 @@ def make_q_actor(
     actions: int,
     *,
     hidden: int = 64,
+    depth: int = 3,
+    activation: ActivationName = "relu",
+    norm: Norm = "none",
     runs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     value_key: NestedKey = "state_action_value",
@@ -67,7 +79,7 @@ def make_q_actor(
     Args:
         widths: of the inputs, one for each of ``in_keys``.
         actions: how many actions there are; they are integers (``Categorical``).
-        hidden: width of the hidden layers.
+        hidden, depth, activation, norm: as for :class:`~torchrl_her.modules.ActorNet`.
         runs: R, how many independent networks.
         in_keys: what it sees; the goal must be among them.
         value_key: where the value of a given action is written.
@@ -83,6 +95,6 @@ def make_q_actor(
         >>> critic(actor(seen))["state_action_value"].shape
         torch.Size([2, 1])
     """
-    net = QNet(sum(widths), actions, hidden=hidden, runs=runs)
+    net = QNet(sum(widths), actions, hidden=hidden, depth=depth, activation=activation, norm=norm, runs=runs)
     actor = QValueActor(net, spec=Categorical(actions), in_keys=list(in_keys), action_space="categorical")
     return actor, TensorDictModule(_ChosenValue(net), in_keys=[*in_keys, "action"], out_keys=[value_key])

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from torchrl_her.modules.networks import StackedLinear, hidden_layer
+from torchrl_her.modules.networks import ActivationName, Norm, StackedLinear, by_run, hidden_layers
 
 _LEAST_SCALE, _GREATEST_SCALE = -10.0, 2.0  # of the logarithm: Haarnoja et al., 2018
 
@@ -22,7 +22,8 @@ class StochasticActorNet(nn.Module):
     Args:
         inputs: width of all inputs together.
         actions: width of the action.
-        hidden: width of each of the three hidden layers.
+        hidden, depth, activation, norm: as for :class:`~torchrl_her.modules.ActorNet`.
+        runs: R, how many independent actors.
 
     Example:
         >>> location, scale = StochasticActorNet(11, 3)(torch.zeros(2, 9), torch.zeros(2, 2))
@@ -30,16 +31,26 @@ class StochasticActorNet(nn.Module):
         (torch.Size([2, 3]), True)
     """
 
-    def __init__(self, inputs: int, actions: int, *, hidden: int = 64) -> None:
+    def __init__(
+        self,
+        inputs: int,
+        actions: int,
+        *,
+        hidden: int = 64,
+        depth: int = 3,
+        activation: ActivationName = "relu",
+        norm: Norm = "none",
+        runs: int = 1,
+    ) -> None:
         super().__init__()
-        widths = [inputs, hidden, hidden, hidden]
-        layers = [hidden_layer(widths[i], widths[i + 1]) for i in range(3)]
-        self.layers = nn.Sequential(*layers, StackedLinear(hidden, 2 * actions))
+        self.runs = runs
+        layers = hidden_layers(inputs, hidden, depth, runs=runs, norm=norm, activation=activation)
+        self.layers = nn.Sequential(*layers, StackedLinear(hidden, 2 * actions, runs=runs))
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """[..., widths] of the inputs to two of [..., actions]."""
         x = torch.cat(inputs, -1)
-        out = self.layers(x.reshape(1, -1, x.shape[-1])).view(*x.shape[:-1], -1)
+        out = self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
         location, scale = out.chunk(2, -1)
         return location, scale.clamp(_LEAST_SCALE, _GREATEST_SCALE).exp()
 
@@ -49,6 +60,10 @@ def make_stochastic_actor(
     action_spec: Bounded,
     *,
     hidden: int = 64,
+    depth: int = 3,
+    activation: ActivationName = "relu",
+    norm: Norm = "none",
+    runs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
 ) -> ProbabilisticActor:
     """SAC's actor: draws from a squashed normal distribution; its greedy action is the squashed location.
@@ -56,7 +71,8 @@ def make_stochastic_actor(
     Args:
         widths: of the inputs, one for each of ``in_keys``.
         action_spec: least and greatest actions, of one environment.
-        hidden: width of the hidden layers.
+        hidden, depth, activation, norm: as for :class:`~torchrl_her.modules.ActorNet`.
+        runs: R, how many independent actors.
         in_keys: what it sees; the goal must be among them.
 
     Example:
@@ -66,7 +82,15 @@ def make_stochastic_actor(
         >>> actor(seen)["action"].shape
         torch.Size([4, 3])
     """
-    net = StochasticActorNet(sum(widths), action_spec.shape[-1], hidden=hidden)
+    net = StochasticActorNet(
+        sum(widths),
+        action_spec.shape[-1],
+        hidden=hidden,
+        depth=depth,
+        activation=activation,
+        norm=norm,
+        runs=runs,
+    )
     return ProbabilisticActor(
         TensorDictModule(net, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

@@ -1,15 +1,19 @@
-"""TorchRL's losses of DDPG, TD3, SAC and DQN, with clamped targets; DDPG with an action L2 penalty."""
+"""TorchRL's losses of DDPG, TD3, SAC and DQN, with clamped targets and an action L2 penalty."""
 
 from torchrl_her.objectives.critics import critic_value
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss, make_ddpg_loss
 from torchrl_her.objectives.dqn import make_dqn_loss
-from torchrl_her.objectives.sac import make_sac_loss
+from torchrl_her.objectives.noise import RunNoise
+from torchrl_her.objectives.sac import PenalizedSACLoss, make_sac_loss
 from torchrl_her.objectives.targets import ClampedTD0, clamped_td0, make_target_updater
-from torchrl_her.objectives.td3 import make_td3_loss
+from torchrl_her.objectives.td3 import PenalizedTD3Loss, make_td3_loss
 
 __all__ = [
     "ClampedTD0",
     "PenalizedDDPGLoss",
+    "PenalizedSACLoss",
+    "PenalizedTD3Loss",
+    "RunNoise",
     "clamped_td0",
     "critic_value",
     "make_ddpg_loss",

@@ -1,11 +1,13 @@
-"""What the critics of a loss think: those that are trained, wherever the loss keeps them."""
+"""The critics of a loss, of which there may be several: what they are, and what they think."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import DDPGLoss, DQNLoss, LossModule
 
@@ -44,11 +46,29 @@ def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None
         network, params, key = loss.value_network, loss.value_network_params, keys.value
     else:
         return None
-    training = network.training
+    training, values = network.training, []
     network.eval()  # neither uses nor changes the statistics of this batch
-    values = []
-    for own in params.data.unbind(0) if params.ndim else [params.data]:
-        with own.to_module(network, preserve_module_state=False):
-            values.append(network(transitions.select(*network.in_keys)).get(key))
-    network.train(training)
+    try:
+        for own in params.data.unbind(0) if params.ndim else [params.data]:
+            with own.to_module(network, preserve_module_state=False):
+                values.append(network(transitions.select(*network.in_keys)).get(key))
+    finally:
+        network.train(training)
     return torch.stack(values).amin(0)
+
+
+def as_critics(
+    critic: TensorDictModule | Sequence[TensorDictModule], critics: int
+) -> TensorDictModule | list[TensorDictModule]:
+    """One critic that others are made like, or all of them in a list.
+
+    Raises:
+        ValueError: the list has another length than ``critics``, or that is below 1.
+    """
+    if critics < 1:
+        raise ValueError(f"critics must be at least 1, got {critics}")
+    if isinstance(critic, TensorDictModule):
+        return critic
+    if len(critic) != critics:
+        raise ValueError(f"there must be {critics} critics, got {len(critic)}")
+    return list(critic)

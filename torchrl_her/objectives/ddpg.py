@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Literal
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss
 
 from torchrl_her.objectives.targets import clamped_td0
@@ -30,16 +32,38 @@ class PenalizedDDPGLoss(DDPGLoss):
         self.action_penalty = action_penalty
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        actions: list[Tensor] = []
-        hook = self.actor_network.register_forward_hook(
-            lambda _module, _inputs, output: actions.append(output.get(self.actor_network.out_keys[0]))
-        )
-        try:
+        with action_penalty_of(self.actor_network, self.action_penalty) as penalties:
             loss, metadata = super().loss_actor(tensordict)
-        finally:
-            hook.remove()
-        penalty = self.action_penalty * actions[0].square().mean(-1)
-        return loss + (penalty if loss.ndim else penalty.mean()), metadata
+        return loss + (penalties[0] if loss.ndim else penalties[0].mean()), metadata
+
+
+@contextmanager
+def action_penalty_of(actor: TensorDictModule, weight: float) -> Iterator[list[Tensor]]:
+    """Collects the action L2 penalty [...] of each call of an actor in the ``with`` block.
+
+    Args:
+        actor: its first output is the action.
+        weight: of the penalty.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> actor = TensorDictModule(nn.Identity(), in_keys=["wish"], out_keys=["action"])
+        >>> with action_penalty_of(actor, 0.5) as penalties:
+        ...     _ = actor(TensorDict({"wish": torch.tensor([[1.0, 1.0], [0.0, 2.0]])}, [2]))
+        >>> penalties[0].tolist()
+        [0.5, 1.0]
+    """
+    penalties: list[Tensor] = []
+
+    def note(_module: nn.Module, _inputs: Any, output: TensorDictBase) -> None:
+        penalties.append(weight * output.get(actor.out_keys[0]).square().mean(-1))
+
+    hook = actor.register_forward_hook(note)
+    try:
+        yield penalties
+    finally:
+        hook.remove()
 
 
 def make_ddpg_loss(

@@ -1,28 +1,133 @@
-"""SAC from TorchRL's loss."""
+"""SAC from TorchRL's loss, with an action L2 penalty."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
 from torchrl.data import Bounded
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SACLoss
 
+from torchrl_her.objectives.critics import as_critics
+from torchrl_her.objectives.noise import RunNoise
+
+
+class PenalizedSACLoss(SACLoss):
+    """TorchRL's SAC loss (its second version) with an action L2 penalty, for one run or several.
+
+    Each of R runs has its own temperature and its own random numbers.
+
+    Args:
+        *args: of :class:`torchrl.objectives.SACLoss`.
+        **kwargs: of the same.
+        action_penalty: the weight of the penalty on drawn actions, see
+            :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        runs: R.
+        noise: where its random numbers come from.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        action_penalty: float = 0.0,
+        runs: int = 1,
+        noise: RunNoise | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.action_penalty, self.runs = action_penalty, runs
+        self.noise = noise or RunNoise()
+        if runs > 1:
+            start: Tensor = self.log_alpha  # type: ignore[has-type]
+            self.log_alpha = nn.Parameter(start.detach().repeat(runs))
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        weights = self._maybe_get_priority_weight(tensordict)
+        action, log_prob = self._draw(tensordict)
+        seen = tensordict.select(*self.qvalue_network.in_keys, strict=False)
+        seen.set(self.tensor_keys.action, action)
+        valued = self._vmap_qnetworkN0(seen, self._cached_detached_qvalue_params)
+        value = valued.get(self.tensor_keys.state_action_value).min(0)[0].squeeze(-1)
+        loss = self._reduce_loss(
+            self._by_run(self._alpha, log_prob) * log_prob - value, tensordict=tensordict, weights=weights
+        )
+        penalty = self.action_penalty * action.square().mean(-1)
+        return loss + (penalty if loss.ndim else penalty.mean()), {"log_prob": log_prob.detach()}
+
+    def _draw(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """An action [..., a] for each row, and the logarithm of its likelihood [...]."""
+        with (
+            set_exploration_type(ExplorationType.RANDOM),
+            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
+        ):
+            dist = self.actor_network.get_dist(tensordict)
+        before = dist.loc + dist.scale * self.noise(dist.loc)
+        squash = dist.transforms[0]
+        action = squash(before)
+        return action, dist.base_dist.log_prob(before) - squash.log_abs_det_jacobian(before, action).sum(-1)
+
+    def _by_run(self, number: Tensor, like: Tensor) -> Tensor:
+        """A number [R] of each run in the shape of rows [R, B]; one number as it is."""
+        return number.view(-1, *[1] * (like.ndim - 1)) if self.runs > 1 else number
+
+    @torch.no_grad()
+    def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
+        tensordict = tensordict.clone(False)
+        after = tensordict.get("next").copy()
+        action, log_prob = self._draw(after)
+        after.set(self.tensor_keys.action, action)
+        valued = self._vmap_qnetworkN0(after, self.target_qvalue_network_params)
+        value = valued.get(self.tensor_keys.state_action_value).min(0)[0]
+        value = value - (self._by_run(self._alpha, log_prob) * log_prob).unsqueeze(-1)
+        tensordict.set(("next", self.value_estimator.tensor_keys.value), value)
+        return self.value_estimator.value_estimate(tensordict).squeeze(-1)
+
+    def _alpha_loss(self, log_prob: Tensor) -> Tensor:
+        return -self._by_run(self.log_alpha, log_prob) * (log_prob + self.target_entropy)
+
 
 def make_sac_loss(
-    actor: ProbabilisticActor, critic: TensorDictModule, *, action_spec: Bounded, gamma: float = 0.98
+    actor: ProbabilisticActor,
+    critic: TensorDictModule | Sequence[TensorDictModule],
+    *,
+    action_spec: Bounded,
+    critics: int = 2,
+    gamma: float = 0.98,
+    temperature: float = 0.1,
+    action_penalty: float = 0.0,
+    runs: int = 1,
+    generators: Sequence[torch.Generator] | None = None,
+    reduction: Literal["mean", "none"] = "mean",
 ) -> SACLoss:
-    """TorchRL's SAC loss with two critics and a learned temperature.
+    """TorchRL's SAC loss with several critics and a learned temperature.
 
     Targets are not clamped, since they contain the policy's entropy besides the rewards.
 
+    Haarnoja et al., Soft actor-critic algorithms and applications, 2018.
+
     Args:
         actor: from :func:`~torchrl_her.make_stochastic_actor`.
-        critic: from :func:`~torchrl_her.make_critic`; the second critic is made like it.
+        critic: from :func:`~torchrl_her.make_critic`, the others are made like it; or all critics in a list.
         action_spec: least and greatest actions, of one environment.
+        critics: how many there are; targets and policy have the least of their values.
         gamma: discount, in [0, 1).
+        temperature: what it begins with. At TorchRL's 1, entropy outweighs rewards of -1 and 0 for so long
+            that some runs never find what is rewarded.
+        action_penalty: weight of the action L2 penalty, see
+            :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        runs: R, how many runs the networks are stacked for; each has a temperature of its own.
+        generators: of the random numbers of each run; None for torch's own.
+        reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
 
     Raises:
-        ValueError: ``gamma`` is outside of [0, 1).
+        ValueError: ``gamma`` is outside of [0, 1), ``temperature`` is not positive, or ``critics`` is below 1
+            or not their number.
 
     Example:
         >>> from torchrl_her import make_critic, make_stochastic_actor
@@ -34,6 +139,22 @@ def make_sac_loss(
     """
     if not 0.0 <= gamma < 1.0:
         raise ValueError(f"gamma must be in [0, 1), got {gamma}")
-    loss = SACLoss(actor, critic, action_spec=action_spec, num_qvalue_nets=2, loss_function="l2")
+    if not temperature > 0:
+        raise ValueError(f"temperature must be positive, got {temperature}")
+    own = as_critics(critic, critics)
+    loss = PenalizedSACLoss(
+        actor,
+        own,
+        action_spec=action_spec,
+        num_qvalue_nets=critics,
+        loss_function="l2",
+        alpha_init=temperature,
+        action_penalty=action_penalty,
+        runs=runs,
+        noise=RunNoise(generators),
+        reduction=reduction,
+        scalar_output_mode="exclude" if reduction == "none" else None,
+    )
+    loss.set_keys(state_action_value=(own[0] if isinstance(own, list) else own).out_keys[0])
     loss.make_value_estimator(gamma=gamma)
     return loss

@@ -6,8 +6,18 @@ from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episode
 from torchrl_her.replay_buffers.episodes import Episodes, find_episodes
 from torchrl_her.replay_buffers.keys import TransitionKeys
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
+from torchrl_her.replay_buffers.runs import (
+    PackedStorage,
+    RunsPrioritizedSampler,
+    RunsSampler,
+    empty_run,
+    rows_of_run,
+    runs_of,
+    sizes_of,
+)
+from torchrl_her.replay_buffers.runs.counts import WriterCounts
 from torchrl_her.replay_buffers.sample_unit import HERSampleUnit
-from torchrl_her.replay_buffers.writer import HERWriter, WriterCounts
+from torchrl_her.replay_buffers.writer import HERWriter
 
 __all__ = [
     "EnvIds",
@@ -17,9 +27,16 @@ __all__ = [
     "HERWriter",
     "HindsightBase",
     "HindsightOptions",
+    "PackedStorage",
+    "RunsPrioritizedSampler",
+    "RunsSampler",
     "TransitionKeys",
     "WriterCounts",
     "draw_goals",
+    "empty_run",
     "find_episodes",
     "index_episodes",
+    "rows_of_run",
+    "runs_of",
+    "sizes_of",
 ]

@@ -93,8 +93,9 @@ def broken(
     trajectory = rows.get(keys.trajectory, None)
     last, new = order[:-1], order[1:]
     same = lanes[last] == lanes[new]
-    if trajectory is None or kind == BY_TRAJECTORY:  # then goals have to tell, everywhere
-        over[last] = _jumps(rows, keys, last, new, same)
+    if trajectory is None or kind == BY_TRAJECTORY:  # then goals have to tell
+        # Rows that were held back have been compared with each other before.
+        over[last] = _jumps(rows, keys, last, new, same & (new >= held))
     else:
         ids = trajectory.reshape(-1)[order]
         seam = same & (last < held) & (new >= held)

@@ -14,11 +14,11 @@ from torchrl.data.replay_buffers.samplers import (
     SamplerEnsemble,
     SliceSampler,
 )
-from torchrl.data.replay_buffers.storages import ListStorage, Storage
+from torchrl.data.replay_buffers.storages import ListStorage, Storage, TensorStorage
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, RoundRobinWriter, Writer
 
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY
-from torchrl_her.replay_buffers.options import HindsightBase
+from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 
 SHARED = (
     "workers send episodes and the learner extends. Leave replay_buffer= of the collector out, and extend "
@@ -37,6 +37,32 @@ def samplers_of(storage: Storage) -> Iterator[Sampler]:
             waiting.extend(sampler._samplers)
         elif isinstance(sampler, Sampler):
             yield sampler
+
+
+def refuse_beside_writer(
+    name: str, storage: Storage, transitions: TensorDictBase, options: HindsightOptions, *, runs: int
+) -> None:
+    """Raises an error beside parts and batches that a writer with hindsight would write wrongly.
+
+    Args:
+        name: of the writer, for messages.
+        storage: into which it writes.
+        transitions: the batch that it is to write.
+        options: its own.
+        runs: for how many runs it was made.
+
+    Raises:
+        ValueError: as in the functions below, or the storage has several dimensions.
+    """
+    refuse_padded(name, transitions)
+    if storage.ndim > 1:
+        raise ValueError(f"{name} needs a storage of 1 dimension, got one of {storage.ndim}")
+    refuse_n_steps(name, transitions)
+    refuse_consuming(name, storage)
+    refuse_slices(name, storage)
+    refuse_priorities(name, storage, transitions)
+    refuse_other_runs(name, storage, transitions, runs=runs)
+    refuse_copies_in_slices(name, storage, options)
 
 
 def refuse_shared(name: str, storage: Storage) -> None:
@@ -150,3 +176,49 @@ def refuse_n_steps(name: str, transitions: TensorDictBase) -> None:
             "MultiStepTransform write it): goals that are passed on the way would be missed. Leave that "
             f"transform out, and give {name} the options n_steps and gamma"
         )
+
+
+def refuse_copies_in_slices(name: str, storage: Storage, options: HindsightOptions) -> None:
+    """Raises an error if sequences are sampled from a storage to which single transitions are written.
+
+    Raises:
+        ValueError: they would be copies of one transition, or overlap.
+    """
+    if not has_slices(storage):
+        return
+    if options.k > 0 and options.per == "transition":
+        raise ValueError(
+            f"under a sampler of slices, {name} needs per='episode': with per='transition' a slice "
+            "would hold copies of one transition for several goals, and no sequence"
+        )
+    if options.n_steps > 1:
+        raise ValueError(
+            f"under a sampler of slices, {name} needs n_steps=1, got {options.n_steps}: "
+            "the steps of a slice follow each other already"
+        )
+
+
+def refuse_other_runs(name: str, storage: Storage, transitions: TensorDictBase, *, runs: int) -> None:
+    """Raises an error if a batch, the storage or a sampler is not that of several runs.
+
+    Raises:
+        ValueError: one of them is not.
+    """
+    if runs == 1:
+        return
+    if transitions.ndim != 2 or len(transitions) % runs:
+        raise ValueError(
+            f"{name}(runs={runs}) takes batches [R * N, T], {runs} equal blocks of "
+            f"environments, got {list(transitions.shape)}"
+        )
+    if not isinstance(storage, TensorStorage) or storage.max_size % runs:
+        raise ValueError(
+            f"{name}(runs={runs}) needs a LazyTensorStorage or PackedStorage of {runs} "
+            f"equal blocks, got a {type(storage).__name__} of {storage.max_size:,} rows"
+        )
+    for sampler in samplers_of(storage):
+        if getattr(sampler, "runs", 1) != runs:
+            raise ValueError(
+                f"{name}(runs={runs}) needs a RunsSampler or RunsPrioritizedSampler of as many "
+                f"runs, got a {type(sampler).__name__} of {getattr(sampler, 'runs', 1)}"
+            )

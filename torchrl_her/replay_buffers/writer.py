@@ -4,60 +4,41 @@ from __future__ import annotations
 
 import os
 import warnings
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from collections.abc import Hashable, Sequence
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
 from torchrl_her.goals.rewards import RewardFunction
-from torchrl_her.goals.weights import GoalWeights
-from torchrl_her.replay_buffers.copies import (
-    Copies,
-    episode_numbers,
-    real_copies,
-    virtual_copies,
-    virtual_episodes,
-    with_ends,
-)
-from torchrl_her.replay_buffers.draw import draw_goals
-from torchrl_her.replay_buffers.episodes import Episodes, find_episodes, time_order
+from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
+from torchrl_her.replay_buffers.draw import draw_for_runs
+from torchrl_her.replay_buffers.episodes import find_episodes, time_order
 from torchrl_her.replay_buffers.keys import entry_of, in_root_and_next
-from torchrl_her.replay_buffers.lanes import BY_ENV, broken, ends_of_held, find_lanes, in_order
-from torchrl_her.replay_buffers.neighbors import (
-    SHARED,
-    has_slices,
-    refuse_consuming,
-    refuse_n_steps,
-    refuse_padded,
-    refuse_priorities,
-    refuse_slices,
-)
+from torchrl_her.replay_buffers.lanes import broken, ends_of_held
+from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
+from torchrl_her.replay_buffers.runs.batches import Batch
+from torchrl_her.replay_buffers.runs.counts import (
+    RunCounts,
+    WriterCounts,
+    real_positives,
+    virtual_positives,
+)
+from torchrl_her.replay_buffers.runs.pieces import Piece, split_runs
+from torchrl_her.replay_buffers.runs.rings import Places, Rings
+from torchrl_her.replay_buffers.runs.rows import join_copies
+from torchrl_her.replay_buffers.runs.shares import Share, real_share, virtual_share
+from torchrl_her.replay_buffers.runs.storage import PackedStorage, write_slices
+from torchrl_her.replay_buffers.runs.streams import check_generators
 
 # Transitions written at once: larger pieces touch fresh memory each time, smaller ones need more calls.
 _ROWS = 1 << 17
 _STATE_FILE = "her_writer.pt"
-
-
-@dataclass
-class WriterCounts:
-    """How many transitions were written; the positive ones are those that achieved their goal.
-
-    ``useful_virtual_positive`` leaves out virtual transitions whose goal was already achieved in the state
-    before. It counts what the filter keeps, or would keep if it were on.
-    """
-
-    real: int = 0
-    virtual: int = 0
-    real_positive: int = 0
-    virtual_positive: int = 0
-    useful_virtual_positive: int = 0
 
 
 class HERWriter(HindsightBase, RoundRobinWriter):
@@ -79,6 +60,10 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     goal, drawn for its first transition, and each with an id of its own under ``trajectory_key``. A copy ends
     where its goal terminates it, or is truncated at its end. That is what samplers of slices need.
 
+    One writer may serve R independent runs: ``HERWriter(..., runs=R, generators=...)``. It takes batches
+    [R * N, T], R equal blocks in the order of the runs, and the storage is R equal blocks of rows, each of
+    them a ring of its own. What is written for a run does not depend on the other runs.
+
     The writer works in any TorchRL replay buffer with a one-dimensional storage, under any sampler that does
     not consume its transitions (those of slices need ``per="episode"``); the capacity counts real and virtual
     transitions alike. Random numbers come from the buffer's generator (``buffer.set_rng``).
@@ -89,13 +74,17 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         options: how transitions are relabeled; None for the defaults.
 
     Keyword Args:
-        weights: prefers some goals to others; None for all alike.
+        weights: prefers some goals to others; None for all alike. For several runs a list, one of each run
+            (``goal_weights``).
+        runs: R.
+        generators: R sources of random numbers; None for the buffer's, with one run only.
         **changes: options by name, as in the example; all are listed in
             :class:`~torchrl_her.HindsightOptions`.
 
     Attributes:
-        counts: transitions written since the buffer was last emptied.
-        totals: transitions ever written.
+        runs: R.
+        counts: transitions written since the buffer was last emptied; of all runs.
+        totals: transitions ever written; of all runs.
         held_back: number of transitions of open episodes that wait for their end.
 
     Raises:
@@ -105,6 +94,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         RuntimeError: the buffer was copied to another process.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
         >>> from torchrl_her import GoalReward
         >>> writer = HERWriter(GoalReward(0.5), k=1, strategy="final")
@@ -141,14 +131,21 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         reward_fn: RewardFunction,
         options: HindsightOptions | None = None,
         *,
-        weights: GoalWeights | None = None,
+        weights: GoalWeights | Sequence[GoalWeights] | None = None,
+        runs: int = 1,
+        generators: Sequence[torch.Generator] | None = None,
         **changes: Any,
     ) -> None:
-        super().__init__(reward_fn, options, weights=weights, **changes)
-        self.counts, self.totals = WriterCounts(), WriterCounts()
-        self._held: TensorDictBase | None = None  # transitions of open episodes, oldest first
-        self._held_lanes: Tensor = torch.empty(0, dtype=torch.int64)
-        self._held_kind = ""  # what these are known by
+        self.generators = check_generators(runs, generators)
+        own = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
+        if own and len(own) != runs:
+            raise ValueError(f"{runs} runs need a list of {runs} weights, one of each run, got {len(own)}")
+        super().__init__(reward_fn, options, weights=own[0] if own and runs == 1 else None, **changes)
+        self._weights = own  # of several runs
+        self.runs = runs
+        self._own_rewards: dict[int, RewardFunction] = {}  # of runs that differ from ``reward_fn``
+        self._counts, self._rings = RunCounts(runs), Rings(runs)
+        self._held = Batch.none(runs)  # transitions of open episodes
         self._episodes = 0  # copies of episodes ever written, if whole ones are
         self._process = os.getpid()
         # Whether the held ones came with a state, or are over, and nothing was written since.
@@ -157,7 +154,53 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     @property
     def held_back(self) -> int:
         """Number of transitions of open episodes that wait for their end."""
-        return len(self._held_lanes)
+        return len(self._held)
+
+    @property
+    def counts(self) -> WriterCounts:
+        """Transitions written since the buffer was last emptied."""
+        return WriterCounts.sum(self._counts.counts)
+
+    @property
+    def totals(self) -> WriterCounts:
+        """Transitions ever written."""
+        return WriterCounts.sum(self._counts.totals)
+
+    def counts_of(self, run: int) -> WriterCounts:
+        """Transitions of a run that were written since it was last emptied."""
+        return self._counts.counts[run]
+
+    def totals_of(self, run: int) -> WriterCounts:
+        """Transitions of a run that were ever written."""
+        return self._counts.totals[run]
+
+    @property
+    def capacity(self) -> int:
+        """Rows of each run's block of the storage."""
+        return self._storage.max_size // self.runs
+
+    @property
+    def sizes(self) -> list[int]:
+        """How many rows each run has in the storage."""
+        return [len(self._storage)] if self.runs == 1 else list(self._rings.sizes)
+
+    @property
+    def goal_weights(self) -> list[GoalWeights]:
+        """The weights of each run's goals; empty if there are none."""
+        if self.runs > 1:
+            return self._weights
+        return [] if self.weights is None else [self.weights]
+
+    def reward_of(self, run: int) -> RewardFunction:
+        """The reward function of a run."""
+        return self._own_rewards.get(run, self.reward_fn)
+
+    def set_reward(self, reward_fn: RewardFunction, *, run: int) -> None:
+        """Relabels the next episodes of a run with a reward function of its own."""
+        if self.runs == 1:
+            self.reward_fn = reward_fn
+        else:
+            self._own_rewards[run] = reward_fn
 
     # TorchRL's hooks
 
@@ -182,36 +225,40 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             KeyError: an entry is missing.
             RuntimeError: the buffer was made by another process.
         """
-        self._refuse(data)
+        if os.getpid() != self._process:
+            raise RuntimeError(f"HERWriter writes only in the process that made its buffer: {SHARED}")
+        refuse_beside_writer("HERWriter", self._storage, data, self.options, runs=self.runs)
         if data.batch_size.numel() == 0:
             return torch.empty(data.shape, dtype=torch.int64, device=data.device)
-        held = self.held_back
-        rows, kind, ids = self._with_held(data)
-        lanes = in_order(ids) if kind == BY_ENV else ids
+        held = self._held
+        batch = Batch.of(data, self._keys, runs=self.runs).after(held)
+        rows, run, lanes = batch.rows, batch.run, batch.lanes()
         order = time_order(lanes)
         ends = entry_of(rows, self._keys.done).reshape(-1)
         if self._all_over:
-            ends = ends | ends_of_held(lanes, order, held)
-        over = broken(rows, lanes, order, ends, self._keys, kind=kind, held=held, resumed=self._loaded)
-        episodes, left = find_episodes(lanes, ends | over, order)
-        cursor, written = self._cursor, 0
-        place = lanes.new_full((len(lanes),), -1)  # of each row, in the order of writing
-        for piece in episodes.split(self._episodes_at_once(episodes)):
-            written += self._write(rows, piece, place, written)
+            ends = ends | ends_of_held(lanes, order, len(held))
+        ends = ends | broken(
+            rows, lanes, order, ends, self._keys, kind=batch.kind, held=len(held), resumed=self._loaded
+        )
+        episodes, left = find_episodes(lanes, ends, order)
+        if self.runs == 1:  # then TorchRL's own cursor counts
+            self._rings.cursors[0] = self._cursor
+        places = Places(run, len(batch), runs=self.runs, device=lanes.device)
+        entries = min(_ROWS, self.capacity) // (self.k + 1), _ROWS // (self.k + 1)
+        own = None if run is None else run[episodes.rows[:, :1]].flatten()
+        for piece in split_runs(episodes, own, self._settings(), each=entries[0], together=entries[1]):
+            self._write(batch, piece, places)
         # Last of all, so that a batch that cannot be written loses nothing that was held back before.
-        self._held = rows[left] if len(left) else None
-        self._held_lanes, self._held_kind = ids[left], kind
+        self._held = batch.take(left)
         self._loaded = self._all_over = False
-        capacity = self._storage.max_size
-        if self.held_back > capacity:
+        if self.held_back > self._storage.max_size:
             warnings.warn(
                 f"{self.held_back:,} transitions of open episodes wait for their end, more than the buffer's "
-                f"{capacity:,}: do all episodes end, and do batches of several environments come as [N, T]?",
+                f"{self._storage.max_size:,}: do all episodes end, and do batches of several environments "
+                "come as [N, T]?",
                 stacklevel=2,
             )
-        lost = place < max(0, written - capacity)  # -1 among them: not written at all
-        index = ((cursor + place) % capacity).masked_fill_(lost, -1)
-        return index[held:].reshape(data.shape)
+        return places.rows(self._rings.cursors, self.capacity)[len(held) :].reshape(data.shape)
 
     def end_episodes(self) -> None:
         """Tells that all environments were reset, so that episodes which are held back do not go on.
@@ -223,11 +270,12 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     def state_dict(self) -> dict[str, Any]:
         """The writer's whole state, as tensors and plain data."""
         state = super().state_dict()
-        state["held"] = None if self._held is None else self._held.to_dict()
-        state["held_lanes"], state["held_kind"] = self._held_lanes.clone(), self._held_kind
+        state["cursors"] = [self._cursor] if self.runs == 1 else list(self._rings.cursors)
+        state["sizes"] = self.sizes
+        state.update(self._held.state_dict())
         state["episodes"], state["all_over"] = self._episodes, self._all_over
-        state["counts"], state["totals"] = asdict(self.counts), asdict(self.totals)
-        state["weights"] = None if self.weights is None else self.weights.state_dict()
+        state.update(self._counts.state_dict())
+        state["weights"] = [weights.state_dict() for weights in self.goal_weights]
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -237,16 +285,16 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         (:func:`~torchrl_her.trainers.load_collector_state_dict`). They end if the next transitions do not
         continue them.
         """
+        if len(state_dict["cursors"]) != self.runs:
+            raise ValueError(f"the state is that of {len(state_dict['cursors'])} runs, not of {self.runs}")
         super().load_state_dict(state_dict)
-        self._held_lanes, self._held_kind = state_dict["held_lanes"].clone(), state_dict["held_kind"]
+        self._rings.cursors, self._rings.sizes = list(state_dict["cursors"]), list(state_dict["sizes"])
+        self._held = Batch.from_state(state_dict, runs=self.runs)
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
-        held, shape = state_dict["held"], self._held_lanes.shape
-        self._held = None if held is None else TensorDict.from_dict(held, batch_size=shape).clone()
-        self.counts = WriterCounts(**state_dict["counts"])
-        self.totals = WriterCounts(**state_dict["totals"])
-        if self.weights is not None and state_dict["weights"] is not None:
-            self.weights.load_state_dict(state_dict["weights"])
+        self._counts.load_state_dict(state_dict)
+        for weights, own in zip(self.goal_weights, state_dict["weights"], strict=False):
+            weights.load_state_dict(own)
 
     def dumps(self, path: str | Path) -> None:
         super().dumps(path)
@@ -258,11 +306,21 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     def _empty(self, empty_write_count: bool = True) -> None:
         super()._empty(empty_write_count)
-        self._held, self._held_lanes = None, self._held_lanes[:0]
         self._loaded = self._all_over = False
-        self.counts = WriterCounts()
-        if self.weights is not None:
-            self.weights.clear()
+        self._held = self._held.take(torch.empty(0, dtype=torch.int64))
+        for run in range(self.runs):
+            self.empty_run(run)
+
+    def empty_run(self, run: int) -> None:
+        """Forgets all that one of several runs has written, and its open episodes.
+
+        Call :func:`~torchrl_her.replay_buffers.runs.empty_run`, which tells the sampler, too.
+        """
+        self._rings.empty(run)
+        self._counts.empty(run)
+        self._held = self._held.without_run(run)
+        if self.goal_weights:
+            self.goal_weights[run].clear()
 
     def __getstate__(self) -> dict[str, Any]:
         if get_spawning_popen() is not None:
@@ -274,177 +332,92 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     # The work
 
-    def _refuse(self, data: TensorDictBase) -> None:
-        """Raises an error beside parts and batches that would be written wrongly."""
-        if os.getpid() != self._process:
-            raise RuntimeError(f"HERWriter writes only in the process that made its buffer: {SHARED}")
-        refuse_padded("HERWriter", data)
-        if self._storage.ndim > 1:
-            raise ValueError(f"HERWriter needs a storage of 1 dimension, got one of {self._storage.ndim}")
-        refuse_n_steps("HERWriter", data)
-        refuse_consuming("HERWriter", self._storage)
-        refuse_slices("HERWriter", self._storage)
-        refuse_priorities("HERWriter", self._storage, data)
-        if not has_slices(self._storage):
-            return
-        if self.k > 0 and self.options.per == "transition":
-            raise ValueError(
-                "under a sampler of slices, HERWriter needs per='episode': with per='transition' a slice "
-                "would hold copies of one transition for several goals, and no sequence"
-            )
-        if self.options.n_steps > 1:
-            raise ValueError(
-                f"under a sampler of slices, HERWriter needs n_steps=1, got {self.options.n_steps}: "
-                "the steps of a slice follow each other already"
-            )
+    def _settings(self) -> list[Hashable]:
+        """For each run, what must be the same for runs that are written at once."""
+        alike = [own.alike for own in self.goal_weights] or [True] * self.runs
+        return [(id(self.reward_of(run)), alike[run]) for run in range(self.runs)]
 
-    def _with_held(self, data: TensorDictBase) -> tuple[TensorDictBase, str, Tensor]:
-        """Flat transitions, those held back first; what lanes are known by, and which lane each is of."""
-        kind, ids = find_lanes(data, self._keys)
-        rows = data.reshape(-1)
-        if self._held is None:
-            return rows, kind, ids
-        if kind != self._held_kind:
-            raise ValueError(
-                f"episodes that are still open were told apart by {self._held_kind}, this batch by {kind}: "
-                "hand over all batches in one form, [N, T] or flat, and with the same ids"
-            )
-        return torch.cat((self._held, rows)), kind, torch.cat((self._held_lanes, ids))
-
-    def _episodes_at_once(self, episodes: Episodes) -> int:
-        rows_of_each = max(1, episodes.rows.shape[1]) * (self.k + 1)
-        return max(1, min(_ROWS, self._storage.max_size) // rows_of_each)
-
-    def _write(self, rows: TensorDictBase, episodes: Episodes, place: Tensor, written: int) -> int:
+    def _write(self, batch: Batch, piece: Piece, places: Places) -> None:
         """Stores the real and virtual transitions of some episodes, and notes where the real ones went.
 
         If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out.
         """
-        n_steps, gamma = self.options.n_steps, self.options.gamma
-        real = real_copies(rows, episodes, self._keys, n_steps=n_steps, gamma=gamma)
-        source, goal_source = self._draw(rows, episodes)
-        parts = [real]
+        rows, runs, options, keys = batch.rows, piece.runs, self.options, self._keys
+        reward_fn, own, virtual = self.reward_of(runs[0]), self.goal_weights, None
+        source, goal_source = draw_for_runs(
+            rows,
+            piece,
+            reward_fn,
+            options,
+            keys,
+            weights=self._weights_of_runs() if own and not own[runs[0]].alike else None,
+            generators=[self._rng] if self.generators is None else [self.generators[run] for run in runs],
+        )
         if len(source) > 0:
-            goals = entry_of(rows, self._keys.next_achieved).index_select(0, goal_source)
-            if self.options.per == "episode":
-                virtual, copy = virtual_episodes(
-                    rows,
-                    episodes,
-                    source,
-                    goals,
-                    self.reward_fn,
-                    self._keys,
-                    achieved_reward=self.achieved_reward,
-                )
-                virtual = self._with_ids(virtual, copy, len(source))
-            else:
-                virtual = virtual_copies(
-                    rows,
-                    episodes,
-                    source,
-                    goals,
-                    self.reward_fn,
-                    self._keys,
-                    achieved_reward=self.achieved_reward,
-                    n_steps=n_steps,
-                    gamma=gamma,
-                )
-            self._note(rows, virtual)
-            parts = [virtual, real]
+            first = self._new_ids(len(source))
+            virtual = virtual_share(
+                rows, batch.run, piece, source, goal_source, reward_fn, options, keys, first_id=first
+            )
+            self._note(rows, virtual, runs)
+        real = real_share(rows, piece, options, keys, first_id=self._new_ids(len(piece.episodes.lengths)))
+        self._counts.add(runs, real=real.counts, **real_positives(*real, self.achieved_reward))
+        exclude = [*self._exclude, *in_root_and_next([keys.env_ids])]
+        out = join_copies(rows, virtual, real, exclude=exclude, virtual_key=options.virtual_key)
+        counts = real.counts
+        if virtual is not None:
+            counts = [sum(both) for both in zip(real.counts, virtual.counts, strict=True)]
+        self._store(out, runs, counts)
+        places.note(runs, real.copies.root.split(real.counts), counts)
+
+    def _new_ids(self, count: int) -> int:
+        """The first of so many trajectory ids that no stored episode has, real or virtual."""
+        first = self._episodes
         if self.options.per == "episode":
-            real = with_ends(real, rows, episodes, self._keys)
-            parts[-1] = self._with_ids(real, episode_numbers(episodes), len(episodes.lengths))
-        out = self._build(rows, parts)
-        behind = len(out) - len(real.root)
-        place[real.root] = torch.arange(written + behind, written + len(out), device=place.device)
-        self._count(real=len(real.root), virtual=behind, real_positive=self._positives(real.reward))
-        excess = max(0, len(out) - self._storage.max_size)
-        self._cursor = (self._cursor + excess) % self._storage.max_size
-        self._store(out[excess:])
-        return len(out)
+            self._episodes += count
+        return first
 
-    def _with_ids(self, copies: Copies, number: Tensor, count: int) -> Copies:
-        """The same with trajectory ids that no other stored episode has, real or virtual."""
-        first, self._episodes = self._episodes, self._episodes + count
-        return replace(copies, changes={**copies.changes, self._keys.trajectory: number + first})
+    def _weights_of_runs(self) -> WeightsOfRuns:
+        """The weights of all runs, of which there are some."""
+        own = self.goal_weights
+        return own[0].of_runs(own) if isinstance(own[0], GoalWeights) else WeightsOfRuns(own)
 
-    def _build(self, rows: TensorDictBase, parts: list[Copies]) -> TensorDictBase:
-        """Transitions, part after part; the last part is that of the real ones."""
-        changed = list(dict.fromkeys(key for part in parts for key in part.changes))
-        env_ids = in_root_and_next([self._keys.env_ids])
-        same = rows.exclude(*self._exclude, *env_ids, *changed)
-        root = torch.cat([part.root for part in parts])
-        if self.options.n_steps == 1:
-            out = _rows(same, root)
+    def _note(self, rows: TensorDictBase, virtual: Share, runs: list[int]) -> None:
+        """Counts virtual transitions, and tells the weights which goals were written."""
+        positives = virtual_positives(
+            rows,
+            *virtual,
+            self.reward_of(runs[0]),
+            self._keys,
+            achieved_reward=self.achieved_reward,
+            filtered=self.filter_achieved,
+        )
+        self._counts.add(runs, virtual=virtual.counts, **positives)
+        if self.goal_weights:
+            goals = virtual.copies.changes[self._keys.goals[0]]
+            self._weights_of_runs().update(goals, runs, virtual.counts)
+
+    def _store(self, rows: TensorDictBase, runs: list[int], counts: list[int]) -> None:
+        """Writes rows as the plain writer does, but slice by slice: far faster than with an index for each.
+
+        Args:
+            rows: [m], run after run.
+            runs: those of a piece.
+            counts: how many rows each of them has.
+        """
+        moves, begin = [], 0
+        for run, count in zip(runs, counts, strict=True):
+            moves += self._rings.moves(run, begin=begin, count=count, capacity=self.capacity)
+            begin += count
+        self._write_count += sum(move.to.stop - move.to.start for move in moves)
+        if self.runs == 1:
+            self._cursor = self._rings.cursors[0]
+        if self.runs == 1 and not isinstance(self._storage, PackedStorage):
+            for move in moves:
+                self._storage.set(move.to, rows[move.source])
         else:
-            out = _rows(same.exclude("next"), root)
-            out.set("next", _rows(same.get("next"), torch.cat([part.last for part in parts])))
-        for key in changed:
-            out.set(key, torch.cat([part.entry(rows, key) for part in parts]))
-        if self.options.virtual_key is not None:
-            marks = torch.arange(len(root), device=root.device) < len(root) - len(parts[-1].root)
-            out.set(self.options.virtual_key, marks.unsqueeze(-1))
-        return out
-
-    def _store(self, rows: TensorDictBase) -> None:
-        """Writes as the plain writer does, but slice by slice: far faster than with an index for each."""
-        room = self._storage.max_size - self._cursor
-        for part in (rows[:room], rows[room:]):  # up to the storage's end, then on from its start
-            if len(part) > 0:
-                place = slice(self._cursor, self._cursor + len(part))
-                self._cursor = place.stop % self._storage.max_size
-                self._write_count += len(part)
-                self._storage.set(place, part)
-                index = torch.arange(place.start, place.stop, device=rows.device)
-                self._bump_generation(index, part)
-                self._mark_update_entities(index)
-
-    def _draw(self, rows: TensorDictBase, episodes: Episodes) -> tuple[Tensor, Tensor]:
-        """The transitions [V] to write once more, and those [V] whose achieved goals they take."""
-        if self.k == 0:  # then the batch may be without goals
-            return episodes.lengths[:0], episodes.lengths[:0]
-        return draw_goals(
-            entry_of(rows, self._keys.achieved),
-            entry_of(rows, self._keys.next_achieved),
-            episodes,
-            self.k,
-            strategy=self.strategy,
-            weights=self.weights,
-            keep=self._keep if self.filter_achieved else None,
-            per=self.options.per,
-            generator=self._rng,
-        )
-
-    def _note(self, rows: TensorDictBase, virtual: Copies) -> None:
-        """Counts the rewards of virtual transitions, and tells the weights which goals were written."""
-        useful, goals = virtual.reward, virtual.changes[self._keys.goals[0]]
-        if not self.filter_achieved:  # otherwise all are useful
-            before = entry_of(rows, self._keys.achieved).index_select(0, virtual.root)
-            useful = useful[self._keep(before, goals)]
-        self._count(
-            virtual_positive=self._positives(virtual.reward), useful_virtual_positive=self._positives(useful)
-        )
-        if self.weights is not None:
-            self.weights.update(goals)
-
-    def _count(self, **rows: int) -> None:
-        for counts in (self.counts, self.totals):
-            for name, number in rows.items():
-                setattr(counts, name, getattr(counts, name) + number)
-
-    def _positives(self, reward: Tensor) -> int:
-        return int((reward >= self.achieved_reward).count_nonzero())
-
-
-def _rows(transitions: TensorDictBase, index: Tensor) -> TensorDictBase:
-    out = transitions.apply(partial(_take, index=index), batch_size=index.shape, is_leaf=is_leaf_nontensor)
-    return TensorDict(batch_size=index.shape, device=index.device) if out is None else out
-
-
-def _take(entry: Any, index: Tensor) -> Any:
-    """Rows of an entry. Torch indexes single numbers several times faster than rows of one number."""
-    if not isinstance(entry, Tensor):
-        return entry[index]
-    if entry.shape[1:].numel() == 1:
-        return entry.flatten().index_select(0, index).view(-1, *entry.shape[1:])
-    return entry.index_select(0, index)
+            write_slices(self._storage, rows, moves)
+        index = [torch.arange(move.to.start, move.to.stop, device=rows.device) for move in moves]
+        if self.tracks_generations:
+            for move, written in zip(moves, index, strict=True):
+                self._bump_generation(written, rows[move.source])
+        self._mark_update_entities(torch.cat(index))

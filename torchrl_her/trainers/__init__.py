@@ -10,19 +10,18 @@ from torchrl_her.trainers.checkpoint import (
     load_newest_checkpoint,
     save_checkpoint,
 )
-from torchrl_her.trainers.compile import CompiledOnce
 from torchrl_her.trainers.cut import cut_episodes
-from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner
+from torchrl_her.trainers.fused import FusedLearner
 from torchrl_her.trainers.fusing import can_fuse, is_plain_adam, why_not_fused
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.metrics import discounted_return, final_distance, first_episode, q_bias, success
 from torchrl_her.trainers.runs import clip_by_run, keep_runs
-from torchrl_her.trainers.trainer import Schedule, Trainer, evaluate
+from torchrl_her.trainers.trainer import CollectsAhead, Schedule, Trainer, evaluate
 
 __all__ = [
     "CheckpointError",
-    "CompiledOnce",
-    "FusedDDPGLearner",
+    "CollectsAhead",
+    "FusedLearner",
     "Learner",
     "LossLearner",
     "Schedule",

@@ -7,17 +7,21 @@ import os
 import pickle
 import warnings
 from collections import OrderedDict
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.utils.serialization import config
 from torchrl.collectors import BaseCollector
 from torchrl.data import TensorDictReplayBuffer
+from torchrl.data.replay_buffers.storages import Storage
 
+from torchrl_her.replay_buffers.runs.buffer import bounds_of_run, runs_of, sizes_of
+from torchrl_her.replay_buffers.runs.storage import Field, PackedStorage, unpack
 from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_state_dict
 
 _MAGIC = b"torchrl-her checkpoint 1\n"
@@ -237,18 +241,33 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> d
     Keyword Args:
         copy: whether the transitions are copied. If not, save them before the buffer changes.
     """
-    n = len(buffer)
-    rows = buffer.storage[:] if n else None  # as stored, without what transforms add
+    own = torch.clone if copy else _alone
+    blocks = [bounds_of_run(buffer, run) for run in range(runs_of(buffer))]
     state: dict[str, Any] = {
-        "rows": None if rows is None else rows.apply(torch.clone if copy else _alone).to_dict(),
-        "shape": [] if rows is None else list(rows.batch_size),
-        "size": n,
+        "rows": [_block(buffer, *bounds, own) for bounds in blocks],
+        "blocks": blocks,
         "capacity": _capacity(buffer),
         "cursor": getattr(buffer.storage, "_last_cursor_index", None),
         "writer": buffer.writer.state_dict(),
-        "sampler": sampler_state_dict(buffer.sampler, n),
+        "sampler": sampler_state_dict(buffer.sampler, len(buffer)),
     }
     return state
+
+
+def _block(
+    buffer: TensorDictReplayBuffer, begin: int, end: int, own: Callable[[Tensor], Tensor]
+) -> dict[str, Any] | None:
+    """The stored rows from ``begin`` to ``end``, each tensor as ``own`` gives it; None if there are none."""
+    storage = buffer.storage
+    if begin == end:
+        return None
+    if isinstance(storage, PackedStorage) and storage.packed is not None:
+        return {
+            "packed": own(storage.packed[begin:end]),
+            "fields": [tuple(field) for field in storage.fields],
+        }
+    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # as stored, without what transforms add
+    return {"entries": rows.apply(own).to_dict(), "shape": list(rows.batch_size)}
 
 
 def _capacity(buffer: TensorDictReplayBuffer) -> int:
@@ -275,15 +294,34 @@ def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]
     Raises:
         ValueError: the buffer is not empty, or has another capacity or another kind of sampler.
     """
-    n, capacity = state["size"], _capacity(buffer)
-    if len(buffer):
-        raise ValueError(f"the buffer must be empty, it holds {len(buffer):,} rows")
+    capacity = _capacity(buffer)
+    if any(sizes_of(buffer)):
+        raise ValueError(f"the buffer must be empty, it holds {sum(sizes_of(buffer)):,} rows")
     if capacity != state["capacity"]:
         raise ValueError(f"the state is that of a buffer of {state['capacity']:,} rows, not of {capacity:,}")
     load_sampler_state_dict(buffer.sampler, state["sampler"])
-    if n:
-        rows = TensorDict.from_dict(state["rows"], batch_size=state["shape"])
-        buffer.storage.set(torch.arange(len(rows)), rows)
+    if len(state["blocks"]) != runs_of(buffer):
+        raise ValueError(f"the state is that of {len(state['blocks'])} runs, not of {runs_of(buffer)}")
+    for (begin, end), block in zip(state["blocks"], state["rows"], strict=True):
+        if block is not None:
+            _load_block(buffer.storage, begin, end, block)
     if state["cursor"] is not None:  # where slice samplers see the oldest row follow the newest
         buffer.storage._set_last_cursor(state["cursor"])
     buffer.writer.load_state_dict(state["writer"])
+
+
+def _load_block(storage: Storage, begin: int, end: int, block: dict[str, Any]) -> None:
+    """Puts back rows of a storage that were ``begin`` to ``end``."""
+    if "packed" in block:
+        fields = [Field(*field) for field in block["fields"]]
+        if isinstance(storage, PackedStorage) and storage.restore(begin, block["packed"], fields):
+            return
+        rows: TensorDictBase = unpack(block["packed"], fields)
+    else:
+        rows = TensorDict.from_dict(block["entries"], batch_size=block["shape"])
+    place = torch.arange(begin, begin + len(rows))
+    if begin == 0:
+        storage.set(place, rows)
+    else:
+        storage.set(place, rows, set_cursor=False)
+        storage._len = end

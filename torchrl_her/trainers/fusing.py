@@ -1,25 +1,97 @@
-"""Which losses, target updates and optimizers the fused gradient step does justice to."""
+"""Which losses, target updates and optimizers the fused gradient steps do justice to."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.modules import QValueActor, TanhNormal
+from torchrl.objectives import DQNLoss, HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import TD0Estimator
 
 from torchrl_her.modules.networks import ActorNet, CriticNet
+from torchrl_her.modules.q_actor import QNet
+from torchrl_her.modules.stochastic_actor import StochasticActorNet
+from torchrl_her.native.job import Algorithm
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss
+from torchrl_her.objectives.sac import PenalizedSACLoss
 from torchrl_her.objectives.targets import ClampedTD0
+from torchrl_her.objectives.td3 import PenalizedTD3Loss
+from torchrl_her.trainers.fused_layers import layers_of, parameter_shapes
 
-_PLAIN = {ActorNet: ActorNet(1, 1, hidden=1), CriticNet: CriticNet(1, 1, hidden=1)}
+
+@dataclass(frozen=True)
+class FusedLoss:
+    """Where a loss that can be fused keeps what the steps need.
+
+    Attributes:
+        algorithm: the steps.
+        actor: the attribute of the actor, or of the values of discrete actions.
+        actor_net: its type.
+        critic: the attribute of the critic or critics, None if there is none.
+        losses: the names of what is measured.
+        fixed: the options that the loss must be set to.
+    """
+
+    algorithm: Algorithm
+    actor: str
+    actor_net: type[nn.Module]
+    critic: str | None
+    losses: tuple[str, ...]
+    fixed: dict[str, Any]
+
+
+FUSED: dict[type[LossModule], FusedLoss] = {
+    PenalizedDDPGLoss: FusedLoss(
+        Algorithm.DDPG,
+        "actor_network",
+        ActorNet,
+        "value_network",
+        ("loss_actor", "loss_value"),
+        {"delay_actor": True, "delay_value": True},
+    ),
+    PenalizedTD3Loss: FusedLoss(
+        Algorithm.TD3,
+        "actor_network",
+        ActorNet,
+        "qvalue_network",
+        ("loss_actor", "loss_qvalue"),
+        {"delay_actor": True, "delay_qvalue": True},
+    ),
+    PenalizedSACLoss: FusedLoss(
+        Algorithm.SAC,
+        "actor_network",
+        StochasticActorNet,
+        "qvalue_network",
+        ("loss_actor", "loss_qvalue", "loss_alpha"),
+        {
+            "delay_actor": False,
+            "delay_qvalue": True,
+            "skip_done_states": False,
+            "fixed_alpha": False,
+            "min_log_alpha": None,
+            "max_log_alpha": None,
+            "_version": 2,
+        },
+    ),
+    DQNLoss: FusedLoss(
+        Algorithm.DQN,
+        "value_network",
+        QNet,
+        None,
+        ("loss",),
+        {"delay_value": True, "double_dqn": True, "action_space": "categorical"},
+    ),
+}
 
 
 def can_fuse(loss: nn.Module, target: TargetNetUpdater | None) -> bool:
-    """Whether :class:`~torchrl_her.FusedDDPGLearner` does what a loss and its target update are set to do.
+    """Whether :class:`~torchrl_her.FusedLearner` does what a loss and its target update are set to do.
 
     Args:
         loss: any loss module.
@@ -29,7 +101,7 @@ def can_fuse(loss: nn.Module, target: TargetNetUpdater | None) -> bool:
 
 
 def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | None:
-    """What :class:`~torchrl_her.FusedDDPGLearner` would get wrong, for messages; None if nothing.
+    """What :class:`~torchrl_her.FusedLearner` would get wrong, for messages; None if nothing.
 
     Args:
         loss: any loss module.
@@ -42,15 +114,15 @@ def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | Non
         >>> why_not_fused(loss, SoftUpdate(loss, tau=0.01))
         "reduction='sum'"
     """
-    if type(loss) is not PenalizedDDPGLoss:
-        return f"a {type(loss).__name__}, not the loss of make_ddpg_loss"
-    if target is None or type(target) is not SoftUpdate or target.loss_module is not loss:
-        return "the targets do not follow this loss by a SoftUpdate"
-    return next(_obstacles(loss), None)
+    if type(loss) not in FUSED:
+        return f"a {type(loss).__name__}, which is not a loss that this library makes"
+    if type(target) not in (SoftUpdate, HardUpdate) or target is None or target.loss_module is not loss:
+        return "targets that do not follow this loss by a SoftUpdate or HardUpdate"
+    return next(_obstacles(loss, FUSED[type(loss)]), None)
 
 
 def is_plain_adam(optimizer: torch.optim.Optimizer, loss: LossModule | None = None) -> bool:
-    """Whether a compiled step can do the work of an optimizer: Adam with one group and without extras.
+    """Whether a fused step can do the work of an optimizer: Adam with one group and without extras.
 
     Args:
         optimizer: any optimizer.
@@ -67,75 +139,131 @@ def is_plain_adam(optimizer: torch.optim.Optimizer, loss: LossModule | None = No
     return loss is None or _ids(group["params"]) == _ids(loss.parameters())
 
 
+def network_of(module: nn.Module) -> nn.Module:
+    """The network within the TensorDict module that a loss keeps."""
+    if isinstance(module, TensorDictSequential):
+        module = module[0]
+    return module.module  # type: ignore[return-value]
+
+
+def action_key(loss: LossModule) -> Any:
+    """The key of the actions: DDPG's loss has no name for it, but its actor has."""
+    if isinstance(loss, PenalizedDDPGLoss):
+        return loss.actor_network.out_keys[0]
+    return loss.tensor_keys.action
+
+
 def _ids(parameters: Iterator[nn.Parameter] | list[nn.Parameter]) -> set[int]:
     return {id(parameter) for parameter in parameters}
 
 
-def _obstacles(loss: PenalizedDDPGLoss) -> Iterator[str]:
+def _obstacles(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
     """All options that the fused step does not know."""
-    if not (loss.delay_actor and loss.delay_value):
-        yield f"delay_actor={loss.delay_actor}, delay_value={loss.delay_value}"
+    for name, value in fused.fixed.items():
+        if getattr(loss, name) != value:
+            yield f"{name}={getattr(loss, name)!r}"
     if loss.loss_function != "l2":
         yield f"loss_function={loss.loss_function!r}"
     if loss.reduction not in ("mean", "none"):
         yield f"reduction={loss.reduction!r}"
-    yield from _strange_networks(loss)
-    yield from _strange_keys(loss)
-    yield from _strange_targets(loss)
+    yield from _strange_networks(loss, fused)
+    yield from _strange_keys(loss, fused)
+    yield from _strange_targets(loss, fused)
     # TorchRL puts one hook on each loss, which warns if nothing updates its targets.
-    if _has_hooks(loss, own=1) or any(_has_hooks(module) for module in _modules(loss)):
+    if _has_hooks(loss, own=1) or any(_has_hooks(module) for module in _modules(loss, fused)):
         yield "hooks on the loss or its networks"
-    if not all(p.requires_grad for p in _parameters(loss)):
+    parameters = list(loss.parameters())
+    if not all(p.requires_grad for p in parameters):
         yield "frozen parameters"
-    if len(_ids(_parameters(loss))) != len(_parameters(loss)):
-        yield "actor and critic share parameters"
-    if any(p._backward_hooks or p._post_accumulate_grad_hooks for p in _parameters(loss)):
+    if any(p._backward_hooks or p._post_accumulate_grad_hooks for p in parameters):
         yield "hooks on parameters"
+    kinds = {(p.device.type, p.dtype) for p in parameters}
+    if len(kinds) > 1 or not kinds <= {("cpu", torch.float32), ("cpu", torch.float64)}:
+        yield f"parameters that are {', '.join(f'{dtype} on {device}' for device, dtype in kinds)}"
 
 
-def _strange_networks(loss: PenalizedDDPGLoss) -> Iterator[str]:
-    actor, critic = loss.actor_network, loss.value_network
+def _strange_networks(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
+    actor = getattr(loss, fused.actor)
     # Exact types: subclasses may compute something else.
-    if any(type(module) is not TensorDictModule for module in (actor, critic)):
-        yield f"a {type(actor).__name__} and a {type(critic).__name__}, not plain TensorDictModules"
-    elif type(actor.module) is not ActorNet or type(critic.module) is not CriticNet:
-        yield f"{type(actor.module).__name__} and {type(critic.module).__name__} as networks"
-    elif actor.module.runs != critic.module.runs:
-        yield f"{actor.module.runs} actors and {critic.module.runs} critics"
-    else:
-        for own in (actor, critic):
-            if _types(own.module) != _types(_PLAIN[type(own.module)]):
-                yield f"other layers than those of a plain {type(own.module).__name__}"
-            if own._kwargs or own._get_kwargs or own.method is not None or own.method_kwargs:
-                yield "options of a network's TensorDictModule"
+    if not _is_plain_module(actor, fused):
+        yield f"a {type(actor).__name__} as {fused.actor}"
+        return
+    nets = {fused.actor: (actor, fused.actor_net)}
+    if fused.critic is not None:
+        critic = getattr(loss, fused.critic)
+        if type(critic) is not TensorDictModule:
+            yield f"a {type(critic).__name__} as {fused.critic}"
+            return
+        nets[fused.critic] = (critic, CriticNet)
+    for name, (module, kind) in nets.items():
+        net = network_of(module)
+        if type(net) is not kind:
+            yield f"a {type(net).__name__} as network of {name}"
+        elif (layers := layers_of(net)) is None:
+            yield f"other layers than those of a plain {kind.__name__} without batch normalization"
+        elif [tuple(p.shape[-2:]) for p in net.parameters()] != parameter_shapes(layers):
+            yield f"parameters beside those of the layers in {name}"
+        inner = module[0] if isinstance(module, TensorDictSequential) else module
+        if inner._kwargs or inner._get_kwargs or inner.method is not None or inner.method_kwargs:
+            yield "options of a network's TensorDictModule"
+    if len({network_of(module).runs for module, _ in nets.values()}) > 1:
+        yield "networks of different numbers of runs"
+    shared = [id(p) for name in nets for p in getattr(loss, f"{name}_params").values(True, True)]
+    if len(shared) != len(set(shared)):
+        yield "networks that share parameters"
 
 
-def _strange_keys(loss: PenalizedDDPGLoss) -> Iterator[str]:
-    actor, critic, keys = loss.actor_network, loss.value_network, loss.tensor_keys
-    if list(critic.in_keys) != [*actor.in_keys, *actor.out_keys]:
-        yield f"a critic that reads {critic.in_keys}, not what the actor reads and writes, in that order"
-    if critic.out_keys != [keys.state_action_value]:
-        yield f"a critic that writes {critic.out_keys}, not {keys.state_action_value!r}"
+def _is_plain_module(actor: nn.Module, fused: FusedLoss) -> bool:
+    """Whether an actor is a network and, for SAC and DQN, what makes an action of its outputs."""
+    if fused.algorithm not in (Algorithm.SAC, Algorithm.DQN):
+        return type(actor) is TensorDictModule
+    if (
+        not isinstance(actor, TensorDictSequential)
+        or len(actor) != 2
+        or type(actor[0]) is not TensorDictModule
+    ):
+        return False
+    head = actor[1]
+    if fused.algorithm is Algorithm.DQN:
+        return type(actor) is QValueActor and head.action_mask_key is None
+    is_squashed = isinstance(head, ProbabilisticTensorDictModule) and head.distribution_class is TanhNormal
+    return is_squashed and set(head.distribution_kwargs) <= {"low", "high"}
+
+
+def _strange_keys(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
+    keys: Any = loss.tensor_keys
+    if fused.critic is not None:
+        actor, critic = getattr(loss, fused.actor), getattr(loss, fused.critic)
+        if list(critic.in_keys) != [*actor.in_keys, action_key(loss)]:
+            yield f"a critic that reads {critic.in_keys}, not what the actor reads and writes, in that order"
+        if critic.out_keys != [keys.state_action_value]:
+            yield f"a critic that writes {critic.out_keys}, not {keys.state_action_value!r}"
     for name in ("reward", "terminated", "done", "priority_weight"):
         if getattr(keys, name) != name:
             yield f"{name} under the key {getattr(keys, name)!r}"
 
 
-def _strange_targets(loss: PenalizedDDPGLoss) -> Iterator[str]:
-    estimator = loss.value_estimator
-    if type(estimator) is not ClampedTD0:
+def _strange_targets(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
+    estimator: Any = loss.value_estimator
+    kinds = (TD0Estimator, ClampedTD0) if fused.algorithm is Algorithm.SAC else (ClampedTD0,)
+    if type(estimator) not in kinds:
         yield f"targets of a {type(estimator).__name__}"
         return
-    if estimator.value_network is not loss.actor_critic or estimator.tensor_keys.value != (
-        loss.tensor_keys.state_action_value
+    if fused.algorithm is Algorithm.DDPG and (
+        estimator.value_network is not loss.actor_critic
+        or estimator.tensor_keys.value != loss.tensor_keys.state_action_value
     ):
         yield "targets from other networks than the loss's"
+    if fused.algorithm in (Algorithm.TD3, Algorithm.SAC) and estimator.value_network is not None:
+        yield "targets from a network of the value estimator's own"
     for name in ("reward", "terminated", "done"):
         if getattr(estimator.tensor_keys, name) != name:
             yield f"{name} of the targets under the key {getattr(estimator.tensor_keys, name)!r}"
     plain = TD0Estimator(gamma=0.0, value_network=None)
+    # TorchRL's default for SAC, whose loss computes the targets without gradients all the same.
+    free = ("differentiable",) if fused.algorithm is Algorithm.SAC else ()
     for name in ("average_rewards", "shifted", "differentiable", "skip_existing", "group_key"):
-        if getattr(estimator, name) != getattr(plain, name):
+        if name not in free and getattr(estimator, name) != getattr(plain, name):
             yield f"targets with {name}={getattr(estimator, name)!r}"
     if estimator.gamma.numel() != 1:
         yield f"a discount of shape {list(estimator.gamma.shape)}"
@@ -143,19 +271,11 @@ def _strange_targets(loss: PenalizedDDPGLoss) -> Iterator[str]:
         yield "hooks on the value estimator"
 
 
-def _types(net: nn.Module) -> list[type]:
-    return [type(module) for module in net.modules()]
-
-
 def _has_hooks(module: nn.Module, own: int = 0) -> bool:
     pre = len(module._forward_pre_hooks) + len(module._backward_pre_hooks)
     return pre > own or bool(module._forward_hooks or module._backward_hooks)
 
 
-def _modules(loss: PenalizedDDPGLoss) -> list[nn.Module]:
-    return [module for net in (loss.actor_network, loss.value_network) for module in net.modules()]
-
-
-def _parameters(loss: PenalizedDDPGLoss) -> list[nn.Parameter]:
-    both = (loss.actor_network_params, loss.value_network_params)
-    return [value for params in both for value in params.values(True, True)]
+def _modules(loss: LossModule, fused: FusedLoss) -> list[nn.Module]:
+    names = [name for name in (fused.actor, fused.critic) if name is not None]
+    return [module for name in names for module in getattr(loss, name).modules()]

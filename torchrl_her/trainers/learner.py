@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
-from torchrl_her.trainers.runs import clip_by_run, keep_runs
+from torchrl_her.trainers.runs import clip_by_run, keep_runs, run_dims
 
 _WEIGHT = "priority_weight"  # of importance sampling, as TorchRL's samplers and losses call it
 
@@ -33,8 +33,10 @@ class Learner(Protocol):
         ...
 
 
-def check_steps(rows: TensorDictBase, steps: int) -> None:
-    """Raises a ValueError if rows [R, n] are not a whole number of batches."""
+def check_rows(rows: TensorDictBase, steps: int, runs: int) -> None:
+    """Raises a ValueError if rows are not [R, n] (or [n] of one run), with a whole number of batches."""
+    if rows.ndim not in (1, 2) or (rows.shape[0] if rows.ndim == 2 else 1) != runs:
+        raise ValueError(f"rows of {runs} runs must be of shape [{runs}, n], got {list(rows.shape)}")
     if steps < 1 or rows.shape[-1] % steps:
         raise ValueError(f"{rows.shape[-1]} rows cannot be shared out among {steps} gradient steps")
 
@@ -76,9 +78,14 @@ class LossLearner:
         self._networks = self._find_networks()
 
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
-        """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`."""
+        """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`.
+
+        Raises:
+            ValueError: the rows are not those of R runs or not a whole number of batches, or the loss does
+                not give one number for each of them.
+        """
+        check_rows(rows, steps, self.runs)
         last = rows.ndim - 1
-        check_steps(rows, steps)
         parts = rows.split(rows.shape[last] // steps, last)
         with keep_runs(self.loss, self.optimizer, idle, runs=self.runs):
             measured = [self._update(part) for part in parts]
@@ -96,28 +103,38 @@ class LossLearner:
             batch.set(_WEIGHT, (by_run / by_run.mean(1, keepdim=True)).view_as(weight))
         output = self.loss(batch)
         losses = {
-            key: value.reshape(self.runs, -1).mean(1)
-            for key, value in output.items()
-            if key.startswith("loss")
+            key: self._mean(key, value, batch) for key, value in output.items() if key.startswith("loss")
         }
         self.optimizer.zero_grad(set_to_none=True)
         torch.stack(list(losses.values())).sum().backward()
-        for parameters in self._networks:
-            self._clip(parameters)
+        for parameters, dim in self._networks:
+            self._clip(parameters, dim)
         self.optimizer.step()
         if self.target is not None:
             self.target.step()
         return {key: value.detach() for key, value in losses.items()}
 
-    def _clip(self, parameters: list[nn.Parameter]) -> None:
+    def _mean(self, name: str, value: Tensor, batch: TensorDictBase) -> Tensor:
+        """The mean loss [R] of each run."""
+        if self.runs > 1 and value.numel() != batch.numel():
+            raise ValueError(
+                f"with {self.runs} runs, {name} must have one number for each of {batch.numel()} rows "
+                f'(reduction="none"), got a shape of {list(value.shape)}'
+            )
+        return value.reshape(self.runs, -1).mean(1)
+
+    def _clip(self, parameters: list[nn.Parameter], dim: int) -> None:
         if self.runs == 1:
             nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         else:
-            clip_by_run(parameters, self.max_grad_norm, runs=self.runs)
+            clip_by_run(parameters, self.max_grad_norm, runs=self.runs, dim=dim)
 
-    def _find_networks(self) -> list[list[nn.Parameter]]:
-        """The parameters of each network: the loss module's children that have any."""
+    def _find_networks(self) -> list[tuple[list[nn.Parameter], int]]:
+        """The parameters of each network (each child of the loss module), and the runs' dimension in them."""
         groups: dict[str, list[nn.Parameter]] = {}
+        dims, dim_of = run_dims(self.loss), {}
         for name, parameter in self.loss.named_parameters():
-            groups.setdefault(name.split(".")[0], []).append(parameter)
-        return list(groups.values())
+            own = name.split(".")[0]
+            groups.setdefault(own, []).append(parameter)
+            dim_of[own] = dims.get(name, 0)
+        return [(parameters, dim_of[own]) for own, parameters in groups.items()]

@@ -8,7 +8,22 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
-from torchrl_her.trainers.ddpg_functional import norms_of_runs
+
+def run_dims(loss: nn.Module) -> dict[str, int]:
+    """The dimension of the runs in each entry of a stacked loss's state, by name.
+
+    It is the first one; in the parameters of a stack of N critics [N, R, ...] it is the second.
+
+    Example:
+        >>> run_dims(nn.Linear(1, 2, bias=False))
+        {'weight': 0}
+    """
+    stacked = {
+        name: len(getattr(child, "batch_size", ()))
+        for name, child in loss.named_children()
+        if name.endswith("_params")
+    }
+    return {name: stacked.get(name.split(".")[0], 0) for name in loss.state_dict()}
 
 
 @contextmanager
@@ -20,7 +35,7 @@ def keep_runs(
     What all runs share, such as Adam's count of steps, does change.
 
     Args:
-        loss: each of its tensors is R equal blocks, in the order of the runs.
+        loss: its tensors have a dimension of R equal blocks, in the order of the runs (see :func:`run_dims`).
         optimizer: over its parameters.
         kept: the runs that stay unchanged.
         runs: R.
@@ -35,31 +50,48 @@ def keep_runs(
     if not kept:
         yield
         return
-    before = {block.data_ptr(): block[list(kept)].clone() for block in _blocks(loss, optimizer, runs)}
+    before = {
+        key: _of_runs(entry, dim, kept, runs).clone() for key, entry, dim in _entries(loss, optimizer, runs)
+    }
     try:
         yield
     finally:
         with torch.no_grad():
-            for block in _blocks(loss, optimizer, runs):
+            for key, entry, dim in _entries(loss, optimizer, runs):
+                own = _of_runs(entry, dim, kept, runs)
                 # the state of an optimizer is made at its first step, and begins with zeros
-                block[list(kept)] = before.get(block.data_ptr(), 0.0)
+                own = before.get(key, torch.zeros_like(own))
+                blocks = entry.unflatten(dim, (runs, -1))
+                blocks.index_copy_(dim, torch.tensor(list(kept), device=entry.device), own)
 
 
-def _blocks(loss: nn.Module, optimizer: torch.optim.Optimizer, runs: int) -> list[Tensor]:
-    """All tensors that are divided among R runs, as [R, n] each."""
-    moments = [entry for state in optimizer.state.values() for entry in state.values()]
-    entries = [*loss.state_dict().values(), *moments]
-    return [entry.view(runs, -1) for entry in entries if entry.ndim > 0 and entry.numel() % runs == 0]
+def _entries(loss: nn.Module, optimizer: torch.optim.Optimizer, runs: int) -> list[tuple[int, Tensor, int]]:
+    """All tensors that are divided among R runs: a key, the tensor, and the dimension of the runs."""
+    dims = run_dims(loss)
+    entries = [(entry, dims[name]) for name, entry in loss.state_dict().items()]
+    of = {id(parameter): dims.get(name, 0) for name, parameter in loss.named_parameters()}
+    for parameter, state in optimizer.state.items():
+        entries += [(entry, of.get(id(parameter), 0)) for entry in state.values()]
+    return [
+        (entry.data_ptr(), entry.data, dim)
+        for entry, dim in entries
+        if isinstance(entry, Tensor) and entry.ndim > dim and entry.shape[dim] % runs == 0
+    ]
+
+
+def _of_runs(entry: Tensor, dim: int, which: Sequence[int], runs: int) -> Tensor:
+    return entry.unflatten(dim, (runs, -1)).index_select(dim, torch.tensor(list(which), device=entry.device))
 
 
 @torch.no_grad()
-def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float, *, runs: int) -> Tensor:
+def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float, *, runs: int, dim: int = 0) -> Tensor:
     """Clips the gradient of each run separately.
 
     Args:
-        parameters: of one stacked network; each is R equal blocks, in the order of the runs.
+        parameters: of one stacked network; each has R equal blocks, in the order of the runs.
         max_norm: greatest norm of a run's gradient, over all parameters together.
         runs: R.
+        dim: the dimension of the runs.
 
     Returns:
         [R], the norms before clipping.
@@ -72,8 +104,10 @@ def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float, *, runs: in
         >>> weight.grad.flatten().round(decimals=4).tolist()
         [3.0, 2.0]
     """
-    blocks = [parameter.grad.view(runs, -1) for parameter in parameters if parameter.grad is not None]
-    norms, scale = norms_of_runs(blocks, max_norm)
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    blocks = [gradient.unflatten(dim, (runs, -1)).movedim(dim, 0) for gradient in gradients]
+    norms = torch.cat([block.reshape(runs, -1) for block in blocks], 1).norm(dim=1)
+    scale = (max_norm / (norms + 1e-6)).clamp(max=1.0)  # as torch's clip_grad_norm_
     for block in blocks:
-        block.mul_(scale.unsqueeze(1))
+        block.mul_(scale.view(-1, *[1] * (block.ndim - 1)))
     return norms

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler, SamplerEnsemble
 
+from torchrl_her.replay_buffers.runs.sampler import RunsPrioritizedSampler
+
 _REMAINING = "_remaining_batches"  # until a pass over the data is over; TorchRL's states leave it out
 
 
@@ -32,7 +34,7 @@ def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
             str(i): sampler_state_dict(part, getattr(part, "_max_capacity", 0))
             for i, part in enumerate(sampler._samplers)
         }
-    elif isinstance(sampler, PrioritizedSampler):
+    elif isinstance(sampler, PrioritizedSampler) and not isinstance(sampler, RunsPrioritizedSampler):
         own = _priorities(sampler, size)
     else:
         own = {key: _copy(value) for key, value in sampler.state_dict().items()}
@@ -51,7 +53,7 @@ def load_sampler_state_dict(sampler: Sampler, state: dict[str, Any]) -> None:
     if isinstance(sampler, SamplerEnsemble):
         for i, part in enumerate(sampler._samplers):
             load_sampler_state_dict(part, state["own"][str(i)])
-    elif isinstance(sampler, PrioritizedSampler):
+    elif isinstance(sampler, PrioritizedSampler) and not isinstance(sampler, RunsPrioritizedSampler):
         _load_priorities(sampler, state["own"])
     else:
         sampler.load_state_dict(state["own"])

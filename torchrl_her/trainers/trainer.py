@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -13,6 +13,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_her.replay_buffers.runs.buffer import runs_of, sizes_of
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.cut import cut_episodes
 from torchrl_her.trainers.learner import Learner
@@ -25,6 +26,15 @@ class Schedule(Protocol):
 
     def step(self) -> None:
         """Called when an epoch has ended."""
+        ...
+
+
+@runtime_checkable
+class CollectsAhead(Protocol):
+    """A collector that can collect while somebody learns."""
+
+    def collect_ahead(self) -> None:
+        """Begins to collect the next batch, with the policy as it is now."""
         ...
 
 
@@ -50,15 +60,18 @@ class Trainer:
     that epoch.
 
     The same loop trains one run or many independent ones. The environments of R runs are R equal blocks of
-    one batch; each run has its own replay buffer.
+    one batch, and one replay buffer holds the rows of all runs.
 
     Args:
-        collector: yields batches [R * E, T] that the exploring policy played.
-        buffers: one for each of R runs, usually with a :class:`~torchrl_her.HERWriter`.
+        collector: yields batches [R * E, T] that the exploring policy played. One that
+            :class:`CollectsAhead` collects the next batch while this loop learns from the last one.
+        buffer: for one run any replay buffer, usually with a :class:`~torchrl_her.HERWriter`; for several one
+            whose writer (``HERWriter(..., runs=R)``) and sampler are for R runs.
         learner: learns from what is sampled.
         schedules: take a step after each epoch, for example exploration and weights of goals.
 
     Keyword Args:
+        runs: R.
         epoch_frames: environment steps of each run in an epoch, rounded up to whole batches.
         frames_per_update: environment steps of each run for each of its gradient steps.
         warmup_frames: environment steps of each run before its first gradient step. The gradient steps that
@@ -69,8 +82,8 @@ class Trainer:
             during these steps count from the next call on.
 
     Raises:
-        ValueError: a number is too small; when running, a batch is not finite, has no trajectory ids, or
-            cannot be divided equally among the runs.
+        ValueError: a number is too small, or the buffer is for another number of runs; when running, a batch
+            is not finite, has no trajectory ids, or cannot be divided equally among the runs.
 
     Attributes:
         frames: environment steps of each run so far.
@@ -83,14 +96,15 @@ class Trainer:
         self,
         *,
         collector: BaseCollector,
-        buffers: Sequence[TensorDictReplayBuffer],
+        buffer: TensorDictReplayBuffer,
         learner: Learner,
         schedules: Sequence[Schedule] = (),
+        runs: int = 1,
         epoch_frames: int = 20_480,
         frames_per_update: float = 20.0,
         warmup_frames: int = 0,
         batch_size: int = 256,
-        batches_per_sample: int = 8,
+        batches_per_sample: int = 32,
     ) -> None:
         counts = {
             "epoch_frames": epoch_frames,
@@ -102,9 +116,9 @@ class Trainer:
                 raise ValueError(f"{name} must be at least 1, got {count}")
         if not frames_per_update > 0:
             raise ValueError(f"frames_per_update must be positive, got {frames_per_update}")
-        if not buffers:
-            raise ValueError("there must be a buffer for each run, got none")
-        self.collector, self.buffers, self.learner = collector, buffers, learner
+        if runs_of(buffer) != runs:
+            raise ValueError(f"there are {runs} runs, but the buffer's writer is for {runs_of(buffer)}")
+        self.collector, self.buffer, self.learner, self.runs = collector, buffer, learner, runs
         self.schedules = list(schedules)
         self.epoch_frames, self.frames_per_update = epoch_frames, frames_per_update
         self.warmup_frames = warmup_frames
@@ -146,9 +160,8 @@ class Trainer:
     def _reset_collector(self) -> None:
         """Begins new episodes everywhere. Those that were under way are written as far as they got."""
         self.collector.reset()
-        for buffer in self.buffers:
-            if isinstance(buffer.writer, HERWriter):
-                buffer.writer.end_episodes()
+        if isinstance(self.buffer.writer, HERWriter):
+            self.buffer.writer.end_episodes()
 
     def _work(
         self,
@@ -167,7 +180,9 @@ class Trainer:
             check_finite(batch)
             if ("collector", "traj_ids") not in batch.keys(True):
                 raise ValueError("the collector must mark trajectories: episodes are cut where epochs begin")
-            is_last = self.frames + batch.numel() // len(self.buffers) >= end
+            is_last = self.frames + batch.numel() // self.runs >= end
+            if not is_last and isinstance(self.collector, CollectsAhead):
+                self.collector.collect_ahead()
             collected = self._write(cut_episodes(batch) if cut and is_last else batch)
             self.frames += collected
             self._credit += collected / self.frames_per_update
@@ -176,51 +191,49 @@ class Trainer:
                 on_batch(self)
 
     def _write(self, batch: TensorDictBase) -> int:
-        """Writes each run's block of the batch into its buffer; returns the number of frames of one run."""
-        runs = len(self.buffers)
-        if len(batch) % runs:
-            raise ValueError(f"{len(batch)} environments cannot be shared out among {runs} runs")
-        blocks = batch.chunk(runs)
-        for buffer, block in zip(self.buffers, blocks, strict=True):
-            buffer.extend(block)
-        return blocks[0].numel()
+        """Writes a batch into the buffer; returns the number of frames of one run."""
+        if len(batch) % self.runs:
+            raise ValueError(f"{len(batch)} environments cannot be shared out among {self.runs} runs")
+        self.buffer.extend(batch)
+        return batch.numel() // self.runs
 
     def _learn(self) -> list[dict[str, Tensor]]:
         """Makes all gradient steps that the collected frames allow."""
-        # Runs must not depend on each other: one whose buffer is still empty skips its steps.
+        # Runs must not depend on each other: one that has no rows yet skips its steps.
         if self.frames < self.warmup_frames:
             return []
-        idle = [run for run, buffer in enumerate(self.buffers) if len(buffer) == 0]
+        idle = [run for run, size in enumerate(sizes_of(self.buffer)) if size == 0]
         measured = []
         while self._credit >= 1.0:
             steps = min(self.batches_per_sample, int(self._credit))
             self._credit -= steps
-            if len(idle) < len(self.buffers):
+            if len(idle) < self.runs:
                 measured.append(self._learn_from(idle, steps))
                 self.updates += steps
         return measured
 
     def _learn_from(self, idle: list[int], steps: int) -> dict[str, Tensor]:
         """Gradient steps of all runs but the idle ones; returns what was measured, [steps, R] each."""
-        size = self.batch_size * steps
-        drawn = [None if run in idle else buffer.sample(size) for run, buffer in enumerate(self.buffers)]
-        stand_in = next(rows for rows in drawn if rows is not None)
-        rows = torch.stack([stand_in if own is None else own for own in drawn])
+        drawn = self.buffer.sample(self.runs * self.batch_size * steps)
+        rows = drawn.view(self.runs, -1)
         measured = self.learner.update(rows, steps, idle=idle)
-        self._set_priorities(drawn, rows)
+        self._set_priorities(drawn, rows, idle)
         nothing = torch.tensor(idle, dtype=torch.int64)
         return {key: value.index_fill(1, nothing, _IDLE) for key, value in measured.items()}
 
-    def _set_priorities(self, drawn: list[TensorDictBase | None], rows: TensorDictBase) -> None:
-        """Gives each run's sampler the new priorities of the transitions that were learned from."""
-        key = self.buffers[0].priority_key
-        priorities = rows.get(key, None)
-        if priorities is None:
+    def _set_priorities(self, drawn: TensorDictBase, rows: TensorDictBase, idle: list[int]) -> None:
+        """Gives the sampler the new priorities of the transitions that were learned from."""
+        key = self.buffer.priority_key
+        priority = rows.get(key, None)
+        if priority is None:
             return
-        for buffer, own, priority in zip(self.buffers, drawn, priorities, strict=True):
-            if own is not None:
-                own.set(key, priority.float())  # the type of TorchRL's trees, also for networks in float64
-                buffer.update_tensordict_priority(own)  # does nothing under a sampler without priorities
+        own = drawn.select("index")
+        # The type of trees, also for networks in float64.
+        own.set(key, priority.flatten(0, 1).float())
+        if idle:  # the rows that they were given are of other runs
+            learned = [run for run in range(self.runs) if run not in idle]
+            own = own.view(self.runs, -1)[learned].flatten()
+        self.buffer.update_tensordict_priority(own)  # does nothing under a sampler without priorities
 
     def state_dict(self) -> dict[str, Any]:
         """The counters, and what was measured in the epoch under way; the parts keep their own state."""

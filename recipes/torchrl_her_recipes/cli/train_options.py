@@ -112,9 +112,28 @@ class OptionsCommand(click.Command):
             rows = [
                 (_written(group, own.name, default_of(own)), own.metadata["help"]) for own in fields(kind)
             ]
+            if group == "learner":
+                rows += _of_other_learners()
             doc = (GROUPS[group].__doc__ or "").splitlines()[0].rstrip(".")
             with formatter.section(f"{group}: {doc[0].lower()}{doc[1:]}"):
                 formatter.write_dl(rows)
+
+
+def _of_other_learners() -> Iterator[tuple[str, str]]:
+    """The options that the default learner does not have, and which have them."""
+    known = {own.name for own in fields(options_of("ddpg"))}
+    learners: dict[str, list[str]] = {}
+    options = {}
+    for spec in LEARNERS.values():
+        for own in fields(spec.options):
+            if own.name not in known:
+                options[own.name] = own
+                learners.setdefault(own.name, []).append(spec.name)
+    for name, own in options.items():
+        yield (
+            _written("learner", name, default_of(own)),
+            f"{own.metadata['help']} ({', '.join(learners[name])})",
+        )
 
 
 def _written(group: str, name: str, default: Any) -> str:

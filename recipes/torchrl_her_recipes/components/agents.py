@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 
 import torch
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
@@ -42,14 +42,12 @@ def make_agent(
         ValueError: the learner cannot choose such actions, or cannot train several runs.
     """
     builder = _builder(recipe, env, curriculum)
-    actor, critic = _networks(builder, recipe, curriculum)
+    actor, critics = _networks(builder, recipe, curriculum)
     exploration, options = builder.exploration(generators), recipe.learner
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(recipe.run.seed)  # second critics are drawn anew
-        loss = builder.loss(actor, critic, rewards)
+    loss = builder.loss(actor, critics, rewards, generators)
     return Agent(
         actor=actor,
-        critic=critic,
+        critic=critics[0],
         exploration=exploration,
         policy=TensorDictSequential(actor, exploration),
         loss=loss,
@@ -89,7 +87,7 @@ def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:
 
 
 def make_networks(recipe: Recipe, env: EnvBase, *, curriculum: Curriculum | None = None) -> Networks:
-    """The actor and the critic; the weights of each run depend on its own seed alone."""
+    """The actor and the critics; the weights of each run depend on its own seed alone."""
     return _networks(_builder(recipe, env, curriculum), recipe, curriculum)
 
 
@@ -98,16 +96,21 @@ def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | 
         alone = []
         for seed in recipe.seeds:
             torch.manual_seed(seed)
-            alone.append(builder.networks(1))
-        networks = builder.networks(recipe.run.num_runs)
+            alone.append(_in_one_list(builder.networks(1)))
+        actor, critics = builder.networks(recipe.run.num_runs)
+    networks = [actor, *critics]
     for network, own in zip(networks, zip(*alone, strict=True), strict=True):
         network.load_state_dict(stack_runs([single.state_dict() for single in own]))
     if curriculum is not None:
-        alphas = recipe.curriculum.alpha_actor, recipe.curriculum.alpha_critic
+        alphas = [recipe.curriculum.alpha_actor, *[recipe.curriculum.alpha_critic] * len(critics)]
         for network, alpha in zip(networks, alphas, strict=True):
             weight = _first_layer(network).weight.data
             weight.copy_(zero_unused_inputs(weight, curriculum.first_inputs, alpha=alpha))
-    return networks
+    return actor, critics
+
+
+def _in_one_list(networks: Networks) -> list[TensorDictModule]:
+    return [networks[0], *networks[1]]
 
 
 def _builder(recipe: Recipe, env: EnvBase, curriculum: Curriculum | None) -> LearnerBuilder:

@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 from torchrl_her_envs.common.goal_env import goal_env, reward_bounds
 from torchrl_her_recipes.components.agents import make_agent
 from torchrl_her_recipes.components.buffers import make_buffer
+from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import (
     in_layers,
@@ -40,7 +41,8 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     """
     if allow_import:
         permit_task(recipe.task.name)
-    task = make_task_envs(recipe, recipe.collection.num_envs, recipe.seeds)
+    processes = recipe.collection.processes > 0  # then those here only tell what the others are like
+    task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
     curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
     state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
     env = task if state is None else in_layers(task, state.progress)
@@ -48,15 +50,17 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     rewards = played_rewards(recipe, task)
     bounds = reward_bounds(goal_env(task)) if curriculum is None else rewards
     agent = make_agent(recipe, env, generators, rewards=bounds, curriculum=curriculum)
+    collector = (
+        ProcessCollector(recipe, agent.policy, None if state is None else state.progress)
+        if processes
+        else make_collector(recipe, env, agent.policy)
+    )
     return Components(
         recipe=recipe,
         env=env,
         eval_env=make_played_env(recipe, recipe.evaluation.episodes, eval_seeds(recipe, 0)),
-        collector=make_collector(recipe, env, agent.policy),
-        buffers=[
-            make_buffer(recipe, task, generator, rewards=rewards, space=space, state=state, run=run)
-            for run, generator in enumerate(generators)
-        ],
+        collector=collector,
+        buffer=make_buffer(recipe, task, generators, rewards=rewards, space=space, state=state),
         goal_target=None if space is None else space.target,
         generators=generators,
         rewards=rewards,

@@ -1,15 +1,18 @@
-"""The replay buffer of a run."""
+"""The replay buffer of all runs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, Sampler
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.envs import EnvBase
 
 from torchrl_her.curriculum.switch import set_layer_goals
 from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her.goals.rewards import EnvReward
+from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
@@ -25,18 +28,28 @@ _NOT_STORED = ("state", "achieved_goal", "input", "collector")
 def make_buffer(
     recipe: Recipe,
     env: EnvBase,
-    generator: torch.Generator,
+    generators: Sequence[torch.Generator],
     *,
     rewards: tuple[float, float] = (-1.0, 0.0),
     space: GoalSpace | None = None,
     state: CurriculumState | None = None,
-    run: int = 0,
 ) -> TensorDictReplayBuffer:
-    """The replay buffer of one run, with its hindsight writer and its sampler."""
-    algorithm, task = get_algorithm(recipe.hindsight.algo), goal_env(env)
-    weights = make_goal_weights(recipe, task, space) if algorithm.hindsight else None
+    """The replay buffer of all runs, with the hindsight writer and the sampler.
+
+    Args:
+        recipe: of the runs.
+        env: of their task.
+        generators: sources of random numbers, one of each run.
+
+    Keyword Args:
+        rewards: of a missed goal and of an achieved one.
+        space: of the goals; None where they are not counted.
+        state: the curriculum, if there is one.
+    """
+    algorithm, task, runs = get_algorithm(recipe.hindsight.algo), goal_env(env), len(generators)
+    own = [make_goal_weights(recipe, task, space) for _ in range(runs if algorithm.hindsight else 0)]
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(recipe.replay.buffer_size),
+        storage=PackedStorage(runs * recipe.replay.buffer_size),
         writer=HERWriter(
             EnvReward(task.compute_reward, task.compute_terminated),
             k=recipe.hindsight.k if algorithm.hindsight else 0,
@@ -45,22 +58,30 @@ def make_buffer(
             gamma=recipe.learner.gamma,
             filter_achieved=algorithm.filter_achieved,
             achieved_reward=rewards[1],
-            weights=weights,
+            weights=[weights for weights in own if weights is not None] or None,
             exclude=_NOT_STORED,
+            runs=runs,
+            generators=generators,
         ),
-        sampler=_make_sampler(recipe),
+        sampler=_make_sampler(recipe, generators),
         priority_key="td_error",
     )
-    buffer.set_rng(generator)
     if state is not None:
-        set_layer_goals(buffer.writer, state.progress.layer_of(run))
-        buffer.append_transform(ZeroPad(state.curriculum, state.progress, run=run))
+        for run in range(runs):
+            set_layer_goals(buffer.writer, state.progress.layer_of(run), run=run)
+        buffer.append_transform(ZeroPad(state.curriculum, state.progress))
     return buffer
 
 
-def _make_sampler(recipe: Recipe) -> Sampler:
-    if recipe.replay.sampler == "uniform":
-        return RandomSampler()
+def _make_sampler(recipe: Recipe, generators: Sequence[torch.Generator]) -> Sampler:
+    options = recipe.replay
+    if options.sampler == "uniform":
+        return RunsSampler(options.buffer_size, runs=len(generators), generators=generators)
     # Alpha is Schaul's, for absolute TD errors; most of TorchRL's losses give their squares.
-    alpha = recipe.replay.priority_alpha / priority_power(recipe.learner.name)
-    return PrioritizedSampler(recipe.replay.buffer_size, alpha=alpha, beta=recipe.replay.priority_beta)
+    return RunsPrioritizedSampler(
+        options.buffer_size,
+        alpha=options.priority_alpha / priority_power(recipe.learner.name),
+        beta=options.priority_beta,
+        runs=len(generators),
+        generators=generators,
+    )

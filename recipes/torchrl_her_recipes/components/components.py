@@ -16,10 +16,12 @@ from torchrl.objectives.utils import TargetNetUpdater
 
 from torchrl_her.goals.ibs import Instructiveness
 from torchrl_her.modules.exploration import Exploration
-from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner
-from torchrl_her.trainers.fusing import can_fuse, is_plain_adam
+from torchrl_her.native.library import CannotCompile
+from torchrl_her.trainers.fused import FusedLearner
+from torchrl_her.trainers.fusing import is_plain_adam, why_not_fused
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.trainer import Trainer
+from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.goal_space import histograms
 from torchrl_her_recipes.config.recipe import Recipe
@@ -34,7 +36,7 @@ class Components:
 
     Attributes:
         recipe: what the components were made from.
-        env: batched training environments: R equal blocks.
+        env: batched training environments: R equal blocks; where other processes collect, one of each run.
         eval_env: batched environments for evaluation, likewise.
         actor: the greedy policy.
         critic: values of (observation, goal, action); what the loss's critics were made from, None if there
@@ -42,8 +44,7 @@ class Components:
         exploration: turns greedy into exploring actions.
         policy: actor, then exploration.
         collector: runs the policy in the environments.
-        buffers: one of each run, with the writer that relabels and the sampler; :attr:`buffer` is
-            that of a single run.
+        buffer: of all runs, with the writer that relabels and the sampler.
         loss: any TorchRL loss module.
         optimizer: over the loss module's parameters.
         target: moves the target networks.
@@ -62,7 +63,7 @@ class Components:
     exploration: Exploration
     policy: TensorDictModuleBase
     collector: BaseCollector
-    buffers: list[TensorDictReplayBuffer]
+    buffer: TensorDictReplayBuffer
     loss: LossModule
     optimizer: torch.optim.Optimizer
     target: TargetNetUpdater | None
@@ -71,48 +72,48 @@ class Components:
     rewards: tuple[float, float] = (-1.0, 0.0)
     curriculum: CurriculumState | None = None
 
-    @property
-    def buffer(self) -> TensorDictReplayBuffer:
-        """The buffer of a single run (of the first one if there are more)."""
-        return self.buffers[0]
-
-    @buffer.setter
-    def buffer(self, buffer: TensorDictReplayBuffer) -> None:
-        if len(self.buffers) > 1:
-            raise ValueError(f"there are {len(self.buffers)} runs: set `buffers`, one for each")
-        self.buffers = [buffer]
-
     def learner(self) -> Learner:
-        """Gradient steps on the loss: fused where that is possible, through the loss module elsewhere."""
-        norm = self.recipe.learner.max_grad_norm
-        fuses = can_fuse(self.loss, self.target)
-        compiles = fuses and is_plain_adam(self.optimizer, self.loss)
-        if getattr(self.recipe.learner, "compile", "auto") == "always" and not compiles:
-            warnings.warn(
-                "compile=always has no effect: only DDPG with this library's networks, without batch "
-                "normalization, with soft target updates and a plain Adam, can be compiled",
-                stacklevel=2,
-            )
-        if fuses:
-            return FusedDDPGLearner(
-                self.loss,
-                self.optimizer,
-                self.target,
-                max_grad_norm=norm,
-                compile_step=self.recipe.compiles and compiles,
-            )
+        """Gradient steps on the loss: fused where that is possible, through the loss module elsewhere.
+
+        Raises:
+            ValueError: ``compile=always``, and they cannot be fused.
+        """
+        norm, choice = self.recipe.learner.max_grad_norm, self.recipe.learner.compile
+        reason = None if choice == "never" else self._why_not_fused()
+        if choice != "never" and reason is None:
+            try:
+                return FusedLearner(self.loss, self.optimizer, self.target, max_grad_norm=norm)
+            except CannotCompile as error:
+                reason = str(error)
+                if choice == "auto":
+                    warnings.warn(
+                        f"gradient steps are several times slower than they could be: {error}", stacklevel=2
+                    )
+        if choice == "always":
+            raise ValueError(f"compile=always cannot be: {reason}; choose auto")
         return LossLearner(
             self.loss, self.optimizer, self.target, max_grad_norm=norm, runs=self.recipe.run.num_runs
         )
+
+    def _why_not_fused(self) -> str | None:
+        if not is_plain_adam(self.optimizer, self.loss):
+            return f"an optimizer that is not a plain Adam over the loss's parameters, {self.optimizer}"
+        return why_not_fused(self.loss, self.target)
+
+    def close(self) -> None:
+        """Ends the processes that collect, if there are any. They start again when they are needed."""
+        if isinstance(self.collector, ProcessCollector):
+            self.collector.shutdown()
 
     def trainer(self) -> Trainer:
         """The training loop over these components."""
         recipe, replay = self.recipe, self.recipe.replay
         return Trainer(
             collector=self.collector,
-            buffers=self.buffers,
+            buffer=self.buffer,
             learner=self.learner(),
             schedules=[self.exploration, *self._goal_weights()],
+            runs=recipe.run.num_runs,
             epoch_frames=recipe.collection.epoch_frames,
             frames_per_update=recipe.collection.frames_per_update,
             warmup_frames=recipe.collection.warmup_frames,
@@ -122,4 +123,4 @@ class Components:
 
     def _goal_weights(self) -> list[Instructiveness]:
         """The weights of goals that change from epoch to epoch."""
-        return [own for own in histograms(self.buffers) if isinstance(own, Instructiveness)]
+        return [own for own in histograms(self.buffer) if isinstance(own, Instructiveness)]

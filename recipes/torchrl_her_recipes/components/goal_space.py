@@ -143,8 +143,7 @@ def make_goal_weights(recipe: Recipe, env: Any, space: GoalSpace | None) -> Goal
     )
 
 
-def histograms(buffers: Sequence[TensorDictReplayBuffer]) -> list[GoalHistogram]:
+def histograms(buffer: TensorDictReplayBuffer) -> list[GoalHistogram]:
     """The histograms of virtual goals of the runs; empty if they are not counted."""
-    writers = [buffer.writer for buffer in buffers]
-    weights = [writer.weights for writer in writers if isinstance(writer, HERWriter)]
+    weights = buffer.writer.goal_weights if isinstance(buffer.writer, HERWriter) else []
     return [own for own in weights if isinstance(own, GoalHistogram)]

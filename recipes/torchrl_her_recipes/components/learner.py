@@ -16,7 +16,7 @@ from torchrl.objectives.utils import TargetNetUpdater
 from torchrl_her.modules.exploration import DecayingEpsilon, Exploration
 from torchrl_her_recipes.config.recipe import Recipe
 
-Networks = tuple[TensorDictModule, TensorDictModule]
+Networks = tuple[TensorDictModule, list[TensorDictModule]]
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Agent:
 
     Attributes:
         actor: the greedy policy.
-        critic: values of (observation, goal, action); TD3 and SAC train others like it.
+        critic: values of (observation, goal, action); the first of several.
         exploration: turns greedy into exploring actions.
         policy: actor, then exploration.
         loss: of TorchRL.
@@ -71,18 +71,23 @@ class LearnerBuilder(ABC):
 
     @abstractmethod
     def networks(self, runs: int) -> Networks:
-        """The actor and the critic of some runs side by side."""
+        """The actor and the critics of some runs side by side."""
 
     @abstractmethod
     def loss(
-        self, actor: TensorDictModule, critic: TensorDictModule, rewards: tuple[float, float]
+        self,
+        actor: TensorDictModule,
+        critics: Sequence[TensorDictModule],
+        rewards: tuple[float, float],
+        generators: Sequence[torch.Generator],
     ) -> LossModule:
         """TorchRL's loss.
 
         Args:
             actor: from :meth:`networks`.
-            critic: likewise.
+            critics: likewise.
             rewards: the least and the greatest that there can be; infinite if the task's is dense.
+            generators: of each run's random numbers.
         """
 
     def exploration(self, generators: Sequence[torch.Generator]) -> Exploration:

@@ -59,9 +59,22 @@ class CollectionConfig(Group):
     steps_per_batch: int = option(10, "steps of each environment between two rounds of updates", at_least=1)
     frames_per_update: float = option(20.0, "environment steps for each gradient step", above=0)
     warmup_frames: int = option(3_200, "environment steps before the first gradient step", at_least=0)
+    processes: int = option(
+        0,
+        "processes that collect while this one learns, for slow environments; 0: this one collects",
+        at_least=0,
+    )
+    sync: bool = option(
+        True, "whether processes collect batches together, which a seed repeats, or each at its own pace"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.processes and self.num_envs % self.processes:
+            raise ValueError(
+                f"num_envs={self.num_envs} cannot be shared out among processes={self.processes}: "
+                "it must be a multiple of it"
+            )
         if self.epoch_frames < self.num_envs * self.steps_per_batch:
             raise ValueError(
                 f"epoch_frames={self.epoch_frames} must be at least num_envs times steps_per_batch, "
@@ -84,7 +97,7 @@ class ReplayConfig(Group):
         1_000_000, "capacity in transitions, real and virtual ones together", at_least=1
     )
     batch_size: int = option(256, "transitions of a gradient step", at_least=1)
-    batches_per_sample: int = option(8, "batches that are sampled in one call", at_least=1)
+    batches_per_sample: int = option(32, "batches that are sampled in one call", at_least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()

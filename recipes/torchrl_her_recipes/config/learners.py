@@ -7,7 +7,7 @@ and a call of :func:`register_learner`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from torchrl_her_recipes.config.groups import Group
 from torchrl_her_recipes.config.options import option, what_there_is
@@ -33,9 +33,31 @@ class LearnerConfig(Group):
     gamma: float = option(0.98, "discount factor", above=0, below=1)
     learning_rate: float = option(1e-3, "learning rate of Adam", above=0)
     max_grad_norm: float = option(3.0, "gradients of each network are clipped to this norm", above=0)
-    hidden: int = option(64, "width of the three hidden layers", at_least=1)
+    hidden: int = option(64, "width of the hidden layers", at_least=1)
+    depth: int = option(3, "how many hidden layers the networks have", at_least=2)
+    activation: str = option("relu", "behind each hidden layer", choices=("relu", "tanh", "elu"))
+    norm: str = option(
+        "none",
+        "normalization of hidden layers: layer, in all networks; batch, in critics only",
+        choices=("none", "layer", "batch"),
+    )
     tau: float = option(0.02, "rate of the soft target update", at_least=0, at_most=1)
     hard_update_interval: int = option(0, "gradient steps between hard target updates; 0: soft", at_least=0)
+    compile: str = option(
+        "auto",
+        "gradient steps in C++, compiled for this machine; auto: where that is possible",
+        choices=("auto", "always", "never"),
+    )
+
+    @property
+    def critic_shape(self) -> dict[str, Any]:
+        """What the hidden layers of critics are like, as the functions that make networks take it."""
+        return {"hidden": self.hidden, "depth": self.depth, "activation": self.activation, "norm": self.norm}
+
+    @property
+    def actor_shape(self) -> dict[str, Any]:
+        """The same for actors, which have no batch normalization."""
+        return self.critic_shape | ({"norm": "none"} if self.norm == "batch" else {})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,33 +82,37 @@ class EpsilonConfig(LearnerConfig):
 class DQNConfig(EpsilonConfig):
     """DQN."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class TD3Config(EpsilonConfig):
-    """TD3."""
-
-    batch_norm: bool = option(False, "batch normalization in the critic")
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.norm == "batch":
+            raise ValueError("norm must be none or layer with learner=dqn, got 'batch'")
 
 
 @dataclass(frozen=True, kw_only=True)
-class DDPGConfig(TD3Config):
+class DDPGConfig(EpsilonConfig):
     """DDPG."""
 
     action_penalty: float = option(
         0.3, "action L2 penalty, which keeps actions off the ends of tanh", at_least=0
     )
-    compile: str = option(
-        "auto",
-        "compile the gradient step; auto: if the run is long enough to gain by it",
-        choices=("auto", "always", "never"),
-    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TD3Config(DDPGConfig):
+    """TD3."""
+
+    critics: int = option(2, "how many critics there are; targets have the least of their values", at_least=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SACConfig(LearnerConfig):
     """SAC. Its policy is stochastic and explores by itself."""
 
-    batch_norm: bool = option(False, "batch normalization in the critics")
+    temperature: float = option(0.1, "the temperature that learning begins with", above=0)
+    critics: int = option(2, "how many critics there are; targets have the least of their values", at_least=1)
+    action_penalty: float = option(
+        0.3, "action L2 penalty, which keeps actions off the ends of tanh", at_least=0
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,14 +166,12 @@ for _spec in (
         summary="two critics and smoothed targets (Fujimoto et al., 2018)",
         builder=f"{_BUILDERS}.td3:TD3Builder",
         options=TD3Config,
-        stacks=False,  # runs would share the random numbers of the loss
     ),
     LearnerSpec(
         name="sac",
         summary="soft actor-critic with a learned temperature (Haarnoja et al., 2018)",
         builder=f"{_BUILDERS}.sac:SACBuilder",
         options=SACConfig,
-        stacks=False,
         priority_power=1,
     ),
     LearnerSpec(

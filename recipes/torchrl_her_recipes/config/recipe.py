@@ -25,9 +25,7 @@ from torchrl_her_recipes.config.shortcuts import GROUPS, Nested, over, place
 from torchrl_her_recipes.config.without_effect import without_effect
 
 # Compiling takes 15 s the first time and saves half a millisecond a step: from this many steps on it pays.
-_WORTH_COMPILING = 20_000
 EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints")  # they leave what was trained as it is
-_MOST_ROWS = 2_000  # transitions of a gradient step: with more, it is arithmetic that takes the time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,15 +70,6 @@ class Recipe:
     def total_frames(self) -> int:
         """Environment steps of a whole run."""
         return self.run.epochs * self.collection.epoch_frames
-
-    @property
-    def compiles(self) -> bool:
-        """Whether the gradient step is to be compiled."""
-        choice = getattr(self.learner, "compile", "never")
-        if choice == "auto":
-            long = self.total_frames / self.collection.frames_per_update >= _WORTH_COMPILING
-            return long and self.run.num_runs * self.replay.batch_size <= _MOST_ROWS
-        return choice == "always"
 
     @property
     def seeds(self) -> list[int]:
@@ -223,6 +212,7 @@ class _Groups:
     task: TaskConfig
     hindsight: HindsightConfig
     learner: LearnerConfig
+    collection: CollectionConfig
     replay: ReplayConfig
 
 

@@ -44,6 +44,8 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         all_of("curriculum", with_algo)
     elif not groups.learner.has_epsilon:
         idle["curriculum", "layer_epsilon"] = f"with learner={groups.learner.name}"
+    if groups.collection.processes == 0:
+        idle["collection", "sync"] = "with processes=0"
     if groups.replay.sampler != "prioritized":
         for name in ("priority_alpha", "priority_beta"):
             idle["replay", name] = f"with sampler={groups.replay.sampler}"

@@ -47,7 +47,7 @@ def move_on(components: Components, state: CurriculumState, samples: Tensor, fra
         seed = components.recipe.seeds[run]
         lines.append(f"seed {seed}: {old.name!r} learned after {frames:,} frames, {new.name!r} begins")
         enter_layer(
-            components.buffers[run],
+            components.buffer,
             new,
             exploration if learner.has_epsilon else None,
             epsilon=components.recipe.curriculum.layer_epsilon,

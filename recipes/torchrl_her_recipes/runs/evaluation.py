@@ -48,12 +48,13 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
 
 def written(components: Components, run: int) -> dict[str, float]:
     """What the writer of one run has counted."""
-    writer = components.buffers[run].writer
+    writer = components.buffer.writer
     if not isinstance(writer, HERWriter):
         return {}
-    counts = {f"rows_{name}": value for name, value in asdict(writer.totals).items()}
-    if isinstance(writer.weights, GoalHistogram) and components.goal_target is not None:
+    counts = {f"rows_{name}": value for name, value in asdict(writer.totals_of(run)).items()}
+    weights = writer.goal_weights[run] if writer.goal_weights else None
+    if isinstance(weights, GoalHistogram) and components.goal_target is not None:
         # q* is that of the full task
         full = components.curriculum is None or components.curriculum.at_the_top(run)
-        counts["kl"] = writer.weights.divergence_to(components.goal_target) if full else math.nan
+        counts["kl"] = weights.divergence_to(components.goal_target) if full else math.nan
     return counts

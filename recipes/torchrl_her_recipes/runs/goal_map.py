@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -55,9 +54,9 @@ class GoalMap:
             raise ValueError(f"{path} is damaged: {error}") from error
 
 
-def goal_map(buffers: Sequence[TensorDictReplayBuffer], target: torch.Tensor | None) -> GoalMap | None:
-    """The map of a run's buffers and its q* [cells]; None where nothing counts virtual goals."""
-    counted = histograms(buffers)
+def goal_map(buffer: TensorDictReplayBuffer, target: torch.Tensor | None) -> GoalMap | None:
+    """The map of the runs' virtual goals and their q* [cells]; None where nothing counts virtual goals."""
+    counted = histograms(buffer)
     if not counted or target is None:
         return None
     shape = counted[0].grid.shape

@@ -155,11 +155,9 @@ def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int =
 
 
 def _policy_of(state: dict[str, Any]) -> TrainedPolicy:
-    actor = make_actor(
-        state["widths"], state["actions"], hidden=state["recipe"]["learner"]["hidden"], in_keys=_KEYS
-    )
-    actor.load_state_dict(state["actor"])
     recipe = Recipe.from_dict(state["recipe"])
+    actor = make_actor(state["widths"], state["actions"], in_keys=_KEYS, **recipe.learner.actor_shape)
+    actor.load_state_dict(state["actor"])
     return TrainedPolicy(
         task=state["task"],
         actor=actor.requires_grad_(False),
@@ -189,8 +187,8 @@ def _check_seen(recipe: Recipe, env: EnvBase) -> None:
 
 def _check_state(recipe: Recipe, state: dict[str, Any]) -> None:
     """Raises a ValueError if these are not the weights of :func:`~torchrl_her.make_actor`."""
-    wanted = ActorNet(sum(state["widths"]), state["actions"], hidden=recipe.learner.hidden).state_dict()
-    shapes = {f"module.{name}": value.shape for name, value in wanted.items()}
+    wanted = ActorNet(sum(state["widths"]), state["actions"], **recipe.learner.actor_shape)
+    shapes = {f"module.{name}": value.shape for name, value in wanted.state_dict().items()}
     if {name: value.shape for name, value in state["actor"].items()} != shapes:
         raise ValueError(
             f"a policy of learner={recipe.learner.name} cannot be exported: its network is not one of "

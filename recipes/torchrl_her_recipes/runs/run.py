@@ -15,7 +15,6 @@ import torch
 from tqdm import tqdm
 
 from torchrl_her.trainers.checkpoint import load_newest_checkpoint, save_checkpoint
-from torchrl_her.trainers.fused_ddpg import FusedDDPGLearner
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import build
@@ -142,7 +141,7 @@ def _newest_state(home: RunFolder, *, keep: int) -> dict[str, Any]:
         state = load_newest_checkpoint(home.checkpoint, keep=keep)
     except FileNotFoundError:
         state = {}
-    if not state.get("buffers"):
+    if not state.get("buffer"):
         raise ValueError(
             f"the run in {home.path} cannot go on: its replay buffer was not kept "
             f"({home.checkpoint.name} {'has none' if state else 'is missing'})"
@@ -163,10 +162,8 @@ def _run(
     torch.set_num_threads(recipe.run.threads)
     torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
     bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
-    interrupted = compiled = saved = False
+    interrupted = saved = False
     unlogged = 0  # rows that are not on the disk yet
-    if isinstance(trainer.learner, FusedDDPGLearner):
-        trainer.learner.before_compiling = lambda: _say(bar, "Compiling the gradient step, once: about 30 s")
     with soft_interrupt() as check:  # also while things are saved at the end
         try:
             while trainer.epochs < recipe.run.epochs:
@@ -174,7 +171,6 @@ def _run(
                 rows += new
                 for line in saturation_notices(rows, recipe):
                     _say(bar, line)
-                compiled = compiled or _say_compiled(trainer, bar)
                 if home is not None:
                     unlogged += len(new)
                     with _despite_a_full_disk("table", trainer):
@@ -190,6 +186,7 @@ def _run(
             interrupted, saved = True, False
         finally:
             bar.close()
+            components.close()
             torch.set_num_threads(threads)
             torch.set_flush_denormal(False)
         if home is not None:
@@ -242,17 +239,6 @@ def _say(bar: tqdm, line: str) -> None:
         bar.write(line)
 
 
-def _say_compiled(trainer: Trainer, bar: tqdm) -> bool:
-    """A line when the gradient step has been compiled; returns whether it was."""
-    learner = trainer.learner
-    if not (isinstance(learner, FusedDDPGLearner) and learner.is_compiled):
-        return False
-    if not bar.disable:
-        bar.start_t += learner.compile_seconds  # which would make the bar guess hours
-    _say(bar, f"gradient step compiled in {learner.compile_seconds:.0f} s (kept for later runs)")
-    return True
-
-
 def _save(components: Components, trainer: Trainer, home: RunFolder) -> bool:
     """Writes a checkpoint; returns whether it could."""
     with _despite_a_full_disk("checkpoint", trainer):
@@ -302,7 +288,7 @@ def median_run(rows: list[dict[str, float]]) -> int:
 
 def _save_goals(components: Components, home: RunFolder) -> GoalMap | None:
     """Writes the histogram of virtual goals, if there is one."""
-    goals = goal_map(components.buffers, components.goal_target)
+    goals = goal_map(components.buffer, components.goal_target)
     if goals is not None:
         goals.save(home.goal_map)
     return goals

@@ -22,7 +22,7 @@ from torchrl_her_recipes.components.components import Components
 
 
 def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
-    """All that a run is, as tensors and plain data. Rows are the buffers' own: save it at once."""
+    """All that a run is, as tensors and plain data. Rows are the buffer's own: save it at once."""
     return {
         "recipe": components.recipe.to_dict(),
         "made_of": _made_of(components),
@@ -31,7 +31,7 @@ def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
         "optimizer": components.optimizer.state_dict(),
         "target": None if components.target is None else components.target.state_dict(),
         "exploration": dict(components.exploration.state_dict()),
-        "buffers": [buffer_state_dict(buffer, copy=False) for buffer in components.buffers],
+        "buffer": buffer_state_dict(components.buffer, copy=False),
         "generators": [generator.get_state() for generator in components.generators],
         "torch_generator": torch.get_rng_state(),  # for losses that draw, as SAC's
         "worlds": None if (worlds := _worlds(components)) is None else worlds.world_state_dict(),
@@ -57,27 +57,29 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
     if components.target is not None:
         components.target.load_state_dict(state["target"])
     components.exploration.load_state_dict(state["exploration"])
-    for buffer, own in zip(components.buffers, state["buffers"], strict=True):
-        load_buffer_state_dict(buffer, own)
+    load_buffer_state_dict(components.buffer, state["buffer"])
     for generator, own in zip(components.generators, state["generators"], strict=True):
         generator.set_state(own)
     torch.set_rng_state(state["torch_generator"])
     if components.curriculum is not None:
         components.curriculum.progress.load_state_dict(state["progress"])
-        for run, buffer in enumerate(components.buffers):
-            set_layer_goals(buffer.writer, components.curriculum.progress.layer_of(run))
+        for run in range(components.recipe.run.num_runs):
+            set_layer_goals(components.buffer.writer, components.curriculum.progress.layer_of(run), run=run)
     load_collector_state_dict(components.collector, state["collector"])
     trainer.load_state_dict(state["trainer"])
     if (worlds := _worlds(components)) is not None:
         worlds.load_world_state_dict(state["worlds"])
-    elif trainer.in_epoch:
-        components.collector.reset()  # such an environment cannot go on with its episodes
+    elif trainer.in_epoch:  # such environments cannot go on with their episodes
+        components.collector.reset()
+        if isinstance(components.buffer.writer, HERWriter):
+            components.buffer.writer.end_episodes()
 
 
 def _worlds(components: Components) -> BatchedEnv | None:
-    """The environment below all transforms, if it is one of ours."""
+    """The environment below all transforms, if it is one of ours and collects here."""
     worlds = goal_env(components.env)
-    return worlds if isinstance(worlds, BatchedEnv) else None
+    here = components.recipe.collection.processes == 0
+    return worlds if here and isinstance(worlds, BatchedEnv) else None
 
 
 def _made_of(components: Components) -> dict[str, str]:
@@ -89,7 +91,7 @@ def _made_of(components: Components) -> dict[str, str]:
             writer.k,
             strategy_name(writer.strategy),
             writer.filter_achieved,
-            type(writer.weights).__name__,
+            type(writer.goal_weights[0] if writer.goal_weights else None).__name__,
         ]
     names = {
         name: type(getattr(components, name)).__name__

@@ -155,6 +155,14 @@ def test_maybe_reset_does_nothing_before_an_end() -> None:
     assert env.started == [[0, 1]]
 
 
+def test_a_state_of_another_number_of_environments_is_refused() -> None:
+    env, other = Counting(4), Counting(1)
+    for each in (env, other):
+        each.reset()
+    with pytest.raises(ValueError, match="the state must be of 4 environments, got '.*' of 1"):
+        env.load_world_state_dict(other.world_state_dict())
+
+
 def test_resuming_and_seeding() -> None:
     env, other = Counting(6, seed=(3, 5)), Counting(6, seed=(9,))
     env.reset()

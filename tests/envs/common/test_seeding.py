@@ -1,11 +1,13 @@
 """Random numbers as a function of (seed, environment, episode)."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 
-from torchrl_her_envs.common.seeding import env_keys, uniform
+from torchrl_her_envs.common.seeding import as_seeds, env_keys, uniform
 
 
 def first_episode(num_envs: int) -> torch.Tensor:
@@ -94,3 +96,15 @@ def test_arrays_give_the_numbers_that_tensors_give() -> None:
     u = uniform(keys, episodes, 7)
     assert isinstance(u, np.ndarray)
     assert np.array_equal(u, uniform(keys, torch.from_numpy(episodes), 7).numpy())
+
+
+def test_seeds_as_a_list() -> None:
+    for seeds in (3, np.int64(3), [3], (np.uint8(3),), np.array([3])):
+        assert as_seeds(seeds) == [3]
+        assert type(as_seeds(seeds)[0]) is int
+
+
+@pytest.mark.parametrize("seeds", [1.7, [1.7], [3, 1.0], np.array([1.7]), "7"])
+def test_seeds_that_are_not_integers_are_refused(seeds: Any) -> None:
+    with pytest.raises(TypeError, match="a seed must be an integer, or several, got "):
+        as_seeds(seeds)

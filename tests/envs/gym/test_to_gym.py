@@ -84,6 +84,23 @@ def test_functions_of_goals_take_one_pair_or_many() -> None:
     assert env.compute_truncated(many, goal, infos).tolist() == [False] * 3
 
 
+def test_functions_of_goals_take_lists() -> None:
+    env = make("hand_v0").unwrapped
+    goals = [[0.0, 0.0], [1, 1]], [0, 0]
+    assert env.compute_reward(*goals, {}).tolist() == [0.0, -1.0]
+    assert env.compute_terminated(*goals, {}).tolist() == [True, False]
+    assert env.compute_truncated(*goals, {}).tolist() == [False, False]
+    assert env.compute_reward([0, 0], [1, 1], {}) == -1.0
+
+
+@pytest.mark.parametrize(("one", "other"), [((2,), (3, 2)), ((3, 2), (2,)), ((4, 1, 2), (3, 2))])
+def test_functions_of_goals_broadcast(one: tuple[int, ...], other: tuple[int, ...]) -> None:
+    env = make("hand_v0").unwrapped
+    shape = np.broadcast_shapes(one, other)[:-1]
+    for function in (env.compute_reward, env.compute_terminated, env.compute_truncated):
+        assert function(np.zeros(one), np.zeros(other), {}).shape == shape
+
+
 def test_the_reward_is_that_of_the_goals_shown() -> None:
     env = make("hand_v0", threshold=0.5).unwrapped
     rewards = set()
@@ -130,6 +147,11 @@ def test_options_reach_the_environment() -> None:
     assert env.unwrapped.compute_reward(np.array([0.4, 0.0]), np.zeros(2), {}) == 0.0
     many = make_many("robot_v1", num_links=3)
     assert many.single_observation_space["observation"].shape == (18,)
+
+
+def test_gravity_may_point_up() -> None:
+    spaces = [make(world=WorldConfig(gravity=gravity)).observation_space for gravity in (20.0, -20.0)]
+    assert spaces[0] == spaces[1]
 
 
 @pytest.mark.parametrize("links", [1, 3, 6])

@@ -71,6 +71,23 @@ def test_seeds_may_be_given_one_by_one() -> None:
     assert not np.array_equal(again, shown)
 
 
+def test_seeds_that_are_not_given_are_drawn() -> None:
+    many = make_many(num_envs=4)
+    starts = [many.reset(seed=[1, None, None, 4])[0]["desired_goal"] for _ in range(2)]
+    for world, seed in ((0, 1), (3, 4)):
+        assert np.array_equal(starts[0][world], make().reset(seed=seed)[0]["desired_goal"])
+        assert np.array_equal(starts[0][world], starts[1][world])
+    drawn = [tuple(start[world]) for start in starts for world in (1, 2)]
+    assert len(set(drawn)) == 4
+    again = []
+    for _ in range(2):  # they come from the generator that a seed sets
+        many.reset(seed=7)
+        again.append(many.reset(seed=[None] * 4)[0]["desired_goal"])
+    assert np.array_equal(*again)
+    with pytest.raises(TypeError, match="'float' object cannot be interpreted as an integer"):
+        many.reset(seed=[1, 2, 3, 4.5])
+
+
 @pytest.mark.parametrize("task", ["hand_v0", "hand_wall_v2", "robot_v2"])
 def test_each_environment_of_a_vector_does_what_it_does_alone(task: str) -> None:
     seeds = [5, 9, 5, 70, 1]
@@ -103,6 +120,34 @@ def test_what_was_returned_stays_as_it_is() -> None:
                 copies.append(copy.deepcopy(kept[-1]))
         for one, other in zip(kept, copies, strict=True):
             equal(one, other)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_no_two_arrays_that_are_returned_are_one(mode: AutoresetMode) -> None:
+    many = make_many("hand_v0", num_envs=4, autoreset_mode=mode, max_episode_steps=1)
+    many.reset(seed=0)
+    _, reward, terminated, truncated, info = many.step(many.action_space.sample())
+    info |= {f"final_{key}": value for key, value in info.pop("final_info", {}).items()}
+    arrays = [reward, terminated, truncated, *info.values()]
+    for k, one in enumerate(arrays):
+        assert not any(np.shares_memory(one, other) for other in arrays[:k])
+        one[:] = 0
+    if mode is AutoresetMode.DISABLED:  # what became of them does not matter to the environments
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            many.step(many.action_space.sample())
+
+
+def test_a_first_reset_is_of_all_environments() -> None:
+    many, mask = make_many(num_envs=2), np.array([True, False])
+    with pytest.raises(
+        gymnasium.error.ResetNeeded, match=r"of all environments, got reset_mask \[True, False\]"
+    ):
+        many.reset(options={"reset_mask": mask})
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset must be called before step"):
+        many.step(many.action_space.sample())
+    many.reset(options={"reset_mask": ~mask | mask})
+    many.reset(options={"reset_mask": mask})
+    many.step(many.action_space.sample())
 
 
 def test_a_vector_must_be_reset_first() -> None:

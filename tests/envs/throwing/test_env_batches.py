@@ -198,6 +198,27 @@ def test_resuming_goes_on_with_the_same_episodes() -> None:
     assert (collect(env, actions) == collect(resumed, actions)).all()
 
 
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_a_state_of_another_number_of_environments_is_refused(count: int) -> None:
+    env, other = make("hand_v1", 4), make("hand_v1", count, seed=1)
+    for each in (env, other):
+        each.reset()
+    before = env.world_state_dict()
+    with pytest.raises(ValueError, match=f"the state must be of 4 environments, got 'joints' of {count}"):
+        env.load_world_state_dict(other.world_state_dict())
+    key = other.world_state_dict()["key"]
+    with pytest.raises(ValueError, match=f"the state must be of 4 environments, got 'key' of {count}"):
+        env.load_world_state_dict(before | {"goal": before["goal"] + 1.0, "key": key})
+    assert all(equal(env.world_state_dict(), before).values())
+
+
+def test_a_state_of_another_task_is_refused() -> None:
+    env, other = make("robot_v1", 4), make("robot_v1", 4)
+    wide = other.world_state_dict() | {"joints": torch.zeros(4, 3, dtype=torch.float64)}
+    with pytest.raises(ValueError, match=r"'joints' of the state must be of shape \[4, 2\], got \[4, 3\]"):
+        env.load_world_state_dict(wide)
+
+
 @pytest.mark.parametrize("load", [False, True])
 def test_a_state_that_was_taken_stays_as_it_was(load: bool) -> None:
     env = make("hand_v1", 4)

@@ -253,6 +253,20 @@ def test_constants_are_used() -> None:
     assert_close(velocity, points([1.4, 1.0]))
 
 
+@pytest.mark.parametrize("size", [0.5, 1.0])
+def test_a_small_world_does_not_depend_on_those_beside_it(size: int) -> None:
+    # Between steps balls wait beyond the right side, which is 1 m thick whatever the size.
+    world = WorldConfig(size=size, gravity=10 * size / 6, hand_speed=8 * size / 6)
+    alone, together = BallPhysics(1, world, wall=False), BallPhysics(3, world, wall=False)
+    position, velocity = points([0.5 * size, 0.03 * size]), points([size / 6, -size / 12])  # on the floor
+    few, many = (position, velocity), (position.repeat(3, 1), velocity.repeat(3, 1))
+    for _ in range(5):
+        few, many = alone.step(*few), together.step(*many)
+        for ours, theirs in zip(few, many, strict=True):
+            assert torch.equal(theirs, ours.repeat(3, 1))
+    assert few[0][0, 0] > 0.5 * size
+
+
 def test_a_ball_that_has_come_to_rest_is_as_if_it_were_still_simulated() -> None:
     resting, simulated = (BallPhysics(2, WorldConfig(), wall=False) for _ in range(2))
     state = (torch.tensor([[1.0, 0.5], [2.0, 0.3]], dtype=torch.float64), torch.zeros(2, 2).double())

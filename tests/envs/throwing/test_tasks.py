@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from torchrl_her_envs import TASKS, Task, WorldConfig, get_task, make_env
+from torchrl_her_envs import TASKS, BallPhysics, Task, WorldConfig, get_task, make_env
 
 TABLE = {
     # name: effector, start of the ball, throws, wall, entries of the observation, of the action
@@ -111,11 +111,67 @@ def test_options_reach_the_environment() -> None:
         ({"hand_speed": -1.0}, "hand_speed must be positive, got -1.0"),
         ({"time_step": 0.0}, "time_step must be positive, got 0.0"),
         ({"size": float("nan")}, "size must be positive, got nan"),
+        ({"size": float("inf")}, "size must be finite, got inf"),
+        ({"gravity": float("nan")}, "gravity must be finite, got nan"),
+        ({"bounce": 1.1}, "bounce must be from 0 to 1, got 1.1"),
+        ({"bounce": -0.1}, "bounce must be from 0 to 1, got -0.1"),
+        ({"bounce": float("nan")}, "bounce must be from 0 to 1, got nan"),
+        ({"friction": -1.0}, "friction must be at least 0, got -1.0"),
+        ({"friction": float("inf")}, "friction must be finite, got inf"),
+        ({"substeps": 2.5}, "substeps must be a whole number, got 2.5"),
+        ({"max_steps": 0.5}, "max_steps must be a whole number, got 0.5"),
     ],
 )
 def test_constants_that_cannot_be(options: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         WorldConfig(**options)
+
+
+def test_numbers_of_steps_may_be_whole_floats() -> None:
+    world = WorldConfig(substeps=4.0, max_steps=50.0)  # type: ignore[arg-type]
+    assert [(type(own), own) for own in (world.substeps, world.max_steps)] == [(int, 4), (int, 50)]
+    env = make_env("hand_wall_v1", world=world)
+    assert env.max_steps == 50
+    assert env.rollout(5).shape == (1, 5)  # it flies: substeps are counted
+
+
+@pytest.mark.parametrize("gravity", [10.0, -10.0])
+@pytest.mark.parametrize(
+    ("substeps", "message"),
+    [
+        (
+            1,
+            "a task with a wall needs at least 3 substeps, got 1: a ball of up to 15.7 m/s moves 0.63 m in a substep",
+        ),
+        (
+            2,
+            "at least 3 substeps, got 2: .* 0.315 m in a substep, .* half of the wall's thickness, 0.24 m together",
+        ),
+    ],
+)
+def test_balls_that_could_pass_through_the_wall_are_refused(
+    gravity: float, substeps: int, message: str
+) -> None:
+    world = WorldConfig(substeps=substeps, gravity=gravity)
+    for task in (name for name in TASKS if get_task(name).wall):
+        with pytest.raises(ValueError, match=message):
+            make_env(task, world=world)
+        make_env(task, world=dataclasses.replace(world, substeps=3))
+    make_env("hand_v1", world=world)  # no wall to pass through
+    make_env("robot_v1", world=world)
+
+
+def test_a_wall_stops_balls_that_are_as_fast_as_can_be() -> None:
+    world, starts = WorldConfig(substeps=3), torch.linspace(0.5, 2.5, 201, dtype=torch.float64)
+    physics = BallPhysics(201, world, wall=True)
+    position = torch.stack((starts, torch.ones_like(starts)), -1)
+    velocity = torch.tensor([world.fastest_ball(2**0.5 * world.hand_speed), 0.0]).double().repeat(201, 1)
+    came_back = torch.zeros(201, dtype=torch.bool)
+    for _ in range(10):
+        position, velocity = physics.step(position, velocity)
+        assert position[:, 0].max() < 3.0
+        came_back |= velocity[:, 0] < 0
+    assert came_back.all()
 
 
 @pytest.mark.parametrize(

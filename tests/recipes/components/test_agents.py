@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 from torchrl_her_recipes import build, run
 from torchrl_her_recipes.components.agents import find_learner, make_networks
 from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.config.learners import LEARNERS
 
 from ..small import small
 
@@ -35,7 +37,6 @@ def test_auto_follows_the_actions(options: dict[str, Any], name: str) -> None:
             "not be used on bit_flip, .* discrete actions: choose dqn",
         ),
         ({"task": "hand_v0", "learner": "dqn"}, "continuous actions: choose ddpg or td3 or sac"),
-        ({"task": "hand_v0", "learner": "sac", "num_runs": 2}, "num_runs must be 1 with learner=sac"),
         (
             {"task": "bit_flip", "action_penalty": 0.5},
             "with learner=dqn: leave it out or write learner=dqn",
@@ -68,3 +69,10 @@ def test_a_learner_that_explores_by_itself_gets_no_epsilon_when_a_layer_begins(
     run(components, progress=False)
     assert progress.layers == (1,)
     assert components.exploration.epsilon.tolist() == [0.0]
+
+
+def test_a_learner_may_be_for_one_run_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(LEARNERS, "sac", replace(LEARNERS["sac"], stacks=False))
+    recipe = small(task="hand_v0", learner="sac", num_runs=2)
+    with pytest.raises(ValueError, match="num_runs must be 1 with learner=sac"):
+        find_learner(recipe, make_task_envs(recipe, 2, [0, 1]))

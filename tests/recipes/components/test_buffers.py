@@ -15,7 +15,7 @@ from ..small import small
 def test_priorities_are_schaul_s_power_of_the_absolute_td_error(learner: str) -> None:
     """The loss gives the error or its square: alpha makes up for that."""
     components = build(small(learner=learner, priority_alpha=0.8))
-    (buffer,), loss = components.buffers, components.loss
+    buffer, loss = components.buffer, components.loss
     for _ in range(6):  # until episodes end
         buffer.extend(components.collector.next())
     rows = buffer.sample(32)
@@ -29,5 +29,5 @@ def test_priorities_are_schaul_s_power_of_the_absolute_td_error(learner: str) ->
 @pytest.mark.parametrize("n_steps", [1, 3])
 def test_steps_and_their_discount_are_the_recipe_s(n_steps: int) -> None:
     components = build(small(n_steps=n_steps, gamma=0.9))
-    options = components.buffers[0].writer.options
+    options = components.buffer.writer.options
     assert (options.n_steps, options.gamma) == (n_steps, 0.9)

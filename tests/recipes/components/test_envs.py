@@ -94,7 +94,6 @@ def test_other_learners_train_by_name(learner: str, loss: type, tmp_path: Path) 
     [
         ({"task": "bit_flip", "learner": "sac"}, "discrete actions: choose dqn"),
         ({"task": "hand_v0", "learner": "dqn"}, "continuous actions: choose ddpg or td3 or sac"),
-        ({"learner": "sac", "num_runs": 2}, "num_runs must be 1 with learner=sac"),
         (
             {"task": "bit_flip", "options": {"bots": 3}},
             "bit_flip takes no option 'bots'; its options are bits",

@@ -31,5 +31,5 @@ def test_the_name_and_the_class_of_options_must_agree() -> None:
 def test_an_unknown_learner_gets_a_hint() -> None:
     with pytest.raises(ValueError, match="unknown learner 'ddgp'; did you mean ddpg. The learners are auto"):
         make_recipe(learner="ddgp")
-    with pytest.raises(ValueError, match="learner=td3 has no option action_penalty; the options are name"):
-        make_recipe(learner="td3", action_penalty=0.5)
+    with pytest.raises(ValueError, match="learner=ddpg has no option critics; the options are name"):
+        make_recipe(learner="ddpg", critics=3)

@@ -8,12 +8,13 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import DQNLoss, SACLoss, SoftUpdate, TD3Loss
 
-from torchrl_her import make_actor, make_critic
+from torchrl_her import FusedLearner, LossLearner, make_actor, make_critic
 from torchrl_her.modules import CriticNet
+from torchrl_her.native import load_steps
+from torchrl_her.replay_buffers import RunsPrioritizedSampler, RunsSampler
 from torchrl_her_recipes import ALGORITHMS, Recipe, build, make_recipe, run
 from torchrl_her_recipes.components.assembly import make_collector
 from torchrl_her_recipes.config.shipped import load_preset
@@ -33,6 +34,10 @@ from ..small import small
         ({"sampler": "best"}, "sampler must be one of prioritized, uniform, got 'best'"),
         ({"threshold": -0.1}, "threshold must be above 0, got -0.1"),
         ({"batch_size": 256, "buffer_size": 100}, "batch_size=256 must fit buffer_size=100"),
+        (
+            {"processes": 3},
+            "num_envs=64 cannot be shared out among processes=3: it must be a multiple of it",
+        ),
         ({"epoch_frames": 100}, "epoch_frames=100 must be at least num_envs times steps_per_batch, 640"),
         ({"seed": 2**40}, "seed must be below 2147483648, got 1099511627776"),
         ({"k": -1}, "k must be at least 0, got -1"),
@@ -75,9 +80,8 @@ def test_a_preset_of_ddpg_serves_tasks_whose_actions_are_discrete(task: str) -> 
 def test_every_algorithm_runs_with_every_sampler(algo: str, sampler: str) -> None:
     components = build(small(algo=algo, sampler=sampler))
     result = run(components, progress=False)
-    assert isinstance(
-        components.buffer.sampler, PrioritizedSampler if sampler == "prioritized" else RandomSampler
-    )
+    kind = RunsPrioritizedSampler if sampler == "prioritized" else RunsSampler
+    assert type(components.buffer.sampler) is kind
     assert len(result.rows) == 2
     assert (result.rows[-1]["rows_virtual"] > 0) == (algo != "no_hindsight")
     filtered = {"filtered_her", "filtered_her_ibs", "cher", "cher_ibs"}
@@ -92,8 +96,8 @@ def test_every_goal_strategy_runs(strategy: str) -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        {"batch_norm": True},
-        {"batch_norm": True, "num_runs": 2},
+        {"norm": "batch"},
+        {"norm": "batch", "num_runs": 2},
         {"hard_update_interval": 50},
         {"dtype": "float64"},
         {"k": 0},
@@ -190,22 +194,49 @@ def test_actor_of_ones_own_keys() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("options", "compiles"),
-    [
-        ({"epochs": 30}, True),  # 30,720 gradient steps
-        ({"epochs": 10}, False),
-        ({"epochs": 10, "compile": "always"}, True),
-        ({"epochs": 30, "compile": "never"}, False),
-        ({"epochs": 30, "num_runs": 15}, False),  # 3,840 rows: nothing to win
-        ({"epochs": 30, "num_runs": 15, "batch_size": 64}, True),
-    ],
-)
-def test_long_runs_of_few_rows_are_compiled(options: dict[str, Any], compiles: bool) -> None:
-    assert make_recipe(**options).compiles is compiles
+@pytest.mark.parametrize("learner", ["ddpg", "td3", "sac"])
+@pytest.mark.parametrize("runs", [1, 2])
+def test_gradient_steps_are_fused_unless_told_otherwise(learner: str, runs: int) -> None:
+    for compile, kind in (("auto", FusedLearner), ("always", FusedLearner), ("never", LossLearner)):
+        components = build(small(learner=learner, num_runs=runs, compile=compile))
+        assert type(components.learner()) is kind
 
 
-def test_compiling_what_cannot_be_is_said() -> None:
-    components = build(small(compile="always", batch_norm=True))
-    with pytest.warns(UserWarning, match="compile=always has no effect"):
+def test_where_they_cannot_be_fused_the_loss_is_used() -> None:
+    components = build(small(norm="batch"))
+    assert isinstance(components.learner(), LossLearner)
+
+
+def test_compiling_what_cannot_be_is_refused() -> None:
+    components = build(small(compile="always", norm="batch"))
+    with pytest.raises(ValueError, match="compile=always cannot be: .*batch normalization"):
         components.learner()
+
+
+def test_without_a_compiler_it_warns_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    load_steps.cache_clear()
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.warns(UserWarning, match="several times slower .* no C\\+\\+ compiler no-such-compiler"):
+        assert isinstance(build(small()).learner(), LossLearner)
+    with pytest.raises(ValueError, match="compile=always cannot be"):
+        build(small(compile="always")).learner()
+
+
+@pytest.mark.parametrize("learner", ["ddpg", "td3", "sac"])
+def test_networks_have_the_shape_that_is_asked_for(learner: str) -> None:
+    options = {"hidden": 8, "depth": 2, "activation": "elu", "norm": "layer"}
+    components = build(small(learner=learner, **options))
+    for network in (components.actor, components.critic):
+        kinds = [type(module).__name__ for module in network.modules()]
+        assert kinds.count("ELU") == kinds.count("StackedLayerNorm") == 2
+
+
+def test_critics_of_a_run_depend_on_its_seed_alone() -> None:
+    alone, beside = (
+        build(small(learner="td3", critics=3, seed=seed, num_runs=runs)).loss.qvalue_network_params
+        for seed, runs in ((4, 1), (3, 2))
+    )
+    for one, two in zip(alone.values(True, True), beside.values(True, True), strict=True):
+        assert one.shape[0] == 3
+        assert torch.equal(one[:, 0], two[:, 1])
+        assert one.ndim < 4 or not torch.equal(one[0], one[1])

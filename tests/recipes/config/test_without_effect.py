@@ -21,6 +21,7 @@ IDLE = [
     ({"sampler": "uniform"}, {"priority_alpha": 0.5}),
     ({"sampler": "uniform"}, {"priority_beta": 0.5}),
     ({"hard_update_interval": 3}, {"tau": 0.5}),
+    ({"processes": 0}, {"sync": False}),
     ({"task": "bit_flip"}, {"threshold": 0.5}),
     ({"task": "chain"}, {"dtype": "float64"}),
     ({"task": "gym:FetchReach-v4"}, {"dtype": "float64"}),

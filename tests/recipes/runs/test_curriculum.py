@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import Instructiveness, enter_layer
+from torchrl_her.replay_buffers.runs import sizes_of
 from torchrl_her_envs import TASKS, Chain, base_env, make_env
 from torchrl_her_recipes import Components, Recipe, build, load_actor, play, resume, run
 from torchrl_her_recipes.cli import main
@@ -47,8 +48,11 @@ def test_every_throwing_task_has_a_curriculum_that_hands_over(task: str) -> None
     shown = env.reset()
     state = shown["state"]
     reach, throw = curriculum.layers
-    assert state[:, list(reach.achieved_goal)].tolist() == env._scale(env.worlds.grip).float().tolist()
-    assert state[:, list(reach.desired_goal)].tolist() == env._scale(env.worlds.ball).float().tolist()
+    grip, ball = (
+        (where * (2.0 / env.world.size) - 1.0).float() for where in (env.worlds.grip, env.worlds.ball)
+    )
+    assert state[:, list(reach.achieved_goal)].tolist() == grip.tolist()
+    assert state[:, list(reach.desired_goal)].tolist() == ball.tolist()
     assert state[:, list(throw.achieved_goal)].tolist() == shown["achieved_goal"].tolist()
     assert state[:, list(throw.desired_goal)].tolist() == env.worlds.goal.float().tolist()
     # What the throw sees first is all that the reach sees, its goal included.
@@ -151,17 +155,18 @@ def test_a_change_of_layer_empties_and_restarts_one_run_alone() -> None:
     steps = [float(state["step"]) for state in components.optimizer.state.values()]
     lines = move(components, run=1)
     assert lines == ["seed 1: 'reach' learned after 1,600 frames, 'throw' begins"]
-    assert [len(buffer) > 0 for buffer in components.buffers] == [True, False]
+    assert [size > 0 for size in sizes_of(components.buffer)] == [True, False]
     assert components.exploration.epsilon.tolist() == pytest.approx([0.81, 1.0])
-    first, second = (buffer.writer for buffer in components.buffers)
-    assert first.counts.real > 0
-    assert second.counts.real == second.held_back == 0
-    assert isinstance(second.weights, Instructiveness)
-    assert (first.weights.alike, second.weights.alike) == (True, False)
-    assert second.weights.sigma == pytest.approx(3 * 0.4)
-    assert first.weights.sigma < second.weights.sigma
-    assert second.reward_fn.threshold == pytest.approx(0.1)
-    assert first.reward_fn.threshold == pytest.approx(0.06)
+    writer = components.buffer.writer
+    assert writer.counts_of(0).real > 0
+    assert writer.counts_of(1).real == 0
+    first, second = writer.goal_weights
+    assert isinstance(second, Instructiveness)
+    assert (first.alike, second.alike) == (True, False)
+    assert second.sigma == pytest.approx(3 * 0.4)
+    assert first.sigma < second.sigma
+    assert writer.reward_of(1).threshold == pytest.approx(0.1)
+    assert writer.reward_of(0).threshold == pytest.approx(0.06)
     assert torch.equal(weights(components), networks)
     assert [float(state["step"]) for state in components.optimizer.state.values()] == steps
 
@@ -172,7 +177,7 @@ def test_training_goes_on_in_two_layers_at_once() -> None:
     trainer.epoch()
     move(components, run=1)
     trainer.epoch()
-    reach, throw = (buffer[:] for buffer in components.buffers)
+    reach, throw = components.buffer.sample(2 * 1_000).chunk(2)
     assert (reach["observation"][:, 5:] == 0).all()
     assert (throw["observation"][:, 5:7] != 0).any()
     assert torch.equal(throw["input"], torch.cat((throw["observation"], throw["desired_goal"]), -1))

@@ -29,7 +29,7 @@ KILLS = 20
 ALL: dict[str, Any] = {
     "task": "hand_v1",
     "algo": "cher_ibs",
-    "seed": 1,
+    "seed": 5,  # of which the first layer ends before the last epoch
     "epochs": 5,
     "epoch_frames": 480,
     "episodes": 10,
@@ -110,10 +110,13 @@ def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not
     "options",
     [
         pytest.param(ALL, id="curriculum"),
-        pytest.param({"task": "robot_v2", "num_runs": 2, "algo": "filtered_her_ibs"}, id="two runs"),
         pytest.param(
-            {"sampler": "uniform", "hard_update_interval": 7, "batch_norm": True}, id="hard updates"
+            {"task": "robot_v2", "num_runs": 2, "algo": "filtered_her_ibs"},
+            id="two runs",
+            # The arm may hold the ball beyond the screen, which the grid over the screen says once.
+            marks=pytest.mark.filterwarnings("ignore:goal .* lies outside"),
         ),
+        pytest.param({"sampler": "uniform", "hard_update_interval": 7, "norm": "batch"}, id="hard updates"),
     ],
 )
 def test_ctrl_c_at_any_batch_changes_nothing(
@@ -150,7 +153,7 @@ def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
     monkeypatch.setattr(run_state, "_worlds", lambda components: None)
     recipe = small(epochs=2)
     run(press_ctrl_c(build(recipe), 25), tmp_path / "run", progress=False)
-    held = load_checkpoint(tmp_path / "run" / "checkpoint.pt")["buffers"][0]["writer"]["held"]
+    held = load_checkpoint(tmp_path / "run" / "checkpoint.pt")["buffer"]["writer"]["held"]
     components = build(recipe)
     result = resume(tmp_path / "run", components=components, progress=False)
     assert [row["frames"] for row in result.rows] == [1_600, 3_200]
@@ -231,7 +234,7 @@ def test_without_its_buffer_a_run_cannot_go_on(
 ) -> None:
     run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
     for path in tmp_path.glob("checkpoint*.pt"):
-        save_checkpoint(load_checkpoint(path) | {"buffers": []}, path)
+        save_checkpoint(load_checkpoint(path) | {"buffer": None}, path)
     said = f"the run in {tmp_path} cannot go on: its replay buffer was not kept (checkpoint.pt"
     for why in ("has none", "is missing"):
         assert cli.main(["train", "--resume", str(tmp_path), "epochs=3"]) == 2

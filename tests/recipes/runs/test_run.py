@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
@@ -14,11 +12,9 @@ import torch
 import yaml
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tqdm import tqdm
 
-from torchrl_her import FusedDDPGLearner, load_checkpoint
+from torchrl_her import load_checkpoint
 from torchrl_her_recipes import Components, Recipe, build, load_actor, play, resume, run
-from torchrl_her_recipes.runs.run import _say_compiled
 
 from ..small import assert_same, small
 
@@ -111,20 +107,3 @@ def test_epochs_without_an_update_leave_a_table_that_fits(tmp_path: Path) -> Non
     assert table["loss_value"].isna().tolist() == [True, True, False]
     assert table["success"].between(0, 1).all()
     assert (tmp_path / "run" / "policy.gif").exists()
-
-
-class Compiled(FusedDDPGLearner):
-    """As a learner whose step was compiled for an hour."""
-
-    is_compiled, compile_seconds = True, 3_600.0
-
-    def __init__(self) -> None:
-        pass
-
-
-@pytest.mark.parametrize("progress", [True, False])
-def test_the_time_to_compile_is_left_out_of_a_bar_that_may_be_switched_off(progress: bool) -> None:
-    with tqdm(total=10, disable=not progress) as bar:
-        begun = time.time()
-        assert _say_compiled(SimpleNamespace(learner=Compiled()), bar)  # type: ignore[arg-type]
-        assert not progress or bar.start_t > begun + 3_000

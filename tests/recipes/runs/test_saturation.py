@@ -59,8 +59,8 @@ def test_each_run_is_told_apart() -> None:
     ("learner", "helps"),
     [
         ("ddpg", "action_penalty above 0.3, learning_rate below 0.001 or num_envs above 64"),
-        ("td3", "learning_rate below 0.001 or num_envs above 64"),
-        ("sac", "learning_rate below 0.001 or num_envs above 64"),
+        ("td3", "action_penalty above 0.3, learning_rate below 0.001 or num_envs above 64"),
+        ("sac", "action_penalty above 0.3, learning_rate below 0.001 or num_envs above 64"),
     ],
 )
 def test_what_helps_are_options_that_the_learner_has(learner: str, helps: str) -> None:

@@ -17,6 +17,8 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import GoalGrid, GoalReward, GoalWeights, HERWriter, Instructiveness, box_target
 from torchrl_her.goals import GoalHistogram, kl_divergence
+from torchrl_her.goals.ibs import HistogramsOfRuns
+from torchrl_her.goals.weights import WeightsOfRuns
 
 from ..goal_grids import LINE, RIGHT, SCREEN
 from ..her_data import make_batch
@@ -360,3 +362,48 @@ def test_emptying_the_buffer_clears_q() -> None:
         buffer.writer.weights(SCREEN.centers), RIGHT(sigma).clamp_min(0.002 * RIGHT(sigma).max())
     )
     assert buffer.writer.weights.sigma == sigma
+
+
+# Several runs at once
+
+
+class Twice(Instructiveness):
+    """A subclass, of which nothing is known."""
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        return 2 * super().__call__(goals)
+
+
+@pytest.mark.parametrize("kind", [GoalHistogram, Instructiveness, Twice])
+def test_runs_are_looked_up_and_counted_as_each_would_be_alone(kind: type[GoalHistogram]) -> None:
+    def make() -> list[Any]:
+        if kind is GoalHistogram:
+            return [GoalHistogram(LINE) for _ in range(3)]
+        target = partial(box_target, LINE, 0.2, 0.9)
+        return [
+            kind(LINE, target, sigma=0.1 + 0.1 * run, floor=0.01 * run, subtract=run != 2)  # type: ignore[call-arg]
+            for run in range(3)
+        ]
+
+    joint, alone = make(), make()
+    together = joint[0].of_runs(joint)
+    assert type(together) is (WeightsOfRuns if kind is Twice else HistogramsOfRuns)
+    generator = torch.Generator().manual_seed(0)
+    for runs, counts in (([0, 1, 2], [5, 0, 7]), ([0, 2], [3, 4]), ([1], [6])):
+        goals = torch.rand(sum(counts), 4, 1, generator=generator)
+        expected = [alone[run](own) for run, own in zip(runs, goals.split(counts), strict=True)]
+        assert torch.equal(together(goals, runs, counts), torch.cat(expected))
+        together.update(goals[:, 0], runs, counts)
+        for run, own in zip(runs, goals[:, 0].split(counts), strict=True):
+            alone[run].update(own)
+    for own, single in zip(joint, alone, strict=True):
+        assert torch.equal(own.counts, single.counts)
+    assert [int(own.counts.sum()) for own in joint] == [8, 6, 11]
+
+
+def test_runs_over_different_grids_are_asked_one_by_one() -> None:
+    own = [GoalHistogram(HALVES), GoalHistogram(GoalGrid(0.0, 1.0, [4]))]
+    together = own[0].of_runs(own)
+    assert type(together) is WeightsOfRuns
+    together.update(torch.tensor([[0.1], [0.9], [0.9]]), [0, 1], [1, 2])
+    assert [weights.counts.tolist() for weights in own] == [[1, 0], [0, 0, 0, 2]]

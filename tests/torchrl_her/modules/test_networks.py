@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_her import make_actor, make_critic
-from torchrl_her.modules import ActorNet, CriticNet, StackedLinear, stack_runs, take_run
+from torchrl_her.modules import ActorNet, CriticNet, StackedLayerNorm, StackedLinear, stack_runs, take_run
 from torchrl_her.modules.networks import StackedBatchNorm
 
 
@@ -94,7 +96,7 @@ def test_actions_are_within_the_range_of_tanh() -> None:
 
 @pytest.mark.parametrize(("normalize", "count"), [(False, 0), (True, 4)])
 def test_batch_normalization_is_of_the_critics_input_and_hidden_layers(normalize: bool, count: int) -> None:
-    critic = make_critic((9, 2), 3, normalize=normalize)
+    critic = make_critic((9, 2), 3, norm="batch" if normalize else "none")
     norms = [m.num_features for m in critic.modules() if isinstance(m, nn.BatchNorm1d)]
     assert norms == [11, 64, 64, 64][:count]
     assert not any(isinstance(m, nn.BatchNorm1d) for m in make_actor((9, 2), 3).modules())
@@ -133,7 +135,7 @@ def test_keys_of_ones_own() -> None:
 def make_nets(kind: str, runs: int) -> nn.Module:
     if kind == "actor":
         return ActorNet(11, 3, hidden=8, runs=runs)
-    return CriticNet(11, 3, hidden=8, normalize=kind == "normalized critic", runs=runs)
+    return CriticNet(11, 3, hidden=8, norm="batch" if kind == "normalized critic" else "none", runs=runs)
 
 
 @pytest.mark.parametrize("kind", ["actor", "critic", "normalized critic"])
@@ -164,9 +166,50 @@ def test_a_run_taken_out_is_what_was_stacked(kind: str) -> None:
 
 
 def test_runs_do_not_reach_each_other() -> None:
-    net = CriticNet(11, 3, runs=2, normalize=True)
+    net = CriticNet(11, 3, runs=2, norm="batch")
     value = net(torch.randn(2, 6, 9), torch.randn(2, 6, 2), torch.randn(2, 6, 3))
     value[0].sum().backward()
     gradients = {name: p.grad for name, p in net.named_parameters() if p.ndim == 3}
     assert all((gradient[1] == 0).all() for gradient in gradients.values())
     assert all((gradient[0] != 0).any() for gradient in gradients.values())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"hidden": 0}, "hidden must be at least 1, got 0"),
+        ({"depth": 1}, "depth must be at least 2, got 1"),
+        ({"activation": "gelu"}, "activation must be one of relu, tanh, elu, got 'gelu'"),
+        ({"norm": "group"}, "norm must be one of none, layer, batch, got 'group'"),
+    ],
+)
+@pytest.mark.parametrize("make", [make_actor, make_critic])
+def test_shapes_that_cannot_be_are_named(
+    make: Callable[..., Any], options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make((4, 2), 3, **options)
+
+
+def test_an_actor_has_no_batch_normalization() -> None:
+    with pytest.raises(ValueError, match="norm must be none or layer in an actor, got 'batch'"):
+        make_actor((4, 2), 3, norm="batch")
+
+
+def test_layer_normalization_is_that_of_torch() -> None:
+    ours, theirs = StackedLayerNorm(5, runs=2), nn.LayerNorm(5)
+    with torch.no_grad():
+        ours.weight[1], ours.bias[1] = torch.arange(5.0), torch.arange(5.0) - 2
+        theirs.weight.copy_(torch.arange(5.0))
+        theirs.bias.copy_(torch.arange(5.0) - 2)
+    x = torch.randn(2, 7, 5)
+    torch.testing.assert_close(ours(x)[1], theirs(x[1]))
+
+
+@pytest.mark.parametrize(("depth", "activation"), [(2, nn.ELU), (5, nn.Tanh)])
+def test_depth_and_activation(depth: int, activation: type[nn.Module]) -> None:
+    name = activation.__name__.lower()
+    critic = CriticNet(6, 3, hidden=8, depth=depth, activation=name)  # type: ignore[arg-type]
+    widths = [module.weight.shape[1:] for module in critic.modules() if isinstance(module, StackedLinear)]
+    assert widths == [(6, 8), (11, 8), *[(8, 8)] * (depth - 2), (8, 1)]
+    assert sum(isinstance(module, activation) for module in critic.modules()) == depth

@@ -23,7 +23,7 @@ from ..lost_game import SPEC, rows
 
 
 def make_loss(kind: str, *, normalize: bool = False) -> LossModule:
-    critic = make_critic((4, 2), 3, normalize=normalize)
+    critic = make_critic((4, 2), 3, norm="batch" if normalize else "none")
     if kind == "ddpg":
         return make_ddpg_loss(make_actor((4, 2), 3), critic)
     if kind == "td3":

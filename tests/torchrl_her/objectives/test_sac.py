@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import LossModule, SACLoss, SoftUpdate
 
 from torchrl_her import LossLearner, make_critic, make_sac_loss, make_stochastic_actor
 
@@ -43,3 +45,62 @@ def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None
     loss(batch)
     # -1 - 7 / 2, -1 - 7 / 4, -1 - 7 / 8, as distances from 0
     assert batch["td_error"].tolist() == pytest.approx([4.5, 2.75, 1.875])
+
+
+def own_and_torchrls(**options: Any) -> tuple[LossModule, SACLoss]:
+    """Our loss, and TorchRL's with the same weights."""
+    actor, critic = make_stochastic_actor((4, 2), SPEC), make_critic((4, 2), 3)
+    ours = make_sac_loss(actor, critic, action_spec=SPEC, gamma=0.5, **options)
+    plain = SACLoss(actor, critic, action_spec=SPEC, loss_function="l2")
+    plain.make_value_estimator(gamma=0.5)
+    plain.load_state_dict(ours.state_dict())
+    for loss in (ours, plain):
+        SoftUpdate(loss, tau=0.1)
+    return ours, plain
+
+
+def seeded(loss: LossModule, batch: Any) -> Any:
+    torch.manual_seed(3)
+    return loss(batch)
+
+
+def test_without_a_penalty_it_is_torchrls_loss() -> None:
+    batches = [rows(16, action=torch.rand(1, 16, 3))[0] for _ in range(2)]
+    batches[1] = batches[0].clone()
+    ours, plain = (seeded(loss, own) for loss, own in zip(own_and_torchrls(), batches, strict=True))
+    for name in ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy"):
+        torch.testing.assert_close(ours[name], plain[name], msg=name)
+    torch.testing.assert_close(batches[0]["td_error"], batches[1]["td_error"])
+
+
+def test_the_penalty_is_the_mean_square_of_the_drawn_actions() -> None:
+    ours, plain = own_and_torchrls(action_penalty=0.7)
+    batch = rows(4_000, action=torch.rand(1, 4_000, 3))[0]
+    with ours.actor_network_params.to_module(ours.actor_network):
+        action = ours.actor_network.get_dist(batch).rsample((10,))
+    added = seeded(ours, batch.clone())["loss_actor"] - seeded(plain, batch.clone())["loss_actor"]
+    assert added.item() == pytest.approx(0.7 * action.square().mean().item(), rel=0.05)
+
+
+def test_each_run_has_a_temperature_of_its_own() -> None:
+    loss = make_sac_loss(
+        make_stochastic_actor((4, 2), SPEC, runs=3),
+        make_critic((4, 2), 3, runs=3),
+        action_spec=SPEC,
+        runs=3,
+        temperature=0.2,
+        reduction="none",
+    )
+    learner = LossLearner(
+        loss, torch.optim.Adam(loss.parameters(), lr=0.1), SoftUpdate(loss, tau=0.1), runs=3
+    )
+    assert loss.log_alpha.exp().tolist() == pytest.approx([0.2] * 3)
+    learner.update(rows(8, action=torch.rand(1, 8, 3)).expand(3, 8).clone(), idle=[1])
+    changed = (loss.log_alpha.exp() - 0.2).abs() > 1e-3
+    assert changed.tolist() == [True, False, True]
+
+
+def test_a_temperature_must_be_positive() -> None:
+    actor, critic = make_stochastic_actor((4, 2), SPEC), make_critic((4, 2), 3)
+    with pytest.raises(ValueError, match="temperature must be positive, got 0"):
+        make_sac_loss(actor, critic, action_spec=SPEC, temperature=0.0)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import LossModule, SoftUpdate, TD3Loss
 
 from torchrl_her import LossLearner, make_actor, make_critic, make_td3_loss
+from torchrl_her.objectives import clamped_td0
 
 from ..lost_game import SPEC, rows, say
 
@@ -42,3 +45,66 @@ def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None
     batch = rows(3, action=torch.rand(1, 3, 3))[0]
     batch["steps_to_next_obs"] = torch.tensor([[1], [2], [3]])
     assert loss(batch)["target_value"].tolist() == [-4.5, -2.75, -1.875]  # -1 - 7 / 2, - 7 / 4, - 7 / 8
+
+
+def own_and_torchrls(**options: Any) -> tuple[LossModule, TD3Loss]:
+    """Our loss, and TorchRL's with the same weights."""
+    actor, critic = make_actor((4, 2), 3), make_critic((4, 2), 3)
+    ours = make_td3_loss(actor, critic, action_spec=SPEC, gamma=0.5, **options)
+    plain = TD3Loss(actor, critic, action_spec=SPEC, loss_function="l2")
+    plain.make_value_estimator(clamped_td0(0.5, (-1.0, 0.0)))
+    plain.value_estimator.set_keys(value="state_action_value")
+    plain.load_state_dict(ours.state_dict())
+    for loss in (ours, plain):
+        SoftUpdate(loss, tau=0.1)
+    return ours, plain
+
+
+def test_without_a_penalty_it_is_torchrls_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    noise = torch.randn(16, 3)
+    monkeypatch.setattr(torch, "randn_like", lambda like: noise)
+    batch = rows(16, action=torch.rand(1, 16, 3) * 4 - 2)[0]
+    ours, plain = (loss(batch.clone()) for loss in own_and_torchrls())
+    for name in ("loss_actor", "loss_qvalue", "target_value"):
+        assert torch.equal(ours[name], plain[name]), name
+
+
+def test_the_penalty_is_the_mean_square_of_the_actions() -> None:
+    ours, plain = own_and_torchrls(action_penalty=0.7)
+    batch = rows(16, action=torch.rand(1, 16, 3) * 4 - 2)[0]
+    with ours.actor_network_params.to_module(ours.actor_network):
+        action = ours.actor_network(batch.clone())["action"]
+    added = ours(batch.clone())["loss_actor"] - plain(batch.clone())["loss_actor"]
+    assert added.item() == pytest.approx(0.7 * action.square().mean().item(), rel=1e-3)
+
+
+def test_the_targets_of_a_run_have_its_own_noise() -> None:
+    """Two runs of one program, and the second of them alone."""
+    generators = [torch.Generator().manual_seed(seed) for seed in (1, 2)]
+    loss = make_td3_loss(
+        make_actor((4, 2), 3, runs=2),
+        make_critic((4, 2), 3, runs=2),
+        action_spec=SPEC,
+        generators=generators,
+        reduction="none",
+    )
+    first = loss.noise(torch.zeros(2, 5, 3))
+    alone = torch.Generator().manual_seed(2)
+    assert torch.equal(first[1].flatten(), torch.empty(15).normal_(generator=alone))
+
+
+@pytest.mark.parametrize(("critics", "given"), [(0, 1), (3, 2)])
+def test_the_number_of_critics_is_checked(critics: int, given: int) -> None:
+    own = [make_critic((4, 2), 3) for _ in range(given)]
+    with pytest.raises(ValueError, match=r"critics must be at least 1, got 0|must be 3 critics, got 2"):
+        make_td3_loss(make_actor((4, 2), 3), own, action_spec=SPEC, critics=critics)
+
+
+def test_critics_of_a_list_are_taken_as_they_are() -> None:
+    own = [make_critic((4, 2), 3) for _ in range(3)]
+    loss = make_td3_loss(make_actor((4, 2), 3), own, action_spec=SPEC, critics=3)
+    weights = loss.qvalue_network_params["module", "first", "0", "0", "weight"]
+    assert weights.shape[0] == 3
+    assert all(
+        torch.equal(w, critic.module.first[0][0].weight) for w, critic in zip(weights, own, strict=True)
+    )

@@ -393,9 +393,9 @@ def test_a_state_is_small_and_apart_from_the_buffer(sampler: str, tmp_path: Path
     buffer = make_buffer(sampler, capacity=100_000)
     buffer.extend(make_batch([[5]]))
     state = buffer_state_dict(buffer)
-    before = state["rows"]["observation"].clone()
+    before = state["rows"][0]["entries"]["observation"].clone()
     buffer.storage[:]["observation"].fill_(9.0)
-    assert torch.equal(state["rows"]["observation"], before)
+    assert torch.equal(state["rows"][0]["entries"]["observation"], before)
     save_checkpoint(state, tmp_path / "buffer.pt")
     assert (tmp_path / "buffer.pt").stat().st_size < 30_000  # rows of 15, not of 100,000
 
@@ -407,11 +407,12 @@ def test_a_state_without_a_copy_is_as_small(tmp_path: Path) -> None:
     save_checkpoint(state, tmp_path / "buffer.pt")
     assert (tmp_path / "buffer.pt").stat().st_size < 30_000
     rows, expected = (
-        TensorDict(own["rows"], [15]) for own in (load_checkpoint(tmp_path / "buffer.pt"), copied)
+        TensorDict(own["rows"][0]["entries"], [15])
+        for own in (load_checkpoint(tmp_path / "buffer.pt"), copied)
     )
     assert same(rows, expected)
     buffer.storage[:]["observation"].fill_(9.0)
-    assert (state["rows"]["observation"] == 9.0).all()
+    assert (state["rows"][0]["entries"]["observation"] == 9.0).all()
 
 
 @SAMPLERS

@@ -14,7 +14,7 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import DDPGLoss, LossModule, SACLoss, SoftUpdate, TD3Loss, ValueEstimators
 
-from torchrl_her import FusedDDPGLearner, LossLearner, make_actor, make_critic, make_ddpg_loss
+from torchrl_her import FusedLearner, LossLearner, make_actor, make_critic, make_ddpg_loss
 
 from ..ddpg_data import WEIGHT, batch, constant_loss, make_loss, rows, step, weights
 from ..her_data import make_batch
@@ -188,7 +188,7 @@ def test_priorities_go_where_the_loss_puts_them() -> None:
 @pytest.mark.parametrize("steps", [0, 3])
 def test_rows_must_be_whole_batches(fused: bool, steps: int) -> None:
     loss = make_ddpg_loss(make_actor((2, 2), 1), make_critic((2, 2), 1))
-    make = FusedDDPGLearner if fused else LossLearner
+    make = FusedLearner if fused else LossLearner
     learner = make(loss, torch.optim.Adam(loss.parameters()), SoftUpdate(loss, tau=0.1))
     with pytest.raises(ValueError, match=f"10 rows cannot be shared out among {steps} gradient steps"):
         learner.update(make_batch([[10]]), steps)

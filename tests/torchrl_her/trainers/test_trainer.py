@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_her import (
     DecayingEpsilon,
-    FusedDDPGLearner,
+    FusedLearner,
     GoalReward,
     HERWriter,
     LossLearner,
@@ -29,6 +29,7 @@ from torchrl_her import (
     success,
 )
 from torchrl_her.objectives import PenalizedDDPGLoss
+from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, empty_run
 
 N, STEPS = 8, 10
 
@@ -109,7 +110,7 @@ def make_trainer(
             total_frames=-1,
             auto_register_policy_transforms=False,
         ),
-        buffers=[buffer],
+        buffer=buffer,
         learner=make_learner(
             loss,
             torch.optim.Adam(loss.parameters(), lr=1e-3),
@@ -121,9 +122,7 @@ def make_trainer(
     return trainer, policy
 
 
-@pytest.mark.parametrize(
-    "make_learner", [FusedDDPGLearner, pytest.param(LossLearner, marks=pytest.mark.full)]
-)
+@pytest.mark.parametrize("make_learner", [FusedLearner, pytest.param(LossLearner, marks=pytest.mark.full)])
 def test_it_learns_a_task_of_one_dimension(make_learner: Any) -> None:
     trainer, policy = make_trainer(make_learner=make_learner)
     before = success(evaluate(LineEnv(1), policy, max_steps=STEPS)).float().mean()
@@ -159,6 +158,37 @@ def test_progress_is_told_after_each_batch() -> None:
     seen: list[int] = []
     trainer.epoch(lambda own: seen.append(own.frames))
     assert seen == [80, 160, 240]
+
+
+def test_the_next_batch_is_collected_during_learning_until_the_epoch_ends() -> None:
+    trainer, _ = make_trainer(epoch_frames=240)  # three batches
+    done: list[str] = []
+    collector, update = trainer.collector, trainer.learner.update
+
+    class Ahead:
+        def reset(self) -> None:
+            done.append("reset")
+            collector.reset()
+
+        def next(self) -> TensorDictBase:
+            done.append("next")
+            return collector.next()
+
+        def collect_ahead(self) -> None:
+            done.append("ahead")
+
+    def learn(*arguments: Any, **options: Any) -> dict[str, Tensor]:
+        if done[-1] != "learn":
+            done.append("learn")
+        return update(*arguments, **options)
+
+    trainer.collector, trainer.learner.update = Ahead(), learn  # type: ignore[assignment,method-assign]
+    epoch = ["reset", "next", "ahead", "learn", "next", "ahead", "learn", "next", "learn"]
+    for _ in range(2):
+        trainer.epoch()
+    assert done == epoch * 2
+    trainer.run(160)
+    assert done[len(epoch) * 2 :] == ["next", "ahead", "learn", "next", "learn"]
 
 
 def test_seeds_make_training_repeat_bit_for_bit() -> None:
@@ -204,17 +234,22 @@ def test_a_run_whose_buffer_is_empty_waits_and_holds_no_other_back() -> None:
             reduction="none",
         )
         optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
-        learner = FusedDDPGLearner(loss, optimizer, make_target_updater(loss, tau=0.1, hard_interval=0))
-        buffers = []
-        for run in range(runs):
-            buffer = TensorDictReplayBuffer(
-                storage=LazyTensorStorage(1_000), writer=HERWriter(GoalReward(0.1)), priority_key="td_error"
-            )
-            buffer.set_rng(torch.Generator().manual_seed(run))
-            buffers.append(buffer)
+        learner = FusedLearner(loss, optimizer, make_target_updater(loss, tau=0.1, hard_interval=0))
+        generators = [torch.Generator().manual_seed(run) for run in range(runs)]
+        buffer = TensorDictReplayBuffer(
+            storage=PackedStorage(runs * 1_000),
+            writer=HERWriter(GoalReward(0.1), runs=runs, generators=generators),
+            sampler=RunsPrioritizedSampler(1_000, 0.6, 0.4, runs=runs, generators=generators),
+            priority_key="td_error",
+        )
         collector = Collector(LineEnv(), None, frames_per_batch=N * STEPS, total_frames=-1)
         trainer = Trainer(
-            collector=collector, buffers=buffers, learner=learner, frames_per_update=4.0, batch_size=16
+            collector=collector,
+            buffer=buffer,
+            learner=learner,
+            runs=runs,
+            frames_per_update=4.0,
+            batch_size=16,
         )
         return trainer, loss
 
@@ -224,20 +259,23 @@ def test_a_run_whose_buffer_is_empty_waits_and_holds_no_other_back() -> None:
         torch.manual_seed(1)
         trainer.run(N * STEPS)
     before = {name: value.clone() for name, value in loss_of_one.state_dict().items()}
-    alone.buffers[1].empty()
+    empty_run(alone.buffer, 1)
     for trainer, empty in ((both, False), (alone, True)):
         trainer._credit = 6.0
         measured = trainer._learn()
         assert trainer._credit == 0.0
         assert bool((measured[0]["loss_value"][:, 1] == -torch.inf).all()) == empty
         assert measured[0]["loss_value"][:, 0].isfinite().all()
+    priorities = [trainer.buffer.sampler.state_dict()["values"] for trainer in (both, alone)]
+    assert torch.equal(priorities[0][0], priorities[1][0])  # though its rows stood in for those of the other
+    assert len(priorities[1][1]) == 0
     expected = loss_of_both.state_dict()
     stacked = {name: value for name, value in loss_of_one.state_dict().items() if value.ndim > 0}
     assert len(stacked) == 32
     for name, value in stacked.items():
         assert torch.equal(value[0], expected[name][0]), name  # learns as if nothing were the matter
         assert torch.equal(value[1], before[name][1]), name  # stays as it was
-    alone.buffers[0].empty()
+    empty_run(alone.buffer, 0)
     alone._credit = 3.0
     assert alone._learn() == []
     assert alone._credit == 0.0  # these steps pass
@@ -259,9 +297,16 @@ def test_numbers_that_cannot_be(options: dict[str, Any], message: str) -> None:
 
 def test_environments_must_be_equal_blocks() -> None:
     trainer, _ = make_trainer()
-    trainer.buffers = trainer.buffers * 3
+    trainer.runs = 3
     with pytest.raises(ValueError, match=f"{N} environments cannot be shared out among 3 runs"):
         trainer.epoch()
+
+
+@pytest.mark.parametrize("runs", [2, 3])
+def test_the_buffer_must_be_for_as_many_runs(runs: int) -> None:
+    trainer, _ = make_trainer()
+    with pytest.raises(ValueError, match=f"there are {runs} runs, but the buffer's writer is for 1"):
+        Trainer(collector=trainer.collector, buffer=trainer.buffer, learner=trainer.learner, runs=runs)
 
 
 def test_trajectories_must_be_marked(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -284,7 +329,7 @@ def test_no_row_is_lost_where_epochs_end(
     trainer, _ = make_trainer(
         shape=shape, frames_per_batch=frames_per_batch, epoch_frames=epoch_frames, warmup_frames=10**6
     )
-    writer = trainer.buffers[0].writer
+    writer = trainer.buffer.writer
     for _ in range(4):
         trainer.epoch()
         assert (writer.held_back, writer.counts.real) == (0, trainer.frames)
@@ -293,7 +338,7 @@ def test_no_row_is_lost_where_epochs_end(
 
 def test_epochs_that_follow_a_run_lose_nothing_either() -> None:
     trainer, _ = make_trainer(shape=(), frames_per_batch=4, epoch_frames=26, warmup_frames=10**6)
-    writer = trainer.buffers[0].writer
+    writer = trainer.buffer.writer
     trainer.run(13)
     assert writer.held_back > 0
     assert writer.held_back + writer.counts.real == trainer.frames == 16

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import LossModule
 
@@ -14,30 +17,40 @@ class DDPGBuilder(LearnerBuilder):
     """See :func:`~torchrl_her.make_ddpg_loss`."""
 
     def networks(self, runs: int) -> Networks:
-        return self.actor(runs).to(self.dtype), self.critic(runs).to(self.dtype)
+        actor = self.actor(runs).to(self.dtype)
+        critics = [self.critic(runs).to(self.dtype) for _ in range(getattr(self.options, "critics", 1))]
+        return actor, critics
 
     def actor(self, runs: int) -> TensorDictModule:
         """The deterministic actor of some runs side by side."""
-        actions, hidden = self.action_spec.shape[-1], self.options.hidden
-        return make_actor(self.widths, actions, hidden=hidden, runs=runs, in_keys=self.in_keys)
+        return make_actor(
+            self.widths,
+            self.action_spec.shape[-1],
+            runs=runs,
+            in_keys=self.in_keys,
+            **self.options.actor_shape,
+        )
 
     def critic(self, runs: int) -> TensorDictModule:
-        """Their critic."""
+        """Their critic, or one of them."""
         return make_critic(
             self.widths,
             self.action_spec.shape[-1],
-            hidden=self.options.hidden,
-            normalize=self.options.batch_norm,
             runs=runs,
             in_keys=self.in_keys,
+            **self.options.critic_shape,
         )
 
     def loss(
-        self, actor: TensorDictModule, critic: TensorDictModule, rewards: tuple[float, float]
+        self,
+        actor: TensorDictModule,
+        critics: Sequence[TensorDictModule],
+        rewards: tuple[float, float],
+        generators: Sequence[torch.Generator],
     ) -> LossModule:
         return make_ddpg_loss(
             actor,
-            critic,
+            critics[0],
             gamma=self.options.gamma,
             reward_range=rewards,
             action_penalty=self.options.action_penalty,

@@ -20,12 +20,21 @@ class DQNBuilder(LearnerBuilder):
     """See :func:`~torchrl_her.make_dqn_loss`."""
 
     def networks(self, runs: int) -> Networks:
-        return make_q_actor(
-            self.widths, self.action_spec.n, hidden=self.options.hidden, runs=runs, in_keys=self.in_keys
+        actor, critic = make_q_actor(
+            self.widths,
+            self.action_spec.n,
+            runs=runs,
+            in_keys=self.in_keys,
+            **self.options.critic_shape,
         )
+        return actor.to(self.dtype), [critic]  # which has the same weights
 
     def loss(
-        self, actor: TensorDictModule, critic: TensorDictModule, rewards: tuple[float, float]
+        self,
+        actor: TensorDictModule,
+        critics: Sequence[TensorDictModule],
+        rewards: tuple[float, float],
+        generators: Sequence[torch.Generator],
     ) -> LossModule:
         return make_dqn_loss(
             cast(QValueActor, actor), gamma=self.options.gamma, reward_range=rewards, reduction="none"

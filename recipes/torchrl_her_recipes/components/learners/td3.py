@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import LossModule
 
@@ -13,8 +16,20 @@ class TD3Builder(DDPGBuilder):
     """See :func:`~torchrl_her.make_td3_loss`; the networks are those of DDPG."""
 
     def loss(
-        self, actor: TensorDictModule, critic: TensorDictModule, rewards: tuple[float, float]
+        self,
+        actor: TensorDictModule,
+        critics: Sequence[TensorDictModule],
+        rewards: tuple[float, float],
+        generators: Sequence[torch.Generator],
     ) -> LossModule:
         return make_td3_loss(
-            actor, critic, action_spec=self.action_spec, gamma=self.options.gamma, reward_range=rewards
+            actor,
+            critics,
+            action_spec=self.action_spec,
+            critics=self.options.critics,
+            gamma=self.options.gamma,
+            reward_range=rewards,
+            action_penalty=self.options.action_penalty,
+            generators=generators,
+            reduction="none",
         )

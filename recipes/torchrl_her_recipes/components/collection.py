@@ -1,0 +1,338 @@
+"""Collecting in processes of their own, while this one learns."""
+
+from __future__ import annotations
+
+import signal
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from copy import deepcopy
+from functools import partial
+from multiprocessing.process import BaseProcess
+from multiprocessing.util import Finalize
+from queue import Empty
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import BaseCollector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.envs.utils import ExplorationType
+from torchrl.weight_update import SharedMemWeightSyncScheme
+
+from torchrl_her.curriculum.layers import CurriculumProgress
+from torchrl_her.modules.exploration import Exploration
+from torchrl_her_recipes.components.collection_worker import (
+    Beginning,
+    WorkerCollector,
+    begin_process,
+    make_worker_env,
+    share_of_envs,
+)
+from torchrl_her_recipes.config.imports import imported_modules
+from torchrl_her_recipes.config.recipe import Recipe
+
+_SECONDS = 1.0  # between two looks at whether processes still run
+_FAILED = "a process failed: worker {} (exit code {})"
+_TRACEBACK = "Worker traceback:"  # what TorchRL's message has below that is in ``__cause__``
+_EXIT_PRIORITY = 100  # at exit, before Python waits for processes that are still there
+
+
+class Workers(Protocol):
+    """Processes that collect. They wait for orders, unless they were told to go on."""
+
+    def begin(self, beginnings: Sequence[Beginning]) -> None:
+        """Drops what they are collecting, and begins new episodes in all of them."""
+        ...
+
+    def ahead(self, weights: TensorDictBase) -> None:
+        """Lets them collect the next batch with these weights of the policy, unless they do already."""
+        ...
+
+    def take(self, weights: TensorDictBase) -> TensorDictBase:
+        """The next batch [..., T], time last; the first dimension may be that of processes."""
+        ...
+
+    def shutdown(self) -> None:
+        """Ends them."""
+        ...
+
+
+class CheckedWeightSync(SharedMemWeightSyncScheme):
+    """Weights in shared memory. Unlike TorchRL's own, it does not wait for a process that has ended."""
+
+    def _wait_for_ack(self, worker_ids: object = None, timeout: float | None = None) -> None:
+        for queue in self._ack_queues.values():
+            _get(queue.get, self.context.procs)
+
+
+class SyncWorkers(MultiSyncCollector):
+    """All processes collect a batch together. Each has its place in it."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="collection")  # which waits for batches
+        self._batch: Future[TensorDictBase] | None = None  # that is being collected
+        super().__init__(*args, cat_results="stack", **options)
+
+    def begin(self, beginnings: Sequence[Beginning]) -> None:
+        if self._batch is not None:
+            self._batch.result()
+            self._batch = None
+        self.map_fn("begin", [(own,) for own in beginnings])
+
+    def ahead(self, weights: TensorDictBase) -> None:
+        if self._batch is None:
+            self.update_policy_weights_(weights)  # while no process looks at them
+            self._batch = self._thread.submit(self.next)
+
+    def take(self, weights: TensorDictBase) -> TensorDictBase:
+        self.ahead(weights)
+        assert self._batch is not None
+        batch = self._batch.result()
+        self._batch = None
+        return batch
+
+    def _shutdown_main(self, timeout: float | None = None) -> None:
+        super()._shutdown_main(timeout)
+        self._thread.shutdown(wait=False)  # it may be the one that calls this
+
+
+class AsyncWorkers(MultiAsyncCollector):
+    """Each process collects batches of its own, one after the other; the first that is ready comes first."""
+
+    running: bool  # whether each process has a batch under way; untyped there
+
+    @property
+    def _queue_len(self) -> int:
+        return self.num_workers  # TorchRL's is 1: with a full queue a process would throw its batch away
+
+    def begin(self, beginnings: Sequence[Beginning]) -> None:
+        if self.running:  # TorchRL's own reset() may take the batches under way for new ones
+            for _ in range(self.num_workers):
+                _get(self._get_from_queue, self.procs)
+            self.running, self._iterator = False, None
+        self.map_fn("begin", [(own,) for own in beginnings])
+
+    def ahead(self, weights: TensorDictBase) -> None:
+        """They always do."""
+
+    def take(self, weights: TensorDictBase) -> TensorDictBase:
+        self.update_policy_weights_(weights)
+        return self.next()
+
+
+class ProcessCollector(BaseCollector):
+    """Collects in the processes that a recipe asks for, each with its share of the environments of every run.
+
+    The processes start when they are first needed and end with :meth:`shutdown`; after that, they start again
+    when needed.
+
+    With ``sync=true`` all of them collect a batch [R * E, T] together, where row k always belongs to the same
+    environment. :meth:`collect_ahead` lets them collect the next one while the caller learns from the last
+    one; the policy that plays in such a batch is always one batch old, and the same seed gives the same
+    batches. With ``sync=false`` no process waits for another one: a batch [R * E / N, T] is that of the
+    process that was ready first, and rows carry ids of their environments.
+
+    All random numbers of a process follow from the seed of each run, the process's number and the number of
+    resets.
+
+    Args:
+        recipe: of the runs.
+        policy: whose weights, epsilon of exploration included, are sent to the processes.
+        progress: the layers of the runs, which are sent with each reset; None without a curriculum.
+
+    Raises:
+        RuntimeError: a process failed, when asked for a batch.
+    """
+
+    def __init__(
+        self, recipe: Recipe, policy: TensorDictModuleBase, progress: CurriculumProgress | None = None
+    ) -> None:
+        super().__init__()
+        self.recipe, self.policy, self.progress = recipe, policy, progress
+        self.requested_frames_per_batch = (
+            len(recipe.seeds) * recipe.collection.num_envs * recipe.collection.steps_per_batch
+        )
+        self.total_frames = -1
+        self.resets = 0
+        self._workers: Workers | None = None
+
+    def next(self) -> TensorDictBase:
+        """The next batch; new episodes begin first if the processes were not running."""
+        if self._workers is None:
+            self.reset()
+        assert self._workers is not None
+        with self._ended_by_errors():
+            return _in_blocks(self._workers.take(self._weights()), len(self.recipe.seeds))
+
+    def collect_ahead(self) -> None:
+        """Lets the next batch be collected meanwhile, with the present weights of the policy."""
+        if self._workers is not None:
+            with self._ended_by_errors():
+                self._workers.ahead(self._weights())
+
+    def reset(self, index: object = None, **kwargs: object) -> None:
+        """Begins new episodes everywhere; what is being collected is dropped."""
+        with self._ended_by_errors():
+            if self._workers is None:
+                self._workers = self._start()
+            self.resets += 1
+            self._workers.begin([self._beginning(own) for own in range(self.recipe.collection.processes)])
+
+    def shutdown(
+        self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True
+    ) -> None:
+        """Ends the processes, if there are any."""
+        workers, self._workers = self._workers, None
+        if workers is not None:
+            _end(workers)
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        while True:
+            yield self.next()
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Random numbers follow from the recipe's seed.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError("seeds of processes that collect are those of the recipe: set its seed")
+
+    def state_dict(self) -> OrderedDict:
+        """The number of resets: the next one begins as it would have, whatever happened since the last."""
+        return OrderedDict(resets=self.resets)
+
+    def load_state_dict(self, state_dict: OrderedDict) -> None:
+        self.resets = state_dict["resets"]
+
+    def _start(self) -> Workers:
+        """Starts the processes, which takes seconds: each of them imports torch."""
+        recipe, config = self.recipe, self.recipe.collection
+        kind = SyncWorkers if config.sync else AsyncWorkers
+        make = partial(make_worker_env, recipe, imported_modules())
+        frames = len(recipe.seeds) * share_of_envs(recipe) * config.steps_per_batch
+        with _interrupts_later():  # processes that were interrupted while they start would say so at length
+            workers = kind(
+                [make] * config.processes,
+                _to_send(self.policy),
+                frames_per_batch=frames * (config.processes if config.sync else 1),
+                total_frames=-1,
+                device="cpu",  # all of it, as where this process collects
+                collector_class=WorkerCollector,
+                exploration_type=ExplorationType.RANDOM,
+                num_threads=torch.get_num_threads(),  # of this process
+                num_sub_threads=1,
+                weight_sync_schemes={"policy": CheckedWeightSync()},
+                init_fn=begin_process,
+                auto_register_policy_transforms=False,
+            )
+        Finalize(workers, _end_if_there, args=(weakref.ref(workers),), exitpriority=_EXIT_PRIORITY)
+        return workers
+
+    def _beginning(self, process: int) -> Beginning:
+        def seeds(kind: int) -> list[int]:
+            return [_derive(seed, process, self.resets, kind) for seed in self.recipe.seeds]
+
+        return Beginning(
+            env_seeds=seeds(0),
+            seeds=seeds(1),
+            progress=None if self.progress is None else self.progress.state_dict(),
+        )
+
+    def _weights(self) -> TensorDictBase:
+        return TensorDict.from_module(self.policy).data
+
+    @contextmanager
+    def _ended_by_errors(self) -> Iterator[None]:
+        """Ends all processes if one of them failed."""
+        try:
+            yield
+        except Exception as error:
+            self.shutdown()
+            reason, traceback, _ = str(error).partition(_TRACEBACK)
+            if traceback:  # of a process that could not start
+                raise RuntimeError(f"a process that collects cannot start: {reason.strip()}") from error
+            if isinstance(error, RuntimeError) and "process failed" in reason:
+                raise RuntimeError(
+                    "a process that collects has ended, and with it all others; "
+                    f"its own error stands above: {error}"
+                ) from error
+            raise
+
+
+def _get(get: Callable[..., Any], processes: Sequence[BaseProcess]) -> Any:
+    """What a queue gives that some processes write to.
+
+    Raises:
+        RuntimeError: one of them has ended.
+    """
+    while True:
+        try:
+            return get(timeout=_SECONDS)
+        except Empty:
+            for number, process in enumerate(processes):
+                if not process.is_alive():
+                    raise RuntimeError(_FAILED.format(number, process.exitcode)) from None
+
+
+def _in_blocks(batch: TensorDictBase, runs: int) -> TensorDictBase:
+    """A batch [R * E, T] with the environments of each run together.
+
+    Args:
+        batch: [N, R * E / N, T] of N processes, or [R * E, T] of one.
+        runs: R.
+    """
+    batch.names = None
+    if batch.ndim == 2:
+        return batch
+    if runs > 1:
+        batch = batch.unflatten(1, (runs, batch.shape[1] // runs)).transpose(0, 1).flatten(0, 1)
+    return batch.flatten(0, 1)
+
+
+def _to_send(policy: TensorDictModuleBase) -> TensorDictModuleBase:
+    """A copy of a policy for other processes, which share the memory of its weights.
+
+    It has no generators of random numbers: each process makes its own, and two of them cannot be sent
+    together.
+    """
+    copy = deepcopy(policy)
+    for module in copy.modules():
+        if isinstance(module, Exploration):
+            module.generators = [None] * len(module.generators)
+    return copy
+
+
+def _derive(*numbers: int) -> int:
+    """A seed that differs for different numbers, which are not negative."""
+    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def _end(workers: Workers) -> None:
+    threads = torch.get_num_threads()
+    try:
+        workers.shutdown()
+    finally:
+        torch.set_num_threads(threads)  # TorchRL takes as many as processes have ended
+
+
+def _end_if_there(workers: weakref.ref[Any]) -> None:
+    if (own := workers()) is not None:
+        _end(own)
+
+
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Holds back Ctrl-C, in this process and in those that it starts."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,0 +1,94 @@
+"""What runs in a process that collects: its environments, its collector, and how episodes begin anew."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, TransformedEnv
+
+from torchrl_her.curriculum.layers import CurriculumProgress
+from torchrl_her.curriculum.transforms import StateToObs
+from torchrl_her.modules.exploration import Exploration
+from torchrl_her.replay_buffers.env_ids import EnvIds
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_recipes.components.curricula import in_layers, make_curriculum
+from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.config.imports import import_modules, permit_task
+from torchrl_her_recipes.config.recipe import Recipe
+
+
+def share_of_envs(recipe: Recipe) -> int:
+    """How many environments of each run one process steps."""
+    return recipe.collection.num_envs // recipe.collection.processes
+
+
+def make_worker_env(recipe: Recipe, modules: Sequence[str] = ()) -> EnvBase:
+    """A process's share of the environments of all runs: R equal blocks, as the layers of the runs see them.
+
+    Args:
+        recipe: of the runs. The process that sends it was permitted to import what its task names.
+        modules: to import first, since they may register tasks.
+    """
+    permit_task(recipe.task.name)
+    import_modules(modules)
+    env = make_task_envs(recipe, share_of_envs(recipe), recipe.seeds)
+    curriculum = make_curriculum(recipe, env)
+    if curriculum is not None:
+        env = in_layers(env, CurriculumProgress(curriculum, runs=recipe.run.num_runs))
+    if not recipe.collection.sync:  # only ids tell then which environment a row of a batch belongs to
+        env = env if isinstance(env, TransformedEnv) else TransformedEnv(env)
+        env.append_transform(EnvIds())
+    return env
+
+
+def begin_process() -> None:
+    """Prepares a process that is to collect; its first call, before environment and policy are made."""
+    if hasattr(os, "setpgrp"):
+        # Ctrl-C and signals to a whole group of processes are for the learner, which ends the others.
+        os.setpgrp()
+    torch.set_flush_denormal(True)  # as the learner does
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """All that the episodes of a process depend on, from one reset to the next.
+
+    Attributes:
+        env_seeds: of its environments, one for each run.
+        seeds: of each run's exploration.
+        progress: state of the curriculum, or None.
+    """
+
+    env_seeds: list[int]
+    seeds: list[int]
+    progress: dict[str, Any] | None = None
+
+
+class WorkerCollector(Collector):
+    """The collector in a process. Its random numbers begin anew with each reset: runs can go on there."""
+
+    def begin(self, beginning: Beginning) -> None:
+        """Begins new episodes everywhere."""
+        goal_env(self.env).set_seeds(beginning.env_seeds)
+        first = beginning.seeds[0]
+        torch.manual_seed(first)  # policies such as SAC's draw from torch's own generator
+        np.random.seed(first % (1 << 32))
+        random.seed(first)
+        for exploration in self.policy.modules():
+            if isinstance(exploration, Exploration):
+                exploration.generators = [torch.Generator().manual_seed(seed) for seed in beginning.seeds]
+        if beginning.progress is not None:
+            _progress_of(self.env).load_state_dict(beginning.progress)
+        self.reset()
+
+
+def _progress_of(env: TransformedEnv) -> CurriculumProgress:
+    """The progress that an environment's transforms look at."""
+    return next(own.progress for own in env.transform if isinstance(own, StateToObs))

@@ -1,0 +1,214 @@
+"""A program that collects in processes. Whatever happens there, all of them end with it.
+
+Processes are forked, which takes a second instead of the ten of TorchRL's own way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from multiprocessing import active_children
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import multiprocessing
+
+from torchrl_her_recipes import Components, Recipe, RunResult, build, resume, run
+from torchrl_her_recipes.components.collection import ProcessCollector
+from torchrl_her_recipes.runs.interrupt import Interrupted
+
+from ..small import small
+from .tagged_task import TASK, block_of
+
+SECONDS = 300  # until it is ended
+RUNS = 2
+_FRAMES = 180  # of each run in an epoch: the last episodes are cut
+_TAGGED: dict[str, Any] = {
+    "task": TASK,
+    "task.options.termination": "reward",
+    "num_runs": RUNS,
+    "processes": 2,
+    "num_envs": 4,
+    "steps_per_batch": 5,
+    "epoch_frames": _FRAMES,
+    "warmup_frames": 40,
+    "frames_per_update": 5,
+    "checkpoint_interval": 100,
+}
+_TABLE = ("seconds",)  # columns that differ
+
+
+def main(out: str, *names: str) -> None:
+    torch.set_num_threads(1)
+    multiprocessing.set_start_method("fork", force=True)
+    torch.save({name: JOBS[name]() for name in names}, out)
+
+
+def tagged(**options: Any) -> Recipe:
+    return small(**{**_TAGGED, **options})
+
+
+def _sync() -> dict[str, Any]:
+    return _run(tagged())
+
+
+def _async() -> dict[str, Any]:
+    return _run(tagged(sync=False))
+
+
+def _run(recipe: Recipe) -> dict[str, Any]:
+    components = build(recipe)
+    return _shown(components, run(components, progress=False))
+
+
+def _shown(components: Components, result: RunResult) -> dict[str, Any]:
+    """The table of a run, its rows, and the numbers of each run's blocks of environments, for each reset."""
+    collector, buffer = components.collector, components.buffer
+    assert isinstance(collector, ProcessCollector)
+    blocks, resets = [], collector.resets
+    for collector.resets in range(1, resets + 1):
+        made = [collector._beginning(process).env_seeds for process in range(2)]
+        blocks.append([[block_of(own[number]) for own in made] for number in range(RUNS)])
+    sizes = buffer.writer.sizes
+    starts = [number * buffer.writer.capacity for number in range(RUNS)]
+    rows = [buffer.storage[start : start + size].clone() for start, size in zip(starts, sizes, strict=True)]
+    return {
+        "table": [{key: value for key, value in own.items() if key not in _TABLE} for own in result.rows],
+        "rows": rows,
+        "held": buffer.writer._held.run.bincount(minlength=RUNS).tolist(),
+        "blocks": blocks,
+        "children": len(active_children()),
+    }
+
+
+def _resumed() -> dict[str, Any]:
+    """Stopped between two epochs."""
+    with tempfile.TemporaryDirectory() as folder:
+        run(build(tagged(epochs=1)), f"{folder}/run", progress=False)
+        components = build(tagged())
+        _extend(folder, components)
+        return _shown(components, resume(f"{folder}/run", components=components, progress=False))
+
+
+def _extend(folder: str, components: Components) -> None:
+    """The same number of epochs in the folder's recipe."""
+    path = Path(folder, "run", "config.yaml")
+    path.write_text(path.read_text().replace("epochs: 1\n", f"epochs: {components.recipe.run.epochs}\n"))
+
+
+def _stopped() -> dict[str, Any]:
+    """Stopped in the middle of the second epoch."""
+    with tempfile.TemporaryDirectory() as folder:
+        components = build(tagged())
+        collect, left = components.collector.next, iter(range(13, -1, -1))
+
+        def next_batch() -> Any:
+            if next(left) == 0:
+                raise Interrupted
+            return collect()
+
+        components.collector.next = next_batch  # type: ignore[method-assign]
+        assert run(components, f"{folder}/run", progress=False).interrupted
+        components = build(tagged())
+        return _shown(components, resume(f"{folder}/run", components=components, progress=False))
+
+
+def _weights() -> dict[str, Any]:
+    """Which of two policies played: they want -1 and 1."""
+    components = build(tagged(num_runs=1, epsilon_start=0.0, epsilon_end=0.0))
+    collector, (*_, bias) = components.collector, components.actor.parameters()
+    assert isinstance(collector, ProcessCollector)
+
+    def set_policy(action: float) -> None:
+        for parameter in components.actor.parameters():
+            parameter.data.zero_()
+        bias.data.fill_(10 * action)
+
+    set_policy(-1.0)
+    collector.reset()
+    first = collector.next()
+    collector.collect_ahead()
+    set_policy(1.0)
+    batches = [first, *(collector.next() for _ in range(2))]
+    components.exploration.epsilon.fill_(1.0)
+    batches.append(collector.next())
+    components.close()
+    return {"actions": [batch["action"].clone() for batch in batches]}
+
+
+def _curriculum() -> dict[str, Any]:
+    """The desired goals before and after all runs came to the last layer."""
+    components = build(small(task="hand_v1", algo="cher", num_runs=RUNS, processes=2, success_threshold=0.01))
+    collector, shown = components.collector, []
+    for layer in range(2):
+        for number in range(RUNS):
+            components.curriculum.progress.set_layer(number, layer)  # type: ignore[union-attr]
+        collector.reset()
+        shown.append(collector.next().clone())
+    trained = run(components, progress=False)
+    return {"batches": shown, "layers": [row["layer"] for row in trained.rows]}
+
+
+def _failure(**options: Any) -> dict[str, Any]:
+    """What is raised when an environment fails, and how many processes are left."""
+    try:
+        run(build(tagged(**options)), progress=False)
+    except Exception as error:
+        return {"error": repr(error), "children": len(active_children())}
+    return {}
+
+
+def _breaks() -> dict[str, Any]:
+    return _failure(epochs=4, **{"task.options.fails_at": 130})
+
+
+def _cannot_start() -> dict[str, Any]:
+    return _failure(**{"task.options.only_in": os.getpid()})
+
+
+def _killed() -> dict[str, Any]:
+    components = build(tagged())
+    components.collector.reset()
+    os.kill(components.collector._workers.procs[0].pid, signal.SIGKILL)  # type: ignore[attr-defined]
+    try:
+        while True:
+            components.collector.next()
+    except RuntimeError as error:
+        return {"error": repr(error), "children": len(active_children())}
+
+
+JOBS = {
+    "sync": _sync,
+    "again": _sync,
+    "resumed": _resumed,
+    "stopped": _stopped,
+    "async": _async,
+    "weights": _weights,
+    "curriculum": _curriculum,
+    "breaks": _breaks,
+    "cannot start": _cannot_start,
+    "killed": _killed,
+}
+
+
+def results_of(*names: str) -> dict[str, Any]:
+    """What the program found out in some of its jobs."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "results.pt"
+        command = [sys.executable, "-m", __name__, str(out), *names]
+        with subprocess.Popen(command, cwd=Path(__file__).parents[3], start_new_session=True) as program:
+            try:
+                program.wait(SECONDS)
+            finally:
+                with contextlib.suppress(ProcessLookupError):  # all of them ended by themselves
+                    os.killpg(program.pid, signal.SIGKILL)
+        return torch.load(out, weights_only=False)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,51 @@
+"""What a process that collects has, and how its episodes begin."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_recipes import build
+from torchrl_her_recipes.components.collection_worker import Beginning, WorkerCollector, make_worker_env
+
+from ..small import small
+
+
+def collect(env_seeds: list[int], seeds: list[int]) -> TensorDictBase:
+    recipe = small(processes=2, num_runs=2)
+    policy = build(recipe).policy
+    collector = WorkerCollector(
+        make_worker_env(recipe),
+        policy,
+        frames_per_batch=80,
+        total_frames=-1,
+        auto_register_policy_transforms=False,
+    )
+    collector.next()
+    collector.begin(Beginning(env_seeds, seeds))
+    return collector.next().clone()
+
+
+def test_it_has_its_share_of_the_environments_of_each_run() -> None:
+    env = make_worker_env(small(processes=4, num_runs=3))  # 8 of each run
+    assert env.batch_size == torch.Size([6])
+    assert "env_ids" not in env.observation_spec
+    check_env_specs(make_worker_env(small(processes=4, sync=False, algo="cher", task="hand_v1")))
+
+
+def test_rows_carry_ids_where_batches_come_from_any_process() -> None:
+    env = make_worker_env(small(processes=4, num_runs=3, sync=False))
+    assert len(env.reset()["env_ids"].unique()) == 6
+    assert goal_env(env).batch_size == torch.Size([6])
+
+
+def test_seeds_repeat_what_follows_and_runs_have_their_own() -> None:
+    first = collect([5, 6], [7, 8])
+    same, other_env, other_draws = collect([5, 6], [7, 8]), collect([5, 9], [7, 8]), collect([5, 6], [7, 9])
+    keys = ("observation", "action", "desired_goal")
+    assert all(torch.equal(first[key], same[key]) for key in keys)
+    for changed, key in ((other_env, "desired_goal"), (other_draws, "action")):
+        assert torch.equal(first[key][:4], changed[key][:4])
+        assert not torch.equal(first[key][4:], changed[key][4:])

@@ -1,0 +1,27 @@
+"""Random numbers of losses: each run's own."""
+
+from __future__ import annotations
+
+import torch
+
+from torchrl_her.objectives import RunNoise
+
+
+def test_a_run_draws_the_same_beside_others() -> None:
+    alone = RunNoise([torch.Generator().manual_seed(7)])(torch.zeros(20, 3))
+    beside = RunNoise([torch.Generator().manual_seed(seed) for seed in (1, 7, 5)])(torch.zeros(3, 20, 3))
+    assert torch.equal(beside[1], alone)
+    assert not torch.equal(beside[0], alone)
+
+
+def test_without_generators_it_is_torchs_own() -> None:
+    torch.manual_seed(4)
+    drawn = RunNoise()(torch.zeros(2, 3))
+    torch.manual_seed(4)
+    assert torch.equal(drawn, torch.randn(2, 3))
+
+
+def test_shape_and_type_are_kept() -> None:
+    drawn = RunNoise([torch.Generator()])(torch.zeros(4, 2, dtype=torch.float64).t())
+    assert drawn.shape == (2, 4)
+    assert drawn.dtype == torch.float64

@@ -1,0 +1,60 @@
+"""What was written is counted for each run."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from torchrl_her import GoalReward, HindsightOptions
+from torchrl_her.replay_buffers.copies import Copies
+from torchrl_her.replay_buffers.runs.counts import RunCounts, WriterCounts, real_positives, virtual_positives
+
+KEYS = HindsightOptions().transition_keys()
+
+
+def copies(reward: list[float], goals: list[float] | None = None) -> Copies:
+    root = torch.arange(len(reward))
+    changes = {} if goals is None else {KEYS.goals[0]: torch.tensor(goals).unsqueeze(-1)}
+    return Copies(root, root, changes, torch.tensor(reward))
+
+
+def test_counts_are_emptied_and_totals_are_not() -> None:
+    own = RunCounts(3)
+    own.add([2, 0], real=[5, 1], virtual=[20, 4])
+    own.add([2], real_positive=[2])
+    own.empty(2)
+    own.add([2], real=[3])
+    assert own.counts == [WriterCounts(real=1, virtual=4), WriterCounts(), WriterCounts(real=3)]
+    assert own.totals[2] == WriterCounts(real=8, virtual=20, real_positive=2)
+    assert WriterCounts.sum(own.totals) == WriterCounts(real=9, virtual=24, real_positive=2)
+
+
+def test_a_state_brings_the_counts_back() -> None:
+    own, other = RunCounts(2), RunCounts(2)
+    own.add([1], real=[5])
+    own.empty(1)
+    own.add([0], virtual=[4])
+    other.load_state_dict(own.state_dict())
+    assert (other.counts, other.totals) == (own.counts, own.totals)
+    other.add([0], virtual=[1])
+    assert own.counts[0].virtual == 4
+
+
+def test_positive_is_what_has_the_reward_of_an_achieved_goal() -> None:
+    real = copies([0.0, -1.0, 1.0, -1.0, -0.5])
+    assert real_positives(real, [3, 0, 2], 0.0) == {"real_positive": [2, 0, 0]}
+    assert real_positives(real, [3, 0, 2], -0.5) == {"real_positive": [2, 0, 1]}
+
+
+def test_useful_is_what_was_not_achieved_before() -> None:
+    """Transitions 0 to 3 are at 0, 1, 2, 3; the goals of 0 and 2 are achieved where they are."""
+    rows = TensorDict({"achieved_goal": torch.arange(4.0).unsqueeze(-1)}, [4])
+    virtual = copies([0.0, 0.0, 0.0, -1.0], [0.0, 2.0, 2.0, 9.0])
+
+    def positives(filtered: bool) -> dict[str, list[int]]:
+        return virtual_positives(
+            rows, virtual, [1, 3], GoalReward(0.5), KEYS, achieved_reward=0.0, filtered=filtered
+        )
+
+    assert positives(False) == {"virtual_positive": [1, 2], "useful_virtual_positive": [0, 1]}
+    assert positives(True) == {"virtual_positive": [1, 2], "useful_virtual_positive": [1, 2]}

@@ -1,0 +1,62 @@
+"""Real and virtual transitions of several runs at once, and how many each run has."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from torchrl_her import GoalReward, HindsightOptions
+from torchrl_her.replay_buffers.episodes import Episodes
+from torchrl_her.replay_buffers.runs.pieces import Piece
+from torchrl_her.replay_buffers.runs.shares import real_share, virtual_share
+
+from ...her_data import make_batch
+
+# Environment 0 plays an episode of 2 steps and environment 1 one of 3 (and one step of another).
+# They are runs 3 and 5 of a writer.
+ROWS: TensorDict = make_batch([[2, 9], [3, 9]], steps=4).reshape(-1)
+RUN = torch.tensor([3, 3, 3, 3, 5, 5, 5, 5])
+PIECE = Piece(
+    [3, 5],
+    Episodes(torch.tensor([[0, 1, 1], [4, 5, 6]]), torch.tensor([2, 3])),
+    torch.tensor([0, 1]),
+)
+REWARD = GoalReward(0.5)
+
+
+def test_a_piece_counts_by_runs() -> None:
+    assert PIECE.sums(torch.tensor([7, 8])) == [7, 8]
+    assert PIECE.counts(torch.tensor([0, 4, 4, 6]), RUN) == [1, 3]
+    assert PIECE.counts(torch.tensor([4]), RUN) == [0, 1]
+    assert Piece([0], PIECE.episodes).sums(torch.tensor([7, 8])) == [15]
+    assert Piece([0], PIECE.episodes).counts(torch.tensor([0, 4, 4]), None) == [3]
+
+
+def test_single_transitions() -> None:
+    options = HindsightOptions()
+    keys = options.transition_keys()
+    real = real_share(ROWS, PIECE, options, keys, first_id=0)
+    assert real.copies.root.tolist() == [0, 1, 4, 5, 6]
+    assert real.counts == [2, 3]
+    assert real.copies.changes == {}
+    # Transition 0 for the goal that 1 achieved, and 5 and 6 for the one that 6 achieved.
+    source, goal_source = torch.tensor([0, 5, 6]), torch.tensor([1, 6, 6])
+    virtual = virtual_share(ROWS, RUN, PIECE, source, goal_source, REWARD, options, keys, first_id=0)
+    assert virtual.counts == [1, 2]
+    assert virtual.copies.changes["desired_goal"][:, 0].tolist() == [2.0, 1003.0, 1003.0]
+    assert virtual.copies.reward.tolist() == [-1.0, -1.0, 0.0]
+    assert keys.trajectory not in virtual.copies.changes
+
+
+def test_whole_episodes_have_ids() -> None:
+    """Two copies of the second episode: one up to its second state, one up to its end."""
+    options = HindsightOptions(per="episode")
+    keys = options.transition_keys()
+    source, goal_source = torch.tensor([4, 4]), torch.tensor([5, 6])
+    virtual = virtual_share(ROWS, RUN, PIECE, source, goal_source, REWARD, options, keys, first_id=10)
+    assert virtual.copies.root.tolist() == [4, 5, 4, 5, 6]
+    assert virtual.counts == [0, 5]
+    assert virtual.copies.changes[keys.trajectory].tolist() == [10, 10, 11, 11, 11]
+    real = real_share(ROWS, PIECE, options, keys, first_id=12)
+    assert real.copies.changes[keys.trajectory].tolist() == [12, 12, 13, 13, 13]
+    assert real.counts == [2, 3]

@@ -1,0 +1,153 @@
+"""What the fused steps would get wrong is named, and refused."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torchrl.objectives import DDPGLoss, HardUpdate, LossModule, SoftUpdate, ValueEstimators
+
+from tests.torchrl_her.trainers.fused_cases import ALGORITHMS, make_loss
+from torchrl_her import FusedLearner, make_actor, make_critic, make_ddpg_loss
+from torchrl_her.objectives import PenalizedDDPGLoss, clamped_td0
+from torchrl_her.trainers import can_fuse, is_plain_adam, why_not_fused
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("update", [lambda loss: SoftUpdate(loss, tau=0.1), lambda loss: HardUpdate(loss)])
+def test_all_losses_of_this_library_can_be_fused(
+    algorithm: str, update: Callable[[LossModule], SoftUpdate | HardUpdate]
+) -> None:
+    loss = make_loss(algorithm, norm="layer", activation="elu", depth=2)
+    assert can_fuse(loss, update(loss))
+
+
+def test_only_a_plain_adam_is_fused() -> None:
+    loss = make_loss("ddpg")
+    target = SoftUpdate(loss, tau=0.1)
+    with_a_hook = torch.optim.Adam(loss.parameters())
+    with_a_hook.register_step_post_hook(lambda *_: None)
+    for optimizer in (
+        torch.optim.SGD(loss.parameters()),
+        torch.optim.Adam(loss.parameters(), weight_decay=1.0),
+        torch.optim.Adam(loss.parameters(), amsgrad=True),
+        torch.optim.Adam(loss.parameters(), maximize=True),
+        torch.optim.Adam(loss.parameters(), differentiable=True),
+        torch.optim.AdamW(loss.parameters()),
+        torch.optim.Adam([{"params": [p], "lr": 0.1 / (i + 1)} for i, p in enumerate(loss.parameters())]),
+        torch.optim.Adam(list(loss.parameters())[1:]),
+        with_a_hook,
+    ):
+        assert not is_plain_adam(optimizer, loss)
+        with pytest.raises(ValueError, match="only a plain torch.optim.Adam can be fused"):
+            FusedLearner(loss, optimizer, target)
+
+
+def set_keys_of_targets(loss: LossModule) -> None:
+    loss.value_estimator.set_keys(reward="cost")
+
+
+def set_order(loss: LossModule) -> None:
+    loss.value_network.in_keys = ["desired_goal", "observation", "action"]
+
+
+def set_plain_targets(loss: LossModule) -> None:
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
+
+
+def set_targets_of_another(loss: LossModule) -> None:
+    loss.value_estimator.value_network = make_loss("ddpg").actor_critic
+
+
+def add_a_hook(loss: LossModule) -> None:
+    loss.value_network.module.rest.register_forward_hook(lambda *_: None)
+
+
+def add_a_hook_to_the_loss(loss: LossModule) -> None:
+    loss.register_forward_hook(lambda *_: None)
+
+
+def add_a_hook_to_a_parameter(loss: LossModule) -> None:
+    next(loss.parameters()).register_hook(lambda gradient: 0.0 * gradient)
+
+
+def use_another_activation(loss: LossModule) -> None:
+    loss.actor_network.module.layers[-1] = torch.nn.Hardtanh()
+
+
+def mask_actions(loss: LossModule) -> None:
+    loss.value_network[1].action_mask_key = "mask"
+
+
+def set_a_value_network(loss: LossModule) -> None:
+    loss.value_estimator.value_network = loss.qvalue_network
+
+
+def add_a_parameter(loss: LossModule) -> None:
+    loss.actor_network.module.extra = torch.nn.Parameter(torch.zeros(1))
+
+
+def freeze(loss: LossModule) -> None:
+    next(loss.parameters()).requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "change", "reason"),
+    [
+        ("ddpg", lambda loss: loss.set_keys(reward="cost"), "reward under the key 'cost'"),
+        ("ddpg", lambda loss: loss.set_keys(priority_weight="importance"), "priority_weight under the key"),
+        ("ddpg", lambda loss: setattr(loss.tensor_keys, "state_action_value", "q"), "a critic that writes"),
+        ("ddpg", set_keys_of_targets, "reward of the targets under the key 'cost'"),
+        ("ddpg", set_order, "a critic that reads"),
+        ("ddpg", lambda loss: setattr(loss, "loss_function", "smooth_l1"), "loss_function='smooth_l1'"),
+        ("ddpg", lambda loss: setattr(loss, "reduction", "sum"), "reduction='sum'"),
+        ("ddpg", set_plain_targets, "targets of a TD0Estimator"),
+        ("ddpg", set_targets_of_another, "targets from other networks"),
+        ("ddpg", lambda loss: setattr(loss.value_estimator, "average_rewards", True), "average_rewards=True"),
+        ("ddpg", lambda loss: setattr(loss.value_estimator, "skip_existing", True), "skip_existing=True"),
+        ("ddpg", add_a_hook, "hooks on the loss or its networks"),
+        ("ddpg", add_a_hook_to_the_loss, "hooks on the loss or its networks"),
+        ("ddpg", add_a_hook_to_a_parameter, "hooks on parameters"),
+        ("ddpg", use_another_activation, "other layers than those of a plain ActorNet"),
+        ("ddpg", freeze, "frozen parameters"),
+        ("ddpg", lambda loss: loss.bfloat16(), "parameters that are torch.bfloat16 on cpu"),
+        ("td3", lambda loss: setattr(loss, "delay_actor", False), "delay_actor=False"),
+        ("sac", lambda loss: setattr(loss, "fixed_alpha", True), "fixed_alpha=True"),
+        ("sac", lambda loss: setattr(loss, "skip_done_states", True), "skip_done_states=True"),
+        ("dqn", lambda loss: setattr(loss, "double_dqn", False), "double_dqn=False"),
+        ("dqn", mask_actions, "a QValueActor as value_network"),
+        ("td3", set_a_value_network, "targets from a network of the value estimator's own"),
+        ("sac", set_a_value_network, "targets from a network of the value estimator's own"),
+        ("ddpg", add_a_parameter, "parameters beside those of the layers in actor_network"),
+        ("dqn", lambda loss: setattr(loss, "loss_function", "l1"), "loss_function='l1'"),
+    ],
+)
+def test_what_they_do_not_know_they_refuse(
+    algorithm: str, change: Callable[[LossModule], Any], reason: str
+) -> None:
+    loss = make_loss(algorithm)
+    target = SoftUpdate(loss, tau=0.1)
+    assert can_fuse(loss, target)
+    change(loss)
+    assert not can_fuse(loss, target)
+    with pytest.raises(ValueError, match=f"cannot be fused: .*{re.escape(reason)}"):
+        FusedLearner(loss, torch.optim.Adam(loss.parameters()), target)
+
+
+def test_other_networks_targets_and_losses_are_refused() -> None:
+    normalized = make_critic((4, 2), 3, norm="batch")
+    loss = make_ddpg_loss(make_actor((4, 2), 3), normalized)
+    assert "without batch normalization" in str(why_not_fused(loss, SoftUpdate(loss, tau=0.1)))
+    loss = make_loss("ddpg")
+    assert not can_fuse(loss, SoftUpdate(make_loss("ddpg"), tau=0.1))
+    assert not can_fuse(loss, None)
+    plain = DDPGLoss(make_actor((4, 2), 3), make_critic((4, 2), 3), delay_actor=True, delay_value=True)
+    assert "a DDPGLoss" in str(why_not_fused(plain, SoftUpdate(plain, tau=0.1)))
+    for delays in ({"delay_actor": False}, {"delay_value": False}):
+        options = {"delay_actor": True, "delay_value": True, "action_penalty": 0.0} | delays
+        loss = PenalizedDDPGLoss(make_actor((4, 2), 3), make_critic((4, 2), 3), **options)
+        loss.make_value_estimator(clamped_td0(0.9, (-1.0, 0.0), loss.actor_critic))
+        assert not can_fuse(loss, SoftUpdate(loss, tau=0.1))

@@ -1,0 +1,82 @@
+"""What the compiled gradient steps are handed: the structures of ``steps.cpp``, field by field."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import lru_cache
+from typing import Any
+
+import torch
+
+
+class Algorithm(IntEnum):
+    """The losses that there are steps for."""
+
+    DDPG = 0
+    TD3 = 1
+    SAC = 2
+    DQN = 3
+
+
+class Activation(IntEnum):
+    """What follows a layer."""
+
+    NONE = 0
+    RELU = 1
+    TANH = 2
+    ELU = 3
+
+
+class Layer(ctypes.Structure):
+    """One layer: its widths, and how many of its inputs come in here (the action, in a critic)."""
+
+    _fields_ = [(name, ctypes.c_int) for name in ("inputs", "outputs", "joined", "activation", "normalized")]
+
+
+@dataclass(frozen=True)
+class Structures:
+    """The structures for one type of numbers."""
+
+    real: Any
+    tensors: Any
+    entry: Any
+    adam: Any
+    job: Any
+
+
+@lru_cache
+def structures(dtype: torch.dtype) -> Structures:
+    """The structures for float32 or float64.
+
+    Example:
+        >>> structures(torch.float64).real.__name__
+        'c_double'
+    """
+    real = ctypes.c_float if dtype == torch.float32 else ctypes.c_double
+    pointer = ctypes.c_void_p
+
+    def structure(name: str, *fields: tuple[str, Any]) -> Any:
+        kinds = [(field, kind) for fields_, kind in fields for field in fields_.split()]
+        return type(name, (ctypes.Structure,), {"_fields_": kinds})
+
+    tensors = structure(
+        "Tensors", ("rows columns", ctypes.c_int), ("value target first_moment second_moment steps", pointer)
+    )
+    entry = structure("Entry", ("data", pointer), ("width", ctypes.c_int))
+    adam = structure("Adam", ("size spread beta2 rest1 rest2 epsilon", real))
+    job = structure(
+        "Job",
+        ("algorithm runs critics batch first_step steps rows actions threads", ctypes.c_int),
+        ("actor_layers critic_layers actor_tensors critic_tensors", ctypes.c_int),
+        ("actor critic", ctypes.POINTER(Layer)),
+        ("tensors", ctypes.POINTER(tensors)),
+        ("entries", ctypes.c_int),
+        ("seen next_seen", ctypes.POINTER(entry)),
+        ("action choice reward terminated weight discount noise own_noise low high idle", pointer),
+        ("gamma least greatest penalty max_norm tau policy_noise noise_limit target_entropy", real),
+        ("adam", ctypes.POINTER(adam)),
+        ("priorities losses", pointer),
+    )
+    return Structures(real, tensors, entry, adam, job)

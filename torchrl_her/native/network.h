@@ -1,0 +1,320 @@
+// Layers, their gradients, and Adam: one network of one run.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <memory>
+#include <vector>
+
+#include "gemm.h"
+
+namespace her {
+
+// Memory that a gradient step works in: taken piece by piece, and all given back at its end.
+class Arena {
+  public:
+    real* take(long count) {
+        count = (count + 63) / 64 * 64;
+        while (block_ < blocks_.size() && used_ + count > sizes_[block_]) ++block_, used_ = 0;
+        if (block_ == blocks_.size()) {
+            sizes_.push_back(std::max(count, 1L << 20));
+            blocks_.emplace_back(new real[sizes_.back()]());
+        }
+        used_ += count;
+        return blocks_[block_].get() + used_ - count;
+    }
+    void clear() { block_ = used_ = 0; }
+
+  private:
+    std::vector<std::unique_ptr<real[]>> blocks_;
+    std::vector<long> sizes_;
+    size_t block_ = 0;
+    long used_ = 0;
+};
+
+struct Matrix {
+    real* data;
+    int rows, columns;
+    long row;  // stride: padded
+    real* operator[](long i) const { return data + i * row; }
+};
+
+inline Matrix matrix(Arena& arena, int rows, int columns) {
+    return {arena.take(long(rows) * padded(columns)), rows, columns, padded(columns)};
+}
+
+enum Activation { kNone, kRelu, kTanh, kElu };
+
+// As Python describes a layer. `joined`: how many of the inputs come in here, behind the outputs of the layer before.
+struct Layer {
+    int inputs, outputs, joined, activation, normalized;
+};
+
+constexpr real kNormEpsilon = 1e-5;  // that of torch's LayerNorm
+
+// A parameter [rows, columns] with all that a step changes.
+struct Parameter {
+    int rows, columns;
+    real *value, *target, *first_moment, *second_moment;
+    Matrix gradient;
+};
+
+// What a forward pass leaves for the backward pass.
+struct Pass {
+    std::vector<Matrix> values;      // the input, and each layer's output
+    std::vector<Matrix> normalized;  // before scale and shift
+    std::vector<real*> spread;       // 1 / standard deviation of each row
+};
+
+class Network {
+  public:
+    Network(const Layer* layers, int count) : layers_(layers, layers + count) {}
+
+    std::vector<Parameter> parameters;  // of each layer: weight, bias and, if normalized, scale and shift
+    bool uses_targets = false;
+
+    // Begins a step: forgets what was made of older weights.
+    void begin(Arena& arena) {
+        arena_ = &arena;
+        weights_.assign(layers_.size(), nullptr);
+        transposed_.assign(layers_.size(), nullptr);
+        biases_.assign(layers_.size(), nullptr);
+    }
+
+    // A pass of an input [rows, inputs], which several networks may share.
+    Pass pass(Matrix input) {
+        const int rows = input.rows;
+        Pass pass;
+        pass.values.push_back(input);
+        for (size_t i = 0; i < layers_.size(); ++i) {
+            const int joined = i + 1 < layers_.size() ? layers_[i + 1].joined : 0;
+            pass.values.push_back(matrix(*arena_, rows, padded(layers_[i].outputs) + joined));
+            pass.values.back().columns = layers_[i].outputs + joined;
+            pass.normalized.push_back(layers_[i].normalized ? matrix(*arena_, rows, layers_[i].outputs) : Matrix{});
+            pass.spread.push_back(layers_[i].normalized ? arena_->take(rows) : nullptr);
+        }
+        return pass;
+    }
+
+    // Where a joined input goes: behind the outputs of the layer before, or of the input.
+    // Returns the output; `joined` [rows, width] with a stride may be null where nothing joins.
+    Matrix forward(Pass& pass, const real* joined = nullptr, long joined_row = 0) {
+        const int rows = pass.values[0].rows;
+        for (size_t i = 0; i < layers_.size(); ++i) {
+            const Layer& layer = layers_[i];
+            const Matrix in = pass.values[i], out = pass.values[i + 1];
+            if (layer.joined && joined)
+                for (int r = 0; r < rows; ++r)
+                    for (int c = 0; c < layer.joined; ++c)
+                        in[r][layer.inputs - layer.joined + c] = joined[r * joined_row + c];
+            const bool relu = layer.activation == kRelu && !layer.normalized;
+            multiply({in.data, in.row, 1, weight(i), padded(layer.outputs), out.data, out.row, layer.inputs, bias(i),
+                      relu},
+                     rows, layer.outputs);
+            if (layer.normalized) normalize(i, pass);
+            if (!relu) activate(layer, out);
+        }
+        return pass.values.back();
+    }
+
+    // Gradients of all parameters (if `learns`), from the gradient in the output, which is overwritten.
+    // `joined_slope` [rows, padded], if not null, gets the gradient in the joined input.
+    void backward(const Pass& pass, Matrix slope, bool learns, Matrix* joined_slope = nullptr) {
+        for (int i = int(layers_.size()) - 1; i >= 0; --i) {
+            const Layer& layer = layers_[i];
+            const int own = layer.inputs - layer.joined;
+            activation_slope(layer, pass.values[i + 1], slope);
+            if (layer.normalized) normalization_slope(i, pass, slope, learns);
+            if (learns) weight_slope(i, pass.values[i], slope);
+            if (layer.joined && joined_slope)
+                multiply({slope.data, slope.row, 1, transposed(i, own, layer.joined), padded(layer.joined),
+                          joined_slope->data, joined_slope->row, layer.outputs, nullptr, false},
+                         slope.rows, layer.joined);
+            const bool done = i == 0 || (layer.joined && !learns);  // nothing before the joint is asked for
+            if (done) return;
+            Matrix before = matrix(*arena_, slope.rows, own);
+            multiply({slope.data, slope.row, 1, back(i, own), padded(own), before.data, before.row, layer.outputs,
+                      nullptr, false},
+                     slope.rows, own);
+            slope = before;
+        }
+    }
+
+    double gradient_square() const {
+        double sum = 0;
+        for (const Parameter& p : parameters)
+            for (int r = 0; r < p.rows; ++r) {
+                real own = 0;
+                const real* g = p.gradient[r];
+                Vector sums{};
+                int c = 0;
+                for (; c + kLanes <= p.columns; c += kLanes) {
+                    const Vector part = *reinterpret_cast<const Vector*>(g + c);
+                    sums += part * part;
+                }
+                for (int l = 0; l < kLanes; ++l) own += sums[l];
+                for (; c < p.columns; ++c) own += g[c] * g[c];
+                sum += own;
+            }
+        return sum;
+    }
+
+  private:
+    std::vector<Layer> layers_;
+    Arena* arena_ = nullptr;
+    std::vector<real*> weights_, transposed_, biases_;
+
+    const Parameter& parameter(int layer, int which) const {
+        int first = 0;
+        for (int i = 0; i < layer; ++i) first += layers_[i].normalized ? 4 : 2;
+        return parameters[first + which];
+    }
+    Parameter& parameter(int layer, int which) {
+        return const_cast<Parameter&>(static_cast<const Network*>(this)->parameter(layer, which));
+    }
+    const real* value(const Parameter& p) const { return uses_targets ? p.target : p.value; }
+
+    // Rows that are not whole vectors are copied into padded ones.
+    const real* padded_rows(const Parameter& p, std::vector<real*>& kept, int layer) {
+        if (p.columns % kLanes == 0) return value(p);
+        if (!kept[layer]) {
+            kept[layer] = arena_->take(long(p.rows) * padded(p.columns));
+            for (int r = 0; r < p.rows; ++r) {
+                real* out = kept[layer] + long(r) * padded(p.columns);
+                std::copy_n(value(p) + long(r) * p.columns, p.columns, out);
+                std::fill(out + p.columns, out + padded(p.columns), real(0));
+            }
+        }
+        return kept[layer];
+    }
+    const real* weight(int layer) { return padded_rows(parameter(layer, 0), weights_, layer); }
+    const real* bias(int layer) { return padded_rows(parameter(layer, 1), biases_, layer); }
+
+    // The transpose [outputs, padded] of some rows of a weight.
+    real* transposed(int layer, int first, int count) {
+        const Parameter& p = parameter(layer, 0);
+        const long row = padded(count);
+        real* out = arena_->take(p.columns * row);
+        const real* in = value(p) + long(first) * p.columns;
+        constexpr int kBlock = 16;  // the lines of a block of both stay in the fastest memory
+        for (int r0 = 0; r0 < count; r0 += kBlock)
+            for (int c = 0; c < p.columns; ++c)
+                for (int r = r0; r < std::min(r0 + kBlock, count); ++r) out[c * row + r] = in[long(r) * p.columns + c];
+        return out;
+    }
+    const real* back(int layer, int own) {
+        if (!transposed_[layer]) transposed_[layer] = transposed(layer, 0, own);
+        return transposed_[layer];
+    }
+
+    void normalize(int layer, Pass& pass) {
+        const int n = layers_[layer].outputs;
+        const Matrix out = pass.values[layer + 1], kept = pass.normalized[layer];
+        const real *scale = value(parameter(layer, 2)), *shift = value(parameter(layer, 3));
+        for (int r = 0; r < out.rows; ++r) {
+            real *y = out[r], *x = kept[r], mean = 0, variance = 0;
+            for (int c = 0; c < n; ++c) mean += y[c];
+            mean /= n;
+            for (int c = 0; c < n; ++c) variance += (y[c] - mean) * (y[c] - mean);
+            const real spread = 1 / std::sqrt(variance / n + kNormEpsilon);
+            pass.spread[layer][r] = spread;
+            for (int c = 0; c < n; ++c) {
+                x[c] = (y[c] - mean) * spread;
+                y[c] = x[c] * scale[c] + shift[c];
+            }
+        }
+    }
+
+    void normalization_slope(int layer, const Pass& pass, Matrix slope, bool learns) {
+        const int n = layers_[layer].outputs;
+        Parameter &scale = parameter(layer, 2), &shift = parameter(layer, 3);
+        if (learns)
+            for (Parameter* p : {&scale, &shift}) {
+                p->gradient = matrix(*arena_, 1, n);
+                std::fill_n(p->gradient.data, n, real(0));
+            }
+        const real* factor = value(scale);
+        for (int r = 0; r < slope.rows; ++r) {
+            real *s = slope[r], sum = 0, along = 0;
+            const real* x = pass.normalized[layer][r];
+            for (int c = 0; c < n; ++c) {
+                if (learns) {
+                    scale.gradient.data[c] += s[c] * x[c];
+                    shift.gradient.data[c] += s[c];
+                }
+                s[c] *= factor[c];
+                sum += s[c];
+                along += s[c] * x[c];
+            }
+            const real spread = pass.spread[layer][r];
+            for (int c = 0; c < n; ++c) s[c] = spread * (s[c] - sum / n - x[c] * (along / n));
+        }
+    }
+
+    static void activate(const Layer& layer, Matrix out) {
+        for (int r = 0; r < out.rows; ++r) {
+            real* y = out[r];
+            if (layer.activation == kRelu)
+                for (int c = 0; c < layer.outputs; ++c) y[c] = y[c] < 0 ? 0 : y[c];
+            else if (layer.activation == kTanh)
+                for (int c = 0; c < layer.outputs; ++c) y[c] = std::tanh(y[c]);
+            else if (layer.activation == kElu)
+                for (int c = 0; c < layer.outputs; ++c) y[c] = y[c] > 0 ? y[c] : std::expm1(y[c]);
+        }
+    }
+
+    // Through the activation, by its output alone.
+    static void activation_slope(const Layer& layer, Matrix out, Matrix slope) {
+        for (int r = 0; r < out.rows; ++r) {
+            const real* y = out[r];
+            real* s = slope[r];
+            if (layer.activation == kRelu)
+                for (int c = 0; c < layer.outputs; ++c) s[c] = y[c] <= 0 ? 0 : s[c];
+            else if (layer.activation == kTanh)
+                for (int c = 0; c < layer.outputs; ++c) s[c] *= 1 - y[c] * y[c];
+            else if (layer.activation == kElu)
+                for (int c = 0; c < layer.outputs; ++c) s[c] *= y[c] > 0 ? 1 : y[c] + 1;
+        }
+    }
+
+    void weight_slope(int layer, Matrix in, Matrix slope) {
+        const Layer& own = layers_[layer];
+        Parameter &weight = parameter(layer, 0), &bias = parameter(layer, 1);
+        weight.gradient = matrix(*arena_, own.inputs, own.outputs);
+        bias.gradient = matrix(*arena_, 1, own.outputs);
+        multiply({in.data, 1, in.row, slope.data, slope.row, weight.gradient.data, weight.gradient.row, slope.rows,
+                  nullptr, false},
+                 own.inputs, own.outputs);
+        real* sum = bias.gradient.data;
+        std::fill_n(sum, own.outputs, real(0));
+        for (int r = 0; r < slope.rows; ++r)
+            for (int c = 0; c < own.outputs; ++c) sum[c] += slope[r][c];
+    }
+};
+
+// The numbers of Adam for one step: the step's size and the divisor of the second moment's root, bias-corrected; the
+// second beta; what is left of 1 beside each beta, which would lose digits if it were computed here; epsilon.
+struct Adam {
+    real size, spread, beta2, rest1, rest2, epsilon;
+};
+
+// One step of Adam in place, with clipped gradients, and the soft update of the targets behind it.
+inline void adam_step(Parameter& p, const Adam& adam, real clip, real tau) {
+    for (int r = 0; r < p.rows; ++r) {
+        const long begin = long(r) * p.columns;
+        const real* __restrict gradient = p.gradient[r];
+        real *__restrict m = p.first_moment + begin, *__restrict v = p.second_moment + begin;
+        real *__restrict w = p.value + begin, *__restrict t = p.target ? p.target + begin : nullptr;
+        for (int c = 0; c < p.columns; ++c) {
+            const real g = gradient[c] * clip;
+            m[c] += (g - m[c]) * adam.rest1;
+            v[c] = v[c] * adam.beta2 + g * g * adam.rest2;
+            w[c] -= adam.size * m[c] / (std::sqrt(v[c]) / adam.spread + adam.epsilon);
+        }
+        if (t && tau > 0)
+            for (int c = 0; c < p.columns; ++c) t[c] += tau * (w[c] - t[c]);
+    }
+}
+
+}  // namespace her

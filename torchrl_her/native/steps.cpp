@@ -1,0 +1,395 @@
+// Gradient steps of DDPG, TD3, SAC and DQN: forward, backward, clipping, Adam and soft targets, run by run.
+//
+// The results are those of TorchRL's losses, which the tests compare them with. Everything that Python hands over
+// is in `Job`; the structures are mirrored in `job.py`.
+#include <cstdint>
+
+#include "network.h"
+
+#if defined(__SSE__)
+#include <xmmintrin.h>
+#endif
+
+namespace her {
+
+enum Algorithm { kDdpg, kTd3, kSac, kDqn };
+
+struct Tensors {
+    int rows, columns;
+    real *value, *target, *first_moment, *second_moment;  // of all runs; target may be null
+    float* steps;  // Adam's count, or null
+};
+
+struct Entry {
+    const real* data;  // [runs, rows of a run, width]
+    int width;
+};
+
+struct Job {
+    int algorithm, runs, critics, batch, first_step, steps, rows, actions, threads;
+    int actor_layers, critic_layers, actor_tensors, critic_tensors;
+    const Layer *actor, *critic;
+    const Tensors* tensors;  // of the actor, of each critic, and SAC's logarithm of the temperature
+    int entries;
+    const Entry *seen, *next_seen;  // `entries` of each, joined into the networks' input
+    const real* action;  // [runs, rows, actions]
+    const int64_t* choice;  // [runs, rows], of discrete actions
+    const real* reward;     // [runs, rows]
+    const uint8_t* terminated;
+    const real* weight;    // of importance sampling, or null
+    const real* discount;  // of each row's next value, or null
+    const real* noise;       // [steps, runs, batch, actions], standard normal: of the next action
+    const real* own_noise;   // and of the present one
+    const real *low, *high;  // [actions]
+    const uint8_t* idle;     // [runs]
+    real gamma, least, greatest, penalty, max_norm, tau, policy_noise, noise_limit, target_entropy;
+    const Adam* adam;  // [steps]
+    real* priorities;  // [runs, rows]
+    real* losses;      // [3, steps, runs]
+};
+
+namespace {
+
+const real kHalfLogTwoPi = real(0.91893853320467274178), kLogTwo = real(0.69314718055994530942);
+const real kMostTanh = 1 - (sizeof(real) == 4 ? real(1e-6) : real(1e-15));  // as TorchRL's TanhNormal
+const real kLeastScale = -10, kGreatestScale = 2;  // of SAC, as in modules/stochastic_actor.py
+
+// Of one run.
+class Learner {
+  public:
+    Learner(const Job& job, int run, Arena& arena) : job_(job), run_(run), arena_(arena) {
+        int next = 0;
+        const int networks = 1 + job.critics;
+        for (int n = 0; n < networks; ++n) {
+            const bool first = n == 0;
+            networks_.emplace_back(first ? job.actor : job.critic, first ? job.actor_layers : job.critic_layers);
+            for (int i = 0; i < (first ? job.actor_tensors : job.critic_tensors); ++i)
+                networks_.back().parameters.push_back(parameter(job.tensors[next++]));
+        }
+        for (const Network& network : networks_) {
+            targets_.push_back(network);
+            targets_.back().uses_targets = true;
+        }
+        if (job.algorithm == kSac) temperature_ = parameter(job.tensors[next]);
+    }
+
+    void step(int step) {
+        arena_.clear();
+        step_ = step;
+        first_ = long(run_) * job_.rows + long(step) * job_.batch;
+        for (Network& network : networks_) network.begin(arena_);
+        for (Network& network : targets_) network.begin(arena_);
+        seen_ = joined(job_.seen);
+        next_seen_ = joined(job_.next_seen);
+        weights_ = arena_.take(job_.batch);
+        mean_weights();
+        if (job_.algorithm == kDqn)
+            learn_q();
+        else
+            learn_values_and_actions();
+        update();
+    }
+
+  private:
+    const Job& job_;
+    const int run_;
+    Arena& arena_;
+    std::vector<Network> networks_, targets_;  // the actor (or the values of actions), then the critics
+    Parameter temperature_{};
+    int step_ = 0;
+    long first_ = 0;  // row
+    real* weights_ = nullptr;
+    Matrix seen_{}, next_seen_{};  // the networks' inputs
+
+    Parameter parameter(const Tensors& own) const {
+        const long at = long(run_) * own.rows * own.columns;
+        return {own.rows,
+                own.columns,
+                own.value + at,
+                own.target ? own.target + at : nullptr,
+                own.first_moment + at,
+                own.second_moment + at,
+                {}};
+    }
+
+    real& loss(int which) { return job_.losses[(long(which) * job_.steps + step_ - job_.first_step) * job_.runs + run_]; }
+
+    // Importance weights with a mean of 1.
+    void mean_weights() {
+        double sum = 0;
+        for (int b = 0; b < job_.batch; ++b) sum += weights_[b] = job_.weight ? job_.weight[first_ + b] : 1;
+        for (int b = 0; b < job_.batch; ++b) weights_[b] *= real(job_.batch / sum);
+    }
+
+    // The entries that networks see, side by side.
+    Matrix joined(const Entry* entries) {
+        int columns = 0;
+        for (int e = 0; e < job_.entries; ++e) columns += entries[e].width;
+        const Matrix out = matrix(arena_, job_.batch, columns);
+        int column = 0;
+        for (int e = 0; e < job_.entries; ++e) {
+            const int width = entries[e].width;
+            const real* from = entries[e].data + first_ * width;
+            for (int b = 0; b < job_.batch; ++b)
+                for (int c = 0; c < width; ++c) out[b][column + c] = from[b * width + c];
+            column += width;
+        }
+        return out;
+    }
+
+    // Clamped targets of the critics, from the next state's values.
+    void make_targets(real* values) {
+        for (int b = 0; b < job_.batch; ++b) {
+            const long row = first_ + b;
+            const real discount = job_.discount ? job_.discount[row] : job_.gamma;
+            const real value = job_.terminated[row] ? 0 : values[b];
+            values[b] = std::min(std::max(job_.reward[row] + discount * value, job_.least), job_.greatest);
+        }
+    }
+
+    // An action drawn from SAC's policy: what its gradient needs.
+    struct Draw {
+        Matrix action, tanh, scale;
+        real* log_likelihood;
+    };
+
+    const real* noise_of(const real* all) const {
+        return all + (long(step_ - job_.first_step) * job_.runs + run_) * job_.batch * job_.actions;
+    }
+
+    // The squashed normal distribution of SAC; Haarnoja et al., 2018, appendix C.
+    Draw draw(Matrix out, const real* noise) {
+        const int actions = job_.actions;
+        Draw draw{matrix(arena_, job_.batch, actions), matrix(arena_, job_.batch, actions),
+                  matrix(arena_, job_.batch, actions), arena_.take(job_.batch)};
+        for (int b = 0; b < job_.batch; ++b) {
+            real sum = 0;
+            for (int a = 0; a < actions; ++a) {
+                const real log_scale = std::min(std::max(out[b][actions + a], kLeastScale), kGreatestScale);
+                const real scale = std::exp(log_scale), own = noise[b * actions + a];
+                const real before = out[b][a] + scale * own, squashed = std::tanh(before);
+                const real half = (job_.high[a] - job_.low[a]) / 2, middle = (job_.high[a] + job_.low[a]) / 2;
+                const real z = -2 * before, softplus = z > 20 ? z : std::log1p(std::exp(z));
+                draw.scale[b][a] = scale;
+                draw.tanh[b][a] = std::min(std::max(squashed, -kMostTanh), kMostTanh);
+                draw.action[b][a] = middle + half * draw.tanh[b][a];
+                sum += -own * own / 2 - log_scale - kHalfLogTwoPi - 2 * (kLogTwo - before - softplus) - std::log(half);
+            }
+            draw.log_likelihood[b] = sum;
+        }
+        return draw;
+    }
+
+    // The least value of the critics at an action.
+    real* least_value(std::vector<Network>& networks, Matrix seen, Matrix action) {
+        real* least = arena_.take(job_.batch);
+        for (int n = 1; n <= job_.critics; ++n) {
+            Pass pass = networks[n].pass(seen);
+            const Matrix out = networks[n].forward(pass, action.data, action.row);
+            for (int b = 0; b < job_.batch; ++b) least[b] = n == 1 ? out[b][0] : std::min(least[b], out[b][0]);
+        }
+        return least;
+    }
+
+    real* targets_of_critics() {
+        Network& actor = job_.algorithm == kSac ? networks_[0] : targets_[0];
+        Pass pass = actor.pass(next_seen_);
+        Matrix action = actor.forward(pass);
+        real* log_likelihood = nullptr;
+        if (job_.algorithm == kSac) {
+            const Draw drawn = draw(action, noise_of(job_.noise));
+            action = drawn.action, log_likelihood = drawn.log_likelihood;
+        }
+        if (job_.algorithm == kTd3)
+            for (int b = 0; b < job_.batch; ++b)
+                for (int a = 0; a < job_.actions; ++a) {
+                    const real own = noise_of(job_.noise)[b * job_.actions + a] * job_.policy_noise;
+                    const real noise = std::min(std::max(own, -job_.noise_limit), job_.noise_limit);
+                    action[b][a] = std::min(std::max(action[b][a] + noise, job_.low[a]), job_.high[a]);
+                }
+        real* values = least_value(targets_, next_seen_, action);
+        if (log_likelihood) {
+            const real temperature = std::exp(*temperature_.value);
+            for (int b = 0; b < job_.batch; ++b) values[b] -= temperature * log_likelihood[b];
+        }
+        make_targets(values);
+        return values;
+    }
+
+    // The gradients of the critics and of the actor.
+    void learn_values_and_actions() {
+        const int batch = job_.batch, actions = job_.actions;
+        const real* wanted = targets_of_critics();
+        const real* action = job_.action + first_ * actions;
+        real* priorities = job_.priorities + first_;
+        double value_loss = 0;
+        for (int n = 1; n <= job_.critics; ++n) {
+            Pass pass = networks_[n].pass(seen_);
+            const Matrix out = networks_[n].forward(pass, action, actions);
+            Matrix slope = matrix(arena_, batch, 1);
+            for (int b = 0; b < batch; ++b) {
+                const real error = out[b][0] - wanted[b], square = error * error;
+                const real priority = job_.algorithm == kSac ? std::abs(error) : square;
+                priorities[b] = n == 1 ? priority : std::max(priorities[b], priority);
+                value_loss += square * weights_[b];
+                slope[b][0] = 2 * error * weights_[b] / batch;
+            }
+            networks_[n].backward(pass, slope, true);
+        }
+        loss(1) = real(value_loss / batch);
+        job_.algorithm == kSac ? learn_stochastic_actions() : learn_actions();
+    }
+
+    // A deterministic actor: it follows the first critic, less the action L2 penalty.
+    void learn_actions() {
+        const int batch = job_.batch, actions = job_.actions;
+        Network &actor = networks_[0], &critic = networks_[1];
+        Pass acted = actor.pass(seen_);
+        const Matrix action = actor.forward(acted);
+        Pass valued = critic.pass(seen_);
+        const Matrix value = critic.forward(valued, action.data, action.row);
+        Matrix slope = matrix(arena_, batch, 1), action_slope = matrix(arena_, batch, actions);
+        double sum = 0, squares = 0;
+        for (int b = 0; b < batch; ++b) {
+            slope[b][0] = -weights_[b] / batch;
+            sum += value[b][0] * weights_[b];
+        }
+        critic.backward(valued, slope, false, &action_slope);
+        const real price = job_.penalty / (real(batch) * actions);
+        for (int b = 0; b < batch; ++b)
+            for (int a = 0; a < actions; ++a) {
+                action_slope[b][a] += 2 * price * action[b][a];
+                squares += action[b][a] * action[b][a];
+            }
+        loss(0) = real(squares * price - sum / batch);
+        actor.backward(acted, action_slope, true);
+    }
+
+    void learn_stochastic_actions() {
+        const int batch = job_.batch, actions = job_.actions;
+        Network& actor = networks_[0];
+        Pass acted = actor.pass(seen_);
+        const Matrix out = actor.forward(acted);
+        const real* noise = noise_of(job_.own_noise);
+        const Draw drawn = draw(out, noise);
+        std::vector<Pass> passes;
+        std::vector<Matrix> values;
+        for (int n = 1; n <= job_.critics; ++n) {
+            passes.push_back(networks_[n].pass(seen_));
+            values.push_back(networks_[n].forward(passes.back(), drawn.action.data, drawn.action.row));
+        }
+        Matrix action_slope = matrix(arena_, batch, actions);
+        for (int b = 0; b < batch; ++b) std::fill_n(action_slope[b], actions, real(0));
+        const real temperature = std::exp(*temperature_.value);
+        double actor_loss = 0, temperature_slope = 0;
+        for (int n = 0; n < job_.critics; ++n) {
+            Matrix slope = matrix(arena_, batch, 1), own = matrix(arena_, batch, actions);
+            for (int b = 0; b < batch; ++b) {
+                int least = 0;
+                for (int other = 1; other < job_.critics; ++other)
+                    if (values[other][b][0] < values[least][b][0]) least = other;
+                slope[b][0] = least == n ? -weights_[b] / batch : 0;
+                if (least == n) actor_loss -= values[n][b][0] * weights_[b];
+            }
+            networks_[n + 1].backward(passes[n], slope, false, &own);
+            for (int b = 0; b < batch; ++b)
+                for (int a = 0; a < actions; ++a) action_slope[b][a] += own[b][a];
+        }
+        const real price = job_.penalty / (real(batch) * actions);
+        Matrix slope = matrix(arena_, batch, 2 * actions);
+        for (int b = 0; b < batch; ++b) {
+            actor_loss += temperature * drawn.log_likelihood[b] * weights_[b];
+            temperature_slope -= (drawn.log_likelihood[b] + job_.target_entropy) * weights_[b];
+            const real surprise = temperature * weights_[b] / batch;
+            for (int a = 0; a < actions; ++a) {
+                const real squashed = drawn.tanh[b][a], action = drawn.action[b][a];
+                const real half = (job_.high[a] - job_.low[a]) / 2, log_scale = out[b][actions + a];
+                const real in_action = action_slope[b][a] + 2 * price * action;
+                const real before = in_action * half * (1 - squashed * squashed) + surprise * 2 * squashed;
+                actor_loss += real(batch) * price * action * action;
+                slope[b][a] = before;
+                slope[b][actions + a] = before * noise[b * actions + a] * drawn.scale[b][a] - surprise;
+                if (log_scale < kLeastScale || log_scale > kGreatestScale) slope[b][actions + a] = 0;
+            }
+        }
+        loss(0) = real(actor_loss / batch);
+        loss(2) = real(*temperature_.value * temperature_slope / batch);
+        temperature_.gradient = matrix(arena_, 1, 1);
+        temperature_.gradient.data[0] = real(temperature_slope / batch);
+        actor.backward(acted, slope, true);
+    }
+
+    // Double DQN, van Hasselt et al., 2016: the online network chooses the next action.
+    void learn_q() {
+        const int batch = job_.batch;
+        Network &values = networks_[0], &target = targets_[0];
+        Pass next = values.pass(next_seen_), next_target = target.pass(next_seen_);
+        const Matrix preferred = values.forward(next), valued = target.forward(next_target);
+        real* wanted = arena_.take(batch);
+        for (int b = 0; b < batch; ++b)
+            wanted[b] = valued[b][std::max_element(preferred[b], preferred[b] + job_.actions) - preferred[b]];
+        make_targets(wanted);
+        Pass pass = values.pass(seen_);
+        const Matrix out = values.forward(pass);
+        Matrix slope = matrix(arena_, batch, job_.actions);
+        double sum = 0;
+        for (int b = 0; b < batch; ++b) {
+            const long choice = job_.choice[first_ + b];
+            const real error = out[b][choice] - wanted[b];
+            std::fill_n(slope[b], job_.actions, real(0));
+            slope[b][choice] = 2 * error * weights_[b] / batch;
+            job_.priorities[first_ + b] = error * error;
+            sum += error * error * weights_[b];
+        }
+        loss(0) = real(sum / batch);
+        values.backward(pass, slope, true);
+    }
+
+    // Clips the gradients of the actor, of all critics together and of the temperature; then Adam and targets.
+    void update() {
+        double critics = 0;
+        for (int n = 1; n <= job_.critics; ++n) critics += networks_[n].gradient_square();
+        const Adam& adam = job_.adam[step_ - job_.first_step];
+        for (int n = 0; n <= job_.critics; ++n) {
+            const real clip = clipping(n == 0 ? networks_[0].gradient_square() : critics);
+            for (Parameter& parameter : networks_[n].parameters) adam_step(parameter, adam, clip, job_.tau);
+        }
+        if (job_.algorithm == kSac) {
+            const double slope = *temperature_.gradient.data;
+            adam_step(temperature_, adam, clipping(slope * slope), 0);
+        }
+    }
+
+    // As torch's clip_grad_norm_.
+    real clipping(double square) const {
+        const double clip = double(job_.max_norm) / (std::sqrt(square) + 1e-6);
+        return real(clip > 1 ? 1 : clip);  // NaN stays what it is
+    }
+};
+
+}  // namespace
+}  // namespace her
+
+extern "C" void her_steps(const her::Job* job) {
+    const int tensors = job->actor_tensors + job->critics * job->critic_tensors + (job->algorithm == her::kSac);
+    for (int i = 0; i < tensors; ++i)
+        if (job->tensors[i].steps) *job->tensors[i].steps += job->steps;
+#pragma omp parallel for schedule(dynamic) num_threads(job->threads) if (job->threads > 1)
+    for (int run = 0; run < job->runs; ++run) {
+        if (job->idle[run]) continue;
+#if defined(__SSE__)
+        // Adam's moments of units without a gradient become denormal, and denormals are ten times as slow.
+        const unsigned before = _mm_getcsr();
+        _mm_setcsr(before | 0x8040);
+#endif
+        static thread_local her::Arena arena;
+        her::Learner learner(*job, run, arena);
+        for (int step = job->first_step; step < job->first_step + job->steps; ++step) learner.step(step);
+#if defined(__SSE__)
+        _mm_setcsr(before);
+#endif
+    }
+}
+
+// So that Python can tell that both mean the same structures.
+extern "C" long her_job_size() { return sizeof(her::Job); }

@@ -1,0 +1,28 @@
+"""Drawing from trees of sums, and updating them, in C++."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import lru_cache
+from typing import Any
+
+from torchrl_her.native.library import CannotCompile, load_library
+
+_ARGUMENTS = {  # levels, widths, their number, runs, then what differs
+    "her_trees_draw": [ctypes.c_int64, *[ctypes.c_void_p] * 3],
+    "her_trees_set": [ctypes.c_int64, *[ctypes.c_void_p] * 2],
+}
+
+
+@lru_cache
+def load_trees() -> Any:
+    """The library of ``trees.cpp``, compiled for this processor once; None if it cannot be compiled."""
+    try:
+        library = load_library("trees.cpp")
+    except CannotCompile:
+        return None
+    for name, arguments in _ARGUMENTS.items():
+        function = getattr(library, name)
+        function.restype = None
+        function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_int64, *arguments]
+    return library

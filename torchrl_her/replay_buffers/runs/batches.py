@@ -1,0 +1,110 @@
+"""Transitions of one or several runs, each with what it belongs to: a batch, or what is held back of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_her.replay_buffers.keys import TransitionKeys
+from torchrl_her.replay_buffers.lanes import BY_ENV, find_lanes, in_order
+from torchrl_her.replay_buffers.runs.rows import take_rows
+
+_NO_ROWS = TensorDict(batch_size=[0])  # made once: most batches hold nothing back; nobody writes into it
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Transitions [n], oldest first.
+
+    Attributes:
+        rows: [n]; without entries if n = 0.
+        kind: what environments are told apart by.
+        ids: [n] int64, the environment or trajectory that each transition is of.
+        run: [n] int64, the run that each is of; None if there is only one.
+
+    Example:
+        >>> from torchrl_her import HindsightOptions
+        >>> data = TensorDict({"x": torch.arange(8.0).view(4, 2)}, [4, 2])  # two environments of each run
+        >>> batch = Batch.of(data, HindsightOptions().transition_keys(), runs=2)
+        >>> batch.run.tolist(), batch.ids.tolist()
+        ([0, 0, 0, 0, 1, 1, 1, 1], [0, 0, 1, 1, 2, 2, 3, 3])
+        >>> batch.take(torch.tensor([1, 7])).without_run(0).rows["x"].tolist()
+        [7.0]
+    """
+
+    rows: TensorDictBase
+    kind: str
+    ids: Tensor
+    run: Tensor | None
+
+    @classmethod
+    def none(cls, runs: int) -> Batch:
+        """No transitions of R runs."""
+        ids = torch.empty(0, dtype=torch.int64)
+        return cls(_NO_ROWS, "", ids, None if runs == 1 else ids)
+
+    @classmethod
+    def of(cls, data: TensorDictBase, keys: TransitionKeys, *, runs: int) -> Batch:
+        """A collector's batch of R runs; if there are several, R equal blocks in their order."""
+        kind, ids = find_lanes(data, keys)
+        run = None
+        if runs > 1:
+            run = torch.arange(runs, device=ids.device).repeat_interleave(len(ids) // runs)
+        return cls(data.reshape(-1), kind, ids, run)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def after(self, held: Batch) -> Batch:
+        """The transitions that were held back, and then these.
+
+        Raises:
+            ValueError: their environments are told apart by something else.
+        """
+        if len(held) == 0:
+            return self
+        if self.kind != held.kind:
+            raise ValueError(
+                f"episodes that are still open were told apart by {held.kind}, this batch by {self.kind}: "
+                "hand over all batches in one form, [N, T] or flat, and with the same ids"
+            )
+        run = None if held.run is None or self.run is None else torch.cat((held.run, self.run))
+        return Batch(torch.cat((held.rows, self.rows)), self.kind, torch.cat((held.ids, self.ids)), run)
+
+    def lanes(self) -> Tensor:
+        """Numbers [n] of environments or trajectories, those of one run above those of the run before."""
+        lanes = in_order(self.ids) if self.kind == BY_ENV else self.ids
+        return lanes if self.run is None else lanes + self.run * (int(lanes.max()) + 1)
+
+    def take(self, index: Tensor) -> Batch:
+        """Copies of some of the transitions, [m]."""
+        rows = take_rows(self.rows, index) if len(index) else _NO_ROWS
+        run = None if self.run is None else self.run[index]
+        return replace(self, rows=rows, ids=self.ids[index], run=run)
+
+    def without_run(self, run: int) -> Batch:
+        """The transitions of all other runs."""
+        stays = self.run != run if self.run is not None else torch.zeros_like(self.ids, dtype=torch.bool)
+        return self.take(stays.nonzero().squeeze(-1))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain data that :meth:`from_state` takes, under the names of what is held back."""
+        return {
+            "held_runs": torch.empty(0, dtype=torch.int64) if self.run is None else self.run.clone(),
+            "held": self.rows.to_dict() if len(self) else None,
+            "held_lanes": self.ids.clone(),
+            "held_kind": self.kind,
+        }
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any], *, runs: int) -> Batch:
+        """The transitions of which this is the state; of R runs."""
+        ids, run, held = state["held_lanes"].clone(), state["held_runs"].clone(), state["held"]
+        rows: TensorDictBase = _NO_ROWS
+        if held is not None:
+            rows = TensorDict.from_dict(held, batch_size=ids.shape).clone()
+        return cls(rows, state["held_kind"], ids, None if runs == 1 else run)

@@ -1,0 +1,69 @@
+"""A replay buffer of several runs, or of one, asked about single runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer
+
+
+def runs_of(buffer: ReplayBuffer) -> int:
+    """For how many runs a buffer was made: 1, unless its writer is for more."""
+    return getattr(buffer.writer, "runs", 1)
+
+
+def sizes_of(buffer: ReplayBuffer) -> list[int]:
+    """How many rows of each run can be sampled from a buffer."""
+    return [len(buffer)] if runs_of(buffer) == 1 else buffer.writer.sizes
+
+
+def rows_of_run(buffer: ReplayBuffer, run: int = 0) -> TensorDictBase:
+    """A run's stored rows [n], in the order in which they lie in its block; a view.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(3))
+        >>> _ = buffer.extend(TensorDict({"x": torch.tensor([5.0, 6.0])}, [2]))
+        >>> rows_of_run(buffer)["x"].tolist()
+        [5.0, 6.0]
+    """
+    begin, end = bounds_of_run(buffer, run)
+    return buffer.storage[begin:end]
+
+
+def bounds_of_run(buffer: ReplayBuffer, run: int) -> tuple[int, int]:
+    """The first row of a run's block in the storage, and the one behind its last row."""
+    _check(buffer, run)
+    if runs_of(buffer) == 1:
+        return 0, len(buffer.storage)
+    begin = run * buffer.writer.capacity
+    return begin, begin + sizes_of(buffer)[run]
+
+
+def empty_run(buffer: ReplayBuffer, run: int = 0) -> None:
+    """Empties one run's block: rows, priorities, counts, weights of goals, open episodes. Others go on.
+
+    Args:
+        buffer: of several runs, or of a single one, which is emptied as a whole.
+        run: which one, from 0.
+
+    Raises:
+        ValueError: there is no such run.
+    """
+    _check(buffer, run)
+    if runs_of(buffer) == 1:
+        buffer.empty()
+        return
+    writer: Any = buffer.writer
+    sampler: Any = buffer.sampler
+    writer.empty_run(run)
+    sampler.empty_run(run)
+    buffer.storage._bump_mutation_revision()  # for whatever remembers what it has read
+
+
+def _check(buffer: ReplayBuffer, run: int) -> None:
+    if not 0 <= run < runs_of(buffer):
+        raise ValueError(f"run must be in [0, {runs_of(buffer) - 1}], got {run}")

@@ -1,0 +1,131 @@
+"""Counting what a writer has written for each of its runs, and how much of it achieved its goal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, astuple, dataclass
+from typing import Any
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_her.goals.rewards import RewardFunction, missed
+from torchrl_her.replay_buffers.copies import Copies
+from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
+
+
+@dataclass
+class WriterCounts:
+    """How many transitions were written; the positive ones are those that achieved their goal.
+
+    ``useful_virtual_positive`` leaves out virtual transitions whose goal was already achieved in the state
+    before. It counts what the filter keeps, or would keep if it were on.
+    """
+
+    real: int = 0
+    virtual: int = 0
+    real_positive: int = 0
+    virtual_positive: int = 0
+    useful_virtual_positive: int = 0
+
+    @classmethod
+    def sum(cls, counts: Iterable[WriterCounts]) -> WriterCounts:
+        """The sums over several."""
+        return cls(*map(sum, zip(*map(astuple, counts), strict=True)))
+
+
+class RunCounts:
+    """The counts of R runs.
+
+    Args:
+        runs: R.
+
+    Attributes:
+        counts: R, since each run was last emptied.
+        totals: R, ever.
+
+    Example:
+        >>> own = RunCounts(2)
+        >>> own.add([1], real=[3])
+        >>> own.empty(1)
+        >>> own.add([0, 1], real=[1, 2])
+        >>> [counts.real for counts in own.counts], [totals.real for totals in own.totals]
+        ([1, 2], [1, 5])
+    """
+
+    def __init__(self, runs: int) -> None:
+        self.counts, self.totals = ([WriterCounts() for _ in range(runs)] for _ in range(2))
+
+    def add(self, runs: Sequence[int], **numbers: Sequence[int]) -> None:
+        """Adds to the counts of some runs.
+
+        Args:
+            runs: m numbers of runs.
+            **numbers: the fields of :class:`WriterCounts`, m numbers each.
+        """
+        for position, run in enumerate(runs):
+            for counts in (self.counts[run], self.totals[run]):
+                for name, own in numbers.items():
+                    setattr(counts, name, getattr(counts, name) + own[position])
+
+    def empty(self, run: int) -> None:
+        """Counts a run from 0 again; its totals go on."""
+        self.counts[run] = WriterCounts()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain data that :meth:`load_state_dict` takes."""
+        return {
+            "counts": [asdict(counts) for counts in self.counts],
+            "totals": [asdict(counts) for counts in self.totals],
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` gave."""
+        self.counts = [WriterCounts(**counts) for counts in state_dict["counts"]]
+        self.totals = [WriterCounts(**counts) for counts in state_dict["totals"]]
+
+
+def real_positives(real: Copies, counts: Sequence[int], achieved_reward: float) -> dict[str, list[int]]:
+    """How many real transitions achieved their goal, as :meth:`RunCounts.add` takes it.
+
+    Args:
+        real: one run after the other.
+        counts: m numbers of transitions, of each run.
+        achieved_reward: the reward of an achieved goal.
+    """
+    return {"real_positive": _set(real.reward >= achieved_reward, counts)}
+
+
+def virtual_positives(
+    rows: TensorDictBase,
+    virtual: Copies,
+    counts: Sequence[int],
+    reward_fn: RewardFunction,
+    keys: TransitionKeys,
+    *,
+    achieved_reward: float,
+    filtered: bool,
+) -> dict[str, list[int]]:
+    """How many virtual transitions achieved their goal, as :meth:`RunCounts.add` takes it.
+
+    Args:
+        rows: [n], the collected transitions of which they are copies.
+        virtual: one run after the other.
+        counts: m numbers of transitions, of each run.
+        reward_fn: maps (achieved, desired) goals to (reward, terminated).
+        keys: where entries are.
+
+    Keyword Args:
+        achieved_reward: the reward of an achieved goal.
+        filtered: whether none of their goals was achieved before; then all positive ones are useful.
+    """
+    positive = useful = virtual.reward >= achieved_reward
+    if not filtered:
+        before = entry_of(rows, keys.achieved).index_select(0, virtual.root)
+        useful = positive & missed(reward_fn, before, virtual.changes[keys.goals[0]], achieved_reward)
+    return {"virtual_positive": _set(positive, counts), "useful_virtual_positive": _set(useful, counts)}
+
+
+def _set(flags: Tensor, counts: Sequence[int]) -> list[int]:
+    """How many of some flags are set, for each run."""
+    return [int(part.count_nonzero()) for part in flags.split(list(counts))]

@@ -1,0 +1,112 @@
+"""Sharing out episodes of several runs in pieces that are written at once."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_her.replay_buffers.episodes import Episodes
+
+
+class Piece(NamedTuple):
+    """Episodes that are written at once.
+
+    Attributes:
+        runs: m numbers of runs that have episodes among these.
+        episodes: those of one run after those of the other.
+        position: [E] int64, ascending: the position in ``runs`` of each episode's run; None for a single run.
+    """
+
+    runs: list[int]
+    episodes: Episodes
+    position: Tensor | None = None
+
+    def sums(self, number: Tensor) -> list[int]:
+        """The sums of numbers [E] of episodes for each of the runs, m of them."""
+        if self.position is None:
+            return [int(number.sum())]
+        return number.new_zeros(len(self.runs)).index_add_(0, self.position, number).tolist()
+
+    def counts(self, index: Tensor, run: Tensor | None) -> list[int]:
+        """How many of some transitions are of each of the runs, m of them.
+
+        Args:
+            index: [V] int64, positions of transitions of these episodes in a batch.
+            run: [n] int64, the run of each transition of the batch; None if there is only one.
+        """
+        if run is None:
+            return [len(index)]
+        numbers = run.index_select(0, index).bincount(minlength=max(self.runs) + 1).tolist()
+        return [numbers[own] for own in self.runs]
+
+
+def split_runs(
+    episodes: Episodes, run: Tensor | None, settings: Sequence[Hashable], *, each: int, together: int
+) -> Iterator[Piece]:
+    """Splits episodes in pieces whose tables have at most so many entries.
+
+    How the episodes of a run are split does not depend on the other runs.
+
+    Args:
+        episodes: those of one run after those of the other.
+        run: [E] int64, ascending: the run of each episode, of R; None if there is only one.
+        settings: R, one of each run: only episodes of runs with the same are written at once.
+
+    Keyword Args:
+        each: entries of the table of a single run's episodes. One episode may have more.
+        together: entries of the table of several runs' episodes.
+    """
+    if len(episodes.lengths) == 0:
+        return
+    if run is None:
+        yield from (Piece([0], part) for part in episodes.split(max(1, each // episodes.rows.shape[1])))
+        return
+    waiting: dict[Hashable, list[_Share]] = {}
+    for share in _shares(episodes, run, len(settings), each):
+        group = waiting.setdefault(settings[share.run], [])
+        horizon = max([share.horizon, *(other.horizon for other in group)])
+        number = share.number + sum(other.number for other in group)
+        if group and (group[-1].run == share.run or number * horizon > together):
+            yield _join(episodes, group)
+            group.clear()
+        group.append(share)
+    yield from (_join(episodes, group) for group in waiting.values())
+
+
+class _Share(NamedTuple):
+    """Some episodes of a run that follow each other."""
+
+    run: int
+    begin: int
+    number: int
+    horizon: int  # the longest of that run
+
+
+def _shares(episodes: Episodes, run: Tensor, runs: int, each: int) -> Iterator[_Share]:
+    numbers = run.bincount(minlength=runs).tolist()
+    longest = episodes.lengths.new_zeros(runs).scatter_reduce_(0, run, episodes.lengths, "amax").tolist()
+    begin = 0
+    for own, (number, horizon) in enumerate(zip(numbers, longest, strict=True)):
+        at_once = max(1, each // max(1, horizon))
+        for start in range(0, number, at_once):
+            yield _Share(own, begin + start, min(at_once, number - start), horizon)
+        begin += number
+
+
+def _join(episodes: Episodes, shares: list[_Share]) -> Piece:
+    """The episodes of some shares as a piece; no two of them are of the same run."""
+    horizon = max(share.horizon for share in shares)
+    first, last = shares[0], shares[-1]
+    if last.begin + last.number - first.begin == sum(share.number for share in shares):  # without a gap
+        own = slice(first.begin, last.begin + last.number)
+        rows, lengths = episodes.rows[own], episodes.lengths[own]
+    else:
+        parts = [slice(share.begin, share.begin + share.number) for share in shares]
+        rows = torch.cat([episodes.rows[part] for part in parts])
+        lengths = torch.cat([episodes.lengths[part] for part in parts])
+    numbers = torch.tensor([share.number for share in shares], device=lengths.device)
+    position = torch.arange(len(shares), device=lengths.device).repeat_interleave(numbers)
+    return Piece([share.run for share in shares], Episodes(rows[:, :horizon], lengths), position)

@@ -1,0 +1,121 @@
+"""Where the rows of each run go: R equal blocks of a storage, each of them written round and round."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchrl_her.replay_buffers.runs.storage import Move
+
+
+class Rings:
+    """R blocks of rows, one of each run. When a block is full, its oldest rows are overwritten.
+
+    How many rows a block can hold is told with each call, because it is known only once there is a storage.
+
+    Args:
+        runs: R.
+
+    Attributes:
+        cursors: R, the places within the blocks where the next rows go.
+        sizes: R, how many rows each block has.
+
+    Example:
+        >>> rings = Rings(2)
+        >>> for move in rings.moves(1, begin=0, count=5, capacity=4):  # one row too many
+        ...     print(move.source, "->", move.to)
+        slice(1, 4, None) -> slice(5, 8, None)
+        slice(4, 5, None) -> slice(4, 5, None)
+        >>> rings.cursors, rings.sizes
+        ([0, 1], [0, 4])
+    """
+
+    def __init__(self, runs: int) -> None:
+        self.cursors, self.sizes = [0] * runs, [0] * runs
+
+    def moves(self, run: int, *, begin: int, count: int, capacity: int) -> list[Move]:
+        """Where the next rows of a run go, and moves its cursor on. Rows that do not fit are left out.
+
+        Args:
+            run: which one.
+
+        Keyword Args:
+            begin: position of the first of these rows among all that are to be written.
+            count: how many they are; they lie one after the other. Of more than ``capacity``, only the last
+                ones are moved.
+            capacity: rows of a block.
+
+        Returns:
+            The slices to copy: one, or two where the block's end is reached, and none for no rows.
+        """
+        end, moves = begin + count, []
+        cursor = (self.cursors[run] + max(0, count - capacity)) % capacity
+        begin = max(begin, end - capacity)
+        while begin < end:  # up to the block's end, then on from its start
+            number = min(end - begin, capacity - cursor)
+            first = run * capacity + cursor
+            moves.append(Move(slice(begin, begin + number), slice(first, first + number)))
+            begin, cursor = begin + number, (cursor + number) % capacity
+            self.sizes[run] = min(capacity, self.sizes[run] + number)
+        self.cursors[run] = cursor
+        return moves
+
+    def empty(self, run: int) -> None:
+        """Forgets the rows of a run."""
+        self.cursors[run] = self.sizes[run] = 0
+
+
+class Places:
+    """Where the rows of a batch are, counted in the order in which the rows of their run are written.
+
+    Args:
+        run: [n] int64, the run of each row; None if all are of one.
+        n: number of rows.
+        runs: R.
+        device: where to count.
+
+    Example:
+        >>> rings, places = Rings(1), Places(None, 3, runs=1)
+        >>> moves = rings.moves(0, begin=0, count=4, capacity=10)  # rows 2 and 0 are the last of four
+        >>> places.note([0], [torch.tensor([2, 0])], [4])
+        >>> places.rows(rings.cursors, capacity=10).tolist()
+        [3, -1, 2]
+    """
+
+    def __init__(self, run: Tensor | None, n: int, *, runs: int, device: torch.device | None = None) -> None:
+        self._run = run
+        self._place = torch.full((n,), -1, dtype=torch.int64, device=device)
+        self._written = [0] * runs
+
+    def note(self, runs: Sequence[int], last: Sequence[Tensor], counts: Sequence[int]) -> None:
+        """Notes that more rows of some runs were written.
+
+        Args:
+            runs: m numbers of runs.
+            last: m tensors [c] int64, for each of these runs the positions in the batch of the rows that were
+                written last, in that order. Rows before them are copies, whose places nobody asks for.
+            counts: m numbers of all rows that were written, of each of these runs.
+        """
+        for run, positions, count in zip(runs, last, counts, strict=True):
+            self._written[run] += count
+            end = self._written[run]
+            self._place[positions] = torch.arange(end - len(positions), end, device=self._place.device)
+
+    def rows(self, cursors: Sequence[int], capacity: int) -> Tensor:
+        """The rows of the storage [n] where the batch's rows are; -1 for those that are not there (any more).
+
+        Args:
+            cursors: R, of :class:`Rings`, after everything was written.
+            capacity: rows of a block.
+        """
+        place, run = self._place, self._run
+        begins = [cursor - count for cursor, count in zip(cursors, self._written, strict=True)]
+        lost = [max(0, count - capacity) for count in self._written]
+        if run is None:
+            gone = place < lost[0]  # -1 among them: not written at all
+            return place.add(begins[0]).remainder_(capacity).masked_fill_(gone, -1)
+        gone = place < place.new_tensor(lost)[run]
+        rows = (place.new_tensor(begins)[run] + place).remainder_(capacity)
+        return rows.add_(run * capacity).masked_fill_(gone, -1)

@@ -1,0 +1,80 @@
+"""The rows that are written, put together of collected transitions and of what their copies change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
+from torch import Tensor
+
+from torchrl_her.replay_buffers.runs.shares import Share
+
+
+def join_copies(
+    rows: TensorDictBase,
+    virtual: Share | None,
+    real: Share,
+    *,
+    exclude: Sequence[NestedKey],
+    virtual_key: NestedKey | None,
+) -> TensorDictBase:
+    """Transitions as they are stored, run after run; of each run first the virtual and then the real ones.
+
+    Args:
+        rows: [n], collected transitions.
+        virtual: those of some runs; None if there are none.
+        real: those of the same runs.
+
+    Keyword Args:
+        exclude: entries of ``rows`` that are left out.
+        virtual_key: where virtual transitions are marked, a bool [..., 1]; None for no mark.
+    """
+    shares = [real] if virtual is None else [virtual, real]
+
+    def join(parts: list[Tensor]) -> Tensor:
+        """A tensor of the virtual and one of the real transitions, as one in the order of runs."""
+        split = [part.split(share.counts) for part, share in zip(parts, shares, strict=True)]
+        return torch.cat([part for run in zip(*split, strict=True) for part in run])
+
+    changed = list(dict.fromkeys(key for copies, _ in shares for key in copies.changes))
+    same = rows.exclude(*exclude, *changed)
+    root = join([copies.root for copies, _ in shares])
+    if all(copies.last is copies.root for copies, _ in shares):  # over single steps
+        out = take_rows(same, root)
+    else:
+        out = take_rows(same.exclude("next"), root)
+        out.set("next", take_rows(same.get("next"), join([copies.last for copies, _ in shares])))
+    for key in changed:
+        out.set(key, join([copies.entry(rows, key) for copies, _ in shares]))
+    if virtual_key is not None:
+        marks = [torch.full_like(share.copies.root, share is virtual, dtype=torch.bool) for share in shares]
+        out.set(virtual_key, join(marks).unsqueeze(-1))
+    return out
+
+
+def take_rows(transitions: TensorDictBase, index: Tensor) -> TensorDictBase:
+    """Copies of some transitions [m], also of entries that are no tensors.
+
+    Args:
+        transitions: [n].
+        index: [m] int64, positions.
+
+    Example:
+        >>> transitions = TensorDict({"x": torch.tensor([[5], [6], [7]])}, [3])
+        >>> take_rows(transitions, torch.tensor([2, 0]))["x"].tolist()
+        [[7], [5]]
+    """
+    out = transitions.apply(partial(_take, index=index), batch_size=index.shape, is_leaf=is_leaf_nontensor)
+    return TensorDict(batch_size=index.shape, device=index.device) if out is None else out
+
+
+def _take(entry: Any, index: Tensor) -> Any:
+    """Rows of an entry. Torch indexes single numbers several times faster than rows of one number."""
+    if not isinstance(entry, Tensor):
+        return entry[index]
+    if entry.shape[1:].numel() == 1:
+        return entry.flatten().index_select(0, index).view(-1, *entry.shape[1:])
+    return entry.index_select(0, index)

@@ -1,0 +1,349 @@
+"""Samplers for a buffer of several runs: as many transitions of each run, in one call."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler
+from torchrl.data.replay_buffers.storages import Storage
+
+from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
+from torchrl_her.replay_buffers.runs.trees import SumTrees
+
+_STATE_FILE = "runs_sampler.pt"
+
+
+class RunsSampler(Sampler):
+    """Draws transitions of each of R runs, all of a run's being equally likely.
+
+    The storage is R equal blocks of rows, as :class:`~torchrl_her.HERWriter` fills them. A batch is R equal
+    blocks, too, in the order of the runs. What a run draws does not depend on the other runs. In place of a
+    run without transitions, rows of the first run that has some are given.
+
+    Args:
+        capacity: rows of each run's block.
+
+    Keyword Args:
+        runs: R.
+        generators: R sources of random numbers; None for the buffer's (``buffer.set_rng``), with one run.
+
+    Raises:
+        ValueError: there is no run, or not a generator for each of several; when sampling, the batch cannot
+            be divided equally among the runs, or the storage is of another size.
+    """
+
+    def __init__(
+        self, capacity: int, *, runs: int = 1, generators: Sequence[torch.Generator] | None = None
+    ) -> None:
+        self.capacity, self.runs = capacity, runs
+        self.generators = check_generators(runs, generators)
+        self._sizes = torch.zeros(runs, dtype=torch.int64)
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        """Indices [batch_size] of rows: R equal blocks."""
+        n, sizes = _share(self, storage, batch_size), self._sizes.tolist()
+        place = torch.zeros(self.runs, n, dtype=torch.int64)
+        for own, size, generator in zip(place, sizes, generators_of(self), strict=True):
+            if size:
+                torch.randint(size, (n,), generator=generator, out=own)
+        return rows_of(place, [size > 0 for size in sizes], self.capacity), {}
+
+    def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
+        """Notes rows that were written."""
+        note_sizes(self._sizes, *run_and_place(index, self.capacity))
+
+    def empty_run(self, run: int) -> None:
+        """Forgets the transitions of a run."""
+        self._sizes[run] = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"sizes": self._sizes.clone()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        _check_runs(state_dict["sizes"], self.runs)
+        self._sizes.copy_(state_dict["sizes"])
+
+    def _empty(self) -> None:
+        self._sizes.zero_()
+
+    def dumps(self, path: str | Path) -> None:
+        _dump(self, path)
+
+    def loads(self, path: str | Path) -> None:
+        _load(self, path)
+
+
+class RunsPrioritizedSampler(PrioritizedSampler):
+    """Draws transitions of each of R runs in proportion to their priorities.
+
+    It is TorchRL's ``PrioritizedSampler`` for R runs: with ``p = (|priority| + eps) ** alpha``, a row is
+    drawn with probability p over the sum of its run, and a new row gets the largest priority that its run has
+    seen. ``priority_weight`` is (p / the least p of its run in the batch) ** -beta, at most 1.
+    A run whose p are all 0 draws all its rows equally often, with weight 1.
+    Schaul et al., Prioritized Experience Replay, 2016.
+
+    The storage is R equal blocks of rows, as :class:`~torchrl_her.HERWriter` fills them. A batch is R equal
+    blocks, too, in the order of the runs. What a run draws does not depend on the other runs. In place of a
+    run without transitions, rows of the first run that has some are given.
+
+    Args:
+        capacity: rows of each run's block.
+        alpha: how much priorities count; 0 for not at all.
+        beta: how far the weights make up for that; 1 for all of it.
+
+    Keyword Args:
+        runs: R.
+        generators: R sources of random numbers; None for the buffer's (``buffer.set_rng``), with one run.
+        eps: added to priorities.
+        reduction: of priorities that come as several numbers for a row.
+
+    Raises:
+        ValueError: there is no run, or not a generator for each of several; alpha or beta is negative; when
+            sampling, the batch cannot be divided equally among the runs, or the storage is of another size.
+
+    Example:
+        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
+        >>> sampler = RunsPrioritizedSampler(4, alpha=1.0, beta=1.0)
+        >>> buffer = ReplayBuffer(storage=LazyTensorStorage(4), sampler=sampler, batch_size=2)
+        >>> index = buffer.extend(torch.arange(3))
+        >>> buffer.update_priority(index, torch.tensor([0.0, 5.0, 0.0]))
+        >>> buffer.sample().tolist()
+        [1, 1]
+    """
+
+    _alpha: float
+    _beta: float
+
+    def __init__(
+        self,
+        capacity: int,
+        alpha: float,
+        beta: float,
+        *,
+        runs: int = 1,
+        generators: Sequence[torch.Generator] | None = None,
+        eps: float = 1e-8,
+        reduction: str = "max",
+    ) -> None:
+        self.capacity, self.runs = capacity, runs
+        self.generators = check_generators(runs, generators)
+        super().__init__(runs * capacity, alpha, beta, eps=eps, reduction=reduction)
+
+    def _init(self) -> None:
+        """Makes the trees, for TorchRL's own constructor."""
+        self._trees = SumTrees(self.capacity, runs=self.runs)
+        self._sizes = torch.zeros(self.runs, dtype=torch.int64)
+        self._most = torch.ones(self.runs)  # the largest priority of each run
+        self._warned: set[int] = set()  # runs that had priorities that are not finite
+
+    @property
+    def device(self) -> torch.device:
+        """Where priorities are kept."""
+        return self._most.device
+
+    @property
+    def alpha(self) -> float:
+        """How much priorities count. It cannot be changed once there are some, which are kept as powers."""
+        return self._alpha
+
+    @alpha.setter
+    def alpha(self, value: float) -> None:
+        if value != self._alpha and bool(self._sizes.any()):
+            raise ValueError(
+                f"alpha is {self._alpha} and cannot become {value}: rows have priorities already"
+            )
+        self._alpha = value
+
+    @property
+    def default_priority(self) -> Tensor | float:
+        """The priority of new rows; [R] if there are several runs."""
+        return float(self._most[0]) if self.runs == 1 else self._most.clone()
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        """Indices [batch_size] of rows, R equal blocks, and their weights."""
+        n = _share(self, storage, batch_size)
+        filled = (self._sizes > 0).tolist()
+        u = uniform([n * own for own in filled], 1, generators_of(self), dtype=torch.float64)
+        if not all(filled):
+            u = torch.zeros(self.runs, n, 1, dtype=u.dtype).masked_scatter_(
+                torch.tensor(filled).view(-1, 1, 1).expand(-1, n, 1), u
+            )
+        u = u.view(self.runs, n)
+        place, p = self._trees.draw(u)
+        least = p.amin(-1, keepdim=True)
+        weight = (p / least).pow_(-self._beta)
+        if bool((none := least == 0).any()):  # runs without rows, or without any priority above 0
+            sizes = self._sizes.unsqueeze(-1)
+            evenly = torch.minimum((u * sizes).long(), sizes - 1).clamp_min_(0)
+            place = torch.where(none, evenly, place)
+            weight.masked_fill_(none, 1.0)
+        return rows_of(place, filled, self.capacity), {"priority_weight": weight.flatten()}
+
+    @torch.no_grad()
+    def update_priority(
+        self, index: int | Tensor, priority: float | Tensor, *, storage: Storage | None = None
+    ) -> None:
+        """Sets the priorities of some rows.
+
+        Rows that were not written yet, or not since their run was emptied, are left out. So are priorities
+        that are not finite, or not once they are raised to the power: these rows keep theirs, and a warning
+        names their run the first time.
+
+        Args:
+            index: [n] of rows; -1 stands for none.
+            priority: [n], or one for all.
+
+        Keyword Args:
+            storage: that of the rows; with a single run, all that it holds were written.
+
+        Raises:
+            RuntimeError: there are neither as many priorities as rows nor one.
+        """
+        index = torch.as_tensor(index, dtype=torch.int64, device=self.device).flatten()
+        priority = torch.as_tensor(priority, dtype=torch.float32, device=self.device).detach().abs().flatten()
+        if priority.numel() not in (1, index.numel()):
+            raise RuntimeError(f"got {priority.numel()} priorities for {index.numel()} rows")
+        run, place = run_and_place(index, self.capacity)
+        priority = priority.expand(index.shape)
+        if len(run) < len(index):
+            priority = priority[index >= 0]
+        value = (priority + self._eps).pow(self._alpha)
+        # alpha = 0 makes 1 of everything, also of what is not a number
+        finite = value.isfinite() & priority.isfinite()
+        sizes = self._sizes
+        if self.runs == 1 and storage is not None:
+            # A buffer that is made around a filled storage tells its sampler of the rows in this way only.
+            sizes = sizes.clamp_min(len(storage))
+        written = place < sizes.index_select(0, run)
+        if not bool((good := finite & written).all()):
+            self._warn_of(run[written & ~finite])
+            run, place, priority, value = run[good], place[good], priority[good], value[good]
+        self._most.scatter_reduce_(0, run, priority, "amax")
+        note_sizes(self._sizes, run, place)
+        self._trees.set(run, place, value)
+
+    def _warn_of(self, run: Tensor) -> None:
+        """Warns of runs [n] that had priorities that are not finite, of each of them once."""
+        for own in sorted(set(run.tolist()) - self._warned):
+            self._warned.add(own)
+            warnings.warn(
+                f"run {own} was given priorities that are not finite; they are ignored, now and later",
+                RuntimeWarning,
+                stacklevel=4,
+            )
+
+    def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
+        """Gives rows that were written the largest priority of their run."""
+        run, place = run_and_place(index, self.capacity)
+        note_sizes(self._sizes, run, place)
+        value = (self._most + self._eps).pow(self._alpha)
+        self._trees.set(run, place, value.index_select(0, run), sorted=True)
+
+    def empty_run(self, run: int) -> None:
+        """Forgets the transitions of a run and their priorities."""
+        self._trees.clear(run)
+        self._sizes[run], self._most[run] = 0, 1.0
+
+    def add(self, index: Tensor | int) -> None:
+        """Nothing is to be done: :meth:`mark_update` was told."""
+
+    def extend(self, index: Tensor | tuple[Tensor, ...]) -> None:
+        """Nothing is to be done: :meth:`mark_update` was told."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """The powers of the priorities of the rows that are filled, as tensors and plain data."""
+        sizes = self._sizes.tolist()
+        return {
+            "sizes": self._sizes.clone(),
+            "values": [self._trees.get(run, size) for run, size in enumerate(sizes)],
+            "most": self._most.clone(),
+            "alpha": float(self._alpha),
+            "beta": float(self._beta),
+            "eps": float(self._eps),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` gave."""
+        _check_runs(state_dict["sizes"], self.runs)
+        self._init()
+        self._sizes.copy_(state_dict["sizes"])
+        self._most.copy_(state_dict["most"])
+        self._alpha, self._beta, self._eps = (state_dict[key] for key in ("alpha", "beta", "eps"))
+        for run, value in enumerate(state_dict["values"]):
+            leaf = torch.arange(len(value))
+            self._trees.set(torch.full_like(leaf, run), leaf, value, sorted=True)
+
+    def dumps(self, path: str | Path) -> None:
+        _dump(self, path)
+
+    def loads(self, path: str | Path) -> None:
+        _load(self, path)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(runs={self.runs}, alpha={self._alpha}, beta={self._beta})"
+
+
+AnyRunsSampler = RunsSampler | RunsPrioritizedSampler
+
+
+def _share(sampler: AnyRunsSampler, storage: Storage, batch_size: int) -> int:
+    """How many transitions of each run a batch has."""
+    if not bool(sampler._sizes.any()):
+        raise RuntimeError("an empty buffer cannot be sampled from")
+    if batch_size % sampler.runs:
+        raise ValueError(f"batch_size must be a multiple of {sampler.runs} runs, got {batch_size}")
+    if storage.max_size != sampler.runs * sampler.capacity:
+        raise ValueError(
+            f"the storage must have {sampler.runs} blocks of {sampler.capacity:,} rows, "
+            f"got one of {storage.max_size:,} rows"
+        )
+    return batch_size // sampler.runs
+
+
+def generators_of(sampler: AnyRunsSampler) -> Generators:
+    """A source of random numbers for each run."""
+    return [sampler._rng] if sampler.generators is None else sampler.generators
+
+
+def rows_of(place: Tensor, filled: Sequence[bool], capacity: int) -> Tensor:
+    """Rows [R * n] of places [R, n] in the runs' blocks; those of the first filled run for empty ones."""
+    row = place + torch.arange(0, len(filled) * capacity, capacity, device=place.device).unsqueeze(-1)
+    if not all(filled):
+        stand_in = list(filled).index(True)
+        for run, own in enumerate(filled):
+            if not own:
+                row[run] = row[stand_in]
+    return row.flatten()
+
+
+def run_and_place(index: int | Tensor, capacity: int) -> tuple[Tensor, Tensor]:
+    """The run of each row that was written, and its place in that run's block."""
+    index = torch.as_tensor(index, dtype=torch.int64).flatten()
+    if len(index) and int(index.min()) < 0:
+        index = index[index >= 0]  # writers give -1 for rows that they did not write
+    run = index.div(capacity, rounding_mode="floor")
+    return run, index - run * capacity
+
+
+def note_sizes(sizes: Tensor, run: Tensor, place: Tensor) -> None:
+    """Enlarges the sizes [R] of blocks so that they hold rows that were written."""
+    sizes.scatter_reduce_(0, run, place + 1, "amax")
+
+
+def _check_runs(sizes: Tensor, runs: int) -> None:
+    if len(sizes) != runs:
+        raise ValueError(f"the state is that of {len(sizes)} runs, not of {runs}")
+
+
+def _dump(sampler: AnyRunsSampler, path: str | Path) -> None:
+    Path(path).mkdir(exist_ok=True)
+    torch.save(sampler.state_dict(), Path(path) / _STATE_FILE)
+
+
+def _load(sampler: AnyRunsSampler, path: str | Path) -> None:
+    sampler.load_state_dict(torch.load(Path(path) / _STATE_FILE, weights_only=True))

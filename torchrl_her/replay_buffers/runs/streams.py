@@ -1,0 +1,63 @@
+"""Random numbers of several runs, each from a generator of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+Generators = Sequence[torch.Generator | None]
+
+
+def uniform(
+    counts: Sequence[int],
+    width: int,
+    generators: Generators,
+    *,
+    dtype: torch.dtype | None = None,
+    device: torch.device | None = None,
+) -> Tensor:
+    """Numbers in [0, 1) for several runs. What a run gets does not depend on the others.
+
+    Args:
+        counts: R numbers of rows; a run without rows draws nothing.
+        width: numbers in a row.
+        generators: R, one of each run; None for torch's own.
+
+    Keyword Args:
+        dtype, device: of the numbers.
+
+    Returns:
+        [sum of counts, width], one run after the other.
+
+    Example:
+        >>> both = uniform([1, 2], 2, [torch.Generator().manual_seed(seed) for seed in (0, 1)])
+        >>> alone = uniform([2], 2, [torch.Generator().manual_seed(1)])
+        >>> both.shape, torch.equal(both[1:], alone)
+        (torch.Size([3, 2]), True)
+    """
+    if len(generators) == 1:
+        return torch.rand(counts[0], width, generator=generators[0], dtype=dtype, device=device)
+    out = torch.empty(sum(counts), width, dtype=dtype, device=device)
+    for part, generator in zip(out.split(list(counts)), generators, strict=True):
+        if len(part):
+            torch.rand(part.shape, generator=generator, out=part)
+    return out
+
+
+def check_generators(runs: int, generators: Sequence[torch.Generator] | None) -> list[torch.Generator] | None:
+    """The generators of R runs as a list; None for the buffer's, which only a single run may use.
+
+    Raises:
+        ValueError: there is no run, or not a generator for each of several runs.
+    """
+    if runs < 1:
+        raise ValueError(f"runs must be at least 1, got {runs}")
+    if generators is None:
+        if runs > 1:
+            raise ValueError(f"{runs} runs need {runs} generators, one of each run, got None")
+        return None
+    if len(generators) != runs:
+        raise ValueError(f"{runs} runs need {runs} generators, one of each run, got {len(generators)}")
+    return list(generators)

@@ -1,0 +1,206 @@
+"""Gradient steps in C++: the results of TorchRL's losses in a fraction of the time.
+
+The learner works on the weights of the loss module, its target networks and its optimizer. So these can be
+saved, loaded and used as always.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import HardUpdate, LossModule
+from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
+from torchrl.objectives.utils import TargetNetUpdater
+
+from torchrl_her.native.job import Algorithm, Layer, structures
+from torchrl_her.native.steps import load_steps
+from torchrl_her.trainers.fused_call import FusedCall
+from torchrl_her.trainers.fused_layers import layers_of
+from torchrl_her.trainers.fused_weights import FusedWeights
+from torchrl_her.trainers.fusing import FUSED, action_key, is_plain_adam, network_of, why_not_fused
+from torchrl_her.trainers.learner import check_rows
+
+
+class FusedLearner:
+    """A :class:`~torchrl_her.trainers.Learner` for this library's losses of DDPG, TD3, SAC and DQN.
+
+    All gradient steps of an update are one call of a program in C++, which does everything: losses,
+    gradients, clipping, Adam and target updates. The program is compiled at first use, which takes some
+    seconds, and kept for later (see :func:`~torchrl_her.native.load_steps`). Several runs are shared out
+    among as many threads as torch may use (``torch.set_num_threads``).
+
+    Args:
+        loss: as :func:`~torchrl_her.make_ddpg_loss`, :func:`~torchrl_her.make_td3_loss`,
+            :func:`~torchrl_her.make_sac_loss` or :func:`~torchrl_her.make_dqn_loss` makes it, with networks
+            of this library, without batch normalization, in float32 or float64, on the CPU.
+        optimizer: a plain ``torch.optim.Adam`` over the loss module's parameters.
+        target: of the loss.
+        max_grad_norm: to which the gradients of each network of each run are clipped separately; all
+            critics count as one network.
+
+    The learner keeps references to the weights: make it after moving the loss to its device and type.
+    Entries of the rows are cast to that type, so rewards may be float64 beside networks in float32. Rows may
+    span several steps (``steps_to_next_obs``, see :class:`~torchrl_her.objectives.ClampedTD0`).
+
+    Raises:
+        ValueError: the loss, its targets or the optimizer are set to what the fused steps do not do, see
+            :func:`~torchrl_her.trainers.why_not_fused`: use :class:`~torchrl_her.LossLearner`.
+        CannotCompile: there is no C++ compiler.
+
+    Example:
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss
+        >>> loss = make_ddpg_loss(make_actor((9, 2), 3), make_critic((9, 2), 3))
+        >>> learner = FusedLearner(loss, torch.optim.Adam(loss.parameters()), SoftUpdate(loss, tau=0.01))
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        optimizer: torch.optim.Optimizer,
+        target: TargetNetUpdater,
+        *,
+        max_grad_norm: float = 3.0,
+    ) -> None:
+        self.loss, self.optimizer, self.target, self.max_grad_norm = loss, optimizer, target, max_grad_norm
+        reason = why_not_fused(loss, target)
+        if reason is not None:
+            raise ValueError(f"these gradient steps cannot be fused: {reason}; use LossLearner")
+        self._check_adam(loss)
+        self._fused, dtype = FUSED[type(loss)], next(iter(loss.parameters())).dtype
+        self._steps, self._kinds = load_steps(dtype), structures(dtype)
+        self._dtype = dtype
+        self._weights = FusedWeights(loss, optimizer, self._kinds)
+        self._keys: list[NestedKey] = list(getattr(loss, self._fused.actor).in_keys)
+        self._action_key = action_key(loss)
+        self._actor, self._critic = self._layers(self._fused.actor), self._layers(self._fused.critic)
+        self.runs: int = network_of(getattr(loss, self._fused.actor)).runs  # type: ignore[assignment]
+
+    @property
+    def tau(self) -> float:
+        """The share of the online weights in a soft update; 0 if targets are copied (``HardUpdate``)."""
+        return 0.0 if isinstance(self.target, HardUpdate) else 1.0 - float(self.target.eps)
+
+    @tau.setter
+    def tau(self, tau: float) -> None:
+        if isinstance(self.target, HardUpdate):
+            raise ValueError(f"tau must not be set where targets are copied by a HardUpdate, got {tau}")
+        self.target.eps = 1.0 - tau
+
+    @torch.no_grad()
+    def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
+        """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`.
+
+        Raises:
+            ValueError: the rows are not those of R runs, not a whole number of batches, not on the CPU, carry
+                a mask of TorchRL's losses or do not fit the networks; or the loss or its optimizer were
+                changed to what this learner cannot do.
+        """
+        check_rows(rows, steps, self.runs)
+        self._check(rows)
+        call = self._call(rows, steps)
+        call.set_idle(idle)
+        if isinstance(self.target, HardUpdate):  # copies the weights after some of the steps
+            losses = []
+            for step in range(steps):
+                losses.append(self._run(call, step, 1))
+                self.target.step()
+        else:
+            losses = [self._run(call, 0, steps)]
+        rows.set(self.loss.tensor_keys.priority, call.priorities.view(rows.batch_size))
+        return dict(zip(self._fused.losses, torch.cat(losses, 1), strict=False))
+
+    def _call(self, rows: TensorDictBase, steps: int) -> FusedCall:
+        """The job of an update, but for its steps."""
+        outputs = self._actor[-1].outputs
+        call = FusedCall(
+            self.loss,
+            self._fused.algorithm,
+            self._kinds,
+            rows,
+            steps,
+            self.runs,
+            inputs=self._actor[0].inputs,
+            actions=outputs // 2 if self._fused.algorithm is Algorithm.SAC else outputs,
+            keys=self._keys,
+            action_key=self._action_key,
+        )
+        job, weights = call.job, self._weights
+        job.actor, job.actor_layers, job.actor_tensors = self._actor, len(self._actor), weights.actor_tensors
+        job.critic, job.critic_layers = self._critic, len(self._critic)
+        job.critics, job.critic_tensors = weights.critics, weights.critic_tensors
+        job.tensors = weights.table()
+        job.max_norm, job.tau = self.max_grad_norm, self.tau
+        return call
+
+    def _run(self, call: FusedCall, first: int, steps: int) -> Tensor:
+        """Makes some of the steps; returns what was measured, [3, steps, R]."""
+        losses = torch.zeros(3, steps, self.runs, dtype=self._dtype)
+        noise, adam = call.draw_noise(steps), self._adam(steps)  # memory that the job points to
+        job = call.job
+        job.first_step, job.steps, job.losses, job.adam = first, steps, losses.data_ptr(), adam
+        self._steps(ctypes.addressof(job))
+        del noise
+        return losses
+
+    def _adam(self, steps: int) -> Any:
+        """Adam's numbers for each step."""
+        (group,) = self.optimizer.param_groups
+        count, rate, (beta1, beta2) = self._weights.steps, float(group["lr"]), group["betas"]
+        kind = self._kinds.adam
+        numbers = [
+            kind(
+                *bias_corrections(count + step, rate, (beta1, beta2)),
+                beta2,
+                1 - beta1,
+                1 - beta2,
+                group["eps"],
+            )
+            for step in range(1, steps + 1)
+        ]
+        # As its step() would: schedulers of learning rates ask for it.
+        self.optimizer._opt_called = True  # type: ignore[attr-defined]
+        return (kind * steps)(*numbers)
+
+    def _layers(self, name: str | None) -> Any:
+        layers = [] if name is None else layers_of(network_of(getattr(self.loss, name)))
+        assert layers is not None  # asked by why_not_fused
+        return (Layer * len(layers))(*layers)
+
+    def _check(self, rows: TensorDictBase) -> None:
+        """What may change after the learner was made."""
+        if self.loss.reduction not in ("mean", "none"):
+            raise ValueError(f"reduction={self.loss.reduction!r} cannot be fused: use LossLearner")
+        if not all(parameter.requires_grad for parameter in self._weights.parameters):
+            raise ValueError("parameters were frozen, but a fused step trains all of them: use LossLearner")
+        own = self.loss.loss_mask_key
+        for key in AUTO_LOSS_MASK_KEYS if own == "auto" else () if own is None else (own,):
+            if rows.get(key, None) is not None:
+                raise ValueError(
+                    f"a fused step learns from all rows, but {key!r} masks some: use LossLearner, or set "
+                    "loss.loss_mask_key = None"
+                )
+        self._check_adam(None)
+
+    def _check_adam(self, loss: LossModule | None) -> None:
+        if not is_plain_adam(self.optimizer, loss):
+            raise ValueError(
+                "only a plain torch.optim.Adam can be fused, with one group of exactly the loss's "
+                f"parameters and without hooks, got {self.optimizer}"
+            )
+
+
+def bias_corrections(count: float, learning_rate: float, betas: tuple[float, float]) -> tuple[float, float]:
+    """Adam's step size at step number ``count``, and the divisor of the root of its second moment.
+
+    Example:
+        >>> [round(number, 6) for number in bias_corrections(1, 0.001, (0.9, 0.999))]
+        [0.01, 0.031623]
+    """
+    return learning_rate / (1.0 - betas[0] ** count), math.sqrt(1.0 - betas[1] ** count)

@@ -1,0 +1,184 @@
+"""One update as compiled gradient steps see it: transitions, random numbers and settings as memory."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_her.native.job import Algorithm, Structures
+from torchrl_her.replay_buffers.keys import under_next
+from torchrl_her.replay_buffers.n_steps import STEPS_KEY
+
+# OpenMP's threads are not there in a process that was forked; starting them anew hangs.
+_FORKED: list[bool] = []
+os.register_at_fork(after_in_child=lambda: _FORKED.append(True))
+
+_DRAWS = {
+    Algorithm.TD3: 1,
+    Algorithm.SAC: 2,
+}  # random numbers of a step: of next actions, then of present ones
+
+
+class FusedCall:
+    """The job of one update. Its attributes keep the memory that it points to.
+
+    Args:
+        loss: whose numbers are read anew for each update, since they may be scheduled.
+        algorithm: the steps.
+        kinds: the structures for the type of the weights.
+        rows: [R, S * B] transitions of R runs.
+        steps: S.
+        runs: R.
+
+    Keyword Args:
+        inputs: width of all that the networks see together.
+        actions: width of the action, or how many discrete ones there are.
+        keys: the entries that the networks see.
+        action_key: where the action is.
+
+    Raises:
+        ValueError: an entry has another width, or a discrete action is none of those that there are.
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        algorithm: Algorithm,
+        kinds: Structures,
+        rows: TensorDictBase,
+        steps: int,
+        runs: int,
+        *,
+        inputs: int,
+        actions: int,
+        keys: Sequence[NestedKey],
+        action_key: NestedKey,
+    ) -> None:
+        self._loss, self._algorithm, self._kinds, self._runs, self._actions = (
+            loss,
+            algorithm,
+            kinds,
+            runs,
+            actions,
+        )
+        self._dtype = torch.float32 if kinds.real is ctypes.c_float else torch.float64
+        count = rows.numel() // runs
+        self.job = kinds.job()
+        self._kept: list[Tensor] = []
+        self.priorities = torch.zeros(runs, count, dtype=self._dtype)
+        job = self.job
+        job.algorithm, job.runs, job.rows, job.batch = algorithm, runs, count, count // steps
+        job.threads, job.actions = 1 if _FORKED else max(1, min(runs, torch.get_num_threads())), actions
+        job.priorities = self._keep(self.priorities)
+        self._read_settings()
+        self._read_rows(rows, inputs, keys, action_key)
+
+    def set_idle(self, idle: Sequence[int]) -> None:
+        """Chooses runs that do not learn."""
+        flags = torch.zeros(self._runs, dtype=torch.uint8)
+        flags[list(idle)] = 1
+        self.job.idle = self._keep(flags)
+
+    def draw_noise(self, steps: int) -> Tensor | None:
+        """The random numbers of some steps, in the order in which TorchRL's loss would draw them."""
+        kinds = _DRAWS.get(self._algorithm, 0)
+        if kinds == 0:
+            return None
+        drawn = torch.empty(kinds, steps, self._runs, self.job.batch, self._actions, dtype=self._dtype)
+        for step in range(steps):
+            for kind in range(kinds):
+                drawn[kind, step] = self._loss.noise(drawn[kind, step])
+        self.job.noise, self.job.own_noise = drawn[0].data_ptr(), drawn[-1].data_ptr()
+        return drawn
+
+    def _keep(self, tensor: Tensor) -> int:
+        """The address of a tensor, which stays as long as this object."""
+        self._kept.append(tensor)
+        return tensor.data_ptr()
+
+    def _read_settings(self) -> None:
+        job, loss, estimator = self.job, self._loss, self._loss.value_estimator
+        job.gamma = float(estimator.gamma)
+        job.least, job.greatest = getattr(estimator, "low", -math.inf), getattr(estimator, "high", math.inf)
+        job.penalty = getattr(loss, "action_penalty", 0.0)
+        if self._algorithm is Algorithm.TD3:
+            job.policy_noise, job.noise_limit = loss.target_noise, loss.target_noise_clip
+            self._read_bounds(loss.min_action, loss.max_action)
+        elif self._algorithm is Algorithm.SAC:
+            job.target_entropy = float(loss.target_entropy)
+            bounds = loss.actor_network[1].distribution_kwargs
+            self._read_bounds(bounds.get("low", -1.0), bounds.get("high", 1.0))
+
+    def _read_bounds(self, low: Any, high: Any) -> None:
+        self.job.low, self.job.high = (
+            self._keep(torch.as_tensor(own).to(self._dtype).expand(self._actions).contiguous())
+            for own in (low, high)
+        )
+
+    def _read_rows(
+        self, rows: TensorDictBase, inputs: int, keys: Sequence[NestedKey], action_key: NestedKey
+    ) -> None:
+        job = self.job
+        job.entries = len(keys)
+        job.seen, job.next_seen = (
+            self._joined(rows, own, inputs) for own in (keys, [under_next(key) for key in keys])
+        )
+        action = rows.get(action_key)
+        if self._algorithm is Algorithm.DQN:
+            whole = not (action.is_floating_point() or action.dtype == torch.bool)
+            if action.numel() != self.priorities.numel() or not whole:
+                raise ValueError(
+                    f"{action_key!r} must be the number of an action in each row, got {action.dtype} "
+                    f"of shape {list(action.shape)}"
+                )
+            choice = action.reshape(-1).to(torch.int64).contiguous()
+            if not 0 <= int(choice.min()) <= int(choice.max()) < self._actions:
+                raise ValueError(
+                    f"actions must be from 0 to {self._actions - 1}, got {choice.unique().tolist()}"
+                )
+            job.choice = self._keep(choice)
+        else:
+            job.action = self._entry(action, self._actions, action_key)
+        job.reward = self._entry(rows.get(("next", "reward")), 1, ("next", "reward"))
+        terminated = rows.get(("next", "terminated"), None)
+        if terminated is None:  # as TorchRL's targets
+            terminated = rows.get(("next", "done"))
+        job.terminated = self._entry(terminated, 1, ("next", "terminated"), torch.bool)
+        weight = rows.get("priority_weight", None)
+        if weight is not None and self._loss.use_prioritized_weights in (True, "auto"):
+            job.weight = self._entry(weight, 1, "priority_weight")
+        span = rows.get(self._loss.value_estimator.tensor_keys.steps_to_next_obs, None)
+        if span is not None:
+            # with the loss's own tensor: so powers are rounded as TorchRL's are
+            discount = self._loss.value_estimator.gamma.to(span.device) ** span
+            job.discount = self._entry(discount, 1, STEPS_KEY)
+
+    def _joined(self, rows: TensorDictBase, keys: Sequence[NestedKey], inputs: int) -> Any:
+        """The entries that networks see, which the steps join."""
+        values = [rows.get(key) for key in keys]
+        width = sum(value.shape[-1] for value in values)
+        if width != inputs:
+            raise ValueError(f"{list(keys)} must have {inputs} columns together, got {width}")
+        kind = self._kinds.entry
+        entries = [
+            kind(self._entry(value, value.shape[-1], key), value.shape[-1])
+            for key, value in zip(keys, values, strict=True)
+        ]
+        return (kind * len(entries))(*entries)
+
+    def _entry(self, value: Tensor, width: int, name: NestedKey, dtype: torch.dtype | None = None) -> int:
+        """The address of an entry [R, S * B, width], in the type of the weights unless told otherwise."""
+        if value.device.type != "cpu":
+            raise ValueError(f"{name!r} must be on the CPU to be fused, got it on {value.device}")
+        own = value.to(dtype or self._dtype).contiguous()
+        if own.numel() != self.priorities.numel() * width:
+            raise ValueError(f"{name!r} must have {width} columns, got a shape of {list(value.shape)}")
+        return self._keep(own)

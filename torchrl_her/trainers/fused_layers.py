@@ -1,0 +1,66 @@
+"""A network's modules as the layers that compiled gradient steps know."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import nn
+
+from torchrl_her.modules.networks import ActorNet, CriticNet, StackedLayerNorm, StackedLinear
+from torchrl_her.modules.q_actor import QNet
+from torchrl_her.modules.stochastic_actor import StochasticActorNet
+from torchrl_her.native.job import Activation, Layer
+
+_NETWORKS = (ActorNet, CriticNet, QNet, StochasticActorNet)
+_ACTIVATIONS = {nn.ReLU: Activation.RELU, nn.Tanh: Activation.TANH, nn.ELU: Activation.ELU}
+
+
+def layers_of(net: nn.Module) -> list[Layer] | None:
+    """The layers of one of this library's networks, from its input on; None if it has others.
+
+    The parameters of the layers, in the same order, are ``net.named_parameters()``: weight and bias, and
+    behind them scale and shift of a layer normalization.
+
+    Args:
+        net: exactly one of this library's types, since a subclass may compute something else.
+
+    Example:
+        >>> [(layer.inputs, layer.outputs, layer.joined) for layer in layers_of(CriticNet(4, 2, hidden=8))]
+        [(4, 8, 0), (10, 8, 2), (8, 8, 0), (8, 1, 0)]
+    """
+    if type(net) not in _NETWORKS:
+        return None
+    layers: list[Layer] = []
+    fresh = False  # whether the last layer may still get a normalization, or an activation
+    for module in net.modules():
+        if module is net or type(module) is nn.Sequential:
+            continue
+        if type(module) is StackedLinear:
+            inputs, outputs = module.weight.shape[-2:]
+            joined = inputs - layers[-1].outputs if layers else 0
+            layers.append(Layer(inputs, outputs, joined, Activation.NONE, 0))
+            fresh = True
+        elif type(module) is StackedLayerNorm and fresh and not layers[-1].normalized:
+            layers[-1].normalized = 1
+        elif type(module) in _ACTIVATIONS and fresh and _is_plain(module):
+            layers[-1].activation, fresh = _ACTIVATIONS[type(module)], False
+        else:
+            return None
+    return layers
+
+
+def parameter_shapes(layers: Sequence[Layer]) -> list[tuple[int, int]]:
+    """The last two dimensions of the parameters that layers have, in order.
+
+    Example:
+        >>> parameter_shapes(layers_of(ActorNet(4, 2, hidden=8, depth=2, norm="layer")))[:4]
+        [(4, 8), (1, 8), (1, 8), (1, 8)]
+    """
+    shapes = []
+    for layer in layers:
+        shapes += [(layer.inputs, layer.outputs), *[(1, layer.outputs)] * (3 if layer.normalized else 1)]
+    return shapes
+
+
+def _is_plain(module: nn.Module) -> bool:
+    return not isinstance(module, nn.ELU) or module.alpha == 1.0

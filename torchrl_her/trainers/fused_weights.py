@@ -1,0 +1,141 @@
+"""The tensors that compiled gradient steps change: a loss's weights, their targets and Adam's moments."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from torchrl_her.native.job import Algorithm, Structures
+from torchrl_her.trainers.fusing import FUSED
+
+State = dict[str, Tensor]
+
+_STATE = ("exp_avg", "exp_avg_sq", "step")  # what Adam keeps of a parameter
+
+
+class FusedWeights:
+    """The weights of a loss, network by network, as memory that the steps work on.
+
+    A stack of N critics has parameters [N, R, ...]; for the steps these are N networks.
+
+    Args:
+        loss: one that can be fused.
+        optimizer: a plain Adam over its parameters.
+        kinds: the structures for the type of its weights.
+
+    Attributes:
+        parameters: of the actor, the critics and SAC's temperature.
+        actor_tensors, critic_tensors: how many of them an actor and a critic have.
+        critics: N.
+    """
+
+    def __init__(self, loss: LossModule, optimizer: torch.optim.Optimizer, kinds: Structures) -> None:
+        self._optimizer, self._kinds, fused = optimizer, kinds, FUSED[type(loss)]
+        self._dtype = torch.float32 if kinds.real is ctypes.c_float else torch.float64
+        is_sac = fused.algorithm is Algorithm.SAC
+        self.critics: int = 0 if fused.critic is None else getattr(loss, "num_qvalue_nets", 1)
+        actor = _tensors(loss, fused.actor, delayed=not is_sac)  # SAC has no delayed actor
+        critic = [] if fused.critic is None else _tensors(loss, fused.critic, delayed=True)
+        stacked = hasattr(loss, "num_qvalue_nets")
+        self.actor_tensors, self.critic_tensors = len(actor), len(critic)
+        temperature = [(loss.log_alpha, None)] if is_sac else []
+        self.parameters: list[nn.Parameter] = [own for own, _ in (*actor, *critic, *temperature)]
+        # Each tensor of each network: which parameter, its target, and which of how many critics in it.
+        self._places = [
+            *((own, delayed, 0, 1) for own, delayed in actor),
+            *(
+                (own, delayed, n, self.critics if stacked else 1)
+                for n in range(self.critics)
+                for own, delayed in critic
+            ),
+            *((own, delayed, 0, 1) for own, delayed in temperature),
+        ]
+        self._memory: list[tuple[int, list[Tensor]]] = []  # what the table was made of
+        self._table: Any = None
+
+    def table(self) -> Any:
+        """The addresses of all tensors, found anew if some were replaced, as by loading a checkpoint.
+
+        Raises:
+            ValueError: tensors do not fit each other, are not contiguous, not on the CPU or of another type
+                than when the learner was made; or Adam's counts of steps differ.
+        """
+        states = [self._optimizer.state[own] or self._start(own) for own in self.parameters]
+        if not self._memory or not all(
+            own.data_ptr() == address
+            and all(state[name] is kept for name, kept in zip(_STATE, tensors, strict=True))
+            for own, state, (address, tensors) in zip(self.parameters, states, self._memory, strict=True)
+        ):
+            for state in states:
+                state["step"] = state["step"].to(torch.float32)  # float64 where that is torch's default
+            self._check(states)
+            self._memory = [
+                (own.data_ptr(), [state[name] for name in _STATE])
+                for own, state in zip(self.parameters, states, strict=True)
+            ]
+            rows = [self._row(*place, self._optimizer.state[place[0]]) for place in self._places]
+            kind = self._kinds.tensors
+            self._table = (kind * len(rows))(*(kind(*row) for row in rows))
+        return self._table
+
+    def _check(self, states: Sequence[State]) -> None:
+        """Raises a ValueError for memory that the steps must not touch."""
+        for parameter, target, *_ in self._places:
+            moments = (self._optimizer.state[parameter][name] for name in _STATE[:2])
+            for tensor in (parameter, target, *moments):
+                if tensor is None:
+                    continue
+                fits = tensor.shape == parameter.shape and tensor.dtype == self._dtype
+                if not (fits and tensor.device.type == "cpu" and tensor.is_contiguous()):
+                    raise ValueError(
+                        "a parameter's target and moments must be like it, contiguous and on the CPU, "
+                        f"{self._dtype} of shape {list(parameter.shape)}; got {tensor.dtype} of shape "
+                        f"{list(tensor.shape)} on {tensor.device}: make the learner after moving the loss, "
+                        "and load states of the same networks"
+                    )
+        counts = {float(state["step"]) for state in states}
+        if len(counts) > 1:
+            raise ValueError(f"Adam must have made as many steps for each parameter, got {sorted(counts)}")
+
+    @property
+    def steps(self) -> float:
+        """How many steps Adam has made."""
+        return float(self._optimizer.state[self.parameters[0]]["step"])
+
+    def _start(self, parameter: nn.Parameter) -> State:
+        """The first state of a parameter, as Adam itself makes it at its first step."""
+        state: State = self._optimizer.state[parameter]
+        state["step"] = torch.zeros((), dtype=torch.float32)
+        state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter.data) for _ in range(2))
+        return state
+
+    @staticmethod
+    def _row(
+        parameter: nn.Parameter, target: Tensor | None, critic: int, critics: int, state: State
+    ) -> Sequence[Any]:
+        height, width = parameter.shape[-2:] if parameter.ndim > 1 else (1, 1)
+        offset = critic * (parameter.numel() // critics)
+        tensors = (parameter, target, state["exp_avg"], state["exp_avg_sq"])
+        counter = state["step"].data_ptr() if critic == 0 else None  # a stack of critics has one
+        return height, width, *(_address(each, offset) for each in tensors), counter
+
+
+def _tensors(loss: LossModule, network: str, *, delayed: bool) -> list[tuple[nn.Parameter, Tensor | None]]:
+    """A network's parameters and their targets, in the order of its layers."""
+    names = [name for name, _ in getattr(loss, network).named_parameters()]
+    online = getattr(loss, f"{network}_params").flatten_keys(".")
+    if not delayed:
+        return [(online[name], None) for name in names]
+    targets = getattr(loss, f"target_{network}_params").flatten_keys(".")
+    return [(online[name], targets[name]) for name in names]
+
+
+def _address(tensor: Tensor | None, offset: int) -> int | None:
+    if tensor is None:
+        return None
+    return tensor.data_ptr() + offset * tensor.element_size()
