@@ -17,6 +17,7 @@ import torch
 from machine import describe, publish, table
 
 from torchrl_her import save_checkpoint
+from torchrl_her.replay_buffers import sizes_of
 from torchrl_her_recipes import Recipe, build, make_recipe
 from torchrl_her_recipes.runs.state import run_state
 
@@ -35,7 +36,7 @@ def measure(recipe: Recipe, folder: Path) -> list[str]:
             save_checkpoint(run_state(components, trainer), path, keep=recipe.run.keep_checkpoints)
             saved.append(time.perf_counter() - began)
     trained -= trainer.learner.compile_seconds  # once in the life of a machine
-    rows = statistics.mean(len(buffer) for buffer in components.buffers)
+    rows = statistics.mean(sizes_of(components.buffer))
     return [
         str(recipe.run.num_runs),
         f"{rows:,.0f}",

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -24,19 +25,58 @@ def describe(*packages: str) -> str:
     return f"{model}, {os.cpu_count()} cores, one thread used; Python {platform.python_version()}, {versions}"
 
 
-def medians(contenders: Mapping[str, Callable[[], int]], *, repeats: int) -> dict[str, float]:
+@contextlib.contextmanager
+def one_core(core: int | None = None) -> Iterator[None]:
+    """Keeps this process with all its threads on one core meanwhile, where systems allow that.
+
+    Enter it before libraries make their threads, so that they count one core. XLA is told to use one thread.
+
+    Args:
+        core: its number; the last one that the process may use if None.
+    """
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    _stay_on({max(before) if core is None else core})
+    try:
+        yield
+    finally:
+        _stay_on(before)
+
+
+def _stay_on(cores: set[int]) -> None:
+    for thread in os.listdir("/proc/self/task"):  # each has cores of its own
+        with contextlib.suppress(ProcessLookupError):  # it has just ended
+            os.sched_setaffinity(int(thread), cores)
+
+
+CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
+
+
+def medians(
+    contenders: Mapping[str, Callable[[], int]], *, repeats: int, clock: str = "wall", warm_up: int = 0
+) -> dict[str, float]:
     """Seconds for one piece of work of each contender: the median of repeats taken in turns.
 
     Args:
         contenders: each does some work and returns how many pieces it was.
         repeats: of each.
+        clock: wall, or cpu: the time that the process was given, which other work on its core leaves alone.
+        warm_up: how often each does its work before that, to compile what it compiles.
     """
+    now = CLOCKS[clock]
+    for work in contenders.values():
+        for _ in range(warm_up):
+            work()
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(repeats):
         for name, work in contenders.items():
-            began = time.perf_counter()
+            began = now()
             pieces = work()
-            seconds[name].append((time.perf_counter() - began) / pieces)
+            seconds[name].append((now() - began) / pieces)
     return {name: statistics.median(values) for name, values in seconds.items()}
 
 

@@ -14,7 +14,9 @@ from pathlib import Path
 PARTS = {
     "env_speed": "Environments",
     "writer_speed": "Writing with hindsight",
+    "replay_speed": "Replay of several runs in one buffer",
     "update_speed": "Gradient steps and the whole loop",
+    "parallel.processes": "Collecting in processes",
     "ibs_update": "How often q is brought up to date",
     "memory": "Memory",
     "startup": "Start-up",
@@ -43,9 +45,8 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             table = Path(folder) / "table.md"
             failed |= bool(import_module(name).main(["--out", str(table)]))
-            sections.append(
-                f"## {PARTS[name]}\n\n`python benchmarks/{name}.py`\n\n{table.read_text().strip()}"
-            )
+            command = f"python benchmarks/run.py {name}" if "." in name else f"python benchmarks/{name}.py"
+            sections.append(f"## {PARTS[name]}\n\n`{command}`\n\n{table.read_text().strip()}")
         options.out.write_text("\n\n".join(sections) + "\n")  # what there is, should a later part fail
     print(f"\nreport: {options.out}")
     return int(failed)

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import torch
 from machine import describe, publish, table
 from matplotlib.figure import Figure
-from peer_sb3 import make_sb3
+from peers.sb3 import make_sb3
 from tensordict import TensorDictBase
 
 from torchrl_her import evaluate, success

@@ -1,149 +1,172 @@
-"""Gradient steps and the whole training loop, beside TorchRL's own pieces and Stable-Baselines3, in one run.
+"""Gradient steps and the whole training loop beside SBX, Stable-Baselines3 and TorchRL's own pieces.
 
     python benchmarks/update_speed.py --out update_speed.md
+    python benchmarks/update_speed.py --tables steps --repeats 15
 
-An update counts everything: drawing rows, loss, backward, optimizer, target networks, priorities.
-Stable-Baselines3 (the extra `bench`) has no prioritized replay and relabels while it samples.
+All train in one process on one core, in turns, after each has compiled what it compiles. They have the same
+task, number of environments, networks (three hidden layers), batches, discount, learning rate, target updates
+and share of virtual transitions, and collect as many frames between two rounds of as many gradient steps.
+Beneath the tables stands what differs.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
-from machine import describe, medians, publish, table
-from peer_sb3 import make_sb3
-from stable_baselines3 import DDPG
+from machine import CLOCKS, describe, medians, one_core, table
+from peers.ours import Ours, OursTD3, TorchRLPieces
+from peers.peer import Peer
+from peers.sb3 import SB3DDPG, SB3TD3
+from peers.sbx_td3 import SBXTD3
 
-from torchrl_her import LossLearner, Trainer
-from torchrl_her_recipes import build, make_recipe
+from torchrl_her_recipes import Recipe, make_recipe
 
-TASK, ENVS, BATCH = "hand_v0", 64, 64
-FILL = 6_400  # frames in the buffers before anything is timed
-UPDATES = 40  # in one measurement
+TASK = "hand_v1"
+FILL = 20_480  # frames in the buffers before anything is timed
+STEPS = 200  # gradient steps in one measurement
+RUNS = 15
 
-
-def ours(
-    runs: int,
-    *,
-    frames_per_update: float = 20.0,
-    fused: bool = True,
-    per_draw: int = 8,
-    batch: int = BATCH,
-    compiled: str = "always",
-) -> Trainer:
-    """A trainer with filled buffers."""
-    recipe = make_recipe(
-        task=TASK,
-        algo="her",
-        num_runs=runs,
-        num_envs=ENVS,
-        batch_size=batch,
-        frames_per_update=frames_per_update,
-        batches_per_sample=per_draw,
-        epoch_frames=FILL,
-        warmup_frames=FILL,
-        buffer_size=200_000,
-        episodes=1,
-        compile=compiled,
-    )
-    components = build(recipe)
-    trainer = components.trainer()
-    if not fused:
-        trainer.learner = LossLearner(components.loss, components.optimizer, components.target, runs=runs)
-    trainer.epoch()
-    return trainer
+STEP_SETTINGS = ((64, 64), (64, 256), (256, 256))  # width of the hidden layers, batch
+STEP_PEERS: tuple[type[Peer], ...] = (Ours, OursTD3, SBXTD3, SB3DDPG, SB3TD3, TorchRLPieces)
+LOOP_SETTINGS = tuple((batch, frames) for batch in (64, 256) for frames in (1, 5, 20))  # frames for a step
+LOOP_PEERS: tuple[type[Peer], ...] = (Ours, SBXTD3, SB3DDPG)
+ROUNDS = {1: 1, 5: 5, 20: 10}  # rounds in one measurement, by frames for a gradient step
+ENV_COUNTS = (1, 8, 16, 64, 160)
 
 
-def updates_of(trainer: Trainer) -> Callable[[], int]:
-    """Gradient steps alone, with their rows and priorities."""
+class Timing(NamedTuple):
+    """How to measure."""
 
-    def work() -> int:
-        trainer._credit = float(UPDATES)
-        trainer._learn()
-        return UPDATES
+    repeats: int
+    clock: str
 
-    return work
-
-
-def frames_of(trainer: Trainer, frames: int) -> Callable[[], int]:
-    """The whole loop, for some environment steps of one run."""
-
-    def work() -> int:
-        before = trainer.frames
-        trainer.run(frames)
-        return trainer.frames - before
-
-    return work
+    def medians(self, contenders: Mapping[str, Callable[[], int]]) -> dict[str, float]:
+        """Seconds for a piece of work of each contender."""
+        return medians(contenders, repeats=self.repeats, clock=self.clock, warm_up=2)
 
 
-def sb3(*, gradient_steps: int) -> DDPG:
-    """Stable-Baselines3's model with its buffer filled."""
-    recipe = make_recipe(task=TASK, num_envs=ENVS, batch_size=BATCH, warmup_frames=FILL)
-    model = make_sb3(recipe, gradient_steps=gradient_steps)
-    model.learn(FILL + ENVS)
-    return model
+def recipe_for(**options: Any) -> Recipe:
+    """A long run, in which ``compile=auto`` compiles whatever gains by it."""
+    return make_recipe(task=TASK, algo="her", episodes=1, epochs=1_000, **options)
 
 
-def sb3_updates(model: DDPG) -> Callable[[], int]:
-    def work() -> int:
-        model.train(gradient_steps=UPDATES, batch_size=BATCH)
-        return UPDATES
-
-    return work
+def frames_in_round(recipe: Recipe) -> int:
+    """What is collected between two rounds of gradient steps."""
+    return recipe.collection.num_envs * recipe.collection.steps_per_batch
 
 
-def sb3_frames(model: DDPG, frames: int) -> Callable[[], int]:
-    def work() -> int:
-        before = model.num_timesteps
-        model.learn(frames, reset_num_timesteps=False)
-        return model.num_timesteps - before
-
-    return work
+def filled(peer: Peer) -> Peer:
+    peer.fill(FILL)
+    return peer
 
 
-def update_table(repeats: int) -> str:
-    names = ("this, one run", "this, 15 runs", "TorchRL's loss and buffer", "Stable-Baselines3")
-    trainers = (ours(1), ours(15), ours(1, fused=False, per_draw=1))
-    work = [*(updates_of(trainer) for trainer in trainers), sb3_updates(sb3(gradient_steps=1))]
-    seconds = medians(dict(zip(names, work, strict=True)), repeats=repeats)
-    seconds[names[1]] /= 15
-    peer = seconds[names[-1]]
-    rows = [[name, f"{peer / value:.1f}x", f"{1e3 * value:.2f}"] for name, value in seconds.items()]
-    return table(("update", "rate over Stable-Baselines3", "ms for an update of one run"), rows)
+def times(one: float, other: float) -> str:
+    return f"{one / other:.2f}x"
 
 
-def loop_table(repeats: int) -> str:
+def differences(peers: Sequence[type[Peer]]) -> str:
+    return "What differs:\n\n" + "\n".join(f"- **{peer.name}**: {peer.differs}" for peer in peers)
+
+
+def steps_table(timing: Timing) -> str:
+    """Gradient steps, with everything that belongs to them."""
     rows = []
-    for label, frames_per_update, steps, frames in (("20", 20.0, 3, 3_200), ("1", 1.0, 64, 640)):
-        # 64 frames make 3.2 updates: Stable-Baselines3, which counts in whole ones, does 3
-        contenders = {
-            "this": frames_of(ours(1, frames_per_update=frames_per_update), frames),
-            "Stable-Baselines3": sb3_frames(sb3(gradient_steps=steps), frames),
-        }
-        seconds = medians(contenders, repeats=repeats)
-        this, peer = seconds.values()
-        rows.append([label, f"{peer / this:.1f}x", f"{1 / this:,.0f}", f"{1 / peer:,.0f}"])
-    header = ("frames for each update", "rate over Stable-Baselines3", "this, frames/s", "Stable-Baselines3")
+    for hidden, batch in STEP_SETTINGS:
+        recipe = recipe_for(hidden=hidden, batch_size=batch)
+        peers = [filled(kind(recipe)) for kind in STEP_PEERS]
+        seconds = timing.medians({peer.name: partial(peer.gradient_steps, STEPS) for peer in peers})
+        sbx, sb3 = seconds[SBXTD3.name], seconds[SB3DDPG.name]
+        ddpg, td3 = seconds[Ours.name], seconds[OursTD3.name]
+        ratios = (times(sbx, td3), times(sbx, ddpg), times(sb3, ddpg))
+        milliseconds = (f"{1e3 * own:.2f}" for own in seconds.values())
+        rows.append([f"3 x {hidden}, batch {batch}", *ratios, *milliseconds])
+    header = (
+        "gradient step",
+        "TD3, rate over SBX's TD3",
+        "DDPG, rate over SBX's TD3",
+        "DDPG, rate over Stable-Baselines3's",
+    )
+    columns = (*header, *(f"{kind.name}, ms" for kind in STEP_PEERS))
+    asked = f"Each is asked for {STEPS} gradient steps in one call."
+    return "\n\n".join((table(columns, rows), asked, differences(STEP_PEERS)))
+
+
+def loop_table(timing: Timing) -> str:
+    """Playing, storing and learning."""
+    rows = []
+    for batch, frames_per_update in LOOP_SETTINGS:
+        recipe = recipe_for(batch_size=batch, frames_per_update=frames_per_update)
+        frames = ROUNDS[frames_per_update] * frames_in_round(recipe)
+        peers = [filled(kind(recipe)) for kind in LOOP_PEERS]
+        seconds = timing.medians({peer.name: partial(peer.loop, frames) for peer in peers})
+        ours, sbx, sb3 = (seconds[kind.name] for kind in LOOP_PEERS)
+        rates = (f"{1 / own:,.0f}" for own in seconds.values())
+        rows.append([str(batch), str(frames_per_update), times(sbx, ours), times(sb3, ours), *rates])
+    header = ("batch", "frames for a gradient step", "DDPG over SBX's TD3", "over Stable-Baselines3's DDPG")
+    columns = (*header, *(f"{kind.name}, frames/s" for kind in LOOP_PEERS))
+    recipe = recipe_for()
+    note = (
+        f"{frames_in_round(recipe)} frames of {recipe.collection.num_envs} environments are collected "
+        "between two rounds of gradient steps. Our environments are stepped as a batch and have exploration; "
+        "those of the others are lean ones of plain Python (`peers/env.py`), without exploration."
+    )
+    return "\n\n".join((table(columns, rows), note, differences(LOOP_PEERS)))
+
+
+def envs_table(timing: Timing) -> str:
+    """With how many environments the others are fastest, where environments take the largest share."""
+    base = recipe_for(batch_size=64, frames_per_update=20)
+    in_round = frames_in_round(base)
+    recipes = {
+        str(count): base.replace(num_envs=count, steps_per_batch=in_round // count) for count in ENV_COUNTS
+    }
+    frames = ROUNDS[20] * in_round
+    rows = []
+    for kind in (SBXTD3, SB3DDPG):
+        peers = {count: filled(kind(recipe)) for count, recipe in recipes.items()}
+        seconds = timing.medians({name: partial(peer.loop, frames) for name, peer in peers.items()})
+        rows.append([kind.name, *(f"{1 / own:,.0f}" for own in seconds.values())])
+    header = ("frames/s, batch 64, 20 frames for a step", *(f"{count} environments" for count in ENV_COUNTS))
     return table(header, rows)
 
 
-def runs_table(repeats: int) -> str:
+def runs_table(timing: Timing) -> str:
+    """Fifteen runs beside one."""
     rows = []
     for batch in (64, 256):
-        contenders = {
-            runs: frames_of(
-                ours(runs, batch=batch, compiled="never" if runs * batch > 2_000 else "always"), 1_280
-            )
-            for runs in (1, 15)
-        }
-        seconds = medians({str(runs): work for runs, work in contenders.items()}, repeats=repeats)
-        one, fifteen = seconds.values()
-        rows.append([str(batch), f"{fifteen / one:.1f}x", f"{1 / one:,.0f}", f"{15 / fifteen:,.0f}"])
-    header = ("batch", "wall-clock of 15 runs over one", "one run, frames/s", "15 runs together, frames/s")
+        one, together = (filled(Ours(recipe_for(batch_size=batch, num_runs=runs))) for runs in (1, RUNS))
+        step, steps = timing.medians(
+            {"one": partial(one.gradient_steps, 80), "together": partial(together.gradient_steps, 80)}
+        ).values()
+        frame, frames = timing.medians(
+            {"one": partial(one.loop, 1_280), "together": partial(together.loop, 1_280)}
+        ).values()
+        milliseconds = (f"{1e3 * own:.2f}" for own in (step, steps / RUNS))
+        rates = (f"{own:,.0f}" for own in (1 / frame, RUNS / frames))
+        rows.append([str(batch), times(steps / RUNS, step), *milliseconds, times(frames, frame), *rates])
+    header = (
+        "batch",
+        f"a run's gradient step among {RUNS} over that of one run",
+        "ms, one run",
+        f"ms, each of {RUNS}",
+        f"loop: wall-clock of {RUNS} runs over one",
+        "one run, frames/s",
+        f"{RUNS} runs together, frames/s",
+    )
     return table(header, rows)
+
+
+TABLES: dict[str, Callable[[Timing], str]] = {
+    "steps": steps_table,
+    "loop": loop_table,
+    "envs": envs_table,
+    "runs": runs_table,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -153,14 +176,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--repeats", type=int, default=7, help="measurements of each, taken in turns (default: 7)"
     )
+    parser.add_argument(
+        "--tables", nargs="+", choices=TABLES, default=list(TABLES), help="some of them (default: all)"
+    )
+    parser.add_argument("--core", type=int, help="where to run (default: the last one)")
+    parser.add_argument(
+        "--clock", choices=CLOCKS, default="wall", help="cpu: for a core that is shared with other work"
+    )
     parser.add_argument("--out", type=Path, help="write the tables to this file, too")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)  # as in runs
-    machine = describe("torch", "torchrl", "stable-baselines3")
-    tables = (update_table, loop_table, runs_table)
-    text = "\n\n".join((machine, *(make(options.repeats) for make in tables)))
-    publish(text, options.out)
+    parts = [describe("torch", "torchrl", "stable-baselines3", "sbx-rl", "jax")]
+    print(parts[0], flush=True)
+    with one_core(options.core):
+        for name in options.tables:
+            parts.append(TABLES[name](Timing(options.repeats, options.clock)))
+            print(f"\n{parts[-1]}", flush=True)
+    if options.out is not None:
+        options.out.write_text("\n\n".join(parts) + "\n")
 
 
 if __name__ == "__main__":

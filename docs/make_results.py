@@ -32,6 +32,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "curriculum": "curriculum",
     "climb": str(HERE / "studies" / "climb.yaml"),
     "draws": str(HERE / "studies" / "draws.yaml"),
+    "learners": str(HERE / "studies" / "learners.yaml"),
     "n_steps": "n_steps",
     "window": "window",
     "initialisation": "initialisation",

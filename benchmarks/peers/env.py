@@ -20,9 +20,9 @@ from torchrl_her_envs import Task, WorldConfig
 Observation = dict[str, Any]  # arrays
 Point = tuple[float, float]
 
-BORDER = 0.5  # metres: half the thickness of the screen's sides
-SLOP = 1e-3  # metres that a ball may sink into a surface
-PARKED = (1.0, 3.0)  # metres: where a ball touches nothing
+BORDER = 0.5  # meters: half the thickness of the screen's sides
+SLOP = 1e-3  # meters that a ball may sink into a surface
+PARKED = (1.0, 3.0)  # meters: where a ball touches nothing
 
 
 class PeerEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -115,7 +115,7 @@ class PeerEnv(gymnasium.Env[Observation, np.ndarray]):
     def place(
         self, *, hand: Point, hand_velocity: Point, ball: Point, ball_velocity: Point, goal: Point, held: bool
     ) -> None:
-        """Puts the world into a state, at the start of an episode; metres, but the goal as it is shown."""
+        """Puts the world into a state, at the start of an episode; meters, but the goal as it is shown."""
         self._hand, self._hand_velocity, self._goal = hand, hand_velocity, goal
         self._held = self._closed = held
         self._ball.position, self._ball.velocity = ball, ball_velocity

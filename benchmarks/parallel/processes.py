@@ -1,0 +1,157 @@
+"""Frames/s with a process that collects beside the learner, beside one process that does both in turn.
+
+    python benchmarks/run.py parallel.processes
+
+First one process alone tells how long collecting and learning take for each frame. From that follow the
+number of frames for each gradient step at which both take equally long, and the most that a second process
+can give: the sum of both times over the longer one. Then the loops take turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from machine import describe, publish, table
+
+from torchrl_her.trainers.trainer import Trainer
+from torchrl_her_recipes import Components, Recipe, build, make_recipe
+from torchrl_her_recipes.config.values import read_yaml
+
+PRESET = Path(__file__).parents[2] / "recipes/torchrl_her_recipes/conf/preset/fetch_push.yaml"
+BATCHES = 50  # of a timed piece: an epoch of the preset, whose first batch the learner waits for
+KINDS: dict[str, dict[str, Any]] = {
+    "one process": {},
+    "one collects, sync": {"processes": 1},
+    "one collects, async": {"processes": 1, "sync": False},
+}
+
+
+@dataclass
+class Shares:
+    """Seconds for each frame: of collecting, of writing, and of learning from it."""
+
+    collect: float
+    write: float
+    learn: float
+    frames_per_update: float
+
+    @property
+    def most(self) -> float:
+        """What a second process can give at most."""
+        other = self.write + self.learn
+        return (self.collect + other) / max(self.collect, other)
+
+    def balanced(self) -> float:
+        """The frames for each gradient step at which collecting takes as long as everything else."""
+        update = self.learn * self.frames_per_update
+        return max(round(update / (self.collect - self.write), 2), 0.05)
+
+
+class Loop:
+    """A training loop that goes on with each call."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.components: Components = build(recipe)
+        self.trainer: Trainer = self.components.trainer()
+        config = recipe.collection
+        self.frames = BATCHES * config.num_envs * config.steps_per_batch
+        self.trainer.run(config.warmup_frames + self.frames // 10)  # the memory is there then
+
+    def __call__(self) -> float:
+        """Frames/s of a timed piece."""
+        began = time.perf_counter()
+        self.trainer.run(self.frames)
+        return self.frames / (time.perf_counter() - began)
+
+    def shares(self) -> Shares:
+        """What takes how long, where one process does everything."""
+        trainer, seconds = self.trainer, {"collect": 0.0, "learn": 0.0}
+        with (
+            _timed(trainer.collector, "next", seconds, "collect"),
+            _timed(trainer, "_learn", seconds, "learn"),
+        ):
+            rate = self()
+        collect, learn = (own / self.frames for own in seconds.values())
+        return Shares(collect, 1.0 / rate - collect - learn, learn, trainer.frames_per_update)
+
+
+@contextmanager
+def _timed(owner: Any, name: str, seconds: dict[str, float], key: str) -> Iterator[None]:
+    work: Callable[..., Any] = getattr(owner, name)
+
+    def timed(*arguments: Any) -> Any:
+        began = time.perf_counter()
+        out = work(*arguments)
+        seconds[key] += time.perf_counter() - began
+        return out
+
+    setattr(owner, name, timed)
+    yield
+    delattr(owner, name)
+
+
+def compare(recipe: Recipe, repeats: int) -> tuple[Shares, dict[str, list[float]]]:
+    """The shares of one process, and frames/s of each loop, taken in turns."""
+    loops = {name: Loop(recipe.replace(**options)) for name, options in KINDS.items()}
+    shares = loops["one process"].shares()
+    rates: dict[str, list[float]] = {name: [] for name in loops}
+    for _ in range(repeats):
+        for name, loop in loops.items():
+            rates[name].append(loop())
+    for loop in loops.values():
+        loop.components.close()
+    return shares, rates
+
+
+def report(cases: dict[str, tuple[Shares, dict[str, list[float]]]]) -> str:
+    rows = []
+    for name, (shares, rates) in cases.items():
+        alone = statistics.median(rates["one process"])
+        gains = [f"{statistics.median(values) / alone:.2f}" for values in list(rates.values())[1:]]
+        whole = shares.collect + shares.write + shares.learn
+        parts = [f"{100 * part / whole:.0f} %" for part in (shares.collect, shares.write, shares.learn)]
+        rows.append(
+            [name, f"{shares.frames_per_update:g}", *parts, f"{alone:,.0f}", f"{shares.most:.2f}", *gains]
+        )
+    header = [
+        "setting",
+        "frames a gradient step",
+        "collecting",
+        "writing",
+        "learning",
+        "frames/s, one process",
+    ]
+    more = ["at most, times", "sync, times", "async, times"]
+    repeats = len(next(iter(cases.values()))[1]["one process"])
+    return (
+        f"FetchPush-v4 with the options of `preset=fetch_push`; medians of {repeats} pieces of {BATCHES} "
+        f"batches, taken in turns. {describe('torch', 'torchrl', 'gymnasium-robotics', 'mujoco')}\n\n"
+        + table([*header, *more], rows)
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--repeats", type=int, default=7, help="timed pieces of each loop")
+    parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
+    options = parser.parse_args(arguments)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    torch.set_num_threads(1)
+    preset = make_recipe(read_yaml(PRESET))
+    cases = {"the preset": compare(preset, options.repeats)}
+    balanced = preset.replace(frames_per_update=cases["the preset"][0].balanced())
+    cases["both take equally long"] = compare(balanced, options.repeats)
+    publish(report(cases), options.out)
+
+
+if __name__ == "__main__":
+    main()
