@@ -239,9 +239,9 @@ def report(task: str, parts: Sequence[str], difference: float, *, repeats: int, 
         [
             f"Environment steps a second of `{task}` with random actions and automatic resets; medians of "
             f"{repeats} runs taken in turns. Same starts and actions gave paths at most {difference:.0e} "
-            f"apart, for {' and '.join(map(str, CHECKED))} environments, beside a peer that finds contacts in "
-            f"our order and forgets them after each step (`exact=True`). The peer that is timed does neither, "
-            f"which is cheaper (`exact=False`): its bounces may differ.{timed}",
+            f"apart, for {' and '.join(map(str, CHECKED))} environments, beside a peer that finds contacts "
+            f"in our order and forgets them after each step (`exact=True`). The peer that is timed does "
+            f"neither, which is cheaper (`exact=False`): its bounces may differ.{timed}",
             f"{describe(*PACKAGES)}.",
             *parts,
         ]

@@ -53,8 +53,12 @@ nitpick_ignore_regex = [
     ("py:.*", r"(collections|pathlib|torch|tensordict|torchrl|numpy|gymnasium)\..*"),
     ("py:class", r"[^.]*"),  # types that are written as text
     ("py:obj", r"typing\.Literal\[.*"),
+    ("py:class", r"ctypes\..*"),
     # Types that appear in signatures and that nobody has to name.
     ("py:class", r"torchrl_her\.replay_buffers\.keys\.TransitionKeys"),
+    ("py:class", r"torchrl_her\.replay_buffers\.runs\.storage\.Field"),
+    ("py:class", r"torchrl_her\.native\.job\.Structures"),
+    ("py:class", r"torchrl_her_envs\.throwing\.arrays\.Array"),
     ("py:class", r"torchrl_her_envs\.throwing\.rendering\.render\.Scene"),
     ("py:class", r"torchrl_her_recipes\.components\.curricula\.CurriculumState"),
     ("py:class", r"torchrl_her_recipes\.studies\.(workers_local\.Workers|study\.StudyResult|plan\.Plan)"),

@@ -94,7 +94,7 @@ def put(env: ThrowingEnv, **values: Tensor) -> None:
 
 
 def joints_at(env: ThrowingEnv, point: Tensor) -> Tensor:
-    """The joints that bring the grip to a point [1, 2] in metres."""
+    """The joints that bring the grip to a point [1, 2] in meters."""
     if env.task.effector == "hand":
         return point
     base = torch.tensor(env.world.arm_base, dtype=torch.float64) * env.world.size

@@ -103,10 +103,27 @@ class BatchedEnv(TaskTraits, EnvBase):
         return state | {"key": torch.from_numpy(self._keys.view(np.int64).copy())}
 
     def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts the environments back to where :meth:`world_state_dict` was taken."""
+        """Puts the environments back to where :meth:`world_state_dict` was taken.
+
+        Raises:
+            ValueError: the state is of another number of environments, or of others than these; nothing has
+                changed then.
+        """
+        self._check_state(state)
         entries = {field.name: state[field.name].clone() for field in fields(self.worlds)}
         self.worlds = type(self.worlds)(**entries)
         self._keys = state["key"].numpy().copy().view(np.uint64)
+
+    def _check_state(self, state: dict[str, Tensor]) -> None:
+        """Raises a ValueError for a state whose entries are of other shapes than these environments'."""
+        own = {field.name: getattr(self.worlds, field.name).shape for field in fields(self.worlds)}
+        for name, shape in (own | {"key": torch.Size(self._keys.shape)}).items():
+            given = state[name].shape
+            if given[:1] != shape[:1]:
+                count = given[0] if given else 0
+                raise ValueError(f"the state must be of {shape[0]} environments, got {name!r} of {count}")
+            if given != shape:
+                raise ValueError(f"{name!r} of the state must be of shape {list(shape)}, got {list(given)}")
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
         """Seeds R equal blocks of environments, each as if it were alone.
@@ -173,7 +190,7 @@ class BatchedEnv(TaskTraits, EnvBase):
         return next_tensordict_out
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Begins new episodes where the old ones are over, as :meth:`EnvBase.maybe_reset` does.
+        """Begins new episodes where the old ones are over, as ``EnvBase.maybe_reset`` does.
 
         TorchRL's own takes longer than a step of a hundred environments, and with many of them there is an
         end in nearly every step. This one writes the new rows and checks nothing: they are known to be right.

@@ -6,6 +6,7 @@ others do. A generator with a state cannot give that; a hash of a counter can.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from numbers import Integral
 from typing import overload
@@ -67,11 +68,19 @@ def block_keys(seeds: Sequence[int], num_envs: int) -> np.ndarray:
 def as_seeds(seed: int | Sequence[int]) -> list[int]:
     """One seed, or several, as a list.
 
+    Raises:
+        TypeError: a seed that is not an integer.
+
     Example:
         >>> as_seeds(3), as_seeds([3, 4])
         ([3], [3, 4])
     """
-    return [int(seed)] if isinstance(seed, int | Integral) else [int(own) for own in seed]
+    if isinstance(seed, int | Integral):
+        return [int(seed)]
+    try:
+        return [operator.index(own) for own in seed]
+    except TypeError:
+        raise TypeError(f"a seed must be an integer, or several, got {seed!r}") from None
 
 
 @overload

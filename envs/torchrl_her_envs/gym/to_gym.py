@@ -39,6 +39,7 @@ class GoalRules:
         Returns:
             [...] of float: 0 where they are nearer than the task's threshold, -1 elsewhere.
         """
+        achieved_goal = np.asarray(achieved_goal)
         rewards = reward_of(self._achieved(achieved_goal, desired_goal))
         return rewards.astype(np.result_type(achieved_goal, np.float16))[()]
 
@@ -48,7 +49,8 @@ class GoalRules:
 
     def compute_truncated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
         """Never, whatever the goals: the time limit alone cuts episodes off. [...] of bool."""
-        return np.zeros(np.shape(achieved_goal)[:-1], np.bool_)[()]
+        shape = np.broadcast_shapes(np.shape(achieved_goal), np.shape(desired_goal))
+        return np.zeros(shape[:-1], np.bool_)[()]
 
     def _achieved(self, achieved_goal: Any, desired_goal: Any) -> np.ndarray:
         return self._core.achieved(np.asarray(achieved_goal), np.asarray(desired_goal))
@@ -209,10 +211,5 @@ def spaces_of(core: ThrowingCore) -> tuple[spaces.Dict, spaces.Box]:
 
 def _largest(core: ThrowingCore) -> float:
     """A bound on all numbers that are shown: positions are about [-1, 1], but falling balls are fast."""
-    world, effector = core.world, core.effector
-    fastest = 2**0.5 * world.hand_speed
-    if core.task.effector == "arm":  # each joint turns all links behind it
-        fastest = world.joint_speed * world.arm_length * (effector.num_joints + 1) / 2
-    falling = (fastest**2 + 2 * world.gravity * world.size) ** 0.5
-    places = max(abs(2 * side - 1) for side in (0.0, 1.0, *effector.reach))
-    return 1.01 * max(places, falling / world.hand_speed)
+    places = max(abs(2 * side - 1) for side in (0.0, 1.0, *core.effector.reach))
+    return 1.01 * max(places, core.fastest_ball / core.world.hand_speed)

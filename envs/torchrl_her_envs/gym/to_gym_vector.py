@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -86,15 +87,18 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         self._seeded = False
 
     def reset(
-        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begins episodes.
 
         Args:
-            seed: of the first environment (each further one has one more), or one for each environment.
+            seed: of the first environment (each further one has one more), or one for each environment, where
+                None draws one.
             options: ``{"reset_mask": [N] of bool}`` resets those environments alone.
 
         Raises:
+            ResetNeeded: a mask leaves out environments in the first reset.
+            TypeError: a seed that is not an integer.
             ValueError: a seed that is out of range, seeds for only some of the environments, or a mask that
                 chooses none.
         """
@@ -105,6 +109,8 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
             )
         if seed is not None and not mask.all():
             raise ValueError("seed and reset_mask must not be given together")
+        if not self._seeded and not mask.all():
+            raise ResetNeeded(f"the first reset must be of all environments, got reset_mask {mask.tolist()}")
         if seed is not None or not self._seeded:
             self._set_seeds(seed)
         self._begin(mask)
@@ -125,12 +131,12 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         shown = core.show()
         terminated, truncated = core.achieved(shown.achieved_goal, shown.desired_goal), core.out_of_time()
         reward = reward_of(terminated).astype(np.float32)
-        info = {"is_success": terminated, "_is_success": np.ones_like(terminated)}
+        info = {"is_success": terminated.copy(), "_is_success": np.ones_like(terminated)}
         self._over = terminated | truncated
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any():
             self._begin(before)
             shown = core.show()
-            for entry in (reward, terminated, truncated, info["_is_success"]):
+            for entry in (reward, terminated, truncated, *info.values()):
                 entry[before] = 0
         elif self.autoreset_mode is AutoresetMode.SAME_STEP and self._over.any():
             info = _ended(_dict(shown), terminated, self._over)
@@ -144,19 +150,22 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
             return None
         return tuple(render(self._core, None, size=self._size).numpy())
 
-    def _set_seeds(self, seed: int | Sequence[int] | None) -> None:
+    def _set_seeds(self, seed: int | Sequence[int | None] | None) -> None:
         if seed is None or isinstance(seed, int | np.integer):
             super().reset(seed=None if seed is None else int(seed))
             first = as_seed(self.np_random_seed)
             seeds: Sequence[int] = [as_seed(first + k) for k in range(self.num_envs)]
         else:
-            seeds = [int(own) for own in seed]
-            if len(seeds) != self.num_envs:
+            if len(seed) != self.num_envs:
                 raise ValueError(
-                    f"{len(seeds)} seeds for {self.num_envs} environments: give one, or one for each"
+                    f"{len(seed)} seeds for {self.num_envs} environments: give one, or one for each"
                 )
+            seeds = [self._drawn_seed() if own is None else operator.index(own) for own in seed]
         self._core.set_seeds(seeds)
         self._seeded = True
+
+    def _drawn_seed(self) -> int:
+        return int(self.np_random.integers(1 << 63))
 
     def _begin(self, mask: np.ndarray) -> None:
         """Begins new episodes in some environments."""
@@ -178,7 +187,7 @@ def _ended(shown: Observation, terminated: np.ndarray, over: np.ndarray) -> dict
         "is_success": np.zeros_like(over),
         "_is_success": ~over,
         "final_obs": final,
-        "_final_obs": over,
-        "final_info": {"is_success": terminated, "_is_success": over},
-        "_final_info": over,
+        "_final_obs": over.copy(),
+        "final_info": {"is_success": terminated.copy(), "_is_success": over.copy()},
+        "_final_info": over.copy(),
     }

@@ -61,6 +61,7 @@ class ThrowingCore:
         world: the constants of the physics.
         effector: the hand or the arm.
         threshold: how near to the goal is achieved, in shown coordinates.
+        fastest_ball: a bound on the speed of the ball, in meters a second.
         achieved_index: where the achieved goal is in an observation.
         observation_size: how many numbers an observation has.
         goal_distribution: of desired goals, in the coordinates that the agent sees.
@@ -68,7 +69,8 @@ class ThrowingCore:
         keys: [N] of uint64, see ``common.seeding``.
 
     Raises:
-        ValueError: ``num_envs`` or ``num_links`` is below 1, or ``threshold`` is not positive.
+        ValueError: ``num_envs`` or ``num_links`` is below 1, ``threshold`` is not positive, or the task has a
+            wall and ``world`` has too few substeps for it.
 
     Example:
         >>> from torchrl_her_envs import get_task
@@ -104,6 +106,9 @@ class ThrowingCore:
             if task.effector == "hand"
             else Arm(self.world, num_links=num_links)
         )
+        self.fastest_ball = self.world.fastest_ball(self._fastest_throw())
+        if task.wall:
+            self.world.check_wall(self.fastest_ball)
         self.observation_size = self.effector.observation_size + (4 if task.throws else 0)
         own = self.world.hole_radius if task.throws else self.world.ball_radius
         self.threshold = self.world.shown(own) if threshold is None else threshold
@@ -287,6 +292,13 @@ class ThrowingCore:
         return self._step >= self.world.max_steps
 
     # Made once
+
+    def _fastest_throw(self) -> float:
+        """A bound on the speed of the grip, in meters a second."""
+        if self.task.effector == "hand":
+            return math.sqrt(2.0) * self.world.hand_speed
+        # each joint turns all links behind it
+        return self.world.joint_speed * self.world.arm_length * (self.effector.num_joints + 1) / 2
 
     def _make_ball_starts(self) -> GoalDistribution:
         """Where a ball that is not held starts, in meters."""

@@ -61,8 +61,9 @@ class ThrowingEnv(BatchedEnv):
         worlds: the state of all environments, which every step writes to: clone what you want to keep.
 
     Raises:
-        ValueError: ``num_envs`` or ``num_links`` is below 1, ``threshold`` is not positive, or ``dtype`` is
-            not a floating-point type.
+        ValueError: ``num_envs`` or ``num_links`` is below 1, ``threshold`` is not positive, ``dtype`` is not
+            a floating-point type, or the task has a wall and ``world`` has too few substeps for it.
+        TypeError: a seed that is not an integer.
 
     Example:
         >>> from torchrl_her_envs import make_env
@@ -238,6 +239,7 @@ class ThrowingEnv(BatchedEnv):
         self._core.keys = keys
 
     def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
+        self._check_state(state)
         for field in fields(self.worlds):  # in place: the core has the same memory
             getattr(self.worlds, field.name).copy_(state[field.name])
         self._keys = state["key"].numpy().copy().view(np.uint64)

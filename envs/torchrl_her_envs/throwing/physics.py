@@ -23,7 +23,7 @@ _SLOP = 1e-3  # meters that a ball may sink into a surface; Chipmunk's default, 
 _SKIN = _SLOP / 2  # surfaces stand out by this: a ball put against one touches it, whatever the rounding
 _ITERATIONS = 4  # of the solver: a ball touches at most a side and a corner at once
 _MOST = 64  # balls in the space at once: each is compared with all that are near it
-_APART = 4.0  # meters between parked balls
+_APART = 4.0  # meters between the edges of parked balls, and of the first and the screen's right side
 _PATIENCE = 64  # steps after which balls that none of them needed are removed
 _FEW = 12  # balls up to which numbers are quicker than arrays
 
@@ -241,7 +241,10 @@ class _Space:
             self._balls.append((body, ball))
         # pymunk lists the space's static body behind the balls: the last row is that one's, and stays 0
         self._parked = np.zeros((count + 1, 4))
-        self._parked[:-1, 0] = 2 * world.size + _APART * np.arange(count)
+        # Beyond the right side, which is 2 * _BORDER thick whatever the size of the world.
+        diameter = 2 * world.ball_radius * world.size
+        first = world.size + 2 * _BORDER + diameter + _APART
+        self._parked[:-1, 0] = first + (diameter + _APART) * np.arange(count)
         self._state = self._parked.copy()
         self._parked_buffer.set_float_buf(self._parked)
         self._buffer.set_float_buf(self._state)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 
@@ -29,21 +28,3 @@ class WorldState:
     free: Tensor
     step: Tensor
     episode: Tensor
-
-    @classmethod
-    def zeros(cls, num_envs: int, num_joints: int) -> WorldState:
-        """N environments before their first reset."""
-
-        def points(n: int) -> Tensor:
-            return torch.zeros(num_envs, n, dtype=torch.float64)
-
-        def flags(dtype: torch.dtype) -> Tensor:
-            return torch.zeros(num_envs, dtype=dtype)
-
-        return cls(
-            points(num_joints),
-            points(num_joints),
-            *(points(2) for _ in range(5)),
-            *(flags(torch.bool) for _ in range(3)),
-            *(flags(torch.int64) for _ in range(2)),
-        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -22,6 +23,7 @@ _POSITIVE = (
     "wall_thickness",
     "arm_pixels",
 )
+_WHOLE = ("substeps", "max_steps")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +35,8 @@ class WorldConfig:
     fraction of ``hand_speed`` (or ``joint_speed``).
 
     Raises:
-        ValueError: a length, speed, mass or number that is not positive.
+        ValueError: a length, speed, mass or number that is not positive and finite, a number of steps that is
+            not whole, a gravity that is not finite, a bounce outside [0, 1], or a friction below 0.
 
     Example:
         >>> world = WorldConfig()
@@ -50,7 +53,7 @@ class WorldConfig:
     friction: float = 0.1  # kinetic: thesis, appendix A
     ball_mass: float = 3.0  # thesis, appendix A; only ratios of masses would matter
     time_step: float = 0.04  # 25 actions a second
-    substeps: int = 4  # a ball at 12 m/s moves 0.12 m a substep, less than its radius
+    substeps: int = 4  # the fastest ball, 15.7 m/s, moves 0.157 m in each: see check_wall
     max_steps: int = 50  # an episode is 2 s
     hand_speed: float = 8.0  # at most, in each direction: enough to throw across the screen
     joint_speed: float = 4.0  # rad/s, at most
@@ -71,6 +74,62 @@ class WorldConfig:
         for name in _POSITIVE:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in (*_POSITIVE, "gravity", "friction"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} must be finite, got {getattr(self, name)}")
+        if not 0.0 <= self.bounce <= 1.0:
+            raise ValueError(f"bounce must be from 0 to 1, got {self.bounce}")
+        if self.friction < 0.0:
+            raise ValueError(f"friction must be at least 0, got {self.friction}")
+        for name in _WHOLE:
+            given = getattr(self, name)
+            if given != int(given):
+                raise ValueError(f"{name} must be a whole number, got {given}")
+            object.__setattr__(self, name, int(given))  # 4.0, as from a file, counts as 4
+
+    def fastest_ball(self, thrown: float) -> float:
+        """A bound on the speed of a ball, in meters a second.
+
+        A bounce takes energy from a ball and gives it none, so nothing but the throw and a fall across the
+        whole screen makes it faster.
+
+        Args:
+            thrown: the highest speed at which it is thrown, in meters a second.
+
+        Example:
+            >>> WorldConfig(gravity=10.0, size=6.0).fastest_ball(11.0)
+            15.524174696260024
+        """
+        return math.sqrt(thrown**2 + 2.0 * abs(self.gravity) * self.size)
+
+    def check_wall(self, fastest: float) -> None:
+        """Checks that no ball passes through the wall.
+
+        Contacts are looked for at the end of each substep. A ball that has then passed the middle of the wall
+        is pushed out on the other side, so in one substep it must not move from contact to there.
+
+        Args:
+            fastest: the highest speed of a ball, in meters a second.
+
+        Raises:
+            ValueError: a substep is too long for this speed.
+
+        Example:
+            >>> WorldConfig().check_wall(16.0)
+            >>> WorldConfig(substeps=1).check_wall(16.0)
+            Traceback (most recent call last):
+            ...
+            ValueError: a task with a wall needs at least 3 substeps, got 1: ...
+        """
+        room = (self.ball_radius + self.wall_thickness / 2) * self.size
+        moved = fastest * self.time_step / self.substeps
+        if moved > room:
+            needed = math.ceil(fastest * self.time_step / room)
+            raise ValueError(
+                f"a task with a wall needs at least {needed} substeps, got {self.substeps}: a ball of up to "
+                f"{fastest:.3g} m/s moves {moved:.3g} m in a substep, more than its radius and half of the "
+                f"wall's thickness, {room:.3g} m together"
+            )
 
     @property
     def arm_length(self) -> float:

@@ -47,6 +47,20 @@ def test_so_do_other_arms(links: int, monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(*paths, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("few", [3, 0])
+def test_a_released_ball_has_the_velocity_of_the_grip(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A held ball always has it; in a state that was written by hand it may not.
+    monkeypatch.setattr(core_module, "_FEW", few)
+    core = ThrowingCore(get_task("hand_v0"), 2)
+    core.set_seeds([0])
+    core.begin(np.arange(2))
+    for point in (core.worlds.grip, core.worlds.ball):
+        point[:] = point.new_tensor([1.5, 3.0])
+    core.worlds.grip_velocity[:] = core.worlds.grip.new_tensor([3.0, 2.0])
+    core.advance(np.array([[1.0, 1.0, -1.0]] * 2))
+    np.testing.assert_allclose(core.worlds.ball_velocity.numpy(), [[3.0, 2.0 - 0.4]] * 2, atol=1e-12)
+
+
 def test_rewards() -> None:
     assert (reward_of(True), reward_of(False)) == (0.0, -1.0)
     assert reward_of(np.array([[True], [False]])).tolist() == [[0.0], [-1.0]]

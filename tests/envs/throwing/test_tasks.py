@@ -141,11 +141,11 @@ def test_numbers_of_steps_may_be_whole_floats() -> None:
     [
         (
             1,
-            "a task with a wall needs at least 3 substeps, got 1: a ball of up to 15.7 m/s moves 0.63 m in a substep",
+            "a wall needs at least 3 substeps, got 1: a ball of up to 15.7 m/s moves 0.63 m in a substep",
         ),
         (
             2,
-            "at least 3 substeps, got 2: .* 0.315 m in a substep, .* half of the wall's thickness, 0.24 m together",
+            "3 substeps, got 2: .* 0.315 m in a substep, .* half of the wall's thickness, 0.24 m together",
         ),
     ],
 )
