@@ -72,7 +72,7 @@ class Instructiveness(GoalHistogram):
     """The weights of IBS: max(q* - q, floor) in a goal's cell. Equations 4.5 and 4.9.
 
     The kernel's sigma starts larger and shrinks at each :meth:`step` down to its final value. Emptying the
-    buffer (:meth:`clear`) forgets q but not sigma; :meth:`restart` sets sigma back to its first value.
+    buffer (``clear``) forgets q but not sigma; :meth:`restart` sets sigma back to its first value.
 
     Args:
         grid: cells over the range of achieved goals.

@@ -314,7 +314,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     def empty_run(self, run: int) -> None:
         """Forgets all that one of several runs has written, and its open episodes.
 
-        Call :func:`~torchrl_her.replay_buffers.runs.empty_run`, which tells the sampler, too.
+        Call :func:`~torchrl_her.replay_buffers.empty_run`, which tells the sampler, too.
         """
         self._rings.empty(run)
         self._counts.empty(run)

@@ -35,7 +35,7 @@ def keep_runs(
     What all runs share, such as Adam's count of steps, does change.
 
     Args:
-        loss: its tensors have a dimension of R equal blocks, in the order of the runs (see :func:`run_dims`).
+        loss: its tensors have a dimension of R equal blocks, in the order of the runs (see ``run_dims``).
         optimizer: over its parameters.
         kept: the runs that stay unchanged.
         runs: R.

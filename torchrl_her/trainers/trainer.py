@@ -72,7 +72,8 @@ class Trainer:
 
     Keyword Args:
         runs: R.
-        epoch_frames: environment steps of each run in an epoch, rounded up to whole batches.
+        epoch_frames: environment steps of each run in an epoch. Epochs end with whole batches: the first n have
+            n times as many steps together, rounded up.
         frames_per_update: environment steps of each run for each of its gradient steps.
         warmup_frames: environment steps of each run before its first gradient step. The gradient steps that
             belong to these frames follow then. With enough frames to end an episode in each environment, all
@@ -126,6 +127,7 @@ class Trainer:
         self.frames = self.updates = self.epochs = 0
         self._credit = 0.0  # gradient steps that the frames so far allow and that were not made yet
         self._measured: list[dict[str, Tensor]] | None = None  # in the epoch under way
+        self._outside = 0  # frames that were collected by run(), which are part of no epoch
 
     @property
     def in_epoch(self) -> bool:
@@ -141,7 +143,8 @@ class Trainer:
         if self._measured is None:
             self._reset_collector()
             self._measured = []
-        self._work((self.epochs + 1) * self.epoch_frames, self._measured, on_batch, cut=True)
+        end = self._outside + (self.epochs + 1) * self.epoch_frames
+        self._work(end, self._measured, on_batch, cut=True)
         measured, self._measured = _means(self._measured), None
         self.epochs += 1
         for schedule in self.schedules:
@@ -154,7 +157,11 @@ class Trainer:
         Episodes that are open at the end go on in the next call, unless that is an epoch.
         """
         measured: list[dict[str, Tensor]] = []
-        self._work(self.frames + frames, measured, on_batch, cut=False)
+        before = self.frames
+        try:
+            self._work(before + frames, measured, on_batch, cut=False)
+        finally:
+            self._outside += self.frames - before
         return _means(measured)
 
     def _reset_collector(self) -> None:
@@ -237,14 +244,19 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         """The counters, and what was measured in the epoch under way; the parts keep their own state."""
-        counters = {"frames": self.frames, "updates": self.updates, "epochs": self.epochs}
+        counters = {
+            "frames": self.frames,
+            "updates": self.updates,
+            "epochs": self.epochs,
+            "outside": self._outside,
+        }
         measured = None if self._measured is None else _joined(self._measured)
         return {**counters, "credit": self._credit, "measured": measured}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Puts back what :meth:`state_dict` gave."""
         self.frames, self.updates, self.epochs = state["frames"], state["updates"], state["epochs"]
-        self._credit = state["credit"]
+        self._credit, self._outside = state["credit"], state["outside"]
         measured = state.get("measured")
         self._measured = None if measured is None else [measured] if measured else []
 

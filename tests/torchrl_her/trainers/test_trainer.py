@@ -344,3 +344,14 @@ def test_epochs_that_follow_a_run_lose_nothing_either() -> None:
     assert writer.held_back + writer.counts.real == trainer.frames == 16
     trainer.epoch()
     assert (writer.held_back, writer.counts.real) == (0, trainer.frames)
+
+
+def test_an_epoch_after_a_run_collects_as_many_frames_as_any_other() -> None:
+    trainer, _ = make_trainer(epoch_frames=2 * N * STEPS)
+    trainer.run(10 * N * STEPS)
+    trainer.epoch()
+    assert trainer.frames == 12 * N * STEPS
+    state, (other, _) = trainer.state_dict(), make_trainer(epoch_frames=2 * N * STEPS)
+    other.load_state_dict(state)
+    other.epoch()
+    assert other.frames == 14 * N * STEPS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -213,19 +214,24 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         if len(run) < len(index):
             priority = priority[index >= 0]
         value = (priority + self._eps).pow(self._alpha)
-        # alpha = 0 makes 1 of everything, also of what is not a number
-        finite = value.isfinite() & priority.isfinite()
         sizes = self._sizes
         if self.runs == 1 and storage is not None:
             # A buffer that is made around a filled storage tells its sampler of the rows in this way only.
             sizes = sizes.clamp_min(len(storage))
-        written = place < sizes.index_select(0, run)
-        if not bool((good := finite & written).all()):
+        if not self._all_known(run, place, sizes) or not _all_finite(priority, value):
+            written = place < sizes.index_select(0, run)
+            finite = priority.isfinite() & value.isfinite()
             self._warn_of(run[written & ~finite])
+            good = written & finite
             run, place, priority, value = run[good], place[good], priority[good], value[good]
         self._most.scatter_reduce_(0, run, priority, "amax")
         note_sizes(self._sizes, run, place)
         self._trees.set(run, place, value)
+
+    def _all_known(self, run: Tensor, place: Tensor, sizes: Tensor) -> bool:
+        """Whether all of some rows [n] are among those of their runs, whose sizes are [R]."""
+        # Full blocks, as most of the time, need no look at each row.
+        return int(sizes.min()) >= self.capacity or bool((place < sizes.index_select(0, run)).all())
 
     def _warn_of(self, run: Tensor) -> None:
         """Warns of runs [n] that had priorities that are not finite, of each of them once."""
@@ -333,6 +339,11 @@ def run_and_place(index: int | Tensor, capacity: int) -> tuple[Tensor, Tensor]:
 def note_sizes(sizes: Tensor, run: Tensor, place: Tensor) -> None:
     """Enlarges the sizes [R] of blocks so that they hold rows that were written."""
     sizes.scatter_reduce_(0, run, place + 1, "amax")
+
+
+def _all_finite(priority: Tensor, value: Tensor) -> bool:
+    """Whether priorities [n] of at least 0 and their powers are finite; with alpha = 0 all powers are 1."""
+    return len(value) == 0 or math.isfinite(float(priority.max()) + float(value.max()))  # NaN is the largest
 
 
 def _check_runs(sizes: Tensor, runs: int) -> None:

@@ -55,6 +55,9 @@ class PackedStorage(LazyTensorStorage):
         ([2.0, 2.0, 1.0], [[0.0, 1.0], [0.0, 1.0], [1.0, 0.0]])
     """
 
+    device: Any  # "auto" until there are rows
+    initialized: bool
+
     def __init__(self, max_size: int, *, device: torch.device | str = "cpu") -> None:
         super().__init__(max_size, device=device)
         self._packed: Tensor | None = None  # [max_size, bytes / 8] of int64
@@ -77,7 +80,7 @@ class PackedStorage(LazyTensorStorage):
         if packed is None or not isinstance(index, Tensor) or index.dtype != torch.int64 or index.ndim != 1:
             return super().get(index)
         # A full storage needs no look at the numbers: there is no row behind the last one.
-        length = self._len  # type: ignore[has-type]
+        length = self._len
         if length < self.max_size and len(index) and int(index.max()) >= length:
             return super().get(index)  # which raises
         try:
@@ -113,7 +116,7 @@ class PackedStorage(LazyTensorStorage):
 
     def restore(self, begin: int, packed: Tensor, fields: Sequence[Field]) -> bool:
         """Puts packed rows [n, m] at ``begin``; returns False if this storage holds rows in another way."""
-        if not self.initialized:  # type: ignore[has-type]
+        if not self.initialized:
             self._allocate(tuple(fields), packed.device)
             self.initialized = True
         if self.packed is None or self._fields != tuple(fields):
