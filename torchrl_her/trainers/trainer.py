@@ -72,8 +72,8 @@ class Trainer:
 
     Keyword Args:
         runs: R.
-        epoch_frames: environment steps of each run in an epoch. Epochs end with whole batches: the first n have
-            n times as many steps together, rounded up.
+        epoch_frames: environment steps of each run in an epoch. Epochs end with whole batches: the first n
+            have n times as many steps together, rounded up.
         frames_per_update: environment steps of each run for each of its gradient steps.
         warmup_frames: environment steps of each run before its first gradient step. The gradient steps that
             belong to these frames follow then. With enough frames to end an episode in each environment, all

@@ -103,7 +103,7 @@ class BatchedEnv(TaskTraits, EnvBase):
         return state | {"key": torch.from_numpy(self._keys.view(np.int64).copy())}
 
     def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts the environments back to where :meth:`world_state_dict` was taken.
+        """Puts the environments back to where ``world_state_dict`` was taken.
 
         Raises:
             ValueError: the state is of another number of environments, or of others than these; nothing has

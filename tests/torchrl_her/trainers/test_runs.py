@@ -46,7 +46,7 @@ def test_runs_learn_together_what_they_learn_alone(weighted: bool) -> None:
         net.load_state_dict(stack_runs([state.state_dict() for state in states]))
     options = {"max_grad_norm": 0.01}  # short enough to clip all of them
     together = make_ddpg_loss(*pair, action_penalty=0.5, reduction="none")
-    measured = step(together, torch.cat(data), runs=2, **options)
+    measured = step(together, torch.stack(data), runs=2, **options)
     for run, (own, rows_of_run) in enumerate(zip(nets, data, strict=True)):
         alone = make_ddpg_loss(*own, action_penalty=0.5)
         single = step(alone, rows_of_run, **options)
