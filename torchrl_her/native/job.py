@@ -39,6 +39,7 @@ class Layer(ctypes.Structure):
 class Structures:
     """The structures for one type of numbers."""
 
+    dtype: torch.dtype
     real: Any
     tensors: Any
     entry: Any
@@ -79,4 +80,4 @@ def structures(dtype: torch.dtype) -> Structures:
         ("adam", ctypes.POINTER(adam)),
         ("priorities losses", pointer),
     )
-    return Structures(real, tensors, entry, adam, job)
+    return Structures(dtype, real, tensors, entry, adam, job)

@@ -75,7 +75,6 @@ class FusedLearner:
         self._check_adam(loss)
         self._fused, dtype = FUSED[type(loss)], next(iter(loss.parameters())).dtype
         self._steps, self._kinds = load_steps(dtype), structures(dtype)
-        self._dtype = dtype
         self._weights = FusedWeights(loss, optimizer, self._kinds)
         self._keys: list[NestedKey] = list(getattr(loss, self._fused.actor).in_keys)
         self._action_key = action_key(loss)
@@ -141,7 +140,7 @@ class FusedLearner:
 
     def _run(self, call: FusedCall, first: int, steps: int) -> Tensor:
         """Makes some of the steps; returns what was measured, [3, steps, R]."""
-        losses = torch.zeros(3, steps, self.runs, dtype=self._dtype)
+        losses = torch.zeros(3, steps, self.runs, dtype=self._kinds.dtype)
         noise, adam = call.draw_noise(steps), self._adam(steps)  # memory that the job points to
         job = call.job
         job.first_step, job.steps, job.losses, job.adam = first, steps, losses.data_ptr(), adam

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
 from collections.abc import Sequence
@@ -69,7 +68,7 @@ class FusedCall:
             runs,
             actions,
         )
-        self._dtype = torch.float32 if kinds.real is ctypes.c_float else torch.float64
+        self._dtype = kinds.dtype
         count = rows.numel() // runs
         self.job = kinds.job()
         self._kept: list[Tensor] = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,7 +35,7 @@ class FusedWeights:
 
     def __init__(self, loss: LossModule, optimizer: torch.optim.Optimizer, kinds: Structures) -> None:
         self._optimizer, self._kinds, fused = optimizer, kinds, FUSED[type(loss)]
-        self._dtype = torch.float32 if kinds.real is ctypes.c_float else torch.float64
+        self._dtype = kinds.dtype
         is_sac = fused.algorithm is Algorithm.SAC
         self.critics: int = 0 if fused.critic is None else getattr(loss, "num_qvalue_nets", 1)
         actor = _tensors(loss, fused.actor, delayed=not is_sac)  # SAC has no delayed actor
