@@ -8,7 +8,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --
 
 .PHONY: demo test test-full test-versions lint bench docs clean
 
-demo: $(VENV)/.ready  ## learn to pick up a ball and throw it, in two minutes; ends with a curve and a GIF
+demo: $(VENV)/.ready  ## learn to pick up a ball and throw it, in a minute; ends with a curve and a GIF
 	$(BIN)/torchrl-her train preset=demo
 
 test: $(VENV)/.ready-test  ## tests and doctests; those of some files or folders only: make test TESTS=tests/envs
