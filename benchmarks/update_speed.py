@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import torch
 from machine import CLOCKS, describe, medians, one_core, table
-from peers.ours import Ours, OursTD3, TorchRLPieces
+from peers.ours import Ours, OursHalf, OursSAC, OursTD3, TorchRLPieces
 from peers.peer import Peer
 from peers.sb3 import SB3DDPG, SB3TD3
 from peers.sbx_td3 import SBXTD3
@@ -32,9 +32,18 @@ STEPS = 200  # gradient steps in one measurement
 RUNS = 15
 
 STEP_SETTINGS = ((64, 64), (64, 256), (256, 256))  # width of the hidden layers, batch
-STEP_PEERS: tuple[type[Peer], ...] = (Ours, OursTD3, SBXTD3, SB3DDPG, SB3TD3, TorchRLPieces)
+STEP_PEERS: tuple[type[Peer], ...] = (
+    Ours,
+    OursHalf,
+    OursTD3,
+    OursSAC,
+    SBXTD3,
+    SB3DDPG,
+    SB3TD3,
+    TorchRLPieces,
+)
 LOOP_SETTINGS = tuple((batch, frames) for batch in (64, 256) for frames in (1, 5, 20))  # frames for a step
-LOOP_PEERS: tuple[type[Peer], ...] = (Ours, SBXTD3, SB3DDPG)
+LOOP_PEERS: tuple[type[Peer], ...] = (Ours, OursHalf, SBXTD3, SB3DDPG)
 ROUNDS = {1: 1, 5: 5, 20: 10}  # rounds in one measurement, by frames for a gradient step
 ENV_COUNTS = (1, 8, 16, 64, 160)
 
@@ -81,15 +90,17 @@ def steps_table(timing: Timing) -> str:
         peers = [filled(kind(recipe)) for kind in STEP_PEERS]
         seconds = timing.medians({peer.name: partial(peer.gradient_steps, STEPS) for peer in peers})
         sbx, sb3 = seconds[SBXTD3.name], seconds[SB3DDPG.name]
-        ddpg, td3 = seconds[Ours.name], seconds[OursTD3.name]
-        ratios = (times(sbx, td3), times(sbx, ddpg), times(sb3, ddpg))
+        ddpg, half, td3, sac = (seconds[kind.name] for kind in (Ours, OursHalf, OursTD3, OursSAC))
+        ratios = (times(sbx, td3), times(sbx, ddpg), times(sbx, half), times(sb3, ddpg), times(sac, td3))
         milliseconds = (f"{1e3 * own:.2f}" for own in seconds.values())
         rows.append([f"3 x {hidden}, batch {batch}", *ratios, *milliseconds])
     header = (
         "gradient step",
         "TD3, rate over SBX's TD3",
         "DDPG, rate over SBX's TD3",
+        "with bfloat16",
         "DDPG, rate over Stable-Baselines3's",
+        "SAC, time over TD3's",
     )
     columns = (*header, *(f"{kind.name}, ms" for kind in STEP_PEERS))
     asked = f"Each is asked for {STEPS} gradient steps in one call."
@@ -104,10 +115,18 @@ def loop_table(timing: Timing) -> str:
         frames = ROUNDS[frames_per_update] * frames_in_round(recipe)
         peers = [filled(kind(recipe)) for kind in LOOP_PEERS]
         seconds = timing.medians({peer.name: partial(peer.loop, frames) for peer in peers})
-        ours, sbx, sb3 = (seconds[kind.name] for kind in LOOP_PEERS)
+        ours, half, sbx, sb3 = (seconds[kind.name] for kind in LOOP_PEERS)
         rates = (f"{1 / own:,.0f}" for own in seconds.values())
-        rows.append([str(batch), str(frames_per_update), times(sbx, ours), times(sb3, ours), *rates])
-    header = ("batch", "frames for a gradient step", "DDPG over SBX's TD3", "over Stable-Baselines3's DDPG")
+        ratios = (times(peer, own) for peer in (sbx, sb3) for own in (ours, half))
+        rows.append([str(batch), str(frames_per_update), *ratios, *rates])
+    header = (
+        "batch",
+        "frames for a gradient step",
+        "DDPG over SBX's TD3",
+        "with bfloat16",
+        "DDPG over Stable-Baselines3's",
+        "with bfloat16",
+    )
     columns = (*header, *(f"{kind.name}, frames/s" for kind in LOOP_PEERS))
     recipe = recipe_for()
     note = (

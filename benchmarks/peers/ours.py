@@ -49,6 +49,18 @@ class Ours:
         return self.trainer.frames - before
 
 
+class OursHalf(Ours):
+    """The same with products of shorter numbers."""
+
+    name: ClassVar[str] = "this, DDPG, bfloat16"
+    differs: ClassVar[str] = (
+        "as our DDPG, with `products=bfloat16`: what is multiplied between hidden layers has three digits."
+    )
+
+    def make(self, recipe: Recipe) -> Trainer:
+        return super().make(recipe.replace(products="bfloat16"))
+
+
 class OursTD3(Ours):
     """The same with TD3."""
 
@@ -57,6 +69,16 @@ class OursTD3(Ours):
 
     def make(self, recipe: Recipe) -> Trainer:
         return super().make(recipe.replace(learner="td3"))
+
+
+class OursSAC(Ours):
+    """The same with SAC."""
+
+    name: ClassVar[str] = "this, SAC"
+    differs: ClassVar[str] = "as our TD3, with a stochastic actor and a learned temperature."
+
+    def make(self, recipe: Recipe) -> Trainer:
+        return super().make(recipe.replace(learner="sac"))
 
 
 class TorchRLPieces(Ours):

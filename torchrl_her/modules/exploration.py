@@ -25,7 +25,9 @@ def explore(
 ) -> Tensor:
     """Replaces some greedy actions by noisy ones, and a few by uniform ones.
 
-    As in appendix B of the thesis that the method is from.
+    As in appendix B of the thesis that the method is from. With ``epsilon=1`` there is noise on every action
+    that is not uniform, as in OpenAI's HER and in MRL: a share of 0.2 of uniform actions, and noise with a
+    standard deviation of 0.1 on actions from -1 to 1, are ``epsilon=1, uniform_share=0.2, noise=0.05``.
 
     Args:
         greedy: [..., a], the actions of the policy.
@@ -166,6 +168,9 @@ class DecayingEpsilon(Exploration):
         noise, uniform_share: see :func:`~torchrl_her.modules.explore`.
         **options: of :class:`~torchrl_her.modules.Exploration`.
 
+    Raises:
+        ValueError: ``noise`` is negative or ``uniform_share`` outside of [0, 1].
+
     Example:
         >>> exploration = DecayingEpsilon(-torch.ones(3), torch.ones(3), start=1.0, decay=0.5)
         >>> exploration.step()
@@ -176,6 +181,10 @@ class DecayingEpsilon(Exploration):
     def __init__(
         self, low: Tensor, high: Tensor, *, noise: float = 0.05, uniform_share: float = 0.2, **options: Any
     ) -> None:
+        if not noise >= 0.0:
+            raise ValueError(f"noise must be at least 0, got {noise}")
+        if not 0.0 <= uniform_share <= 1.0:
+            raise ValueError(f"uniform_share must be in [0, 1], got {uniform_share}")
         super().__init__(**options)
         self.noise, self.uniform_share = noise, uniform_share
         self.register_buffer("low", low.clone())

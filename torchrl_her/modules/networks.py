@@ -191,7 +191,7 @@ class ActorNet(nn.Module):
 
 
 class CriticNet(nn.Module):
-    """(observation, goal, action) to the action's value.
+    """(observation, goal, action) to the action's value, or to several numbers such as its quantiles.
 
     Args:
         inputs: width of all inputs together, without the action.
@@ -202,6 +202,7 @@ class CriticNet(nn.Module):
         norm: ``"layer"`` for layer normalization of the hidden layers, ``"batch"`` for batch normalization of
             the input and the hidden layers, ``"none"`` without.
         runs: R, how many independent critics.
+        outputs: how many numbers.
 
     Raises:
         ValueError: an option cannot be.
@@ -221,21 +222,26 @@ class CriticNet(nn.Module):
         activation: ActivationName = "relu",
         norm: Norm = "none",
         runs: int = 1,
+        outputs: int = 1,
     ) -> None:
         super().__init__()
-        self.runs = runs
+        if outputs < 1:
+            raise ValueError(f"outputs must be at least 1, got {outputs}")
+        self.runs, self.outputs = runs, outputs
         first, *rest = hidden_layers(
             inputs, hidden, depth, joined=actions, runs=runs, norm=norm, activation=activation
         )
         own = [StackedBatchNorm(inputs, runs=runs)] if norm == "batch" else []
         self.first = nn.Sequential(*own, first)
-        self.rest = nn.Sequential(*rest, StackedLinear(hidden, 1, runs=runs, bound=_LAST_LAYER))
+        self.rest = nn.Sequential(*rest, StackedLinear(hidden, outputs, runs=runs, bound=_LAST_LAYER))
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[..., widths] of the inputs, the action last, to [..., 1]."""
+        """[..., widths] of the inputs, the action last, to [..., outputs]."""
         *seen, action = inputs
         hidden = self.first(by_run(torch.cat(seen, -1), self.runs))
-        return self.rest(torch.cat((hidden, by_run(action, self.runs)), -1)).view(*action.shape[:-1], 1)
+        return self.rest(torch.cat((hidden, by_run(action, self.runs)), -1)).view(
+            *action.shape[:-1], self.outputs
+        )
 
 
 def by_run(x: Tensor, runs: int) -> Tensor:
@@ -318,6 +324,7 @@ def make_critic(
     activation: ActivationName = "relu",
     norm: Norm = "none",
     runs: int = 1,
+    outputs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     action_key: NestedKey = "action",
     value_key: NestedKey = "state_action_value",
@@ -329,6 +336,7 @@ def make_critic(
         actions: width of the action.
         hidden, depth, activation, norm: see :class:`CriticNet`.
         runs: R, how many independent critics.
+        outputs: how many numbers each gives, for example quantiles of the return.
         in_keys: what it sees besides the action; the goal must be among them.
         action_key: where it reads the action.
         value_key: where it writes the action's value.
@@ -341,6 +349,13 @@ def make_critic(
         torch.Size([4, 1])
     """
     net = CriticNet(
-        sum(widths), actions, hidden=hidden, depth=depth, activation=activation, norm=norm, runs=runs
+        sum(widths),
+        actions,
+        hidden=hidden,
+        depth=depth,
+        activation=activation,
+        norm=norm,
+        runs=runs,
+        outputs=outputs,
     )
     return TensorDictModule(net, in_keys=[*in_keys, action_key], out_keys=[value_key])

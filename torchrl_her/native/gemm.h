@@ -3,7 +3,13 @@
 // A tile of the result stays in registers while the sum over k runs; the rows of B are read in whole vectors. So B
 // and C have rows that are padded to whole vectors (`padded`), and A may have any strides: with the strides of its
 // transpose swapped, the same code multiplies by a transpose.
+//
+// The numbers of A and B are reals, or pairs of numbers in bfloat16 that stand next to each other along k: then a
+// product of two pairs adds two products, and sums are float32 as before.
 #pragma once
+
+#include <cstdint>
+
 
 #ifndef REAL
 #define REAL float
@@ -28,35 +34,66 @@ typedef real Vector __attribute__((vector_size(kVectorBytes), aligned(alignof(re
 
 inline int padded(int columns) { return (columns + kLanes - 1) / kLanes * kLanes; }
 
+using Pair = uint32_t;  // the first number in the low half
+typedef Pair Pairs __attribute__((vector_size(kVectorBytes), aligned(alignof(Pair)), may_alias));
+
+inline Vector add_product(Vector sum, real left, Vector right) { return sum + left * right; }
+
+// Only for float32, whose upper half is a number in bfloat16.
+inline Vector add_product(Vector sum, Pair left, Pairs right) {
+#if defined(__AVX512BF16__)
+    // Not the intrinsic, with which g++ 12 copies the sums to memory and back in each round.
+    asm("vdpbf16ps %2, %1, %0" : "+v"(sum) : "v"(Pairs{} + left), "v"(right));
+    return sum;
+#else
+    constexpr Pair kHigh = 0xffff0000;
+    const Pairs lefts = Pairs{} + left;
+    return sum + (Vector)(lefts << 16) * (Vector)(right << 16) + (Vector)(lefts & kHigh) * (Vector)(right & kHigh);
+#endif
+}
+
+template <class Number>
+struct VectorOf;
+template <>
+struct VectorOf<real> {
+    using Type = Vector;
+};
+template <>
+struct VectorOf<Pair> {
+    using Type = Pairs;
+};
+
 // What is multiplied, and what is added to each row of the result before the activation.
+template <class Number>
 struct Product {
-    const real* a;
+    const Number* a;
     long a_row, a_column;  // strides
-    const real* b;
+    const Number* b;
     long b_row;
     real* c;
     long c_row;
-    int k;
+    int k;  // of reals, or of pairs
     const real* bias;  // padded, or null
     bool relu;
 };
 
 // M rows and P vectors of columns of the result.
-template <int M, int P>
-inline __attribute__((always_inline)) void tile(const Product& p, long row, long column) {
-    const real* a = p.a + row * p.a_row;
-    const real* b = p.b + column;
+template <int M, int P, class Number>
+inline __attribute__((always_inline)) void tile(const Product<Number>& p, long row, long column) {
+    const Number* a = p.a + row * p.a_row;
+    const Number* b = p.b + column;
+    using Right = typename VectorOf<Number>::Type;
     Vector sum[M][P];
     for (int j = 0; j < P; ++j) {
         const Vector start = p.bias ? reinterpret_cast<const Vector*>(p.bias + column)[j] : Vector{};
         for (int i = 0; i < M; ++i) sum[i][j] = start;
     }
     for (int k = 0; k < p.k; ++k) {
-        Vector right[P];
-        for (int j = 0; j < P; ++j) right[j] = reinterpret_cast<const Vector*>(b + k * p.b_row)[j];
+        Right right[P];
+        for (int j = 0; j < P; ++j) right[j] = reinterpret_cast<const Right*>(b + k * p.b_row)[j];
         for (int i = 0; i < M; ++i) {
-            const real left = a[i * p.a_row + k * p.a_column];
-            for (int j = 0; j < P; ++j) sum[i][j] += left * right[j];
+            const Number left = a[i * p.a_row + k * p.a_column];
+            for (int j = 0; j < P; ++j) sum[i][j] = add_product(sum[i][j], left, right[j]);
         }
     }
     for (int i = 0; i < M; ++i) {
@@ -66,21 +103,54 @@ inline __attribute__((always_inline)) void tile(const Product& p, long row, long
 }
 
 // All rows from `row` on, in tiles of M rows and then of fewer.
-template <int M, int P>
-void rows_of(const Product& p, int row, int end, long column) {
+template <int M, int P, class Number>
+void rows_of(const Product<Number>& p, int row, int end, long column) {
     for (; row + M <= end; row += M) tile<M, P>(p, row, column);
     if constexpr (M > 1)
         if (row < end) rows_of<(M > 6 ? 6 : M / 2), P>(p, row, end, column);
 }
 
 // C [rows, columns] = A B + bias, with as many columns as whole vectors hold.
-inline void multiply(const Product& p, int rows, int columns) {
+template <class Number>
+void multiply(const Product<Number>& p, int rows, int columns) {
     int column = 0;
     const int end = padded(columns);
     if constexpr (kAccumulators >= 24)
         for (; column + 4 * kLanes <= end; column += 4 * kLanes) rows_of<kAccumulators / 4, 4>(p, 0, rows, column);
     for (; column + 2 * kLanes <= end; column += 2 * kLanes) rows_of<kAccumulators / 2, 2>(p, 0, rows, column);
     for (; column < end; column += kLanes) rows_of<12, 1>(p, 0, rows, column);
+}
+
+// The upper half of float32, rounded to the nearest number in bfloat16, and to the even one of two.
+inline Pair rounded(float number) {
+    Pair bits;
+    __builtin_memcpy(&bits, &number, sizeof(bits));
+    const bool is_nan = (bits & 0x7fffffff) > 0x7f800000;
+    return is_nan ? bits | 0x400000 : bits + 0x7fff + (bits >> 16 & 1);
+}
+
+inline Pair pair(real first, real second) { return rounded(float(first)) >> 16 | (rounded(float(second)) & 0xffff0000); }
+
+inline int pairs(int count) { return (count + 1) / 2; }
+
+// Pairs of columns: out [rows, pairs(columns)].
+inline void pair_columns(const real* in, long row, int rows, int columns, Pair* out) {
+    for (int r = 0; r < rows; ++r, in += row, out += pairs(columns)) {
+        for (int c = 0; c < columns / 2; ++c) out[c] = pair(in[2 * c], in[2 * c + 1]);
+        if (columns % 2) out[columns / 2] = pair(in[columns - 1], 0);
+    }
+}
+
+// Pairs of rows: out [pairs(rows), padded(columns)].
+inline void pair_rows(const real* in, long row, int rows, int columns, Pair* out) {
+    for (int r = 0; r < rows; r += 2, out += padded(columns)) {
+        const real *first = in + r * row, *second = first + row;
+        if (r + 1 < rows)
+            for (int c = 0; c < columns; ++c) out[c] = pair(first[c], second[c]);
+        else
+            for (int c = 0; c < columns; ++c) out[c] = pair(first[c], 0);
+        for (int c = columns; c < padded(columns); ++c) out[c] = 0;
+    }
 }
 
 }  // namespace her

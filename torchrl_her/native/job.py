@@ -18,6 +18,10 @@ class Algorithm(IntEnum):
     TD3 = 1
     SAC = 2
     DQN = 3
+    TQC = 4
+
+
+STOCHASTIC = (Algorithm.SAC, Algorithm.TQC)  # whose actors draw from a distribution, with a temperature
 
 
 class Activation(IntEnum):
@@ -70,12 +74,13 @@ def structures(dtype: torch.dtype) -> Structures:
     job = structure(
         "Job",
         ("algorithm runs critics batch first_step steps rows actions threads", ctypes.c_int),
-        ("actor_layers critic_layers actor_tensors critic_tensors", ctypes.c_int),
+        ("actor_layers critic_layers actor_tensors critic_tensors bfloat16", ctypes.c_int),
+        ("target_critics dropped", ctypes.c_int),
         ("actor critic", ctypes.POINTER(Layer)),
         ("tensors", ctypes.POINTER(tensors)),
         ("entries", ctypes.c_int),
         ("seen next_seen", ctypes.POINTER(entry)),
-        ("action choice reward terminated weight discount noise own_noise low high idle", pointer),
+        ("action choice reward terminated weight discount noise own_noise low high idle drawn", pointer),
         ("gamma least greatest penalty max_norm tau policy_noise noise_limit target_entropy", real),
         ("adam", ctypes.POINTER(adam)),
         ("priorities losses", pointer),

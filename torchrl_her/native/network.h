@@ -24,6 +24,10 @@ class Arena {
         used_ += count;
         return blocks_[block_].get() + used_ - count;
     }
+    Pair* take_pairs(long count) {
+        static_assert(sizeof(Pair) <= sizeof(real));
+        return reinterpret_cast<Pair*>(take(count));
+    }
     void clear() { block_ = used_ = 0; }
 
   private:
@@ -52,6 +56,7 @@ struct Layer {
 };
 
 constexpr real kNormEpsilon = 1e-5;  // that of torch's LayerNorm
+constexpr int kLeastPaired = 32;     // width of layers between which products may be of numbers in bfloat16
 
 // A parameter [rows, columns] with all that a step changes.
 struct Parameter {
@@ -67,9 +72,23 @@ struct Pass {
     std::vector<real*> spread;       // 1 / standard deviation of each row
 };
 
+// The sum of term(0), ..., term(n - 1), lane by lane, so that it is one of vectors.
+template <class Term>
+inline real sum_of(int n, Term term) {
+    real lanes[kLanes] = {}, sum = 0;
+    int c = 0;
+    for (; c + kLanes <= n; c += kLanes)
+        for (int l = 0; l < kLanes; ++l) lanes[l] += term(c + l);
+    for (int l = 0; l < kLanes; ++l) sum += lanes[l];
+    for (; c < n; ++c) sum += term(c);
+    return sum;
+}
+
 class Network {
   public:
-    Network(const Layer* layers, int count) : layers_(layers, layers + count) {}
+    // `bfloat16`: products between hidden layers are of numbers in bfloat16; those of inputs and outputs never are.
+    Network(const Layer* layers, int count, bool bfloat16)
+        : layers_(layers, layers + count), bfloat16_(bfloat16 && sizeof(real) == sizeof(float)) {}
 
     std::vector<Parameter> parameters;  // of each layer: weight, bias and, if normalized, scale and shift
     bool uses_targets = false;
@@ -79,6 +98,8 @@ class Network {
         arena_ = &arena;
         weights_.assign(layers_.size(), nullptr);
         transposed_.assign(layers_.size(), nullptr);
+        weight_pairs_.assign(layers_.size(), nullptr);
+        transposed_pairs_.assign(layers_.size(), nullptr);
         biases_.assign(layers_.size(), nullptr);
     }
 
@@ -109,9 +130,15 @@ class Network {
                     for (int c = 0; c < layer.joined; ++c)
                         in[r][layer.inputs - layer.joined + c] = joined[r * joined_row + c];
             const bool relu = layer.activation == kRelu && !layer.normalized;
-            multiply({in.data, in.row, 1, weight(i), padded(layer.outputs), out.data, out.row, layer.inputs, bias(i),
-                      relu},
-                     rows, layer.outputs);
+            const long width = padded(layer.outputs);
+            if (paired(i))
+                multiply(Product<Pair>{columns_paired(in, layer.inputs), pairs(layer.inputs), 1, weight_pairs(i), width,
+                                       out.data, out.row, pairs(layer.inputs), bias(i), relu},
+                         rows, layer.outputs);
+            else
+                multiply(Product<real>{in.data, in.row, 1, weight(i), width, out.data, out.row, layer.inputs, bias(i),
+                                       relu},
+                         rows, layer.outputs);
             if (layer.normalized) normalize(i, pass);
             if (!relu) activate(layer, out);
         }
@@ -128,15 +155,20 @@ class Network {
             if (layer.normalized) normalization_slope(i, pass, slope, learns);
             if (learns) weight_slope(i, pass.values[i], slope);
             if (layer.joined && joined_slope)
-                multiply({slope.data, slope.row, 1, transposed(i, own, layer.joined), padded(layer.joined),
-                          joined_slope->data, joined_slope->row, layer.outputs, nullptr, false},
+                multiply(Product<real>{slope.data, slope.row, 1, transposed(i, own, layer.joined), padded(layer.joined),
+                                       joined_slope->data, joined_slope->row, layer.outputs, nullptr, false},
                          slope.rows, layer.joined);
             const bool done = i == 0 || (layer.joined && !learns);  // nothing before the joint is asked for
             if (done) return;
             Matrix before = matrix(*arena_, slope.rows, own);
-            multiply({slope.data, slope.row, 1, back(i, own), padded(own), before.data, before.row, layer.outputs,
-                      nullptr, false},
-                     slope.rows, own);
+            if (paired(i))
+                multiply(Product<Pair>{columns_paired(slope, layer.outputs), pairs(layer.outputs), 1, back_pairs(i, own),
+                                       padded(own), before.data, before.row, pairs(layer.outputs), nullptr, false},
+                         slope.rows, own);
+            else
+                multiply(Product<real>{slope.data, slope.row, 1, back(i, own), padded(own), before.data, before.row,
+                                       layer.outputs, nullptr, false},
+                         slope.rows, own);
             slope = before;
         }
     }
@@ -145,25 +177,33 @@ class Network {
         double sum = 0;
         for (const Parameter& p : parameters)
             for (int r = 0; r < p.rows; ++r) {
-                real own = 0;
                 const real* g = p.gradient[r];
-                Vector sums{};
-                int c = 0;
-                for (; c + kLanes <= p.columns; c += kLanes) {
-                    const Vector part = *reinterpret_cast<const Vector*>(g + c);
-                    sums += part * part;
-                }
-                for (int l = 0; l < kLanes; ++l) own += sums[l];
-                for (; c < p.columns; ++c) own += g[c] * g[c];
-                sum += own;
+                sum += sum_of(p.columns, [g](int c) { return g[c] * g[c]; });
             }
         return sum;
     }
 
   private:
     std::vector<Layer> layers_;
+    bool bfloat16_;
     Arena* arena_ = nullptr;
     std::vector<real*> weights_, transposed_, biases_;
+    std::vector<Pair*> weight_pairs_, transposed_pairs_;
+
+    bool paired(int layer) const {
+        const bool hidden = layer > 0 && layer + 1 < int(layers_.size());
+        return bfloat16_ && hidden && std::min(layers_[layer].inputs, layers_[layer].outputs) >= kLeastPaired;
+    }
+    const Pair* columns_paired(Matrix in, int columns) {
+        Pair* out = arena_->take_pairs(long(in.rows) * pairs(columns));
+        pair_columns(in.data, in.row, in.rows, columns, out);
+        return out;
+    }
+    Pair* rows_paired(const real* in, long row, int rows, int columns) {
+        Pair* out = arena_->take_pairs(long(pairs(rows)) * padded(columns));
+        pair_rows(in, row, rows, columns, out);
+        return out;
+    }
 
     const Parameter& parameter(int layer, int which) const {
         int first = 0;
@@ -191,21 +231,40 @@ class Network {
     const real* weight(int layer) { return padded_rows(parameter(layer, 0), weights_, layer); }
     const real* bias(int layer) { return padded_rows(parameter(layer, 1), biases_, layer); }
 
+    const Pair* weight_pairs(int layer) {
+        const Parameter& p = parameter(layer, 0);
+        if (!weight_pairs_[layer]) weight_pairs_[layer] = rows_paired(value(p), p.columns, p.rows, p.columns);
+        return weight_pairs_[layer];
+    }
+
+    // out [columns, padded(rows)] of in [rows, columns].
+    template <class Number>
+    static void transpose(const Number* in, int rows, int columns, Number* out) {
+        const long row = padded(rows);
+        constexpr int kBlock = 16;  // the lines of a block of both stay in the fastest memory
+        for (int r0 = 0; r0 < rows; r0 += kBlock)
+            for (int c = 0; c < columns; ++c)
+                for (int r = r0; r < std::min(r0 + kBlock, rows); ++r) out[c * row + r] = in[long(r) * columns + c];
+    }
     // The transpose [outputs, padded] of some rows of a weight.
     real* transposed(int layer, int first, int count) {
         const Parameter& p = parameter(layer, 0);
-        const long row = padded(count);
-        real* out = arena_->take(p.columns * row);
-        const real* in = value(p) + long(first) * p.columns;
-        constexpr int kBlock = 16;  // the lines of a block of both stay in the fastest memory
-        for (int r0 = 0; r0 < count; r0 += kBlock)
-            for (int c = 0; c < p.columns; ++c)
-                for (int r = r0; r < std::min(r0 + kBlock, count); ++r) out[c * row + r] = in[long(r) * p.columns + c];
+        real* out = arena_->take(long(p.columns) * padded(count));
+        transpose(value(p) + long(first) * p.columns, count, p.columns, out);
         return out;
     }
     const real* back(int layer, int own) {
         if (!transposed_[layer]) transposed_[layer] = transposed(layer, 0, own);
         return transposed_[layer];
+    }
+    const Pair* back_pairs(int layer, int own) {
+        if (!transposed_pairs_[layer]) {
+            const Parameter& p = parameter(layer, 0);
+            const Pair* rows = columns_paired({const_cast<real*>(value(p)), own, p.columns, p.columns}, p.columns);
+            transposed_pairs_[layer] = arena_->take_pairs(long(pairs(p.columns)) * padded(own));
+            transpose(rows, own, pairs(p.columns), transposed_pairs_[layer]);
+        }
+        return transposed_pairs_[layer];
     }
 
     void normalize(int layer, Pass& pass) {
@@ -213,11 +272,10 @@ class Network {
         const Matrix out = pass.values[layer + 1], kept = pass.normalized[layer];
         const real *scale = value(parameter(layer, 2)), *shift = value(parameter(layer, 3));
         for (int r = 0; r < out.rows; ++r) {
-            real *y = out[r], *x = kept[r], mean = 0, variance = 0;
-            for (int c = 0; c < n; ++c) mean += y[c];
-            mean /= n;
-            for (int c = 0; c < n; ++c) variance += (y[c] - mean) * (y[c] - mean);
-            const real spread = 1 / std::sqrt(variance / n + kNormEpsilon);
+            real *y = out[r], *x = kept[r];
+            const real mean = sum_of(n, [y](int c) { return y[c]; }) / n;
+            const real variance = sum_of(n, [y, mean](int c) { return (y[c] - mean) * (y[c] - mean); }) / n;
+            const real spread = 1 / std::sqrt(variance + kNormEpsilon);
             pass.spread[layer][r] = spread;
             for (int c = 0; c < n; ++c) {
                 x[c] = (y[c] - mean) * spread;
@@ -236,19 +294,17 @@ class Network {
             }
         const real* factor = value(scale);
         for (int r = 0; r < slope.rows; ++r) {
-            real *s = slope[r], sum = 0, along = 0;
-            const real* x = pass.normalized[layer][r];
-            for (int c = 0; c < n; ++c) {
-                if (learns) {
-                    scale.gradient.data[c] += s[c] * x[c];
-                    shift.gradient.data[c] += s[c];
-                }
-                s[c] *= factor[c];
-                sum += s[c];
-                along += s[c] * x[c];
+            real* s = slope[r];
+            const real *x = pass.normalized[layer][r], spread = pass.spread[layer][r];
+            if (learns) {
+                real *__restrict in_scale = scale.gradient.data, *__restrict in_shift = shift.gradient.data;
+                for (int c = 0; c < n; ++c) in_scale[c] += s[c] * x[c];
+                for (int c = 0; c < n; ++c) in_shift[c] += s[c];
             }
-            const real spread = pass.spread[layer][r];
-            for (int c = 0; c < n; ++c) s[c] = spread * (s[c] - sum / n - x[c] * (along / n));
+            for (int c = 0; c < n; ++c) s[c] *= factor[c];
+            const real mean = sum_of(n, [s](int c) { return s[c]; }) / n;
+            const real along = sum_of(n, [s, x](int c) { return s[c] * x[c]; }) / n;
+            for (int c = 0; c < n; ++c) s[c] = spread * (s[c] - mean - x[c] * along);
         }
     }
 
@@ -283,9 +339,16 @@ class Network {
         Parameter &weight = parameter(layer, 0), &bias = parameter(layer, 1);
         weight.gradient = matrix(*arena_, own.inputs, own.outputs);
         bias.gradient = matrix(*arena_, 1, own.outputs);
-        multiply({in.data, 1, in.row, slope.data, slope.row, weight.gradient.data, weight.gradient.row, slope.rows,
-                  nullptr, false},
-                 own.inputs, own.outputs);
+        Matrix& out = weight.gradient;
+        if (paired(layer))
+            multiply(Product<Pair>{rows_paired(in.data, in.row, slope.rows, own.inputs), 1, padded(own.inputs),
+                                   rows_paired(slope.data, slope.row, slope.rows, own.outputs), padded(own.outputs),
+                                   out.data, out.row, pairs(slope.rows), nullptr, false},
+                     own.inputs, own.outputs);
+        else
+            multiply(Product<real>{in.data, 1, in.row, slope.data, slope.row, out.data, out.row, slope.rows, nullptr,
+                                   false},
+                     own.inputs, own.outputs);
         real* sum = bias.gradient.data;
         std::fill_n(sum, own.outputs, real(0));
         for (int r = 0; r < slope.rows; ++r)

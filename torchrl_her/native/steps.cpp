@@ -1,4 +1,4 @@
-// Gradient steps of DDPG, TD3, SAC and DQN: forward, backward, clipping, Adam and soft targets, run by run.
+// Gradient steps of DDPG, TD3, SAC, TQC and DQN: forward, backward, clipping, Adam and soft targets, run by run.
 //
 // The results are those of TorchRL's losses, which the tests compare them with. Everything that Python hands over
 // is in `Job`; the structures are mirrored in `job.py`.
@@ -12,7 +12,7 @@
 
 namespace her {
 
-enum Algorithm { kDdpg, kTd3, kSac, kDqn };
+enum Algorithm { kDdpg, kTd3, kSac, kDqn, kTqc };
 
 struct Tensors {
     int rows, columns;
@@ -27,7 +27,9 @@ struct Entry {
 
 struct Job {
     int algorithm, runs, critics, batch, first_step, steps, rows, actions, threads;
-    int actor_layers, critic_layers, actor_tensors, critic_tensors;
+    int actor_layers, critic_layers, actor_tensors, critic_tensors, bfloat16;
+    int target_critics;  // how many critics are drawn for targets, and the actor follows the mean of all; 0: all
+    int dropped;         // how many of the greatest quantiles of all critics TQC's targets leave out
     const Layer *actor, *critic;
     const Tensors* tensors;  // of the actor, of each critic, and SAC's logarithm of the temperature
     int entries;
@@ -42,6 +44,7 @@ struct Job {
     const real* own_noise;   // and of the present one
     const real *low, *high;  // [actions]
     const uint8_t* idle;     // [runs]
+    const int32_t* drawn;    // [steps, runs, target_critics], critics
     real gamma, least, greatest, penalty, max_norm, tau, policy_noise, noise_limit, target_entropy;
     const Adam* adam;  // [steps]
     real* priorities;  // [runs, rows]
@@ -54,6 +57,9 @@ const real kHalfLogTwoPi = real(0.91893853320467274178), kLogTwo = real(0.693147
 const real kMostTanh = 1 - (sizeof(real) == 4 ? real(1e-6) : real(1e-15));  // as TorchRL's TanhNormal
 const real kLeastScale = -10, kGreatestScale = 2;  // of SAC, as in modules/stochastic_actor.py
 
+// Whether the actor draws actions from a distribution, with a temperature.
+bool is_stochastic(const Job& job) { return job.algorithm == kSac || job.algorithm == kTqc; }
+
 // Of one run.
 class Learner {
   public:
@@ -62,7 +68,8 @@ class Learner {
         const int networks = 1 + job.critics;
         for (int n = 0; n < networks; ++n) {
             const bool first = n == 0;
-            networks_.emplace_back(first ? job.actor : job.critic, first ? job.actor_layers : job.critic_layers);
+            networks_.emplace_back(first ? job.actor : job.critic, first ? job.actor_layers : job.critic_layers,
+                                   job.bfloat16);
             for (int i = 0; i < (first ? job.actor_tensors : job.critic_tensors); ++i)
                 networks_.back().parameters.push_back(parameter(job.tensors[next++]));
         }
@@ -70,7 +77,7 @@ class Learner {
             targets_.push_back(network);
             targets_.back().uses_targets = true;
         }
-        if (job.algorithm == kSac) temperature_ = parameter(job.tensors[next]);
+        if (is_stochastic(job)) temperature_ = parameter(job.tensors[next]);
     }
 
     void step(int step) {
@@ -137,14 +144,16 @@ class Learner {
         return out;
     }
 
-    // Clamped targets of the critics, from the next state's values.
-    void make_targets(real* values) {
-        for (int b = 0; b < job_.batch; ++b) {
-            const long row = first_ + b;
-            const real discount = job_.discount ? job_.discount[row] : job_.gamma;
-            const real value = job_.terminated[row] ? 0 : values[b];
-            values[b] = std::min(std::max(job_.reward[row] + discount * value, job_.least), job_.greatest);
-        }
+    // The clamped target of a row, from the next state's value.
+    real target(int b, real next) const {
+        const long row = first_ + b;
+        const real discount = job_.discount ? job_.discount[row] : job_.gamma;
+        const real value = job_.terminated[row] ? 0 : next;
+        return std::min(std::max(job_.reward[row] + discount * value, job_.least), job_.greatest);
+    }
+
+    void make_targets(real* values) const {
+        for (int b = 0; b < job_.batch; ++b) values[b] = target(b, values[b]);
     }
 
     // An action drawn from SAC's policy: what its gradient needs.
@@ -180,25 +189,39 @@ class Learner {
         return draw;
     }
 
-    // The least value of the critics at an action.
-    real* least_value(std::vector<Network>& networks, Matrix seen, Matrix action) {
+    Matrix value_next(int critic, Matrix action) {
+        Network& target = targets_[1 + critic];
+        Pass pass = target.pass(next_seen_);
+        return target.forward(pass, action.data, action.row);
+    }
+
+    // The least value of the target critics at the next action: of all, or of those that were drawn.
+    real* least_value(Matrix action) {
+        const int some = job_.target_critics, count = some ? some : job_.critics;
+        const int32_t* drawn = job_.drawn + (long(step_ - job_.first_step) * job_.runs + run_) * some;
         real* least = arena_.take(job_.batch);
-        for (int n = 1; n <= job_.critics; ++n) {
-            Pass pass = networks[n].pass(seen);
-            const Matrix out = networks[n].forward(pass, action.data, action.row);
-            for (int b = 0; b < job_.batch; ++b) least[b] = n == 1 ? out[b][0] : std::min(least[b], out[b][0]);
+        for (int i = 0; i < count; ++i) {
+            const Matrix out = value_next(some ? drawn[i] : i, action);
+            for (int b = 0; b < job_.batch; ++b) least[b] = i == 0 ? out[b][0] : std::min(least[b], out[b][0]);
         }
         return least;
     }
 
-    real* targets_of_critics() {
-        Network& actor = job_.algorithm == kSac ? networks_[0] : targets_[0];
+    // The next action, and what is to be added to its value.
+    struct Next {
+        Matrix action;
+        real* entropy;  // or null
+    };
+
+    Next next_action() {
+        Network& actor = is_stochastic(job_) ? networks_[0] : targets_[0];
         Pass pass = actor.pass(next_seen_);
         Matrix action = actor.forward(pass);
-        real* log_likelihood = nullptr;
-        if (job_.algorithm == kSac) {
+        if (is_stochastic(job_)) {
             const Draw drawn = draw(action, noise_of(job_.noise));
-            action = drawn.action, log_likelihood = drawn.log_likelihood;
+            const real temperature = std::exp(*temperature_.value);
+            for (int b = 0; b < job_.batch; ++b) drawn.log_likelihood[b] *= -temperature;
+            return {drawn.action, drawn.log_likelihood};
         }
         if (job_.algorithm == kTd3)
             for (int b = 0; b < job_.batch; ++b)
@@ -207,19 +230,22 @@ class Learner {
                     const real noise = std::min(std::max(own, -job_.noise_limit), job_.noise_limit);
                     action[b][a] = std::min(std::max(action[b][a] + noise, job_.low[a]), job_.high[a]);
                 }
-        real* values = least_value(targets_, next_seen_, action);
-        if (log_likelihood) {
-            const real temperature = std::exp(*temperature_.value);
-            for (int b = 0; b < job_.batch; ++b) values[b] -= temperature * log_likelihood[b];
-        }
-        make_targets(values);
-        return values;
+        return {action, nullptr};
     }
 
     // The gradients of the critics and of the actor.
     void learn_values_and_actions() {
+        job_.algorithm == kTqc ? learn_quantiles() : learn_values();
+        is_stochastic(job_) ? learn_stochastic_actions() : learn_actions();
+    }
+
+    void learn_values() {
         const int batch = job_.batch, actions = job_.actions;
-        const real* wanted = targets_of_critics();
+        const Next next = next_action();
+        real* wanted = least_value(next.action);
+        if (next.entropy)
+            for (int b = 0; b < batch; ++b) wanted[b] += next.entropy[b];
+        make_targets(wanted);
         const real* action = job_.action + first_ * actions;
         real* priorities = job_.priorities + first_;
         double value_loss = 0;
@@ -237,24 +263,86 @@ class Learner {
             networks_[n].backward(pass, slope, true);
         }
         loss(1) = real(value_loss / batch);
-        job_.algorithm == kSac ? learn_stochastic_actions() : learn_actions();
     }
 
-    // A deterministic actor: it follows the first critic, less the action L2 penalty.
-    void learn_actions() {
+    // TQC's targets [batch, K] are the quantiles of all critics without the greatest ones; Kuznetsov et al., 2020.
+    Matrix quantile_targets() {
+        const int batch = job_.batch, quantiles = job_.critic[job_.critic_layers - 1].outputs;
+        const int all = job_.critics * quantiles, kept = all - job_.dropped;
+        const Next next = next_action();
+        Matrix every = matrix(arena_, batch, all);
+        for (int n = 0; n < job_.critics; ++n) {
+            const Matrix out = value_next(n, next.action);
+            for (int b = 0; b < batch; ++b) std::copy_n(out[b], quantiles, every[b] + n * quantiles);
+        }
+        const auto less = [](real a, real b) { return a < b || (b != b && a == a); };  // NaN is the greatest
+        for (int b = 0; b < batch; ++b) {
+            if (kept < all) std::nth_element(every[b], every[b] + kept, every[b] + all, less);
+            for (int k = 0; k < kept; ++k) every[b][k] = target(b, every[b][k] + next.entropy[b]);
+        }
+        every.columns = kept;
+        return every;
+    }
+
+    // Each quantile of each critic learns from all targets, by the quantile Huber loss.
+    void learn_quantiles() {
         const int batch = job_.batch, actions = job_.actions;
-        Network &actor = networks_[0], &critic = networks_[1];
+        const Matrix wanted = quantile_targets();
+        const int kept = wanted.columns;
+        const real* action = job_.action + first_ * actions;
+        real* priorities = job_.priorities + first_;
+        double value_loss = 0;
+        for (int n = 1; n <= job_.critics; ++n) {
+            Pass pass = networks_[n].pass(seen_);
+            const Matrix out = networks_[n].forward(pass, action, actions);
+            const int quantiles = out.columns;
+            const real pairs = real(quantiles) * kept;
+            Matrix slope = matrix(arena_, batch, quantiles);
+            for (int b = 0; b < batch; ++b) {
+                const real* goal = wanted[b];
+                real distances = 0, costs = 0;
+                for (int q = 0; q < quantiles; ++q) {
+                    const real own = out[b][q], above = (q + real(0.5)) / quantiles, below = 1 - above;
+                    real distance = 0, cost = 0, pull = 0;
+#pragma omp simd reduction(+ : distance, cost, pull)
+                    for (int k = 0; k < kept; ++k) {
+                        const real error = goal[k] - own, size = std::abs(error), part = error < 0 ? below : above;
+                        distance += size;
+                        cost += part * (size <= 1 ? error * error / 2 : size - real(0.5));
+                        pull += part * (size <= 1 ? error : error < 0 ? real(-1) : real(1));
+                    }
+                    distances += distance, costs += cost;
+                    slope[b][q] = -pull / pairs * weights_[b] / batch;
+                }
+                priorities[b] = n == 1 ? distances / pairs : std::max(priorities[b], distances / pairs);
+                value_loss += costs / pairs * weights_[b];
+            }
+            networks_[n].backward(pass, slope, true);
+        }
+        loss(1) = real(value_loss / batch);
+    }
+
+    // A deterministic actor: it follows the first critic, or the mean of all, less the action L2 penalty.
+    void learn_actions() {
+        const int batch = job_.batch, actions = job_.actions, followed = job_.target_critics ? job_.critics : 1;
+        Network& actor = networks_[0];
         Pass acted = actor.pass(seen_);
         const Matrix action = actor.forward(acted);
-        Pass valued = critic.pass(seen_);
-        const Matrix value = critic.forward(valued, action.data, action.row);
-        Matrix slope = matrix(arena_, batch, 1), action_slope = matrix(arena_, batch, actions);
+        Matrix action_slope = matrix(arena_, batch, actions);
         double sum = 0, squares = 0;
-        for (int b = 0; b < batch; ++b) {
-            slope[b][0] = -weights_[b] / batch;
-            sum += value[b][0] * weights_[b];
+        for (int n = 1; n <= followed; ++n) {
+            Pass valued = networks_[n].pass(seen_);
+            const Matrix value = networks_[n].forward(valued, action.data, action.row);
+            Matrix slope = matrix(arena_, batch, 1), own = n == 1 ? action_slope : matrix(arena_, batch, actions);
+            for (int b = 0; b < batch; ++b) {
+                slope[b][0] = -weights_[b] / (real(batch) * followed);
+                sum += value[b][0] * weights_[b] / followed;
+            }
+            networks_[n].backward(valued, slope, false, &own);
+            if (n > 1)
+                for (int b = 0; b < batch; ++b)
+                    for (int a = 0; a < actions; ++a) action_slope[b][a] += own[b][a];
         }
-        critic.backward(valued, slope, false, &action_slope);
         const real price = job_.penalty / (real(batch) * actions);
         for (int b = 0; b < batch; ++b)
             for (int a = 0; a < actions; ++a) {
@@ -282,9 +370,17 @@ class Learner {
         for (int b = 0; b < batch; ++b) std::fill_n(action_slope[b], actions, real(0));
         const real temperature = std::exp(*temperature_.value);
         double actor_loss = 0, temperature_slope = 0;
+        const bool follows_mean = job_.target_critics || job_.algorithm == kTqc;  // of all outputs, or the least
         for (int n = 0; n < job_.critics; ++n) {
-            Matrix slope = matrix(arena_, batch, 1), own = matrix(arena_, batch, actions);
+            const int outputs = values[n].columns;
+            const real parts = real(job_.critics) * outputs;
+            Matrix slope = matrix(arena_, batch, outputs), own = matrix(arena_, batch, actions);
             for (int b = 0; b < batch; ++b) {
+                if (follows_mean) {
+                    std::fill_n(slope[b], outputs, -weights_[b] / batch / parts);
+                    for (int q = 0; q < outputs; ++q) actor_loss -= values[n][b][q] / parts * weights_[b];
+                    continue;
+                }
                 int least = 0;
                 for (int other = 1; other < job_.critics; ++other)
                     if (values[other][b][0] < values[least][b][0]) least = other;
@@ -354,7 +450,7 @@ class Learner {
             const real clip = clipping(n == 0 ? networks_[0].gradient_square() : critics);
             for (Parameter& parameter : networks_[n].parameters) adam_step(parameter, adam, clip, job_.tau);
         }
-        if (job_.algorithm == kSac) {
+        if (is_stochastic(job_)) {
             const double slope = *temperature_.gradient.data;
             adam_step(temperature_, adam, clipping(slope * slope), 0);
         }
@@ -371,7 +467,7 @@ class Learner {
 }  // namespace her
 
 extern "C" void her_steps(const her::Job* job) {
-    const int tensors = job->actor_tensors + job->critics * job->critic_tensors + (job->algorithm == her::kSac);
+    const int tensors = job->actor_tensors + job->critics * job->critic_tensors + her::is_stochastic(*job);
     for (int i = 0; i < tensors; ++i)
         if (job->tensors[i].steps) *job->tensors[i].steps += job->steps;
 #pragma omp parallel for schedule(dynamic) num_threads(job->threads) if (job->threads > 1)

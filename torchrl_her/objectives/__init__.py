@@ -1,4 +1,4 @@
-"""TorchRL's losses of DDPG, TD3, SAC and DQN, with clamped targets and an action L2 penalty."""
+"""TorchRL's losses of DDPG, TD3, SAC, TQC and DQN, with clamped targets and an action L2 penalty."""
 
 from torchrl_her.objectives.critics import critic_value
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss, make_ddpg_loss
@@ -7,12 +7,14 @@ from torchrl_her.objectives.noise import RunNoise
 from torchrl_her.objectives.sac import PenalizedSACLoss, make_sac_loss
 from torchrl_her.objectives.targets import ClampedTD0, clamped_td0, make_target_updater
 from torchrl_her.objectives.td3 import PenalizedTD3Loss, make_td3_loss
+from torchrl_her.objectives.tqc import PenalizedTQCLoss, make_tqc_loss
 
 __all__ = [
     "ClampedTD0",
     "PenalizedDDPGLoss",
     "PenalizedSACLoss",
     "PenalizedTD3Loss",
+    "PenalizedTQCLoss",
     "RunNoise",
     "clamped_td0",
     "critic_value",
@@ -21,4 +23,5 @@ __all__ = [
     "make_sac_loss",
     "make_target_updater",
     "make_td3_loss",
+    "make_tqc_loss",
 ]

@@ -1,4 +1,4 @@
-"""The critics of a loss, of which there may be several: what they are, and what they think."""
+"""The critics of a loss, of which there may be several: what they are and what they think."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.objectives import DDPGLoss, DQNLoss, LossModule
+from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, TQCLoss
+
+from torchrl_her.objectives.noise import RunNoise
 
 
 @torch.no_grad()
@@ -17,11 +19,14 @@ def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None
     """The value of actions, as the loss's own critics see it.
 
     TD3 and SAC train several critics, which they make anew from the one they are given. Their value is the
-    least of these, as in their targets. That of DQN is the value of the best action.
+    least of these, as in their targets. Where targets take some critics at random, it is the mean of all, and
+    in TQC the mean of all quantiles, since the actors follow these means. That of DQN is the value of the
+    best action.
 
     Args:
         loss: of TorchRL, for example from :func:`~torchrl_her.make_td3_loss`.
-        transitions: [...], with all that the critics read; for all but DQN that includes the action.
+        transitions: [...], with all that the critics read; for all but DQN that includes the action. They are
+            normalized if the loss is trained on normalized ones (:class:`~torchrl_her.modules.RunningNorm`).
 
     Returns:
         [..., 1]; None if the loss has no critics of actions that are known here.
@@ -54,7 +59,51 @@ def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None
                 values.append(network(transitions.select(*network.in_keys)).get(key))
     finally:
         network.train(training)
-    return torch.stack(values).amin(0)
+    every = torch.stack(values)
+    if isinstance(loss, TQCLoss):
+        return every.mean((0, -1)).unsqueeze(-1)
+    return every.mean(0) if getattr(loss, "target_critics", 0) else every.amin(0)
+
+
+def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
+    """The least value of critics, or of as many of them as are drawn at random for each run.
+
+    Args:
+        values: [N, ...] of N critics; the rest is one equal block for each run.
+        count: how many critics are drawn; 0 for all of them.
+        noise: draws them, if ``count`` is not 0.
+
+    Returns:
+        [...].
+
+    Example:
+        >>> values = torch.tensor([[-1.0, -5.0], [-2.0, -2.0], [-3.0, -1.0]])
+        >>> least_of_some(values, 0, RunNoise()).tolist()
+        [-3.0, -5.0]
+    """
+    if count == 0:
+        return values.amin(0)
+    drawn = noise.subsets(count, len(values)).to(values.device)  # [R, count]
+    blocks = values.reshape(len(values), len(drawn), -1)
+    own = torch.arange(len(drawn), device=values.device)
+    return blocks[drawn.T, own].amin(0).view(values.shape[1:])
+
+
+def checked_subset(target_critics: int, critics: int) -> int:
+    """How many critics are drawn for targets; 0 if all are.
+
+    Raises:
+        ValueError: not from 0 to their number.
+
+    Example:
+        >>> checked_subset(2, 10), checked_subset(10, 10)
+        (2, 0)
+    """
+    if not 0 <= target_critics <= critics:
+        raise ValueError(
+            f"target_critics must be from 0 (all) to the number of critics, {critics}, got {target_critics}"
+        )
+    return 0 if target_critics == critics else target_critics
 
 
 def as_critics(

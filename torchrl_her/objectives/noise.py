@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class RunNoise:
-    """Standard normal numbers for R runs, each from its own generator.
+    """Standard normal numbers and random subsets for R runs, each from its own generator.
 
     What a run draws then does not depend on which other runs are trained beside it.
 
@@ -35,3 +35,16 @@ class RunNoise:
         for block, generator in zip(out.view(len(self.generators), -1), self.generators, strict=True):
             block.normal_(generator=generator)
         return out
+
+    def subsets(self, count: int, of: int) -> Tensor:
+        """Whole numbers below ``of``, without repetition, drawn for each run: [R, count], in order of size.
+
+        From torch's own generator, all runs share one draw: [1, count].
+
+        Example:
+            >>> RunNoise([torch.Generator().manual_seed(run) for run in range(3)]).subsets(2, 5).shape
+            torch.Size([3, 2])
+        """
+        sources: Sequence[torch.Generator | None] = self.generators or [None]
+        drawn = [torch.randperm(of, generator=own)[:count] for own in sources]
+        return torch.stack(drawn).sort(-1).values

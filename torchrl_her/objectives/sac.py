@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -14,8 +15,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SACLoss
 
-from torchrl_her.objectives.critics import as_critics
+from torchrl_her.objectives.critics import as_critics, checked_subset, least_of_some
 from torchrl_her.objectives.noise import RunNoise
+from torchrl_her.objectives.targets import clamped_td0
 
 
 class PenalizedSACLoss(SACLoss):
@@ -23,25 +25,37 @@ class PenalizedSACLoss(SACLoss):
 
     Each of R runs has its own temperature and its own random numbers.
 
+    Actor and targets have the least value of all critics. Or targets have the least value of some that are
+    drawn at random in each gradient step, and the actor follows the mean of all critics: this is REDQ (Chen
+    et al., 2021). TorchRL's ``REDQLoss`` cannot be used for it: it draws one subset for all runs, from
+    torch's own generator, has one temperature for all of them, and with ``reduction="none"`` it gives a loss
+    for each critic where stacked runs need one for each transition.
+
     Args:
         *args: of :class:`torchrl.objectives.SACLoss`.
         **kwargs: of the same.
         action_penalty: the weight of the penalty on drawn actions, see
             :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        target_critics: how many critics are drawn for targets; 0 for all.
         runs: R.
         noise: where its random numbers come from.
+
+    Raises:
+        ValueError: ``target_critics`` is not from 0 to the number of critics.
     """
 
     def __init__(
         self,
         *args: Any,
         action_penalty: float = 0.0,
+        target_critics: int = 0,
         runs: int = 1,
         noise: RunNoise | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
         self.action_penalty, self.runs = action_penalty, runs
+        self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
         self.noise = noise or RunNoise()
         if runs > 1:
             start: Tensor = self.log_alpha  # type: ignore[has-type]
@@ -53,12 +67,16 @@ class PenalizedSACLoss(SACLoss):
         seen = tensordict.select(*self.qvalue_network.in_keys, strict=False)
         seen.set(self.tensor_keys.action, action)
         valued = self._vmap_qnetworkN0(seen, self._cached_detached_qvalue_params)
-        value = valued.get(self.tensor_keys.state_action_value).min(0)[0].squeeze(-1)
+        value = self._value_for_actor(valued.get(self.tensor_keys.state_action_value))
         loss = self._reduce_loss(
             self._by_run(self._alpha, log_prob) * log_prob - value, tensordict=tensordict, weights=weights
         )
         penalty = self.action_penalty * action.square().mean(-1)
         return loss + (penalty if loss.ndim else penalty.mean()), {"log_prob": log_prob.detach()}
+
+    def _value_for_actor(self, values: Tensor) -> Tensor:
+        """What the actor makes as great as possible [...], from the outputs [N, ..., 1] of N critics."""
+        return (values.mean(0) if self.target_critics else values.amin(0)).squeeze(-1)
 
     def _draw(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """An action [..., a] for each row, and the logarithm of its likelihood [...]."""
@@ -83,7 +101,8 @@ class PenalizedSACLoss(SACLoss):
         action, log_prob = self._draw(after)
         after.set(self.tensor_keys.action, action)
         valued = self._vmap_qnetworkN0(after, self.target_qvalue_network_params)
-        value = valued.get(self.tensor_keys.state_action_value).min(0)[0]
+        values = valued.get(self.tensor_keys.state_action_value)
+        value = least_of_some(values, self.target_critics, self.noise)
         value = value - (self._by_run(self._alpha, log_prob) * log_prob).unsqueeze(-1)
         tensordict.set(("next", self.value_estimator.tensor_keys.value), value)
         return self.value_estimator.value_estimate(tensordict).squeeze(-1)
@@ -98,7 +117,9 @@ def make_sac_loss(
     *,
     action_spec: Bounded,
     critics: int = 2,
+    target_critics: int = 0,
     gamma: float = 0.98,
+    reward_range: tuple[float, float] | None = None,
     temperature: float = 0.1,
     action_penalty: float = 0.0,
     runs: int = 1,
@@ -107,7 +128,10 @@ def make_sac_loss(
 ) -> SACLoss:
     """TorchRL's SAC loss with several critics and a learned temperature.
 
-    Targets are not clamped, since they contain the policy's entropy besides the rewards.
+    Targets contain the policy's entropy besides the rewards, so they may rightly be outside of the range of
+    possible returns, and are not clamped unless ``reward_range`` is given. Clamping them makes sense where
+    rewards outweigh entropy, as they do when the temperature has become small: an overestimated value cannot
+    exceed what is possible then.
 
     Haarnoja et al., Soft actor-critic algorithms and applications, 2018.
 
@@ -116,7 +140,12 @@ def make_sac_loss(
         critic: from :func:`~torchrl_her.make_critic`, the others are made like it; or all critics in a list.
         action_spec: least and greatest actions, of one environment.
         critics: how many there are; targets and policy have the least of their values.
+        target_critics: as many critics are drawn at random in each gradient step, and targets have the least
+            of their values alone, while the policy has the mean of all. 0: both have the least of all. Chen
+            et al., Randomized ensembled double Q-learning, 2021.
         gamma: discount, in [0, 1).
+        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
+            leave them as they are.
         temperature: what it begins with. At TorchRL's 1, entropy outweighs rewards of -1 and 0 for so long
             that some runs never find what is rewarded.
         action_penalty: weight of the action L2 penalty, see
@@ -126,8 +155,8 @@ def make_sac_loss(
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
 
     Raises:
-        ValueError: ``gamma`` is outside of [0, 1), ``temperature`` is not positive, or ``critics`` is below 1
-            or not their number.
+        ValueError: ``gamma`` is outside of [0, 1), ``temperature`` is not positive, ``critics`` is below 1 or
+            not their number, or ``target_critics`` is not from 0 to ``critics``.
 
     Example:
         >>> from torchrl_her import make_critic, make_stochastic_actor
@@ -137,10 +166,6 @@ def make_sac_loss(
         >>> loss.num_qvalue_nets
         2
     """
-    if not 0.0 <= gamma < 1.0:
-        raise ValueError(f"gamma must be in [0, 1), got {gamma}")
-    if not temperature > 0:
-        raise ValueError(f"temperature must be positive, got {temperature}")
     own = as_critics(critic, critics)
     loss = PenalizedSACLoss(
         actor,
@@ -148,13 +173,39 @@ def make_sac_loss(
         action_spec=action_spec,
         num_qvalue_nets=critics,
         loss_function="l2",
-        alpha_init=temperature,
+        alpha_init=positive_temperature(temperature),
         action_penalty=action_penalty,
+        target_critics=target_critics,
         runs=runs,
         noise=RunNoise(generators),
         reduction=reduction,
         scalar_output_mode="exclude" if reduction == "none" else None,
     )
     loss.set_keys(state_action_value=(own[0] if isinstance(own, list) else own).out_keys[0])
-    loss.make_value_estimator(gamma=gamma)
+    set_soft_targets(loss, gamma, reward_range)
     return loss
+
+
+def positive_temperature(temperature: float) -> float:
+    """The temperature.
+
+    Raises:
+        ValueError: it is not positive.
+    """
+    if not temperature > 0:
+        raise ValueError(f"temperature must be positive, got {temperature}")
+    return temperature
+
+
+def set_soft_targets(loss: SACLoss, gamma: float, reward_range: tuple[float, float] | None) -> None:
+    """Gives a loss targets of one or several steps, clamped to possible returns if these are given.
+
+    Raises:
+        ValueError: ``gamma`` is outside of [0, 1).
+    """
+    clamped = clamped_td0(gamma, reward_range or (-math.inf, math.inf))
+    if reward_range is None:
+        loss.make_value_estimator(gamma=gamma)
+    else:
+        clamped.set_keys(value=loss.tensor_keys.value)
+        loss.make_value_estimator(clamped)

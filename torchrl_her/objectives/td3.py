@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.objectives import TD3Loss
+from torchrl.objectives.utils import distance_loss
 
-from torchrl_her.objectives.critics import as_critics
-from torchrl_her.objectives.ddpg import action_penalty_of
+from torchrl_her.objectives.critics import as_critics, checked_subset, least_of_some
 from torchrl_her.objectives.noise import RunNoise
 from torchrl_her.objectives.targets import clamped_td0
 
@@ -21,19 +21,28 @@ from torchrl_her.objectives.targets import clamped_td0
 class PenalizedTD3Loss(TD3Loss):
     """TorchRL's TD3 loss with an action L2 penalty, and with random numbers of each run's own.
 
+    Targets have the least value of all critics, or of some that are drawn at random in each gradient step, as
+    in REDQ (Chen et al., 2021). In the second case the actor follows the mean of all critics instead of the
+    first one.
+
     Args:
         *args: of :class:`torchrl.objectives.TD3Loss`.
         **kwargs: of the same, without ``policy_noise`` and ``noise_clip``.
         action_penalty: the weight of the penalty, see :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        target_critics: how many critics are drawn for targets; 0 for all.
         target_noise: standard deviation of the noise on the target's actions.
         target_noise_clip: the greatest noise.
         noise: where its random numbers come from.
+
+    Raises:
+        ValueError: ``target_critics`` is not from 0 to the number of critics.
     """
 
     def __init__(
         self,
         *args: Any,
         action_penalty: float = 0.0,
+        target_critics: int = 0,
         target_noise: float = 0.2,
         target_noise_clip: float = 0.5,
         noise: RunNoise | None = None,
@@ -41,29 +50,58 @@ class PenalizedTD3Loss(TD3Loss):
     ) -> None:
         super().__init__(*args, policy_noise=0.0, noise_clip=0.0, **kwargs)
         self.action_penalty = action_penalty
+        self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
         self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
         self.noise = noise or RunNoise()
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        with action_penalty_of(self.actor_network, self.action_penalty) as penalties:
-            loss, metadata = super().actor_loss(tensordict)
-        return loss + (penalties[0] if loss.ndim else penalties[0].mean()), metadata
+        weights = self._maybe_get_priority_weight(tensordict)
+        acted = self._act(tensordict, self.actor_network_params)
+        values = self._values(acted, self._cached_detach_qvalue_network_params)
+        value = values.mean(0) if self.target_critics else values[0]
+        loss = self._reduce_loss(-value, tensordict=tensordict, weights=weights)
+        penalty = self.action_penalty * acted.get(self.tensor_keys.action).square().mean(-1)
+        metadata = {"state_action_value_actor": values.detach()}
+        return loss + (penalty if loss.ndim else penalty.mean()), metadata
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        key = self.actor_network.out_keys[0]
+        weights = self._maybe_get_priority_weight(tensordict)
+        tensordict = tensordict.clone(False)
+        with torch.no_grad():
+            after = self._next_value(tensordict)
+            tensordict.set(("next", self.tensor_keys.state_action_value), after.unsqueeze(-1))
+        values = self._values(tensordict, self.qvalue_network_params)
+        target = self.value_estimator.value_estimate(tensordict).squeeze(-1)
+        loss = distance_loss(values, target.expand_as(values), loss_function=self.loss_function).sum(0)
+        metadata = {
+            "td_error": (values - target).pow(2),
+            "next_state_value": after,
+            "pred_value": values.detach(),
+            "target_value": target.detach(),
+        }
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
 
-        def smooth(_module: nn.Module, _inputs: Any, output: TensorDictBase) -> None:
-            action = output.get(key)
-            noise = (self.noise(action) * self.target_noise).clamp(
-                -self.target_noise_clip, self.target_noise_clip
-            )
-            output.set(key, action + noise)  # TorchRL's loss clamps it to the range of actions
+    def _next_value(self, tensordict: TensorDictBase) -> Tensor:
+        """The value [...] of the next state, where the target actor acts with noise."""
+        after = self._act(tensordict.get("next"), self.target_actor_network_params)
+        action = after.get(self.tensor_keys.action)
+        noise = (self.noise(action) * self.target_noise).clamp(
+            -self.target_noise_clip, self.target_noise_clip
+        )
+        after.set(self.tensor_keys.action, (action + noise).clamp(self.min_action, self.max_action))
+        values = self._values(after, self.target_qvalue_network_params)
+        return least_of_some(values, self.target_critics, self.noise)
 
-        hook = self.actor_network.register_forward_hook(smooth)
-        try:
-            return super().value_loss(tensordict)
-        finally:
-            hook.remove()
+    def _act(self, tensordict: TensorDictBase, params: TensorDictParams) -> TensorDictBase:
+        """What an actor sees, and its action."""
+        with params.to_module(self.actor_network, preserve_module_state=False):
+            return self.actor_network(tensordict.select(*self.actor_network.in_keys, strict=False))
+
+    def _values(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        """The values [N, ...] of actions, as N critics see them."""
+        seen = tensordict.select(*self.qvalue_network.in_keys, strict=False)
+        valued = self._vmap_qvalue_network00(seen.expand(self.num_qvalue_nets, *seen.batch_size), params)
+        return valued.get(self.tensor_keys.state_action_value).squeeze(-1)
 
 
 def make_td3_loss(
@@ -72,6 +110,7 @@ def make_td3_loss(
     *,
     action_spec: Bounded,
     critics: int = 2,
+    target_critics: int = 0,
     gamma: float = 0.98,
     reward_range: tuple[float, float] = (-1.0, 0.0),
     action_penalty: float = 0.0,
@@ -89,6 +128,8 @@ def make_td3_loss(
         critic: from :func:`~torchrl_her.make_critic`, the others are made like it; or all critics in a list.
         action_spec: least and greatest actions, of one environment.
         critics: how many there are; targets have the least of their values.
+        target_critics: as many critics are drawn at random in each gradient step, and targets have the least
+            of their values alone; 0 for all. Chen et al., Randomized ensembled double Q-learning, 2021.
         gamma: discount, in [0, 1).
         reward_range: least and greatest reward; targets are clamped to the returns that these allow.
         action_penalty: weight of the action L2 penalty, see
@@ -97,7 +138,8 @@ def make_td3_loss(
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
 
     Raises:
-        ValueError: ``gamma`` is outside of [0, 1), or ``critics`` is below 1 or not their number.
+        ValueError: ``gamma`` is outside of [0, 1), ``critics`` is below 1 or not their number, or
+            ``target_critics`` is not from 0 to ``critics``.
 
     Example:
         >>> from torchrl_her import make_actor, make_critic
@@ -115,6 +157,7 @@ def make_td3_loss(
         num_qvalue_nets=critics,
         loss_function="l2",
         action_penalty=action_penalty,
+        target_critics=target_critics,
         noise=RunNoise(generators),
         reduction=reduction,
     )

@@ -12,7 +12,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_her.native.job import Algorithm, Structures
+from torchrl_her.native.job import STOCHASTIC, Algorithm, Structures
 from torchrl_her.replay_buffers.keys import under_next
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY
 
@@ -23,6 +23,7 @@ os.register_at_fork(after_in_child=lambda: _FORKED.append(True))
 _DRAWS = {
     Algorithm.TD3: 1,
     Algorithm.SAC: 2,
+    Algorithm.TQC: 2,
 }  # random numbers of a step: of next actions, then of present ones
 
 
@@ -44,7 +45,8 @@ class FusedCall:
         action_key: where the action is.
 
     Raises:
-        ValueError: an entry has another width, or a discrete action is none of those that there are.
+        ValueError: an entry has another width, a discrete action is none of those that there are, or the loss
+            was set to leave out more quantiles than there are.
     """
 
     def __init__(
@@ -86,17 +88,21 @@ class FusedCall:
         flags[list(idle)] = 1
         self.job.idle = self._keep(flags)
 
-    def draw_noise(self, steps: int) -> Tensor | None:
+    def draw_noise(self, steps: int) -> tuple[Tensor, ...]:
         """The random numbers of some steps, in the order in which TorchRL's loss would draw them."""
         kinds = _DRAWS.get(self._algorithm, 0)
         if kinds == 0:
-            return None
-        drawn = torch.empty(kinds, steps, self._runs, self.job.batch, self._actions, dtype=self._dtype)
+            return ()
+        job, noise, some = self.job, self._loss.noise, self.job.target_critics
+        drawn = torch.empty(kinds, steps, self._runs, job.batch, self._actions, dtype=self._dtype)
+        critics = torch.empty(steps, self._runs, some, dtype=torch.int32)
         for step in range(steps):
             for kind in range(kinds):
-                drawn[kind, step] = self._loss.noise(drawn[kind, step])
-        self.job.noise, self.job.own_noise = drawn[0].data_ptr(), drawn[-1].data_ptr()
-        return drawn
+                drawn[kind, step] = noise(drawn[kind, step])
+                if kind == 0 and some:  # the next action comes first, then who values it
+                    critics[step] = noise.subsets(some, self._loss.num_qvalue_nets)
+        job.noise, job.own_noise, job.drawn = drawn[0].data_ptr(), drawn[-1].data_ptr(), critics.data_ptr()
+        return drawn, critics
 
     def _keep(self, tensor: Tensor) -> int:
         """The address of a tensor, which stays as long as this object."""
@@ -108,10 +114,18 @@ class FusedCall:
         job.gamma = float(estimator.gamma)
         job.least, job.greatest = getattr(estimator, "low", -math.inf), getattr(estimator, "high", math.inf)
         job.penalty = getattr(loss, "action_penalty", 0.0)
+        job.target_critics = getattr(loss, "target_critics", 0)
+        if self._algorithm is Algorithm.TQC:
+            dropped, quantiles = loss.top_quantiles_to_drop_per_net, loss.qvalue_network.module.outputs
+            if not 0 <= dropped < quantiles:
+                raise ValueError(
+                    f"top_quantiles_to_drop_per_net must be from 0 to {quantiles - 1}, got {dropped}"
+                )
+            job.dropped = dropped * loss.num_qvalue_nets
         if self._algorithm is Algorithm.TD3:
             job.policy_noise, job.noise_limit = loss.target_noise, loss.target_noise_clip
             self._read_bounds(loss.min_action, loss.max_action)
-        elif self._algorithm is Algorithm.SAC:
+        elif self._algorithm in STOCHASTIC:
             job.target_entropy = float(loss.target_entropy)
             bounds = loss.actor_network[1].distribution_kwargs
             self._read_bounds(bounds.get("low", -1.0), bounds.get("high", 1.0))

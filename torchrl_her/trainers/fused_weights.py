@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from torchrl_her.native.job import Algorithm, Structures
+from torchrl_her.native.job import STOCHASTIC, Structures
 from torchrl_her.trainers.fusing import FUSED
 
 State = dict[str, Tensor]
@@ -36,13 +36,13 @@ class FusedWeights:
     def __init__(self, loss: LossModule, optimizer: torch.optim.Optimizer, kinds: Structures) -> None:
         self._optimizer, self._kinds, fused = optimizer, kinds, FUSED[type(loss)]
         self._dtype = kinds.dtype
-        is_sac = fused.algorithm is Algorithm.SAC
+        is_stochastic = fused.algorithm in STOCHASTIC
         self.critics: int = 0 if fused.critic is None else getattr(loss, "num_qvalue_nets", 1)
-        actor = _tensors(loss, fused.actor, delayed=not is_sac)  # SAC has no delayed actor
+        actor = _tensors(loss, fused.actor, delayed=not is_stochastic)  # SAC has no delayed actor
         critic = [] if fused.critic is None else _tensors(loss, fused.critic, delayed=True)
         stacked = hasattr(loss, "num_qvalue_nets")
         self.actor_tensors, self.critic_tensors = len(actor), len(critic)
-        temperature = [(loss.log_alpha, None)] if is_sac else []
+        temperature = [(loss.log_alpha, None)] if is_stochastic else []
         self.parameters: list[nn.Parameter] = [own for own, _ in (*actor, *critic, *temperature)]
         # Each tensor of each network: which parameter, its target, and which of how many critics in it.
         self._places = [

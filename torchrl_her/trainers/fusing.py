@@ -17,11 +17,12 @@ from torchrl.objectives.value import TD0Estimator
 from torchrl_her.modules.networks import ActorNet, CriticNet
 from torchrl_her.modules.q_actor import QNet
 from torchrl_her.modules.stochastic_actor import StochasticActorNet
-from torchrl_her.native.job import Algorithm
+from torchrl_her.native.job import STOCHASTIC, Algorithm
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss
 from torchrl_her.objectives.sac import PenalizedSACLoss
 from torchrl_her.objectives.targets import ClampedTD0
 from torchrl_her.objectives.td3 import PenalizedTD3Loss
+from torchrl_her.objectives.tqc import PenalizedTQCLoss
 from torchrl_her.trainers.fused_layers import layers_of, parameter_shapes
 
 
@@ -46,6 +47,16 @@ class FusedLoss:
     fixed: dict[str, Any]
 
 
+_SOFT = {
+    "delay_actor": False,
+    "delay_qvalue": True,
+    "skip_done_states": False,
+    "fixed_alpha": False,
+    "min_log_alpha": None,
+    "max_log_alpha": None,
+    "_version": 2,
+}
+
 FUSED: dict[type[LossModule], FusedLoss] = {
     PenalizedDDPGLoss: FusedLoss(
         Algorithm.DDPG,
@@ -53,7 +64,7 @@ FUSED: dict[type[LossModule], FusedLoss] = {
         ActorNet,
         "value_network",
         ("loss_actor", "loss_value"),
-        {"delay_actor": True, "delay_value": True},
+        {"delay_actor": True, "delay_value": True, "loss_function": "l2"},
     ),
     PenalizedTD3Loss: FusedLoss(
         Algorithm.TD3,
@@ -61,7 +72,7 @@ FUSED: dict[type[LossModule], FusedLoss] = {
         ActorNet,
         "qvalue_network",
         ("loss_actor", "loss_qvalue"),
-        {"delay_actor": True, "delay_qvalue": True},
+        {"delay_actor": True, "delay_qvalue": True, "loss_function": "l2"},
     ),
     PenalizedSACLoss: FusedLoss(
         Algorithm.SAC,
@@ -69,15 +80,15 @@ FUSED: dict[type[LossModule], FusedLoss] = {
         StochasticActorNet,
         "qvalue_network",
         ("loss_actor", "loss_qvalue", "loss_alpha"),
-        {
-            "delay_actor": False,
-            "delay_qvalue": True,
-            "skip_done_states": False,
-            "fixed_alpha": False,
-            "min_log_alpha": None,
-            "max_log_alpha": None,
-            "_version": 2,
-        },
+        {**_SOFT, "loss_function": "l2"},
+    ),
+    PenalizedTQCLoss: FusedLoss(
+        Algorithm.TQC,
+        "actor_network",
+        StochasticActorNet,
+        "qvalue_network",
+        ("loss_actor", "loss_qvalue", "loss_alpha"),
+        {**_SOFT, "loss_function": "smooth_l1"},
     ),
     DQNLoss: FusedLoss(
         Algorithm.DQN,
@@ -85,7 +96,7 @@ FUSED: dict[type[LossModule], FusedLoss] = {
         QNet,
         None,
         ("loss",),
-        {"delay_value": True, "double_dqn": True, "action_space": "categorical"},
+        {"delay_value": True, "double_dqn": True, "action_space": "categorical", "loss_function": "l2"},
     ),
 }
 
@@ -162,8 +173,6 @@ def _obstacles(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
     for name, value in fused.fixed.items():
         if getattr(loss, name) != value:
             yield f"{name}={getattr(loss, name)!r}"
-    if loss.loss_function != "l2":
-        yield f"loss_function={loss.loss_function!r}"
     if loss.reduction not in ("mean", "none"):
         yield f"reduction={loss.reduction!r}"
     yield from _strange_networks(loss, fused)
@@ -203,6 +212,8 @@ def _strange_networks(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
             yield f"other layers than those of a plain {kind.__name__} without batch normalization"
         elif [tuple(p.shape[-2:]) for p in net.parameters()] != parameter_shapes(layers):
             yield f"parameters beside those of the layers in {name}"
+        elif kind is CriticNet and fused.algorithm is not Algorithm.TQC and layers[-1].outputs != 1:
+            yield f"critics with {layers[-1].outputs} outputs"
         inner = module[0] if isinstance(module, TensorDictSequential) else module
         if inner._kwargs or inner._get_kwargs or inner.method is not None or inner.method_kwargs:
             yield "options of a network's TensorDictModule"
@@ -214,8 +225,8 @@ def _strange_networks(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
 
 
 def _is_plain_module(actor: nn.Module, fused: FusedLoss) -> bool:
-    """Whether an actor is a network and, for SAC and DQN, what makes an action of its outputs."""
-    if fused.algorithm not in (Algorithm.SAC, Algorithm.DQN):
+    """Whether an actor is a network and, for SAC, TQC and DQN, what makes an action of its outputs."""
+    if fused.algorithm not in (*STOCHASTIC, Algorithm.DQN):
         return type(actor) is TensorDictModule
     if (
         not isinstance(actor, TensorDictSequential)
@@ -245,7 +256,7 @@ def _strange_keys(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
 
 def _strange_targets(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
     estimator: Any = loss.value_estimator
-    kinds = (TD0Estimator, ClampedTD0) if fused.algorithm is Algorithm.SAC else (ClampedTD0,)
+    kinds = (TD0Estimator, ClampedTD0) if fused.algorithm in STOCHASTIC else (ClampedTD0,)
     if type(estimator) not in kinds:
         yield f"targets of a {type(estimator).__name__}"
         return
@@ -254,14 +265,14 @@ def _strange_targets(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
         or estimator.tensor_keys.value != loss.tensor_keys.state_action_value
     ):
         yield "targets from other networks than the loss's"
-    if fused.algorithm in (Algorithm.TD3, Algorithm.SAC) and estimator.value_network is not None:
+    if fused.algorithm in (Algorithm.TD3, *STOCHASTIC) and estimator.value_network is not None:
         yield "targets from a network of the value estimator's own"
     for name in ("reward", "terminated", "done"):
         if getattr(estimator.tensor_keys, name) != name:
             yield f"{name} of the targets under the key {getattr(estimator.tensor_keys, name)!r}"
     plain = TD0Estimator(gamma=0.0, value_network=None)
     # TorchRL's default for SAC, whose loss computes the targets without gradients all the same.
-    free = ("differentiable",) if fused.algorithm is Algorithm.SAC else ()
+    free = ("differentiable",) if fused.algorithm in STOCHASTIC else ()
     for name in ("average_rewards", "shifted", "differentiable", "skip_existing", "group_key"):
         if name not in free and getattr(estimator, name) != getattr(plain, name):
             yield f"targets with {name}={getattr(estimator, name)!r}"

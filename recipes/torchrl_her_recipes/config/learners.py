@@ -14,6 +14,9 @@ from torchrl_her_recipes.config.options import option, what_there_is
 
 Actions = Literal["continuous", "discrete"]
 
+_CRITICS = "how many critics there are; targets have the least of their values"
+_TARGET_CRITICS = "so many critics, drawn at random, are asked for each step's targets; 0: all"
+
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerConfig(Group):
@@ -41,12 +44,29 @@ class LearnerConfig(Group):
         "normalization of hidden layers: layer, in all networks; batch, in critics only",
         choices=("none", "layer", "batch"),
     )
+    normalize: bool = option(
+        False, "whether observations and goals are normalized, by mean and deviation of all that was written"
+    )
+    normalize_clip: float = option(5.0, "normalized values are clipped to plus and minus this", above=0)
     tau: float = option(0.02, "rate of the soft target update", at_least=0, at_most=1)
+    average_decay: float = option(
+        0.999,
+        "what stays, in a gradient step, of the average of the actor's weights that is evaluated and kept; "
+        "0: no average",
+        at_least=0,
+        below=1,
+    )
     hard_update_interval: int = option(0, "gradient steps between hard target updates; 0: soft", at_least=0)
     compile: str = option(
         "auto",
         "gradient steps in C++, compiled for this machine; auto: where that is possible",
         choices=("auto", "always", "never"),
+    )
+    products: str = option(
+        "float32",
+        "numbers that compiled gradient steps multiply between hidden layers; bfloat16: twice as fast where "
+        "the processor has AVX512-BF16",
+        choices=("float32", "bfloat16"),
     )
 
     @property
@@ -89,7 +109,24 @@ class DQNConfig(EpsilonConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DDPGConfig(EpsilonConfig):
+class NoiseConfig(EpsilonConfig):
+    """A learner with a deterministic policy of continuous actions.
+
+    Of its actions, the share ``epsilon * uniform_share`` is drawn uniformly, noise is added to
+    ``epsilon * (1 - uniform_share)``, and all others are greedy. With ``epsilon_start=1 epsilon_end=1`` every
+    action that is not uniform has noise.
+    """
+
+    action_noise: float = option(
+        0.05, "standard deviation of noise on exploring actions, as a share of their range", at_least=0
+    )
+    uniform_share: float = option(
+        0.2, "share of exploring actions that are uniform; the others have noise", at_least=0, at_most=1
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DDPGConfig(NoiseConfig):
     """DDPG."""
 
     action_penalty: float = option(
@@ -101,18 +138,68 @@ class DDPGConfig(EpsilonConfig):
 class TD3Config(DDPGConfig):
     """TD3."""
 
-    critics: int = option(2, "how many critics there are; targets have the least of their values", at_least=1)
+    critics: int = option(2, _CRITICS, at_least=1)
+    target_critics: int = option(0, _TARGET_CRITICS, at_least=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_target_critics(self.target_critics, self.critics)
 
 
 @dataclass(frozen=True, kw_only=True)
-class SACConfig(LearnerConfig):
-    """SAC. Its policy is stochastic and explores by itself."""
+class EntropyConfig(LearnerConfig):
+    """A learner whose policy is stochastic and explores by itself."""
 
     temperature: float = option(0.1, "the temperature that learning begins with", above=0)
-    critics: int = option(2, "how many critics there are; targets have the least of their values", at_least=1)
     action_penalty: float = option(
         0.3, "action L2 penalty, which keeps actions off the ends of tanh", at_least=0
     )
+    clamp_targets: bool = option(
+        False, "whether targets are clamped to the returns that rewards allow, which entropy may exceed"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(EntropyConfig):
+    """SAC."""
+
+    critics: int = option(2, _CRITICS, at_least=1)
+    target_critics: int = option(0, _TARGET_CRITICS, at_least=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_target_critics(self.target_critics, self.critics)
+
+
+@dataclass(frozen=True, kw_only=True)
+class REDQConfig(SACConfig):
+    """SAC with many critics, of which targets take a few."""
+
+    critics: int = option(10, _CRITICS, at_least=1)
+    target_critics: int = option(2, _TARGET_CRITICS, at_least=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TQCConfig(EntropyConfig):
+    """TQC."""
+
+    critics: int = option(2, "how many critics there are; targets have all of their quantiles", at_least=1)
+    quantiles: int = option(25, "quantiles of the return that each critic gives", at_least=1)
+    dropped_quantiles: int = option(
+        2, "targets leave out so many of the greatest quantiles for each critic", at_least=0
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.dropped_quantiles >= self.quantiles:
+            raise ValueError(
+                f"dropped_quantiles={self.dropped_quantiles} must be below quantiles={self.quantiles}"
+            )
+
+
+def _check_target_critics(target_critics: int, critics: int) -> None:
+    if target_critics > critics:
+        raise ValueError(f"target_critics={target_critics} must be at most critics={critics}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,6 +259,20 @@ for _spec in (
         summary="soft actor-critic with a learned temperature (Haarnoja et al., 2018)",
         builder=f"{_BUILDERS}.sac:SACBuilder",
         options=SACConfig,
+        priority_power=1,
+    ),
+    LearnerSpec(
+        name="redq",
+        summary="SAC with ten critics, targets of two of them at random (Chen et al., 2021)",
+        builder=f"{_BUILDERS}.sac:SACBuilder",
+        options=REDQConfig,
+        priority_power=1,
+    ),
+    LearnerSpec(
+        name="tqc",
+        summary="SAC whose critics give quantiles, the greatest left out (Kuznetsov et al., 2020)",
+        builder=f"{_BUILDERS}.tqc:TQCBuilder",
+        options=TQCConfig,
         priority_power=1,
     ),
     LearnerSpec(

@@ -43,6 +43,34 @@ def test_shares(epsilon: float) -> None:
     assert share(~without_noise) == pytest.approx(0.2 * epsilon, abs=0.01)
 
 
+def test_uniform_actions_and_noise_on_all_others() -> None:
+    """As MRL explores: 20 % uniform actions, and noise with a deviation of 0.1 of the greatest action."""
+    low, high = -torch.ones(2), torch.ones(2)
+    module = DecayingEpsilon(
+        low, high, start=1.0, end=1.0, noise=0.05, uniform_share=0.2, generators=[seeded()]
+    )
+    module.step()
+    action = module(TensorDict({"action": torch.zeros(ROWS, 2)}, [ROWS]))["action"]
+    near = action.abs().amax(-1) < 0.6  # six deviations of noise
+    # of uniform actions, 0.6 ** 2 are near as well
+    assert share(near) == pytest.approx(0.8 + 0.2 * 0.36, abs=0.01)
+    assert share((action == 0.0).any(-1)) < 1e-4
+    assert action[near].abs().quantile(0.5).item() == pytest.approx(0.0729, abs=0.002)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"noise": -0.1}, "noise must be at least 0, got -0.1"),
+        ({"noise": math.nan}, "noise must be at least 0, got nan"),
+        ({"uniform_share": 1.5}, r"uniform_share must be in \[0, 1\], got 1.5"),
+    ],
+)
+def test_noise_that_cannot_be(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        DecayingEpsilon(LOW, HIGH, **options)
+
+
 def test_a_row_explores_as_a_whole() -> None:
     same = explored(0.5) == GREEDY
     assert torch.equal(same[:, 0], same[:, 1])

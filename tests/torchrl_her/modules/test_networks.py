@@ -116,6 +116,7 @@ def test_any_batch_shape(shape: list[int]) -> None:
     for net, inputs in (
         (ActorNet(11, 3), (observation, goal)),
         (CriticNet(11, 3), (observation, goal, action)),
+        (CriticNet(11, 3, outputs=5), (observation, goal, action)),
     ):
         flat = net(*(x.reshape(-1, x.shape[-1]) for x in inputs))
         assert torch.allclose(net(*inputs), flat.view(*shape, -1), atol=1e-6)
@@ -189,6 +190,19 @@ def test_shapes_that_cannot_be_are_named(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         make((4, 2), 3, **options)
+
+
+def test_a_critic_may_have_several_outputs() -> None:
+    critic = make_critic((4, 2), 3, outputs=5, runs=2)
+    data = TensorDict(
+        {"observation": torch.randn(2, 6, 4), "desired_goal": torch.randn(2, 6, 2)}
+        | {"action": torch.randn(2, 6, 3)},
+        [2, 6],
+    )
+    assert critic(data)["state_action_value"].shape == (2, 6, 5)
+    assert critic(data[:, :0])["state_action_value"].shape == (2, 0, 5)
+    with pytest.raises(ValueError, match="outputs must be at least 1, got 0"):
+        make_critic((4, 2), 3, outputs=0)
 
 
 def test_an_actor_has_no_batch_normalization() -> None:

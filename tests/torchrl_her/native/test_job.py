@@ -21,7 +21,7 @@ def fields_in_c(name: str) -> list[str]:
     body = re.search(rf"struct {name} \{{(.*?)\n\}};", SOURCES, re.DOTALL)
     assert body is not None
     text = re.sub(r"//[^\n]*", "", body[1])
-    declared = re.findall(r"(?:const )?(?:int64_t|uint8_t|int|long|real|\w+)\s*([^;]+);", text)
+    declared = re.findall(r"(?:const )?(?:int64_t|int32_t|uint8_t|int|long|real|\w+)\s*([^;]+);", text)
     return [part.strip().lstrip("*").strip() for line in declared for part in line.split(",")]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.objectives import ClipPPOLoss, LossModule
+from torchrl.objectives import ClipPPOLoss, LossModule, SoftUpdate
 
 from torchrl_her import (
     make_actor,
@@ -17,9 +17,10 @@ from torchrl_her import (
     make_stochastic_actor,
     make_td3_loss,
 )
-from torchrl_her.objectives import critic_value
+from torchrl_her.objectives import RunNoise, critic_value
+from torchrl_her.objectives.critics import least_of_some
 
-from ..lost_game import SPEC, rows
+from ..lost_game import SPEC, rows, say
 
 
 def make_loss(kind: str, *, normalize: bool = False) -> LossModule:
@@ -58,6 +59,38 @@ def test_it_is_the_least_of_the_critics_that_are_trained(
     )
     params[last].data.copy_(torch.tensor(biases).view_as(params[last]))
     assert critic_value(loss, make_rows(kind)).tolist() == [[value]] * 5
+
+
+@pytest.mark.parametrize("kind", ["td3", "sac"])
+def test_it_is_the_mean_of_critics_of_which_targets_take_some(kind: str) -> None:
+    critic = make_critic((4, 2), 3)
+    if kind == "td3":
+        actor = make_actor((4, 2), 3)
+        loss = make_td3_loss(actor, critic, action_spec=SPEC, critics=3, target_critics=2)
+    else:
+        drawing = make_stochastic_actor((4, 2), SPEC)
+        loss = make_sac_loss(drawing, critic, action_spec=SPEC, critics=3, target_critics=2)
+    SoftUpdate(loss, tau=0.1)
+    say(loss, [-1.0, -2.0, -6.0], [0.0, 0.0, 0.0])
+    assert critic_value(loss, make_rows(kind)).tolist() == [[-3.0]] * 5
+
+
+def test_the_least_of_critics_that_are_drawn_for_each_run() -> None:
+    """Two runs of two rows, and three critics: by hand for the subsets that the generators give."""
+    values = torch.tensor(
+        [[[1.0, 9.0], [4.0, 4.0]], [[2.0, 8.0], [3.0, 5.0]], [[0.0, 7.0], [6.0, 2.0]]]
+    )  # [critics, runs, rows]
+    seen = set()
+    for seed in range(20):
+        noise = RunNoise([torch.Generator().manual_seed(seed + run) for run in (0, 100)])
+        again = RunNoise([torch.Generator().manual_seed(seed + run) for run in (0, 100)])
+        first, second = again.subsets(2, 3).tolist()
+        assert least_of_some(values.unsqueeze(-1), 2, noise).squeeze(-1).tolist() == [
+            [min(values[n, run, row].item() for n in own) for row in range(2)]
+            for run, own in enumerate((first, second))
+        ]
+        seen |= {tuple(first), tuple(second)}
+    assert seen == {(0, 1), (0, 2), (1, 2)}
 
 
 @pytest.mark.parametrize("kind", ["ddpg", "td3", "sac"])

@@ -47,6 +47,55 @@ def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None
     assert batch["td_error"].tolist() == pytest.approx([4.5, 2.75, 1.875])
 
 
+def test_targets_of_critics_that_are_drawn_and_the_mean_for_the_actor() -> None:
+    """By hand: the least of two of three targets, which differ from run to run and from step to step."""
+    loss = make_sac_loss(
+        make_stochastic_actor((4, 2), SPEC, runs=2),
+        make_critic((4, 2), 3, runs=2),
+        action_spec=SPEC,
+        critics=3,
+        target_critics=2,
+        gamma=0.5,
+        runs=2,
+        generators=[torch.Generator().manual_seed(run) for run in range(2)],
+        reduction="none",
+    )
+    SoftUpdate(loss, tau=0.1)
+    loss.log_alpha.data.fill_(-50.0)
+    say(loss, [0.0, 0.0, 3.0], [-2.0, -4.0, -6.0])
+    batch = rows(2, action=torch.rand(2, 2, 3), runs=2)
+    seen = set()
+    for _ in range(30):
+        measured = loss(batch)
+        assert measured["loss_actor"].flatten().tolist() == pytest.approx([-1.0] * 4)
+        first, second = (batch["td_error"] - 3.0).tolist()  # of the critic that says 3
+        assert first[0] == first[1]
+        assert second[0] == second[1]
+        seen.add((first[0], second[0]))
+    assert seen == {(a, b) for a in (3.0, 4.0) for b in (3.0, 4.0)}  # 1 + half of 4 or of 6
+
+
+def test_targets_may_be_clamped_to_possible_returns() -> None:
+    losses = [
+        make_sac_loss(
+            make_stochastic_actor((4, 2), SPEC),
+            make_critic((4, 2), 3),
+            action_spec=SPEC,
+            gamma=0.5,
+            reward_range=bounds,
+        )
+        for bounds in (None, (-1.0, 0.0))
+    ]
+    batch, errors = rows(1, action=torch.rand(1, 1, 3))[0], []
+    for loss in losses:
+        SoftUpdate(loss, tau=0.1)
+        loss.log_alpha.data.fill_(-50.0)
+        say(loss, [0.0, 0.0], [-9.0, 9.0])
+        loss(batch)
+        errors += batch["td_error"].tolist()
+    assert errors == pytest.approx([5.5, 2.0])  # -1 - 9 / 2, and the least return -1 / (1 - 1 / 2)
+
+
 def own_and_torchrls(**options: Any) -> tuple[LossModule, SACLoss]:
     """Our loss, and TorchRL's with the same weights."""
     actor, critic = make_stochastic_actor((4, 2), SPEC), make_critic((4, 2), 3)

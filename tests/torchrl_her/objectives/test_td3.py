@@ -93,6 +93,44 @@ def test_the_targets_of_a_run_have_its_own_noise() -> None:
     assert torch.equal(first[1].flatten(), torch.empty(15).normal_(generator=alone))
 
 
+def test_targets_of_critics_that_are_drawn_and_the_mean_for_the_actor() -> None:
+    """By hand: the least of two of three targets, which differ from step to step."""
+    loss = make_td3_loss(
+        make_actor((4, 2), 3),
+        make_critic((4, 2), 3),
+        action_spec=SPEC,
+        critics=3,
+        target_critics=2,
+        gamma=0.5,
+        reward_range=(-10.0, 0.0),
+        generators=[torch.Generator().manual_seed(0)],
+    )
+    SoftUpdate(loss, tau=0.1)
+    say(loss, [-1.0, -3.0, -8.0], [-2.0, -4.0, -6.0])
+    batch = rows(2, action=torch.rand(1, 2, 3))[0]
+    seen = set()
+    for _ in range(30):
+        measured = loss(batch)
+        assert measured["loss_actor"].item() == pytest.approx(4.0)
+        first, second = measured["target_value"].tolist()
+        assert first == second
+        seen.add(first)
+    assert seen == {-3.0, -4.0}  # -1 + half of -4 (critics 0 and 1) or of -6
+
+
+@pytest.mark.parametrize("target_critics", [-1, 4])
+def test_more_critics_than_there_are_cannot_be_drawn(target_critics: int) -> None:
+    message = rf"target_critics must be from 0 \(all\) to the number of critics, 3, got {target_critics}"
+    with pytest.raises(ValueError, match=message):
+        make_td3_loss(
+            make_actor((4, 2), 3),
+            make_critic((4, 2), 3),
+            action_spec=SPEC,
+            critics=3,
+            target_critics=target_critics,
+        )
+
+
 @pytest.mark.parametrize(("critics", "given"), [(0, 1), (3, 2)])
 def test_the_number_of_critics_is_checked(critics: int, given: int) -> None:
     own = [make_critic((4, 2), 3) for _ in range(given)]

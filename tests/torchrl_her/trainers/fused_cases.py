@@ -20,11 +20,13 @@ from torchrl_her import (
     make_sac_loss,
     make_stochastic_actor,
     make_td3_loss,
+    make_tqc_loss,
 )
 from torchrl_her.objectives import RunNoise
 
 WIDTHS, ACTIONS = (4, 2), 3
-ALGORITHMS = ("ddpg", "td3", "sac", "dqn")
+ALGORITHMS = ("ddpg", "td3", "sac", "redq", "tqc", "dqn")
+QUANTILES = 5
 
 
 def make_loss(
@@ -32,17 +34,25 @@ def make_loss(
     *,
     runs: int = 1,
     critics: int = 2,
+    target_critics: int = 0,
     penalty: float = 0.3,
+    bounded: bool = False,
     dtype: torch.dtype = torch.float64,
     **network: Any,
 ) -> LossModule:
-    """A loss with small networks and random numbers of its own; actions have three different ranges."""
+    """A loss with small networks and random numbers of its own; actions have three different ranges.
+
+    ``bounded`` clamps targets of SAC and TQC as well; ``redq`` is SAC with targets of two critics at random.
+    """
+    if algorithm == "redq":
+        critics, target_critics = critics + 1, 2
     low, high = (torch.tensor(own, dtype=dtype) for own in ((-1.0, -2.0, 0.0), (1.0, 2.0, 3.0)))
     spec = Bounded(low, high, dtype=dtype)
     options: dict[str, Any] = {"hidden": 16, "runs": runs, **network}
     if algorithm == "dqn":
         return make_dqn_loss(make_q_actor(WIDTHS, ACTIONS, **options)[0].to(dtype), reduction="none")
-    critic = make_critic(WIDTHS, ACTIONS, **options).to(dtype)
+    outputs = QUANTILES if algorithm == "tqc" else 1
+    critic = make_critic(WIDTHS, ACTIONS, outputs=outputs, **options).to(dtype)
     if algorithm == "ddpg":
         actor = make_actor(WIDTHS, ACTIONS, **options).to(dtype)
         return make_ddpg_loss(actor, critic, action_penalty=penalty, reduction="none")
@@ -55,9 +65,14 @@ def make_loss(
     }
     if algorithm == "td3":
         actor = make_actor(WIDTHS, ACTIONS, **options).to(dtype)
-        return make_td3_loss(actor, critic, action_spec=spec, **shared).to(dtype)
+        return make_td3_loss(actor, critic, action_spec=spec, target_critics=target_critics, **shared).to(
+            dtype
+        )
     actor = make_stochastic_actor(WIDTHS, spec, **options).to(dtype)
-    return make_sac_loss(actor, critic, action_spec=spec, runs=runs, **shared).to(dtype)
+    shared |= {"action_spec": spec, "runs": runs, "reward_range": (-0.02, 0.0) if bounded else None}
+    if algorithm == "tqc":
+        return make_tqc_loss(actor, critic, dropped_quantiles=1, **shared).to(dtype)
+    return make_sac_loss(actor, critic, target_critics=target_critics, **shared).to(dtype)
 
 
 def twin(loss: LossModule) -> LossModule:

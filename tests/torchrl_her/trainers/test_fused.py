@@ -70,6 +70,26 @@ def test_everything_is_as_with_torchrl_s_loss(
     check_equal(first, second, lambda seed: make_rows(algorithm, (runs, 24), seed, **extras), 3)
 
 
+@pytest.mark.parametrize("algorithm", ["td3", "sac"])
+@pytest.mark.parametrize("runs", [1, 3])
+@pytest.mark.parametrize("target_critics", [1, 2, 5])
+def test_targets_of_critics_that_are_drawn(algorithm: str, runs: int, target_critics: int) -> None:
+    loss = make_loss(algorithm, runs=runs, critics=5, target_critics=target_critics)
+    first, second = both(loss, runs=runs)
+    check_equal(first, second, lambda seed: make_rows(algorithm, (runs, 24), seed, weights=True), 3)
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "tqc"])
+def test_targets_that_contain_entropy_and_are_clamped(algorithm: str) -> None:
+    first, second = both(make_loss(algorithm, bounded=True))
+    free, _ = both(make_loss(algorithm))
+    check_equal(first, second, lambda seed: make_rows(algorithm, (1, 24), seed), 3)
+    free.loss.load_state_dict(first.loss.state_dict())
+    rows = [make_rows(algorithm, (1, 24)) for _ in range(2)]
+    losses = [learner.update(own)["loss_qvalue"] for learner, own in zip((first, free), rows, strict=True)]
+    assert not torch.equal(*losses)
+
+
 @given(
     algorithm=st.sampled_from(ALGORITHMS),
     hidden=st.integers(1, 70),
@@ -196,6 +216,17 @@ def test_numbers_may_change_during_training() -> None:
         learner.optimizer.param_groups[0].update(betas=(0.5, 0.9), eps=1e-3, lr=5e-2)
     assert second.tau == 0.5
     check_equal(first, second, lambda seed: make_rows("ddpg", (1, 8), seed), 1)
+
+
+def test_the_number_of_dropped_quantiles_may_change_within_its_range() -> None:
+    first, second = both(make_loss("tqc"))
+    for learner in (first, second):
+        learner.loss.top_quantiles_to_drop_per_net = 3
+    check_equal(first, second, lambda seed: make_rows("tqc", (1, 8), seed), 1)
+    for wrong in (-1, 5):
+        second.loss.top_quantiles_to_drop_per_net = wrong
+        with pytest.raises(ValueError, match=f"per_net must be from 0 to 4, got {wrong}"):
+            second.update(make_rows("tqc", (1, 8)))
 
 
 def test_importance_weights_are_ignored_if_the_loss_ignores_them() -> None:

@@ -8,10 +8,19 @@ from typing import Any
 
 import pytest
 import torch
+from torchrl.data import Bounded
 from torchrl.objectives import DDPGLoss, HardUpdate, LossModule, SoftUpdate, ValueEstimators
 
 from tests.torchrl_her.trainers.fused_cases import ALGORITHMS, make_loss
-from torchrl_her import FusedLearner, make_actor, make_critic, make_ddpg_loss
+from torchrl_her import (
+    FusedLearner,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    make_sac_loss,
+    make_stochastic_actor,
+    make_tqc_loss,
+)
 from torchrl_her.objectives import PenalizedDDPGLoss, clamped_td0
 from torchrl_her.trainers import can_fuse, is_plain_adam, why_not_fused
 
@@ -117,6 +126,9 @@ def freeze(loss: LossModule) -> None:
         ("td3", lambda loss: setattr(loss, "delay_actor", False), "delay_actor=False"),
         ("sac", lambda loss: setattr(loss, "fixed_alpha", True), "fixed_alpha=True"),
         ("sac", lambda loss: setattr(loss, "skip_done_states", True), "skip_done_states=True"),
+        ("tqc", lambda loss: setattr(loss, "fixed_alpha", True), "fixed_alpha=True"),
+        ("tqc", lambda loss: setattr(loss, "loss_function", "l2"), "loss_function='l2'"),
+        ("tqc", set_a_value_network, "targets from a network of the value estimator's own"),
         ("dqn", lambda loss: setattr(loss, "double_dqn", False), "double_dqn=False"),
         ("dqn", mask_actions, "a QValueActor as value_network"),
         ("td3", set_a_value_network, "targets from a network of the value estimator's own"),
@@ -135,6 +147,15 @@ def test_what_they_do_not_know_they_refuse(
     assert not can_fuse(loss, target)
     with pytest.raises(ValueError, match=f"cannot be fused: .*{re.escape(reason)}"):
         FusedLearner(loss, torch.optim.Adam(loss.parameters()), target)
+
+
+def test_critics_of_quantiles_are_those_of_tqc_alone() -> None:
+    spec = Bounded(-1.0, 1.0, (3,))
+    critic = make_critic((4, 2), 3, outputs=5)
+    loss = make_sac_loss(make_stochastic_actor((4, 2), spec), critic, action_spec=spec)
+    assert why_not_fused(loss, SoftUpdate(loss, tau=0.1)) == "critics with 5 outputs"
+    loss = make_tqc_loss(make_stochastic_actor((4, 2), spec), critic, action_spec=spec)
+    assert can_fuse(loss, SoftUpdate(loss, tau=0.1))
 
 
 def test_other_networks_targets_and_losses_are_refused() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -153,6 +154,17 @@ def test_frames_that_do_not_divide_are_not_lost() -> None:
     assert trainer.updates == 800 // 30
 
 
+@pytest.mark.parametrize("frames_per_update", [0.5, 0.3])
+def test_several_gradient_steps_for_each_frame(frames_per_update: float) -> None:
+    trainer, _ = make_trainer(
+        epoch_frames=160, frames_per_update=frames_per_update, batch_size=4, make_learner=FusedLearner
+    )
+    for epoch in (1, 2, 3):
+        trainer.epoch()
+        assert trainer.frames == 160 * epoch
+        assert trainer.updates == pytest.approx(160 * epoch / frames_per_update, abs=1.0)
+
+
 def test_progress_is_told_after_each_batch() -> None:
     trainer, _ = make_trainer(epoch_frames=240)
     seen: list[int] = []
@@ -287,7 +299,9 @@ def test_a_run_whose_buffer_is_empty_waits_and_holds_no_other_back() -> None:
         ({"epoch_frames": 0}, "epoch_frames must be at least 1, got 0"),
         ({"batches_per_sample": 0}, "batches_per_sample must be at least 1, got 0"),
         ({"batch_size": 0}, "batch_size must be at least 1, got 0"),
-        ({"frames_per_update": -1.0}, "frames_per_update must be positive, got -1.0"),
+        ({"frames_per_update": -1.0}, "frames_per_update must be positive and finite, got -1.0"),
+        ({"frames_per_update": math.inf}, "frames_per_update must be positive and finite, got inf"),
+        ({"frames_per_update": math.nan}, "frames_per_update must be positive and finite, got nan"),
     ],
 )
 def test_numbers_that_cannot_be(options: dict[str, Any], message: str) -> None:

@@ -1,7 +1,8 @@
-"""SAC."""
+"""SAC, and REDQ, which is SAC with other defaults."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -33,13 +34,30 @@ class SACBuilder(DDPGBuilder):
             critics,
             action_spec=self.action_spec,
             critics=self.options.critics,
+            target_critics=self.options.target_critics,
             gamma=self.options.gamma,
+            reward_range=self.bounds(rewards),
             temperature=self.options.temperature,
             action_penalty=self.options.action_penalty,
             runs=self.recipe.run.num_runs,
             generators=generators,
             reduction="none",
         )
+
+    def bounds(self, rewards: tuple[float, float]) -> tuple[float, float] | None:
+        """The rewards whose returns targets are clamped to; None if they are not clamped.
+
+        Raises:
+            ValueError: they are to be clamped, but rewards have no bounds.
+        """
+        if not self.options.clamp_targets:
+            return None
+        if not all(map(math.isfinite, rewards)):
+            raise ValueError(
+                f"clamp_targets=true has no effect on {self.recipe.task.name}, whose rewards have no bounds: "
+                "leave it out"
+            )
+        return rewards
 
     def epsilon(self) -> dict[str, float]:
         """None: the policy explores by itself."""

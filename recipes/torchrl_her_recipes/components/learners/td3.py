@@ -27,6 +27,7 @@ class TD3Builder(DDPGBuilder):
             critics,
             action_spec=self.action_spec,
             critics=self.options.critics,
+            target_critics=self.options.target_critics,
             gamma=self.options.gamma,
             reward_range=rewards,
             action_penalty=self.options.action_penalty,

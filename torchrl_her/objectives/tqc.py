@@ -1,0 +1,128 @@
+"""TQC from TorchRL's loss, with an action L2 penalty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import TQCLoss
+
+from torchrl_her.objectives.critics import as_critics
+from torchrl_her.objectives.noise import RunNoise
+from torchrl_her.objectives.sac import PenalizedSACLoss, positive_temperature, set_soft_targets
+
+
+class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
+    """TorchRL's TQC loss with an action L2 penalty, for one run or several.
+
+    Critics give quantiles of the return instead of its mean. Targets are the quantiles of all critics without
+    the greatest ones, and each critic learns all of them. The actor follows the mean of all quantiles.
+
+    Priorities are absolute TD errors: the mean distance between a critic's quantiles and the targets, of the
+    critic where it is greatest.
+
+    Args:
+        *args: of :class:`torchrl.objectives.TQCLoss`.
+        **kwargs: of the same, and of :class:`~torchrl_her.objectives.PenalizedSACLoss`.
+    """
+
+    def _value_for_actor(self, values: Tensor) -> Tensor:
+        return values.mean((0, -1))
+
+    @torch.no_grad()
+    def compute_target(self, tensordict: TensorDictBase) -> Tensor:
+        """The targets [..., K]: the least K quantiles of all critics together."""
+        after = tensordict.get("next").copy()
+        action, log_prob = self._draw(after)
+        after.set(self.tensor_keys.action, action)
+        valued = self._vmap_qnetworkN0(after, self.target_qvalue_network_params)
+        every = valued.get(self.tensor_keys.state_action_value).movedim(0, -2).flatten(-2)
+        kept = every.shape[-1] - self.top_quantiles_to_drop_per_net * self.num_qvalue_nets
+        entropy = -(self._by_run(self._alpha, log_prob) * log_prob).unsqueeze(-1)
+        value = every.sort(-1).values[..., :kept] + entropy
+        keys, steps_key = self.tensor_keys, self.value_estimator.tensor_keys.steps_to_next_obs
+        entries = [("next", key) for key in (keys.reward, keys.done, keys.terminated)]
+        rows = tensordict.select(*entries, steps_key, strict=False)
+        rows = rows.apply(lambda entry: entry.expand_as(value))  # TorchRL's targets want one shape
+        return self.value_estimator.value_estimate(rows, next_value=value)
+
+
+def make_tqc_loss(
+    actor: ProbabilisticActor,
+    critic: TensorDictModule | Sequence[TensorDictModule],
+    *,
+    action_spec: Bounded,
+    critics: int = 2,
+    dropped_quantiles: int = 2,
+    gamma: float = 0.98,
+    reward_range: tuple[float, float] | None = None,
+    temperature: float = 0.1,
+    action_penalty: float = 0.0,
+    runs: int = 1,
+    generators: Sequence[torch.Generator] | None = None,
+    reduction: Literal["mean", "none"] = "mean",
+) -> TQCLoss:
+    """TorchRL's TQC loss: critics that give quantiles, of which targets leave out the greatest ones.
+
+    Kuznetsov et al., Controlling overestimation bias with truncated mixture of continuous distributional
+    quantile critics, 2020.
+
+    Args:
+        actor: from :func:`~torchrl_her.make_stochastic_actor`.
+        critic: from ``make_critic(..., outputs=M)`` with M quantiles, the others are made like it; or all
+            critics in a list.
+        action_spec: least and greatest actions, of one environment.
+        critics: N, how many there are.
+        dropped_quantiles: D; targets leave out the D * N greatest of all N * M quantiles.
+        gamma: discount, in [0, 1).
+        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
+            leave them as they are, since they contain entropy: see :func:`~torchrl_her.make_sac_loss`.
+        temperature: what it begins with.
+        action_penalty: weight of the action L2 penalty, see
+            :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        runs: R, how many runs the networks are stacked for; each has a temperature of its own.
+        generators: of the random numbers of each run; None for torch's own.
+        reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
+
+    Raises:
+        ValueError: ``gamma`` is outside of [0, 1), ``temperature`` is not positive, ``critics`` is below 1 or
+            not their number, or ``dropped_quantiles`` is negative or leaves none.
+
+    Example:
+        >>> from torchrl_her import make_critic, make_stochastic_actor
+        >>> spec = Bounded(-1.0, 1.0, (3,))
+        >>> actor, critic = make_stochastic_actor((9, 2), spec), make_critic((9, 2), 3, outputs=25)
+        >>> make_tqc_loss(actor, critic, action_spec=spec).top_quantiles_to_drop_per_net
+        2
+    """
+    own = as_critics(critic, critics)
+    first = own[0] if isinstance(own, list) else own
+    quantiles = first.module.outputs
+    if not 0 <= dropped_quantiles < quantiles:
+        raise ValueError(
+            f"dropped_quantiles must be from 0 to {quantiles - 1}, since critics have {quantiles} quantiles, "
+            f"got {dropped_quantiles}"
+        )
+    options: dict[str, Any] = {"scalar_output_mode": "exclude" if reduction == "none" else None}
+    loss = PenalizedTQCLoss(
+        actor,
+        own,
+        action_spec=action_spec,
+        num_qvalue_nets=critics,
+        top_quantiles_to_drop_per_net=dropped_quantiles,
+        alpha_init=positive_temperature(temperature),
+        action_penalty=action_penalty,
+        runs=runs,
+        noise=RunNoise(generators),
+        reduction=reduction,
+        **options,
+    )
+    loss.set_keys(state_action_value=first.out_keys[0])
+    set_soft_targets(loss, gamma, reward_range)
+    return loss
