@@ -1,9 +1,11 @@
 """Drawing virtual goals: candidates times weights times filter, then k draws for each transition.
 
-For transition t of an episode of length T, the goal achieved by transition t' is drawn with
-probability proportional to ``candidate(t, t') * weight(g_t') * keep(t, t')``. Plain HER, filtered
-HER, instructive goals (IBS) and their combinations differ only in these factors. All functions work on
-episodes padded to a common horizon T and take any leading batch shape.
+For transition t, a goal g is drawn with probability proportional to
+``candidate(t, g) * weight(g) * keep(t, g)``. A strategy's candidates are goals that transitions t' of the
+same episode achieved; other sources have a pool of goals of recent episodes, all of which are candidates.
+Plain HER, filtered HER, instructive goals (IBS), goals of other episodes and their combinations differ only
+in these factors. All functions work on episodes, or pools, padded to a common length T and take any leading
+batch shape.
 """
 
 from __future__ import annotations

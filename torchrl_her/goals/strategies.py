@@ -30,6 +30,9 @@ def episode(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
 STRATEGIES: dict[str, StrategyFunction] = {"future": future, "final": final, "episode": episode}
 _SAFE = tuple(STRATEGIES.values())  # these never leave the episode, so that is not checked
 
+# Sources of goals that are no strategies, as they look beyond the episode: see ``sources``.
+RECENT = ("actual", "achieved")
+
 
 def register_strategy(name: str, function: StrategyFunction) -> None:
     """Gives a goal strategy a name, which is then accepted wherever ``"future"`` is.
@@ -56,8 +59,9 @@ def register_strategy(name: str, function: StrategyFunction) -> None:
     """
     if not name:
         raise ValueError(f"a goal strategy needs a name, got {name!r}")
-    if name in STRATEGIES:
-        raise ValueError(f"the name {name!r} is taken by another goal strategy; taken are {_known()}")
+    if name in STRATEGIES or name in RECENT:
+        taken = ", ".join([*STRATEGIES, *RECENT])
+        raise ValueError(f"the name {name!r} is taken by another goal strategy; taken are {taken}")
     if not callable(function):
         raise TypeError(f"goal strategy {name!r} must be a function, got {function!r}")
     STRATEGIES[name] = function
@@ -80,6 +84,8 @@ def get_strategy(strategy: Strategy) -> StrategyFunction:
         return STRATEGIES[strategy]
     nearest = get_close_matches(str(strategy), STRATEGIES, n=1)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+    if strategy in RECENT:
+        hint = f"; goals of other episodes are asked for by goal_sources={{{strategy!r}: 4}}"
     raise ValueError(f"unknown goal strategy {strategy!r}; the strategies are {_known()}{hint}")
 
 

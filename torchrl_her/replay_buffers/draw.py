@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_her.goals.factors import between, combine, draw, draw_alike, draw_weighted
+from torchrl_her.goals.choose import TRIES, Candidates, Index, choose_goals
 from torchrl_her.goals.rewards import RewardFunction, missed
-from torchrl_her.goals.strategies import Strategy, candidate_range
-from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights
+from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
+from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 from torchrl_her.replay_buffers.episodes import Episodes
 from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
 from torchrl_her.replay_buffers.options import HindsightOptions, Per
 from torchrl_her.replay_buffers.runs.pieces import Piece
-from torchrl_her.replay_buffers.runs.streams import Generators, uniform
-
-# Likelihoods of goals [transitions, T] that are held in memory at once.
-LIKELIHOODS = 1 << 17
+from torchrl_her.replay_buffers.runs.recent import RecentGoals
+from torchrl_her.replay_buffers.runs.streams import Generators, RunDraws
 
 Keep = Callable[[Tensor, Tensor], Tensor]
 
@@ -41,9 +40,7 @@ def draw_goals(
 ) -> tuple[Tensor, Tensor]:
     """Draws k virtual goals for each transition, or each episode, by strategy times weights times filter.
 
-    To save work, goals are first proposed by strategy and weights alone. If the filter rejects one of a
-    transition's k goals, all k are drawn again, from the likelihoods of all its candidates. The result still
-    follows the product of the three factors.
+    This is for goals of the own episode; see :class:`~torchrl_her.HindsightOptions` for those of others.
 
     Args:
         before: [n, g], the goals that were achieved before the actions.
@@ -77,38 +74,20 @@ def draw_goals(
         >>> source.tolist(), goal_source.tolist()
         ([0, 0, 1, 1, 2, 2], [2, 2, 2, 2, 2, 2])
     """
-    if per == "episode":
-        real, episode = episodes.rows[:, 0], torch.arange(len(episodes.lengths), device=episodes.rows.device)
-        time = torch.zeros_like(episode)
-    else:
-        real = episodes.rows[episodes.inside]
-        episode, time = episodes.inside.nonzero(as_tuple=True)
-    if k == 0 or len(real) == 0:
-        return real[:0], real[:0]
+    drawn = _Transitions.of(episodes, per)
+    if k == 0 or len(drawn.row) == 0:
+        return drawn.row[:0], drawn.row[:0]
     alike = weights is None or (isinstance(weights, GoalWeights) and weights.alike)
-    weight = None if weights is None or alike else checked_weights(weights(after[episodes.rows]))
     sources = [generator] if generators is None else generators
-    draws = _Draws(sources, None if runs is None or len(sources) == 1 else runs[episode])
-    index = _propose(episodes, episode, time, k, strategy, weight, draws)
-    valid = torch.ones_like(real, dtype=torch.bool)
-    begin = (episode * episodes.rows.shape[1]).unsqueeze(-1)  # of the episode in the flat table of rows
-    refused = torch.zeros_like(index, dtype=torch.bool)
-    if weight is not None and not bool((weight > 0).all()):
-        refused |= weight.take(begin + index) == 0
-    if keep is not None:
-        refused |= ~keep(before[real].unsqueeze(1), after[episodes.rows.take(begin + index)])
-    again = refused.any(-1).nonzero().squeeze(-1)
-    if len(again) > 0:
-        own_before, own_episode, own_time = before[real[again]], episode[again], time[again]
-        likelihoods = _likelihoods(
-            own_before, own_episode, own_time, after, episodes, strategy=strategy, weight=weight, keep=keep
-        )
-        dtype = torch.float32 if weight is None else weight.dtype
-        parts = iter(draws.of(again)((len(again), k), dtype, real.device).split(_at_once(episodes)))
-        drawn = [draw(likelihood, k, generator=lambda *_: next(parts)) for likelihood in likelihoods]
-        index[again], valid[again] = (torch.cat(part) for part in zip(*drawn, strict=True))
-    source = real[valid].unsqueeze(-1).expand(-1, k).flatten()
-    return source, episodes.rows.take(begin + index)[valid].flatten()
+    index, valid = choose_goals(
+        drawn.candidates(after, episodes, strategy),
+        k,
+        weights=None if alike else weights,
+        keep=drawn.filter(before, keep),
+        draws=drawn.draws(sources, runs),
+    )
+    source = drawn.row[valid].unsqueeze(-1).expand(-1, k).flatten()
+    return source, index[valid].flatten()
 
 
 def draw_for_runs(
@@ -120,117 +99,109 @@ def draw_for_runs(
     *,
     weights: WeightsOfRuns | None,
     generators: Generators,
+    recent: RecentGoals,
 ) -> tuple[Tensor, Tensor]:
     """Draws the virtual goals of episodes of several runs, each run with its own weights and generator.
 
+    Each source is a factor of its own: its goals are drawn by candidate times weight times filter, where
+    its candidates are goals of the own episode, or those that the run remembers of recent episodes.
+
     Args:
-        rows: [n], collected transitions.
+        rows: [n], transitions of whole episodes and others.
         piece: some episodes of them, of m runs.
         reward_fn: maps (achieved, desired) goals to (reward, terminated); the filter asks it.
-        options: how many goals, and by which strategy and filter.
+        options: how many goals, from which sources and by which filter.
         keys: where entries are.
 
     Keyword Args:
         weights: of all runs; None for all goals alike.
         generators: m of them.
+        recent: the goals of recent episodes of all runs, those of these episodes among them.
 
     Returns:
-        ``(source, goal_source)``, as :func:`draw_goals` does.
+        ``(source, goals)``, [V] and [V, g]: the transitions to be relabeled, one after the other, each of
+        them for up to k goals. Those without a goal that may be drawn are left out.
     """
     episodes = piece.episodes
     if options.k == 0:  # then the batch may be without goals
         return episodes.lengths[:0], episodes.lengths[:0]
-    own_weights = None
-    if weights is not None:
-        counts = piece.sums(torch.ones_like(episodes.lengths))
-        own_weights = partial(weights, runs=piece.runs, counts=counts)
-    keep = partial(missed, reward_fn, achieved_reward=options.achieved_reward)
-    return draw_goals(
-        entry_of(rows, keys.achieved),
-        entry_of(rows, keys.next_achieved),
-        episodes,
-        options.k,
-        strategy=options.strategy,
-        weights=own_weights,
-        keep=keep if options.filter_achieved else None,
-        per=options.per,
-        runs=piece.position,
-        generators=generators,
-    )
+    drawn = _Transitions.of(episodes, options.per)
+    before, after = entry_of(rows, keys.achieved), entry_of(rows, keys.next_achieved)
+    keep = None
+    if options.filter_achieved:
+        keep = drawn.filter(before, partial(missed, reward_fn, achieved_reward=options.achieved_reward))
+    draws = drawn.draws(generators, piece.position)
+    pools: list[Tensor] = []
+    parts: list[tuple[Tensor, Tensor]] = []
+    for source, number in options.sources.items():
+        if source in RECENT:
+            pool, lines = recent.lines(str(source), piece.runs)
+            candidates, counts, tries = drawn.pool(pool, lines, piece.position), [1] * len(piece.runs), TRIES
+        else:
+            candidates, tries = drawn.candidates(after, episodes, source), 0
+            counts = piece.sums(torch.ones_like(episodes.lengths))
+        own_weights = None if weights is None else partial(weights, runs=piece.runs, counts=counts)
+        index, valid = choose_goals(
+            candidates, number, weights=own_weights, keep=keep, draws=draws, tries=tries
+        )
+        parts.append((index + sum(map(len, pools)), valid.unsqueeze(-1).expand_as(index)))
+        pools.append(candidates.goals)
+    index, valid = parts[0]
+    if len(parts) > 1:
+        index, valid = (torch.cat(each, -1) for each in zip(*parts, strict=True))
+    row, goals = drawn.row.unsqueeze(-1).expand_as(index).flatten(), index.flatten()
+    if not bool(valid.all()):
+        some = valid.flatten().nonzero().squeeze(-1)
+        row, goals = row.index_select(0, some), goals.index_select(0, some)
+    return row, (pools[0] if len(pools) == 1 else torch.cat(pools)).index_select(0, goals)
 
 
-class _Draws:
-    """Uniform numbers for transitions, from the generator of the run that each is of.
+class _Transitions(NamedTuple):
+    """The transitions [n] that get goals of their own.
 
-    Args:
-        generators: R.
-        run: [n], ascending; None for one run.
+    Attributes:
+        row: [n] int64, where they are.
+        episode: [n] int64, ascending: the episode of each.
+        time: [n] int64, its step there.
     """
 
-    def __init__(self, generators: Generators, run: Tensor | None) -> None:
-        self.generators, self.run = generators, run
+    row: Tensor
+    episode: Tensor
+    time: Tensor
 
-    def of(self, some: Tensor) -> _Draws:
-        """Those of some transitions, in order."""
-        return self if self.run is None else _Draws(self.generators, self.run[some])
+    @classmethod
+    def of(cls, episodes: Episodes, per: Per) -> _Transitions:
+        """All transitions of some episodes, or the first one of each."""
+        if per == "episode":
+            episode = torch.arange(len(episodes.lengths), device=episodes.rows.device)
+            return cls(episodes.rows[:, 0], episode, torch.zeros_like(episode))
+        return cls(episodes.rows[episodes.inside], *episodes.inside.nonzero(as_tuple=True))
 
-    def __call__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-        n, k = shape
-        counts = [n] if self.run is None else self.run.bincount(minlength=len(self.generators)).tolist()
-        return uniform(counts, k, self.generators, dtype=dtype, device=device)
+    def candidates(self, after: Tensor, episodes: Episodes, strategy: Strategy) -> Candidates:
+        """Goals that were achieved in the own episode."""
+        first, end = candidate_range(strategy, self.time, episodes.lengths[self.episode])
+        return Candidates(after, episodes.rows, self.episode, first, end)
 
+    def pool(self, goals: Tensor, lines: Episodes, position: Tensor | None) -> Candidates:
+        """Goals that the own run remembers.
 
-def _propose(
-    episodes: Episodes,
-    episode: Tensor,
-    time: Tensor,
-    k: int,
-    strategy: Strategy,
-    weight: Tensor | None,
-    draws: _Draws,
-) -> Tensor:
-    """Goals [n, k] for transitions, by strategy and weights alone."""
-    if weight is None:
-        first, end = candidate_range(strategy, time, episodes.lengths[episode])
-        return draw_alike(first, end, k, generator=draws)
-    steps = torch.arange(int(time.max()) + 1, device=weight.device)
-    length = episodes.lengths.unsqueeze(-1)
-    first, end = candidate_range(strategy, steps.minimum(length - 1), length)
+        Args:
+            goals: [p, g].
+            lines: where those of each run lie in there.
+            position: [E] int64, the position of each episode's run; None if there is only one.
+        """
+        line = torch.zeros_like(self.episode) if position is None else position[self.episode]
+        return Candidates(goals, lines.rows, line, torch.zeros_like(line), lines.lengths[line])
 
-    def padded(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-        """Numbers for transitions alone: what is drawn must not depend on how far episodes are padded."""
-        u = draws((len(time), k), dtype, device)
-        if u.numel() == first.numel() * k:
-            return u.view(shape)
-        return torch.zeros(shape, dtype=dtype, device=device).index_put_((episode, time), u)
+    def filter(self, before: Tensor, keep: Keep | None) -> Callable[[Index, Tensor], Tensor] | None:
+        """The filter, for goals achieved before [n, g], as :func:`choose_goals` asks it."""
+        if keep is None:
+            return None
+        own = before[self.row]
+        return lambda which, goals: keep(own[which].unsqueeze(1), goals)
 
-    return draw_weighted(weight, first, end, k, generator=padded)[episode, time]
-
-
-def _at_once(episodes: Episodes) -> int:
-    """Transitions for which the likelihoods of all goals are held in memory at once."""
-    return max(1, LIKELIHOODS // episodes.rows.shape[1])
-
-
-def _likelihoods(
-    before: Tensor,
-    episode: Tensor,
-    time: Tensor,
-    after: Tensor,
-    episodes: Episodes,
-    *,
-    strategy: Strategy,
-    weight: Tensor | None,
-    keep: Keep | None,
-) -> Iterator[Tensor]:
-    """For some transitions, the likelihoods [n, T] of all goals of their episodes, piece by piece."""
-    first, end = candidate_range(strategy, time, episodes.lengths[episode])
-    goals = after[episodes.rows]
-    horizon = goals.shape[1]
-    for part in torch.arange(len(time), device=time.device).split(_at_once(episodes)):
-        own = episode[part]
-        yield combine(
-            between(first[part], end[part], horizon),
-            None if weight is None else weight[own],
-            None if keep is None else keep(before[part].unsqueeze(1), goals[own]),
+    def draws(self, generators: Generators, position: Tensor | None) -> RunDraws:
+        """Random numbers, from the generator of the run that each transition is of."""
+        return RunDraws(
+            generators, None if position is None or len(generators) == 1 else position[self.episode]
         )

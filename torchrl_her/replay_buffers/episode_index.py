@@ -55,6 +55,18 @@ class EpisodeIndex:
         episode = torch.searchsorted(self.first, place, right=True) - 1
         return self.first[episode], self.first[episode + 1]
 
+    def newest(self, count: int) -> Tensor:
+        """The newest rows, at most so many, oldest first."""
+        rows = self.slots * self.lanes
+        number = torch.arange(max(0, rows - count), rows, device=self.first.device)
+        return (number // self.lanes + self.oldest) % self.slots * self.lanes + number % self.lanes
+
+    def newest_episodes(self, count: int) -> Tensor:
+        """The first rows of the episodes that ended last or are open, at most so many, oldest first."""
+        last = self.row(self.first[1:] - 1)
+        time = (last // self.lanes - self.oldest) % self.slots
+        return self.row(self.first[:-1][time.argsort(stable=True)[-count:]])
+
 
 def index_episodes(
     done: Tensor,

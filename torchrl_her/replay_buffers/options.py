@@ -11,7 +11,8 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor
 
 from torchrl_her.goals.rewards import RewardFunction, missed
-from torchrl_her.goals.strategies import Strategy, get_strategy
+from torchrl_her.goals.sources import GoalSources, check_goal_sources, sources_name
+from torchrl_her.goals.strategies import RECENT, Strategy, get_strategy
 from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.replay_buffers.keys import TransitionKeys, in_root_and_next, under_next
 
@@ -28,6 +29,15 @@ class HindsightOptions:
         strategy: which achieved goals of its episode a transition may take: ``"future"`` (those achieved by
             its action or later), ``"final"`` (the last one), ``"episode"`` (any), another name given to
             :func:`~torchrl_her.register_strategy`, or a function as described there.
+        goal_sources: how many virtual goals come from where, in place of ``k`` and ``strategy``, which are
+            short for a single source: ``k=4, strategy="future"`` is ``{"future": 4}``. Besides strategies
+            there are two sources that look beyond the own episode: ``"actual"``, goals that were really
+            wanted in recent episodes, and ``"achieved"``, goals that were achieved in them. ``weights`` and
+            filter act on all alike. None: ``k`` and ``strategy`` count.
+        recent_actual, recent_achieved: how many of the newest goals these two sources remember: one that was
+            wanted for each episode, and one that was achieved for each transition. Those of the episodes
+            that are just written are among them. A sample unit looks at as many of the newest episodes, and
+            newest transitions, that are stored. Where the filter refuses nearly all, large numbers cost time.
         per: what gets a goal of its own. ``"transition"``: each transition, for learning from single
             transitions. ``"episode"``: each copy of a whole episode, for learning from sequences, as
             recurrent policies do; see :class:`~torchrl_her.HERWriter`.
@@ -51,18 +61,25 @@ class HindsightOptions:
         virtual_key: where a bool [..., 1] marks virtual transitions; None for no mark.
 
     Raises:
-        ValueError: ``k`` is negative, there is no such strategy, ``n_steps`` is below 1 or above 1 without
-            ``gamma`` or with whole episodes, ``per`` is neither of the two.
-        TypeError: ``exclude`` is a single key.
+        ValueError: ``k`` is negative, there is no such strategy or source, ``goal_sources`` and another ``k``
+            or ``strategy`` are given, ``n_steps`` is below 1 or above 1 without ``gamma`` or with whole
+            episodes, ``per`` is neither of the two.
+        TypeError: ``exclude`` is a single key, or ``goal_sources`` no mapping.
 
     Example:
         >>> options = HindsightOptions(k=8, filter_achieved=True)
         >>> options.k, options.strategy
         (8, 'future')
+        >>> mixed = HindsightOptions(goal_sources={"future": 2, "actual": 2})
+        >>> mixed.k, mixed.sources
+        (4, {'future': 2, 'actual': 2})
     """
 
     k: int = 4
     strategy: Strategy = "future"
+    goal_sources: GoalSources | None = None
+    recent_actual: int = 1_000
+    recent_achieved: int = 2_000
     per: Per = "transition"
     n_steps: int = 1
     gamma: float | None = None
@@ -93,14 +110,37 @@ class HindsightOptions:
             )
         if self.n_steps > 1 and (self.gamma is None or not 0 < self.gamma <= 1):
             raise ValueError(f"n_steps={self.n_steps} needs 0 < gamma <= 1, the loss's; got {self.gamma}")
+        for name in RECENT:
+            if getattr(self, f"recent_{name}") < 1:
+                raise ValueError(f"recent_{name} must be at least 1, got {getattr(self, f'recent_{name}')}")
         get_strategy(self.strategy)
         in_root_and_next(self.exclude)
+        if self.goal_sources is not None:
+            sources = check_goal_sources(self.goal_sources)
+            k = sum(sources.values())
+            if self.k not in (HindsightOptions.k, k) or self.strategy != HindsightOptions.strategy:
+                raise ValueError(_twice(self.goal_sources, k=self.k, strategy=self.strategy))
+            object.__setattr__(self, "goal_sources", sources)
+            object.__setattr__(self, "k", k)
+
+    @property
+    def sources(self) -> dict[Strategy, int]:
+        """How many virtual goals of each transition come from where; empty if there are none."""
+        if self.goal_sources is not None:
+            return dict(self.goal_sources)
+        return {self.strategy: self.k} if self.k > 0 else {}
+
+    @property
+    def remembered(self) -> dict[str, int]:
+        """How many goals of recent episodes are to be remembered, for each source that takes them."""
+        return {name: getattr(self, f"recent_{name}") for name in RECENT if name in self.sources}
 
     def changed(self, changes: dict[str, Any]) -> HindsightOptions:
-        """The same options, some of them changed.
+        """The same options, some of them changed. Goal sources take the place of ``k`` and ``strategy``.
 
         Raises:
             TypeError: there is no option of one of these names.
+            ValueError: an option cannot be, or ``goal_sources`` and one of ``k`` and ``strategy`` are given.
 
         Example:
             >>> HindsightOptions(k=8).changed({"strategy": "final"}).strategy
@@ -112,6 +152,11 @@ class HindsightOptions:
                 nearest = get_close_matches(name, known, n=1)
                 hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
                 raise TypeError(f"there is no option {name!r}{hint} The options are {', '.join(known)}")
+        sources = changes.get("goal_sources", self.goal_sources)
+        if sources is not None:
+            if given := {name: changes[name] for name in ("k", "strategy") if name in changes}:
+                raise ValueError(_twice(sources, **given))
+            changes = {"k": HindsightOptions.k, "strategy": HindsightOptions.strategy, **changes}
         return replace(self, **changes)
 
     def transition_keys(self) -> TransitionKeys:
@@ -129,6 +174,12 @@ class HindsightOptions:
         )
 
 
+def _twice(sources: GoalSources, **given: Any) -> str:
+    """The message about two ways to say which goals are drawn."""
+    shown = " and ".join(f"{name}={value!r}" for name, value in given.items())
+    return f"{shown} and goal_sources={{{sources_name(sources)}}} say the same: give one of them"
+
+
 class _Option(Generic[T]):
     """One of the options, to be read and set as an attribute of what they belong to."""
 
@@ -144,7 +195,7 @@ class _Option(Generic[T]):
         return self if instance is None else getattr(instance.options, self.name)
 
     def __set__(self, instance: Any, value: T) -> None:
-        instance.options = replace(instance.options, **{self.name: value})
+        instance.options = instance.options.changed({self.name: value})
 
 
 class HindsightBase:
@@ -160,7 +211,8 @@ class HindsightBase:
 
     Attributes:
         options: as a whole; assign another :class:`~torchrl_her.HindsightOptions` to change them.
-        k, strategy, filter_achieved, achieved_reward: the options of that name; can be set, too.
+        k, strategy, goal_sources, filter_achieved, achieved_reward: the options of that name; they can be
+            set, too.
 
     Raises:
         ValueError: an option that cannot be.
@@ -169,6 +221,7 @@ class HindsightBase:
 
     k = _Option[int]()
     strategy = _Option[Strategy]()
+    goal_sources = _Option[GoalSources | None]()
     filter_achieved = _Option[bool]()
     achieved_reward = _Option[float]()
 

@@ -26,11 +26,11 @@ from torchrl.data import ReplayBuffer, SampleUnit, Storage
 from torchrl.data.replay_buffers.samplers import SliceSampler
 from torchrl.data.replay_buffers.storages import StorageEnsemble
 
+from torchrl_her.goals.choose import LIKELIHOODS, TRIES, Candidates, Index, choose_goals
 from torchrl_her.goals.factors import combine, draw, draw_alike
 from torchrl_her.goals.rewards import RewardFunction
-from torchrl_her.goals.strategies import candidate_range
+from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
-from torchrl_her.replay_buffers.draw import LIKELIHOODS
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
 from torchrl_her.replay_buffers.keys import entry_of, failed
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_return, windows
@@ -44,6 +44,7 @@ from torchrl_her.replay_buffers.neighbors import (
     refuse_unordered,
 )
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
+from torchrl_her.replay_buffers.runs.streams import RunDraws
 from torchrl_her.replay_buffers.slices import slice_positions
 
 
@@ -55,7 +56,9 @@ class _Stored(NamedTuple):
     rows: TensorDictBase  # [n], a view
     before: Tensor  # [n, g], goals achieved before the action
     after: Tensor  # [n, g], those that the action achieved: the candidates
+    wanted: Tensor  # [n, g], those that were really wanted, of the type of achieved ones
     episodes: EpisodeIndex
+    recent: dict[tuple[str, int], Tensor]  # rows of the newest episodes, as far as they were asked for
 
 
 class _Ahead(NamedTuple):
@@ -91,6 +94,9 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     trajectory ids. Under samplers of slices, all transitions of a slice get the same goal: one that its last
     transition may take and, with the filter, that was not achieved before. A priority belongs to the real
     transition, whatever goal it had when the priority was computed.
+
+    With several ``goal_sources``, each gives its part of the virtual transitions. What was wanted or achieved
+    in recent episodes is what the newest stored transitions say, those of open episodes included.
 
     After each write, the next batch looks through all that is stored for the ends of episodes.
 
@@ -198,8 +204,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             inside = _moved(info.get(MASK), row.device)  # type: ignore[call-overload]  # TorchRL's keys may be nested
             own = slice_positions(place, stored.episodes.episode(place)[0], ends, inside)
         generator = self.generator if self.generator is not None else storage._rng
-        rows, source = self._choose(stored, row, own, generator)
-        goals = stored.after[source]
+        rows, goals = self._choose(stored, row, own, generator)
         if self.weights is not None:
             self.weights.update(goals)
         ahead = None if self.options.n_steps == 1 else self._look_ahead(stored, row, rows, goals)
@@ -284,18 +289,27 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _choose(
         self, stored: _Stored, row: Tensor, own: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """Places [V] in a batch of rows [B] that become virtual, and the rows [V] whose goals they take.
+        """Places [V] in a batch of rows [B] that become virtual, and the goals [V, g] that they get.
 
         ``own``, [G, L], are the places in the batch that get the same goal: single ones, or those of a slice.
         """
         coin = torch.rand(len(own), device=row.device, generator=generator)
-        own = own[coin < self.k / (self.k + 1)]
-        source, valid = self._draw(stored, row[own], generator)
-        if valid is not None:
-            own, source = own[valid], source[valid]
-        source_of = torch.full_like(row, -1).index_put_((own,), source.unsqueeze(-1).expand_as(own))
-        rows = (source_of >= 0).nonzero().squeeze(-1)
-        return rows, source_of[rows]
+        becomes = coin < self.k / (self.k + 1)
+        sources = self.options.sources
+        bounds = torch.tensor(list(sources.values()), device=row.device).cumsum(0)[:-1]
+        # The same coin tells the source.
+        own, number = own[becomes], torch.bucketize(coin[becomes] * (self.k + 1), bounds, right=True)
+        virtual = torch.zeros_like(row, dtype=torch.bool)
+        goals = stored.after.new_zeros(len(row), *stored.after.shape[1:])
+        for place, source in enumerate(sources):
+            part = own[number == place]
+            drawn, valid = self._draw(stored, row[part], source, generator)
+            if valid is not None:
+                part, drawn = part[valid], drawn[valid]
+            virtual.index_fill_(0, part.flatten(), True)
+            goals.index_put_((part,), drawn.unsqueeze(1).expand(-1, part.shape[1], -1))
+        rows = virtual.nonzero().squeeze(-1)
+        return rows, goals[rows]
 
     def _ends(self, sampler: SliceSampler, info: dict[str, Any], device: torch.device) -> Tensor | None:
         """Where a sampler of slices says that they end, [B, 1]; None if it does not."""
@@ -367,35 +381,65 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                 seams=((after, before), (next_wanted, wanted)),
             )
             rows = rows if dims == 1 else rows.flatten(0, dims - 1)
-            self._stored = stored = _Stored(storage, state, rows, before, after, episodes)
+            wanted = wanted.to(after.dtype)
+            self._stored = stored = _Stored(storage, state, rows, before, after, wanted, episodes, {})
         return stored
 
     def _draw(
-        self, stored: _Stored, group: Tensor, generator: torch.Generator | None
+        self, stored: _Stored, group: Tensor, source: Strategy, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor | None]:
-        """The rows [V] whose goals are taken, and where [V] one may be taken; None for everywhere.
+        """Goals [V, g] from a source, and for which groups [V] there is one; None for all.
 
         Groups [V, L] are rows that get the same goal, which is one of their last row: single rows, or slices.
         """
+        if len(group) == 0:
+            return stored.after[:0], None
+        if source in RECENT:
+            return self._draw_recent(stored, group, str(source), generator)
         episodes, row = stored.episodes, group[:, -1]
         place = episodes.place(row)
         begin, behind = episodes.episode(place)
-        first, end = (
-            bound + begin for bound in candidate_range(self.strategy, place - begin, behind - begin)
-        )
+        first, end = (bound + begin for bound in candidate_range(source, place - begin, behind - begin))
         if self.weights is not None and not self.weights.alike:
-            return self._draw_by_likelihood(stored, group, first, end, generator)
-        source = episodes.row(draw_alike(first, end, 1, generator=generator).squeeze(-1))
+            lent, valid = self._draw_by_likelihood(stored, group, first, end, generator)
+            return stored.after[lent], valid
+        lent = episodes.row(draw_alike(first, end, 1, generator=generator).squeeze(-1))
         if not self.filter_achieved:
-            return source, None
+            return stored.after[lent], None
         # Goals are proposed without the filter; only where it rejects one are all candidates looked at.
-        kept = self._keep(stored.before[group], stored.after[source].unsqueeze(1)).all(-1)
+        kept = self._keep(stored.before[group], stored.after[lent].unsqueeze(1)).all(-1)
         again = (~kept).nonzero().squeeze(-1)
         valid = torch.ones_like(row, dtype=torch.bool)
-        source[again], valid[again] = self._draw_by_likelihood(
+        lent[again], valid[again] = self._draw_by_likelihood(
             stored, group[again], first[again], end[again], generator
         )
-        return source, valid
+        return stored.after[lent], valid
+
+    def _draw_recent(
+        self, stored: _Stored, group: Tensor, source: str, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """The same from the goals that were wanted or achieved in the newest episodes."""
+        goals, newest = stored.after, stored.episodes.newest
+        if source == "actual":
+            goals, newest = stored.wanted, stored.episodes.newest_episodes
+        which = source, self.options.remembered[source]
+        if which not in stored.recent:
+            stored.recent[which] = newest(which[1])
+        line, table = torch.zeros_like(group[:, 0]), stored.recent[which].unsqueeze(0)
+
+        def keep(which: Index, goals: Tensor) -> Tensor:
+            before = stored.before[group[which]]  # [m, L, g]
+            return self._keep(before.unsqueeze(1), goals.unsqueeze(2)).all(-1)
+
+        index, valid = choose_goals(
+            Candidates(goals, table, line, line, torch.full_like(line, table.shape[1])),
+            1,
+            weights=None if self.weights is None or self.weights.alike else self.weights,
+            keep=keep if self.filter_achieved else None,
+            draws=RunDraws([generator]),
+            tries=TRIES,
+        )
+        return goals[index.squeeze(-1)], valid
 
     def _draw_by_likelihood(
         self, stored: _Stored, group: Tensor, first: Tensor, end: Tensor, generator: torch.Generator | None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from torchrl_her.replay_buffers.runs.counts import (
     virtual_positives,
 )
 from torchrl_her.replay_buffers.runs.pieces import Piece, split_runs
+from torchrl_her.replay_buffers.runs.recent import RecentGoals
 from torchrl_her.replay_buffers.runs.rings import Places, Rings
 from torchrl_her.replay_buffers.runs.rows import join_copies
 from torchrl_her.replay_buffers.runs.shares import Share, real_share, virtual_share
@@ -40,6 +41,8 @@ from torchrl_her.replay_buffers.runs.streams import check_generators
 _ROWS = 1 << 17
 _STATE_FILE = "her_writer.pt"
 
+OnWrite = Callable[[TensorDictBase, list[int], list[int]], None]
+
 
 class HERWriter(HindsightBase, RoundRobinWriter):
     """Writes each transition as it was, and up to k times more with a goal that was achieved later.
@@ -48,7 +51,11 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     open at the end of a batch are held back until they end. A virtual transition has another desired goal
     in the root and under ``next``; its reward, terminated and done are computed again for that goal (but an
     episode that terminated without achieving its goal, as by a fall, does so for any goal), and everything
-    else stays as it was. Goals never come from another episode or another environment.
+    else stays as it was.
+
+    Goals come from the same episode and no other one, unless ``goal_sources`` asks for ``"actual"`` or
+    ``"achieved"`` ones: the writer remembers what was wanted and achieved in recent episodes, of all
+    environments of the run. They are part of its state, and forgotten when the buffer is emptied.
 
     Rows of the next batch that go on with an open episode are found by the ids of environments
     (:class:`~torchrl_her.EnvIds`), if there are any; otherwise by their place in a batch [N, T], or by
@@ -78,6 +85,9 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             (``goal_weights``).
         runs: R.
         generators: R sources of random numbers; None for the buffer's, with one run only.
+        on_write: called with all that is written, real and virtual transitions, as ``(rows, runs, counts)``:
+            rows run after run, which runs these are, and how many rows each has. It may come several times
+            for one batch. See :class:`~torchrl_her.modules.RunningNorm`.
         **changes: options by name, as in the example; all are listed in
             :class:`~torchrl_her.HindsightOptions`.
 
@@ -122,6 +132,14 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         [3.0, 3.0, 3.0, 9.0, 9.0, 9.0]
         >>> buffer[:]["next", "reward"].flatten().tolist()
         [-1.0, -1.0, 0.0, -1.0, -1.0, -1.0]
+
+        One goal of the own future, and one that was really wanted in a recent episode:
+
+        >>> writer = HERWriter(GoalReward(0.5), goal_sources={"future": 1, "actual": 1})
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), writer=writer, batch_size=4)
+        >>> _ = buffer.extend(episode)
+        >>> buffer[:]["desired_goal"].flatten().tolist()[1:6:2]  # behind each goal of the future
+        [9.0, 9.0, 9.0]
     """
 
     _cursor: int  # where the plain writer writes next; untyped there
@@ -134,9 +152,10 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         weights: GoalWeights | Sequence[GoalWeights] | None = None,
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
+        on_write: OnWrite | None = None,
         **changes: Any,
     ) -> None:
-        self.generators = check_generators(runs, generators)
+        self.generators, self.on_write = check_generators(runs, generators), on_write
         own = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
         if own and len(own) != runs:
             raise ValueError(f"{runs} runs need a list of {runs} weights, one of each run, got {len(own)}")
@@ -146,6 +165,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._own_rewards: dict[int, RewardFunction] = {}  # of runs that differ from ``reward_fn``
         self._counts, self._rings = RunCounts(runs), Rings(runs)
         self._held = Batch.none(runs)  # transitions of open episodes
+        self._recent = RecentGoals.none(runs)
         self._episodes = 0  # copies of episodes ever written, if whole ones are
         self._process = os.getpid()
         # Whether the held ones came with a state, or are over, and nothing was written since.
@@ -246,10 +266,11 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         places = Places(run, len(batch), runs=self.runs, device=lanes.device)
         entries = min(_ROWS, self.capacity) // (self.k + 1), _ROWS // (self.k + 1)
         own = None if run is None else run[episodes.rows[:, :1]].flatten()
+        recent = self._recent.after(rows, episodes, own, self._keys, sizes=self.options.remembered)
         for piece in split_runs(episodes, own, self._settings(), each=entries[0], together=entries[1]):
-            self._write(batch, piece, places)
+            self._write(batch, piece, places, recent)
         # Last of all, so that a batch that cannot be written loses nothing that was held back before.
-        self._held = batch.take(left)
+        self._held, self._recent = batch.take(left), recent
         self._loaded = self._all_over = False
         if self.held_back > self._storage.max_size:
             warnings.warn(
@@ -273,6 +294,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         state["cursors"] = [self._cursor] if self.runs == 1 else list(self._rings.cursors)
         state["sizes"] = self.sizes
         state.update(self._held.state_dict())
+        state["recent"] = self._recent.state_dict()
         state["episodes"], state["all_over"] = self._episodes, self._all_over
         state.update(self._counts.state_dict())
         state["weights"] = [weights.state_dict() for weights in self.goal_weights]
@@ -290,6 +312,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         super().load_state_dict(state_dict)
         self._rings.cursors, self._rings.sizes = list(state_dict["cursors"]), list(state_dict["sizes"])
         self._held = Batch.from_state(state_dict, runs=self.runs)
+        if "recent" in state_dict:  # states from before there were goals of other episodes have none
+            self._recent = RecentGoals.from_state(state_dict["recent"])
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
         self._counts.load_state_dict(state_dict)
@@ -318,7 +342,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         """
         self._rings.empty(run)
         self._counts.empty(run)
-        self._held = self._held.without_run(run)
+        self._held, self._recent = self._held.without_run(run), self._recent.without_run(run)
         if self.goal_weights:
             self.goal_weights[run].clear()
 
@@ -337,14 +361,14 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         alike = [own.alike for own in self.goal_weights] or [True] * self.runs
         return [(id(self.reward_of(run)), alike[run]) for run in range(self.runs)]
 
-    def _write(self, batch: Batch, piece: Piece, places: Places) -> None:
+    def _write(self, batch: Batch, piece: Piece, places: Places, recent: RecentGoals) -> None:
         """Stores the real and virtual transitions of some episodes, and notes where the real ones went.
 
         If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out.
         """
         rows, runs, options, keys = batch.rows, piece.runs, self.options, self._keys
         reward_fn, own, virtual = self.reward_of(runs[0]), self.goal_weights, None
-        source, goal_source = draw_for_runs(
+        source, goals = draw_for_runs(
             rows,
             piece,
             reward_fn,
@@ -352,11 +376,12 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             keys,
             weights=self._weights_of_runs() if own and not own[runs[0]].alike else None,
             generators=[self._rng] if self.generators is None else [self.generators[run] for run in runs],
+            recent=recent,
         )
         if len(source) > 0:
             first = self._new_ids(len(source))
             virtual = virtual_share(
-                rows, batch.run, piece, source, goal_source, reward_fn, options, keys, first_id=first
+                rows, batch.run, piece, source, goals, reward_fn, options, keys, first_id=first
             )
             self._note(rows, virtual, runs)
         real = real_share(rows, piece, options, keys, first_id=self._new_ids(len(piece.episodes.lengths)))
@@ -366,6 +391,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         counts = real.counts
         if virtual is not None:
             counts = [sum(both) for both in zip(real.counts, virtual.counts, strict=True)]
+        if self.on_write is not None:
+            self.on_write(out, runs, counts)
         self._store(out, runs, counts)
         places.note(runs, real.copies.root.split(real.counts), counts)
 

@@ -12,6 +12,7 @@ from torchrl_her.goals.weights import WeightsOfRuns
 from torchrl_her.replay_buffers import Episodes, draw_goals
 from torchrl_her.replay_buffers.draw import draw_for_runs
 from torchrl_her.replay_buffers.runs.pieces import Piece
+from torchrl_her.replay_buffers.runs.recent import RecentGoals
 
 WALK = torch.arange(6.0).unsqueeze(-1)  # two episodes: 0 to 3 and 3 to 5; then they have 3 and 2 steps
 EPISODES = Episodes(rows=torch.tensor([[0, 1, 2], [3, 4, 4]]), lengths=torch.tensor([3, 2]))
@@ -101,8 +102,9 @@ def test_each_run_draws_with_its_own_weights_and_filter() -> None:
             options.transition_keys(),
             weights=weights,
             generators=generators,
+            recent=RecentGoals.none(6),
         )
-        return out[0].tolist(), out[1].tolist()
+        return out[0].tolist(), [int(goal) - 1 for goal in out[1]]  # goal i + 1 was achieved by transition i
 
     seeded = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
     source, goal = draw(*seeded)

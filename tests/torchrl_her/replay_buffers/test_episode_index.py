@@ -73,3 +73,21 @@ def test_places_agree_with_a_walk_through_the_rows(rows: list[tuple[int, bool]],
     index = index_episodes(torch.tensor(done), torch.tensor(ids), oldest=oldest)
     every = torch.arange(len(rows))
     assert torch.equal(index.row(index.place(every)), every)
+
+
+def test_the_newest_rows_and_episodes() -> None:
+    # Slots 0 and 1 are the newest; trajectory 6 began before 5 did, and 5 ended before 6.
+    index = index_episodes(torch.tensor([0, 0, 0, 1, 1]).bool(), torch.tensor([7, 7, 6, 5, 6]), oldest=2)
+    assert index.newest(3).tolist() == [4, 0, 1]
+    assert index.newest(9).tolist() == [2, 3, 4, 0, 1]
+    assert index.newest_episodes(2).tolist() == [2, 0]
+    assert index.newest_episodes(9).tolist() == [3, 2, 0]
+
+
+def test_the_newest_rows_of_several_environments() -> None:
+    done = torch.tensor([[0, 1], [1, 0], [0, 0]]).bool()  # three slots of two environments, slot 1 is oldest
+    index = index_episodes(done, oldest=1)
+    assert index.newest(3).tolist() == [5, 0, 1]
+    # Environment 0: row 2 alone, then 4 and 0. Environment 1: rows 3, 5 and 1.
+    assert index.newest_episodes(2).tolist() == [4, 3]
+    assert index.newest_episodes(1).tolist() == [3]

@@ -21,6 +21,9 @@ REWARD = GoalReward(0.5)  # tags differ by at least 1
 OTHERS = {
     "k": 2,
     "strategy": "episode",
+    "goal_sources": None,
+    "recent_actual": 7,
+    "recent_achieved": 70,
     "per": "episode",
     "n_steps": 1,
     "gamma": 0.9,
@@ -62,7 +65,7 @@ def test_every_option_has_another_value_in_these_tests() -> None:
     defaults = HindsightOptions()
     assert [field.name for field in fields(defaults)] == list(OTHERS)
     alike = [name for name, value in OTHERS.items() if getattr(defaults, name) == value]
-    assert alike == ["n_steps"]  # which excludes whole episodes
+    assert alike == ["goal_sources", "n_steps"]  # which exclude k and strategy, and whole episodes
 
 
 @both
@@ -108,6 +111,73 @@ def test_an_unknown_option_is_named_with_the_nearest(make: Callable[..., Any]) -
         make(REWARD, zzz=1)
     with pytest.raises(TypeError, match=r"options must be HindsightOptions or None, got \{'k': 3\}"):
         make(REWARD, {"k": 3})
+
+
+# Sources of goals
+
+
+@both
+def test_k_and_strategy_are_short_for_one_source(make: Callable[..., Any]) -> None:
+    first = relabeled(make, k=3, strategy="episode", filter_achieved=True)
+    second = relabeled(make, goal_sources={"episode": 3}, filter_achieved=True)
+    assert all(torch.equal(first[key], second[key]) for key in first.keys(True, True))
+    assert make(REWARD, goal_sources={"episode": 3}).k == 3
+    assert HindsightOptions(k=3, strategy="final").sources == {"final": 3}
+    assert HindsightOptions(k=0).sources == {}
+
+
+@both
+def test_sources_take_the_place_of_k_and_strategy(make: Callable[..., Any]) -> None:
+    mixed = {"final": 1, "actual": 2, "achieved": 3}
+    part = make(REWARD, HindsightOptions(k=8, strategy="episode"), goal_sources=mixed)
+    assert (part.k, part.goal_sources, part.options.sources) == (6, mixed, mixed)
+    assert part.options.remembered == {"actual": 1_000, "achieved": 2_000}
+    assert replace(part.options, reward_key="cost").sources == mixed
+    part.goal_sources = {"actual": 1}
+    assert (part.k, part.options.remembered) == (1, {"actual": 1_000})
+    mixed["future"] = 9  # the options have their own
+    assert part.options.sources == {"actual": 1}
+
+
+@both
+def test_two_ways_to_say_which_goals_are_drawn_are_refused(make: Callable[..., Any]) -> None:
+    both = "say the same: give one of them"
+    with pytest.raises(ValueError, match=rf"k=4 and goal_sources=\{{actual: 1\}} {both}"):
+        make(REWARD, goal_sources={"actual": 1}, k=4)
+    with pytest.raises(ValueError, match=rf"strategy='future' and goal_sources=\{{final: 1\}} {both}"):
+        make(REWARD, goal_sources={"final": 1}, strategy="future")
+    part = make(REWARD, goal_sources={"actual": 1})
+    with pytest.raises(ValueError, match=rf"k=7 and goal_sources=\{{actual: 1\}} {both}"):
+        part.k = 7
+    with pytest.raises(ValueError, match=rf"strategy='final' and goal_sources=.* {both}"):
+        part.strategy = "final"
+    with pytest.raises(ValueError, match=rf"k=2 and strategy='final' and goal_sources=.* {both}"):
+        HindsightOptions(k=2, strategy="final", goal_sources={"future": 2, "actual": 2})
+
+
+@pytest.mark.parametrize(
+    ("sources", "error", "message"),
+    [
+        ({}, ValueError, r"at least one source, as in \{'future': 4\}; k=0 asks for no goals"),
+        ({"futur": 2}, ValueError, "'futur'; the sources are future, .*achieved; did you mean 'future'"),
+        ({"actual": 0}, ValueError, "whole numbers of at least 1, got 0 for 'actual'"),
+        ({"actual": True}, ValueError, "got True for 'actual'"),
+        ({"future": 1.5}, ValueError, "got 1.5 for 'future'"),
+        ("actual", TypeError, r"must be numbers by source, as in \{'future': 4\}, got 'actual'"),
+    ],
+)
+def test_sources_that_cannot_be_are_named(sources: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        HindsightOptions(goal_sources=sources)
+
+
+def test_goals_of_other_episodes_are_no_strategy() -> None:
+    with pytest.raises(ValueError, match=r"'actual'.* asked for by goal_sources=\{'actual': 4\}"):
+        HindsightOptions(strategy="actual")
+    with pytest.raises(ValueError, match="the name 'achieved' is taken"):
+        register_strategy("achieved", next_only)
+    with pytest.raises(ValueError, match="recent_actual must be at least 1, got 0"):
+        HindsightOptions(recent_actual=0)
 
 
 def test_options_that_cannot_be_are_named_and_options_stay_as_they_are() -> None:

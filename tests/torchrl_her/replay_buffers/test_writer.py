@@ -25,6 +25,7 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampl
 from torchrl.envs.transforms import MultiStepTransform
 
 from torchrl_her import EnvReward, GoalReward, GoalWeights, HERWriter
+from torchrl_her.replay_buffers.runs import RunsSampler
 
 from ..her_data import WANTED, make_batch, tag
 
@@ -1079,3 +1080,40 @@ def test_an_emptied_writer_is_as_new() -> None:
     buffer.extend(make_batch([[9]], steps=3))
     with pytest.raises(ValueError, match="1 episodes are not over"):
         buffer.extend(make_batch([[9], [9]], steps=3)[1:])
+
+
+# What it tells others
+
+
+@pytest.mark.parametrize("runs", [1, 2])
+def test_all_that_is_written_is_told_once(runs: int) -> None:
+    told: list[tuple[TensorDict, list[int], list[int]]] = []
+    generators = None if runs == 1 else [torch.Generator().manual_seed(run) for run in range(runs)]
+    writer = HERWriter(
+        REWARD,
+        k=2,
+        runs=runs,
+        generators=generators,
+        on_write=lambda *own: told.append((own[0].clone(), *own[1:])),
+    )
+    storage = LazyTensorStorage(1_000)
+    buffer = TensorDictReplayBuffer(
+        storage=storage,
+        writer=writer,
+        sampler=None if runs == 1 else RunsSampler(500, runs=2, generators=generators),
+    )
+    buffer.extend(make_batch([[4, 3], [2, 9]], steps=7))  # the last episode is held back
+    for run in range(runs):
+        rows = torch.cat(
+            [
+                part
+                for out, own, counts in told
+                for part, at in zip(out.split(counts), own, strict=True)
+                if at == run
+            ]
+        )
+        stored = storage[run * 500 : run * 500 + writer.sizes[run]]
+        assert len(rows) == len(stored)
+        assert (rows == stored).all()
+    assert sum(len(out) for out, _, _ in told) == writer.counts.real + writer.counts.virtual
+    assert writer.held_back == 5

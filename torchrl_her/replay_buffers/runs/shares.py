@@ -17,7 +17,7 @@ from torchrl_her.replay_buffers.copies import (
     virtual_episodes,
     with_ends,
 )
-from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
+from torchrl_her.replay_buffers.keys import TransitionKeys
 from torchrl_her.replay_buffers.options import HindsightOptions
 from torchrl_her.replay_buffers.runs.pieces import Piece
 
@@ -62,7 +62,7 @@ def virtual_share(
     run: Tensor | None,
     piece: Piece,
     source: Tensor,
-    goal_source: Tensor,
+    goals: Tensor,
     reward_fn: RewardFunction,
     options: HindsightOptions,
     keys: TransitionKeys,
@@ -75,13 +75,12 @@ def virtual_share(
         rows, piece, options, keys: as for :func:`real_share`.
         run: [n] int64, the run of each row; None if there is only one.
         source: [V] int64, the transitions that are copied, or the first ones of whole episodes that are.
-        goal_source: [V] int64, those whose achieved goals they take.
+        goals: [V, g], those that they get.
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
 
     Keyword Args:
         first_id: the trajectory id of the first copy of an episode.
     """
-    goals = entry_of(rows, keys.next_achieved).index_select(0, goal_source)
     of, achieved_reward = (rows, piece.episodes, source, goals, reward_fn, keys), options.achieved_reward
     if options.per == "episode":
         virtual, number = virtual_episodes(*of, achieved_reward=achieved_reward)

@@ -46,6 +46,32 @@ def uniform(
     return out
 
 
+class RunDraws:
+    """Uniform numbers for transitions, from the generator of the run that each is of.
+
+    Args:
+        generators: R.
+        run: [n], ascending; None for one run.
+
+    Example:
+        >>> draws = RunDraws([torch.Generator().manual_seed(0)])
+        >>> draws.of(torch.tensor([1]))((1, 3), torch.float32, torch.device("cpu")).shape
+        torch.Size([1, 3])
+    """
+
+    def __init__(self, generators: Generators, run: Tensor | None = None) -> None:
+        self.generators, self.run = generators, run
+
+    def of(self, some: Tensor) -> RunDraws:
+        """Those of some transitions, in order."""
+        return self if self.run is None else RunDraws(self.generators, self.run[some])
+
+    def __call__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+        n, k = shape
+        counts = [n] if self.run is None else self.run.bincount(minlength=len(self.generators)).tolist()
+        return uniform(counts, k, self.generators, dtype=dtype, device=device)
+
+
 def check_generators(runs: int, generators: Sequence[torch.Generator] | None) -> list[torch.Generator] | None:
     """The generators of R runs as a list; None for the buffer's, which only a single run may use.
 

@@ -146,11 +146,23 @@ CASES: list[dict[str, Any]] = [
     {"n_steps": 3, "gamma": 0.9},
     {"k": 0},
     {"packed": False, "capacity": 60},
+    {"goal_sources": {"future": 2, "actual": 2}, "filter_achieved": True},
+    {
+        "goal_sources": {"achieved": 2, "final": 1},
+        "filter_achieved": True,
+        "weights": "ibs",
+        "recent_achieved": 20,
+    },
+    {"goal_sources": {"achieved": 3}, "weights": "own", "n_steps": 3, "gamma": 0.9},
 ]
 
 
+def _shown(value: object) -> str:
+    return "_".join(value) if isinstance(value, dict) else str(value)
+
+
 @pytest.mark.parametrize(
-    "options", CASES, ids=lambda options: "-".join(map(str, options.values())) or "plain"
+    "options", CASES, ids=lambda options: "-".join(map(_shown, options.values())) or "plain"
 )
 @settings(max_examples=4, deadline=None, derandomize=True, phases=[Phase.generate])
 @given(data=st.data())
@@ -235,6 +247,7 @@ def test_episodes_are_ended_for_all_runs() -> None:
 def test_emptying_a_run_empties_it_alone(weights: str) -> None:
     """Rows, priorities, q, counts and open episodes; the others go on as if nothing were the matter."""
     options: dict[str, Any] = {"filter_achieved": True, "weights": weights, "capacity": 50}
+    options["goal_sources"] = {"future": 2, "achieved": 2}
     together = make_buffer(range(RUNS), **options)
     alone = [make_buffer(range(run, run + 1), **options) for run in range(RUNS)]
     for step, batch in enumerate(batches([[3, 6, 5, 7, 30], [11, 4, 30]] * RUNS, 8)):
@@ -273,9 +286,12 @@ def test_runs_relabel_with_rewards_and_weights_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("pieces", [1 << 7, 1 << 9])
-def test_pieces_do_not_change_what_a_run_writes(pieces: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("sources", [{"future": 4}, {"future": 2, "achieved": 2}])
+def test_pieces_do_not_change_what_a_run_writes(
+    pieces: int, sources: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("torchrl_her.replay_buffers.writer._ROWS", pieces)
-    options: dict[str, Any] = {"filter_achieved": True, "weights": "ibs"}
+    options: dict[str, Any] = {"filter_achieved": True, "weights": "ibs", "goal_sources": sources}
     together = make_buffer(range(RUNS), **options)
     alone = [make_buffer(range(run, run + 1), **options) for run in range(RUNS)]
     lengths = [[2] * 20, [3] * 12, [20, 30], [7, 9, 2, 30], [1] * 30, [24]]
@@ -290,6 +306,7 @@ def test_pieces_do_not_change_what_a_run_writes(pieces: int, monkeypatch: pytest
 @pytest.mark.parametrize("packed", [True, False])
 def test_a_state_goes_on_as_the_unbroken_buffer(sampler: str, packed: bool) -> None:
     options: dict[str, Any] = {"weights": "ibs", "capacity": 40, "sampler": sampler, "packed": packed}
+    options |= {"goal_sources": {"future": 2, "achieved": 2}, "recent_achieved": 30}
     buffer, other = (make_buffer(range(RUNS), **options) for _ in range(2))
     stream = batches([[3, 6, 5, 7, 30], [11, 4, 30]] * RUNS, 8)
     for step in range(8):

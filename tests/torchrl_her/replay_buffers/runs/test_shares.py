@@ -40,8 +40,8 @@ def test_single_transitions() -> None:
     assert real.counts == [2, 3]
     assert real.copies.changes == {}
     # Transition 0 for the goal that 1 achieved, and 5 and 6 for the one that 6 achieved.
-    source, goal_source = torch.tensor([0, 5, 6]), torch.tensor([1, 6, 6])
-    virtual = virtual_share(ROWS, RUN, PIECE, source, goal_source, REWARD, options, keys, first_id=0)
+    source, goals = torch.tensor([0, 5, 6]), ROWS["next", "achieved_goal"][[1, 6, 6]]
+    virtual = virtual_share(ROWS, RUN, PIECE, source, goals, REWARD, options, keys, first_id=0)
     assert virtual.counts == [1, 2]
     assert virtual.copies.changes["desired_goal"][:, 0].tolist() == [2.0, 1003.0, 1003.0]
     assert virtual.copies.reward.tolist() == [-1.0, -1.0, 0.0]
@@ -52,8 +52,8 @@ def test_whole_episodes_have_ids() -> None:
     """Two copies of the second episode: one up to its second state, one up to its end."""
     options = HindsightOptions(per="episode")
     keys = options.transition_keys()
-    source, goal_source = torch.tensor([4, 4]), torch.tensor([5, 6])
-    virtual = virtual_share(ROWS, RUN, PIECE, source, goal_source, REWARD, options, keys, first_id=10)
+    source, goals = torch.tensor([4, 4]), ROWS["next", "achieved_goal"][[5, 6]]
+    virtual = virtual_share(ROWS, RUN, PIECE, source, goals, REWARD, options, keys, first_id=10)
     assert virtual.copies.root.tolist() == [4, 5, 4, 5, 6]
     assert virtual.counts == [0, 5]
     assert virtual.copies.changes[keys.trajectory].tolist() == [10, 10, 11, 11, 11]

@@ -1,0 +1,182 @@
+"""Choosing goals for transitions from lines of candidates, by candidate times weight times filter.
+
+A line is all that a transition may take its goal from: the goals of its episode, or those of a pool that
+many transitions share. What the strategy allows is a part of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, Protocol, Self
+
+import torch
+from torch import Tensor
+
+from torchrl_her.goals.factors import between, combine, draw, draw_alike, draw_weighted
+from torchrl_her.goals.weights import checked_weights
+
+# Likelihoods of goals [transitions, W] that are held in memory at once.
+LIKELIHOODS = 1 << 17
+# How often refused goals are proposed again where lines are long.
+TRIES = 8
+
+Index = Tensor | slice
+Keep = Callable[[Index, Tensor], Tensor]
+
+
+class Draws(Protocol):
+    """Uniform numbers in [0, 1) for transitions [n]."""
+
+    def __call__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Numbers of a shape [n, k]."""
+
+    def of(self, some: Tensor) -> Self:
+        """Those of some of the transitions."""
+
+
+class Candidates(NamedTuple):
+    """The goals that transitions [n] may take, before weights and filter.
+
+    Attributes:
+        goals: [p, g].
+        table: [L, W] int64, positions in ``goals``; shorter lines are padded with their last position.
+        line: [n] int64, ascending: the line of each transition.
+        first, end: [n] int64: which places of its line a transition may take, ``first <= place < end``.
+    """
+
+    goals: Tensor
+    table: Tensor
+    line: Tensor
+    first: Tensor
+    end: Tensor
+
+    def of(self, some: Tensor) -> Candidates:
+        """Those of some of the transitions, in order."""
+        return self._replace(line=self.line[some], first=self.first[some], end=self.end[some])
+
+
+def choose_goals(
+    candidates: Candidates,
+    k: int,
+    *,
+    weights: Callable[[Tensor], Tensor] | None,
+    keep: Keep | None,
+    draws: Draws,
+    tries: int = 0,
+) -> tuple[Tensor, Tensor]:
+    """Draws k goals for each transition, with replacement, by candidate times weight times filter.
+
+    To save work, goals are proposed by candidate and weight alone. Those that the filter refuses are proposed
+    again, ``tries`` times. If a transition still has one that is refused, all its k goals are drawn again,
+    from the likelihoods of all its candidates. The result follows the product of the three factors.
+
+    Args:
+        candidates: of n transitions.
+        k: number of draws.
+
+    Keyword Args:
+        weights: maps goals [L, W, g] to how useful each is, [L, W]; None for all alike.
+        keep: the filter. It is given which transitions are asked for, an index [m] or a slice, and goals
+            [m, c, g] for them. It returns which of them may be drawn, [m, c] of bool; None for all.
+        draws: source of the random numbers.
+        tries: worth it where lines are long, and few goals refused.
+
+    Returns:
+        ``(position, valid)``: [n, k] int64, positions in ``candidates.goals``, and [n] of bool, False where
+        a transition has no goal that may be drawn (its positions are then meaningless).
+
+    Raises:
+        ValueError: weights are negative or not finite.
+
+    Example:
+        >>> from torchrl_her.replay_buffers.runs.streams import RunDraws
+        >>> goals = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
+        >>> line = torch.tensor([[0, 1, 2, 3]])  # for two transitions; the second may take the last two
+        >>> first, end = torch.tensor([0, 2]), torch.tensor([4, 4])
+        >>> candidates = Candidates(goals, line, torch.tensor([0, 0]), first, end)
+        >>> def even(which, goals):
+        ...     return goals[..., 0] % 2 == 0
+        >>> draws = RunDraws([torch.Generator().manual_seed(0)])
+        >>> position, valid = choose_goals(candidates, 3, weights=None, keep=even, draws=draws)
+        >>> position[1].tolist(), set(position[0].tolist()) <= {0, 2}
+        ([2, 2, 2], True)
+    """
+    goals, table, line, *_ = candidates
+    width = table.shape[1]
+    valid = torch.ones_like(line, dtype=torch.bool)
+    lines = None if weights is None else goals[table]
+    weight = None if weights is None or lines is None else checked_weights(weights(lines))
+    index = _propose(candidates, k, weight, draws)
+    useless = weight is not None and not bool((weight > 0).all())
+    begin = line * width  # of the lines in the flat table
+
+    def test(which: Index, index: Tensor) -> Tensor:
+        """Which goals [m, c] of some transitions may not be taken."""
+        at = begin[which].unsqueeze(-1) + index
+        out = torch.zeros_like(at, dtype=torch.bool)
+        if weight is not None and useless:
+            out |= weight.take(at) == 0
+        if keep is not None:
+            out |= ~keep(which, goals[table.take(at)])
+        return out
+
+    if keep is not None or useless:
+        refused = test(slice(None), index)
+        for _ in range(tries):
+            which, column = refused.nonzero(as_tuple=True)
+            if len(which) == 0:
+                break
+            again = _propose(candidates.of(which), 1, weight, draws.of(which))
+            index[which, column] = again.squeeze(-1)
+            refused[which, column] = test(which, again).squeeze(-1)
+        rest = refused.any(-1).nonzero().squeeze(-1)
+        if len(rest) > 0:
+            at_once = max(1, LIKELIHOODS // width)
+            lines = goals[table] if lines is None else lines
+            likelihoods = _likelihoods(candidates, lines, rest.split(at_once), weight, keep)
+            dtype = torch.float32 if weight is None else weight.dtype
+            parts = iter(draws.of(rest)((len(rest), k), dtype, line.device).split(at_once))
+            drawn = [draw(likelihood, k, generator=lambda *_: next(parts)) for likelihood in likelihoods]
+            index[rest], valid[rest] = (torch.cat(part) for part in zip(*drawn, strict=True))
+    return table.take(begin.unsqueeze(-1) + index), valid
+
+
+def _propose(candidates: Candidates, k: int, weight: Tensor | None, draws: Draws) -> Tensor:
+    """Places [n, k] in the lines of transitions, by candidates and weights alone."""
+    _, _, line, first, end = candidates
+    if weight is None:
+        return draw_alike(first, end, k, generator=draws)
+    n, counts = len(line), line.bincount(minlength=len(weight))
+    longest = int(counts.max())
+    whole = n == len(counts) * longest
+    place = None if whole else torch.arange(n, device=line.device) - (counts.cumsum(0) - counts)[line]
+
+    def by_line(x: Tensor) -> Tensor:
+        """Entries [n, ...] as [L, longest, ...]."""
+        if place is None:
+            return x.reshape(len(counts), longest, *x.shape[1:])
+        return x.new_zeros(len(counts), longest, *x.shape[1:]).index_put_((line, place), x)
+
+    def numbers(_: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Numbers for transitions alone: what is drawn must not depend on how far lines are padded."""
+        return by_line(draws((n, k), dtype, device))
+
+    drawn = draw_weighted(weight, by_line(first), by_line(end), k, generator=numbers)
+    return drawn.flatten(0, 1) if place is None else drawn[line, place]
+
+
+def _likelihoods(
+    candidates: Candidates,
+    lines: Tensor,
+    parts: tuple[Tensor, ...],
+    weight: Tensor | None,
+    keep: Keep | None,
+) -> Iterator[Tensor]:
+    """For some transitions, the likelihoods [m, W] of all goals of their lines, part by part."""
+    for part in parts:
+        own = candidates.line[part]
+        yield combine(
+            between(candidates.first[part], candidates.end[part], lines.shape[1]),
+            None if weight is None else weight[own],
+            None if keep is None else keep(part, lines[own]),
+        )

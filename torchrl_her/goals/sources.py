@@ -1,0 +1,72 @@
+"""Goal sources: how many of a transition's virtual goals come from where."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from difflib import get_close_matches
+from numbers import Integral
+
+from torchrl_her.goals.strategies import RECENT, STRATEGIES, Strategy, get_strategy, strategy_name
+
+GoalSources = Mapping[Strategy, int]
+
+
+def check_goal_sources(sources: GoalSources) -> dict[Strategy, int]:
+    """Checks how many virtual goals each transition gets from each source.
+
+    A source is a goal strategy, which gives goals of the transition's own episode, or one of two that look
+    beyond it: ``"actual"``, the goals that were really wanted in recent episodes, and ``"achieved"``, those
+    that were achieved in recent episodes.
+
+    Args:
+        sources: the number of goals, at least 1, of each source.
+
+    Returns:
+        The same as a dictionary of its own, with plain numbers.
+
+    Raises:
+        ValueError: there is no source, an unknown one, or a number below 1.
+        TypeError: these are no numbers by source.
+
+    Example:
+        >>> check_goal_sources({"future": 2, "actual": 2})
+        {'future': 2, 'actual': 2}
+    """
+    if not isinstance(sources, Mapping):
+        raise TypeError(f"goal_sources must be numbers by source, as in {{'future': 4}}, got {sources!r}")
+    if not sources:
+        raise ValueError("goal_sources needs at least one source, as in {'future': 4}; k=0 asks for no goals")
+    checked: dict[Strategy, int] = {}
+    for source, number in sources.items():
+        _check_source(source)
+        if not isinstance(number, Integral) or isinstance(number, bool) or number < 1:
+            raise ValueError(
+                f"goal_sources must give whole numbers of at least 1, got {number!r} for "
+                f"{strategy_name(source)!r}"
+            )
+        checked[source] = int(number)
+    return checked
+
+
+def sources_name(sources: GoalSources) -> str:
+    """What to call goal sources in a report.
+
+    Example:
+        >>> sources_name({"future": 2, "actual": 2})
+        'future: 2, actual: 2'
+    """
+    return ", ".join(f"{strategy_name(source)}: {number}" for source, number in sources.items())
+
+
+def _check_source(source: Strategy) -> None:
+    if source in RECENT:
+        return
+    try:
+        get_strategy(source)
+    except ValueError:
+        known = [*STRATEGIES, *RECENT]
+        nearest = get_close_matches(str(source), known, n=1)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        raise ValueError(
+            f"unknown goal source {source!r}; the sources are {', '.join(known)}{hint}"
+        ) from None

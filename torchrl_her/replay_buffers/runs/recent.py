@@ -1,0 +1,116 @@
+"""The goals of recent episodes, which transitions of other episodes may take, too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_her.goals.strategies import RECENT
+from torchrl_her.replay_buffers.episodes import Episodes
+from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
+
+Goals = tuple[Tensor | None, ...]
+
+
+@dataclass(frozen=True)
+class RecentGoals:
+    """What each of R runs remembers: the goals wanted in recent episodes, and those achieved in them.
+
+    Attributes:
+        goals: for ``"actual"`` and ``"achieved"``, those of each run, [m, g] with the newest last; None for
+            a run that has none.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_her import HindsightOptions
+        >>> wanted, got = torch.tensor([[9.0], [9.0], [8.0]]), torch.tensor([[1.0], [2.0], [3.0]])
+        >>> rows = TensorDict({"desired_goal": wanted, "next": {"achieved_goal": got}}, [3])
+        >>> episodes = Episodes(torch.tensor([[0, 1], [2, 2]]), torch.tensor([2, 1]))
+        >>> keys = HindsightOptions().transition_keys()
+        >>> recent = RecentGoals.none(1).after(rows, episodes, None, keys, sizes={"actual": 9, "achieved": 2})
+        >>> [recent.goals[name][0].flatten().tolist() for name in ("actual", "achieved")]
+        [[9.0, 8.0], [2.0, 3.0]]
+    """
+
+    goals: Mapping[str, Goals]
+
+    @classmethod
+    def none(cls, runs: int) -> RecentGoals:
+        """No goals of R runs."""
+        return cls(dict.fromkeys(RECENT, (None,) * runs))
+
+    def after(
+        self,
+        rows: TensorDictBase,
+        episodes: Episodes,
+        run: Tensor | None,
+        keys: TransitionKeys,
+        *,
+        sizes: Mapping[str, int],
+    ) -> RecentGoals:
+        """What is remembered after some episodes.
+
+        Args:
+            rows: [n], transitions.
+            episodes: positions among them; those of one run after those of the other.
+            run: [E] int64, the run of each episode; None if there is only one.
+            keys: where goals are.
+
+        Keyword Args:
+            sizes: how many goals a run keeps, of each kind that is to be remembered.
+        """
+        if len(episodes.lengths) == 0 or not sizes:
+            return self
+        out, lengths = dict(self.goals), episodes.lengths
+        for name, size in sizes.items():
+            if name == "actual":  # one of each episode
+                number, key, row = torch.ones_like(lengths), keys.goals[0], episodes.rows[:, 0]
+            else:
+                number, key, row = lengths, keys.next_achieved, episodes.rows[episodes.inside]
+            # Of the type of achieved goals, as all virtual goals are.
+            new = entry_of(rows, key).index_select(0, row).to(entry_of(rows, keys.next_achieved).dtype)
+            counts = [len(new)]
+            if run is not None:
+                counts = number.new_zeros(len(out[name])).index_add_(0, run, number).tolist()
+            parts = zip(out[name], new.split(counts), strict=True)
+            out[name] = tuple(_last(before, part, size) for before, part in parts)
+        return RecentGoals(out)
+
+    def without_run(self, run: int) -> RecentGoals:
+        """What the other runs remember."""
+        return RecentGoals({name: (*own[:run], None, *own[run + 1 :]) for name, own in self.goals.items()})
+
+    def lines(self, name: str, runs: Sequence[int]) -> tuple[Tensor, Episodes]:
+        """The goals of one kind of some runs, which have some.
+
+        Returns:
+            ``(goals, lines)``: [p, g], and where those of each run lie in there, as those of an episode do.
+        """
+        own = [goals for run in runs if (goals := self.goals[name][run]) is not None]
+        goals = own[0] if len(own) == 1 else torch.cat(own)
+        lengths = torch.tensor([len(part) for part in own], device=goals.device)
+        step = torch.arange(int(lengths.max()), device=goals.device).minimum(lengths.unsqueeze(-1) - 1)
+        return goals, Episodes((lengths.cumsum(0) - lengths).unsqueeze(-1) + step, lengths)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain data that :meth:`from_state` takes."""
+        return {name: list(own) for name, own in self.goals.items()}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Sequence[Tensor | None]]) -> RecentGoals:
+        """What was remembered when :meth:`state_dict` was called."""
+        return cls({name: tuple(state[name]) for name in RECENT})
+
+
+def _last(before: Tensor | None, new: Tensor, size: int) -> Tensor | None:
+    """The last goals, at most so many, of some [m, g] and new ones."""
+    if len(new) == 0:
+        return before
+    if before is None or len(new) >= size:
+        return new[-size:].clone()  # not a view of the whole batch
+    return torch.cat((before[max(0, len(before) + len(new) - size) :].to(new), new))
