@@ -23,6 +23,7 @@ from torchrl_her.objectives.dqn import make_dqn_loss
 from torchrl_her.objectives.sac import make_sac_loss
 from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her.objectives.td3 import make_td3_loss
+from torchrl_her.objectives.tqc import make_tqc_loss
 from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her.replay_buffers.options import HindsightOptions
 from torchrl_her.replay_buffers.sample_unit import HERSampleUnit
@@ -66,6 +67,7 @@ __all__ = [
     "make_stochastic_actor",
     "make_target_updater",
     "make_td3_loss",
+    "make_tqc_loss",
     "register_strategy",
     "sampled_target",
     "save_checkpoint",

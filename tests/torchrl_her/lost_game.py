@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
@@ -19,10 +21,13 @@ def rows(n: int, *, action: torch.Tensor, runs: int = 1) -> TensorDict:
     return TensorDict(seen() | {"action": action, "next": after}, [runs, n])
 
 
-def say(loss: LossModule, values: list[float], target_values: list[float]) -> None:
-    """Lets the two critics of a loss, and their targets, say the same values of everything."""
+def say(loss: LossModule, values: Sequence[object], target_values: Sequence[object]) -> None:
+    """Lets the critics of a loss, and their targets, say the same values of everything.
+
+    Of each critic a number, or a list of quantiles.
+    """
     for name, bias in (("qvalue_network_params", values), ("target_qvalue_network_params", target_values)):
         params = getattr(loss, name)
         for value in params.values(True, True):
             value.data.zero_()
-        params["module", "rest", "2", "bias"].data.copy_(torch.tensor(bias).view(2, 1, 1, 1))
+        params["module", "rest", "2", "bias"].data.copy_(torch.tensor(bias).view(len(bias), 1, 1, -1))

@@ -1,6 +1,7 @@
 """Curriculum-HER: layers, their transforms, and how a run moves from one to the next."""
 
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress, zero_unused_inputs
+from torchrl_her.curriculum.normalization import count_inputs, restart_inputs
 from torchrl_her.curriculum.switch import enter_layer, set_layer_goals
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
 
@@ -10,7 +11,9 @@ __all__ = [
     "CurriculumProgress",
     "StateToObs",
     "ZeroPad",
+    "count_inputs",
     "enter_layer",
+    "restart_inputs",
     "set_layer_goals",
     "zero_unused_inputs",
 ]

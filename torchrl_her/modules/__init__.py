@@ -1,5 +1,6 @@
-"""Networks, and exploration around a greedy policy."""
+"""Networks, exploration around a greedy policy, and normalization of what they see."""
 
+from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import (
     DecayingEpsilon,
     DecayingEpsilonGreedy,
@@ -17,6 +18,8 @@ from torchrl_her.modules.networks import (
     stack_runs,
     take_run,
 )
+from torchrl_her.modules.normalization import RunningNorm
+from torchrl_her.modules.normalized import NormalizeBatch, NormalizedPolicy
 from torchrl_her.modules.q_actor import QNet, make_q_actor
 from torchrl_her.modules.stochastic_actor import StochasticActorNet, make_stochastic_actor
 
@@ -26,7 +29,11 @@ __all__ = [
     "DecayingEpsilon",
     "DecayingEpsilonGreedy",
     "Exploration",
+    "NormalizeBatch",
+    "NormalizedPolicy",
+    "PolicyAverage",
     "QNet",
+    "RunningNorm",
     "StackedLayerNorm",
     "StackedLinear",
     "StochasticActorNet",

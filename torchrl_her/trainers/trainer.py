@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -13,6 +14,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.replay_buffers.runs.buffer import runs_of, sizes_of
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.cut import cut_episodes
@@ -74,13 +76,15 @@ class Trainer:
         runs: R.
         epoch_frames: environment steps of each run in an epoch. Epochs end with whole batches: the first n
             have n times as many steps together, rounded up.
-        frames_per_update: environment steps of each run for each of its gradient steps.
+        frames_per_update: environment steps of each run for each of its gradient steps; 0.5, for example, for
+            two gradient steps for each environment step. They are made after each collected batch.
         warmup_frames: environment steps of each run before its first gradient step. The gradient steps that
             belong to these frames follow then. With enough frames to end an episode in each environment, all
             runs have transitions to learn from at their first gradient step.
         batch_size: transitions in a gradient step of one run.
         batches_per_sample: gradient steps whose transitions are drawn in one call. Priorities that change
             during these steps count from the next call on.
+        average: follows the policy that learns, after each update.
 
     Raises:
         ValueError: a number is too small, or the buffer is for another number of runs; when running, a batch
@@ -106,6 +110,7 @@ class Trainer:
         warmup_frames: int = 0,
         batch_size: int = 256,
         batches_per_sample: int = 32,
+        average: PolicyAverage | None = None,
     ) -> None:
         counts = {
             "epoch_frames": epoch_frames,
@@ -115,8 +120,8 @@ class Trainer:
         for name, count in counts.items():
             if count < 1:
                 raise ValueError(f"{name} must be at least 1, got {count}")
-        if not frames_per_update > 0:
-            raise ValueError(f"frames_per_update must be positive, got {frames_per_update}")
+        if not 0 < frames_per_update < math.inf:
+            raise ValueError(f"frames_per_update must be positive and finite, got {frames_per_update}")
         if runs_of(buffer) != runs:
             raise ValueError(f"there are {runs} runs, but the buffer's writer is for {runs_of(buffer)}")
         self.collector, self.buffer, self.learner, self.runs = collector, buffer, learner, runs
@@ -124,6 +129,7 @@ class Trainer:
         self.epoch_frames, self.frames_per_update = epoch_frames, frames_per_update
         self.warmup_frames = warmup_frames
         self.batch_size, self.batches_per_sample = batch_size, batches_per_sample
+        self.average = average
         self.frames = self.updates = self.epochs = 0
         self._credit = 0.0  # gradient steps that the frames so far allow and that were not made yet
         self._measured: list[dict[str, Tensor]] | None = None  # in the epoch under way
@@ -224,6 +230,8 @@ class Trainer:
         drawn = self.buffer.sample(self.runs * self.batch_size * steps)
         rows = drawn.view(self.runs, -1)
         measured = self.learner.update(rows, steps, idle=idle)
+        if self.average is not None:
+            self.average.follow(steps)
         self._set_priorities(drawn, rows, idle)
         nothing = torch.tensor(idle, dtype=torch.int64)
         return {key: value.index_fill(1, nothing, _IDLE) for key, value in measured.items()}

@@ -122,18 +122,14 @@ class OptionsCommand(click.Command):
 def _of_other_learners() -> Iterator[tuple[str, str]]:
     """The options that the default learner does not have, and which have them."""
     known = {own.name for own in fields(options_of("ddpg"))}
-    learners: dict[str, list[str]] = {}
-    options = {}
+    learners: dict[tuple[str, str], list[str]] = {}  # of an option as it is written, with its default
     for spec in LEARNERS.values():
         for own in fields(spec.options):
             if own.name not in known:
-                options[own.name] = own
-                learners.setdefault(own.name, []).append(spec.name)
-    for name, own in options.items():
-        yield (
-            _written("learner", name, default_of(own)),
-            f"{own.metadata['help']} ({', '.join(learners[name])})",
-        )
+                shown = _written("learner", own.name, default_of(own)), own.metadata["help"]
+                learners.setdefault(shown, []).append(spec.name)
+    for (written, help), names in learners.items():
+        yield written, f"{help} ({', '.join(names)})"
 
 
 def _written(group: str, name: str, default: Any) -> str:

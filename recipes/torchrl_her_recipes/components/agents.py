@@ -6,15 +6,17 @@ from collections.abc import Sequence
 from dataclasses import fields
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
 from torchrl_her.curriculum.layers import Curriculum, zero_unused_inputs
+from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.networks import StackedLinear, stack_runs
 from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her_recipes.components.learner import Agent, LearnerBuilder, Networks
+from torchrl_her_recipes.components.normalization import acting, make_norm
 from torchrl_her_recipes.config.learners import AUTO, LEARNERS, Actions, LearnerSpec
 from torchrl_her_recipes.config.options import default_of
 from torchrl_her_recipes.config.recipe import Recipe
@@ -45,14 +47,18 @@ def make_agent(
     actor, critics = _networks(builder, recipe, curriculum)
     exploration, options = builder.exploration(generators), recipe.learner
     loss = builder.loss(actor, critics, rewards, generators)
+    norm = make_norm(recipe, dict(zip(builder.in_keys, builder.widths, strict=True)))
+    player = acting(actor, norm)
     return Agent(
-        actor=actor,
+        actor=player,
         critic=critics[0],
         exploration=exploration,
-        policy=TensorDictSequential(actor, exploration),
+        policy=TensorDictSequential(player, exploration),
         loss=loss,
         optimizer=torch.optim.Adam(loss.parameters(), lr=options.learning_rate, fused=True),
         target=make_target_updater(loss, tau=options.tau, hard_interval=options.hard_update_interval),
+        norm=norm,
+        average=PolicyAverage(player, decay=options.average_decay) if options.average_decay > 0 else None,
     )
 
 
@@ -89,6 +95,15 @@ def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:
 def make_networks(recipe: Recipe, env: EnvBase, *, curriculum: Curriculum | None = None) -> Networks:
     """The actor and the critics; the weights of each run depend on its own seed alone."""
     return _networks(_builder(recipe, env, curriculum), recipe, curriculum)
+
+
+def make_player(
+    recipe: Recipe, env: EnvBase, *, curriculum: Curriculum | None = None
+) -> TensorDictModuleBase:
+    """The greedy policy with its normalization, whose weights and statistics can be loaded."""
+    builder = _builder(recipe, env, curriculum)
+    actor, _ = _networks(builder, recipe, curriculum)
+    return acting(actor, make_norm(recipe, dict(zip(builder.in_keys, builder.widths, strict=True))))
 
 
 def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | None) -> Networks:

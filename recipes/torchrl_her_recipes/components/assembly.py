@@ -60,7 +60,9 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
         env=env,
         eval_env=make_played_env(recipe, recipe.evaluation.episodes, eval_seeds(recipe, 0)),
         collector=collector,
-        buffer=make_buffer(recipe, task, generators, rewards=rewards, space=space, state=state),
+        buffer=make_buffer(
+            recipe, task, generators, rewards=rewards, space=space, state=state, norm=agent.norm
+        ),
         goal_target=None if space is None else space.target,
         generators=generators,
         rewards=rewards,

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import torch
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.envs import EnvBase
 
+from torchrl_her.curriculum.normalization import count_inputs
 from torchrl_her.curriculum.switch import set_layer_goals
 from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her.goals.rewards import EnvReward
+from torchrl_her.modules.normalization import RunningNorm
+from torchrl_her.modules.normalized import NormalizeBatch
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler
-from torchrl_her.replay_buffers.writer import HERWriter
+from torchrl_her.replay_buffers.writer import HERWriter, OnWrite
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.goal_space import GoalSpace, make_goal_weights
@@ -33,6 +38,7 @@ def make_buffer(
     rewards: tuple[float, float] = (-1.0, 0.0),
     space: GoalSpace | None = None,
     state: CurriculumState | None = None,
+    norm: RunningNorm | None = None,
 ) -> TensorDictReplayBuffer:
     """The replay buffer of all runs, with the hindsight writer and the sampler.
 
@@ -45,6 +51,7 @@ def make_buffer(
         rewards: of a missed goal and of an achieved one.
         space: of the goals; None where they are not counted.
         state: the curriculum, if there is one.
+        norm: counts what is written and normalizes what is sampled; None for raw transitions.
     """
     algorithm, task, runs = get_algorithm(recipe.hindsight.algo), goal_env(env), len(generators)
     own = [make_goal_weights(recipe, task, space) for _ in range(runs if algorithm.hindsight else 0)]
@@ -52,8 +59,7 @@ def make_buffer(
         storage=PackedStorage(runs * recipe.replay.buffer_size),
         writer=HERWriter(
             EnvReward(task.compute_reward, task.compute_terminated),
-            k=recipe.hindsight.k if algorithm.hindsight else 0,
-            strategy=recipe.hindsight.strategy,
+            **_goals(recipe),
             n_steps=recipe.hindsight.n_steps,
             gamma=recipe.learner.gamma,
             filter_achieved=algorithm.filter_achieved,
@@ -62,6 +68,7 @@ def make_buffer(
             exclude=_NOT_STORED,
             runs=runs,
             generators=generators,
+            on_write=None if norm is None else _counted_by(norm, state),
         ),
         sampler=_make_sampler(recipe, generators),
         priority_key="td_error",
@@ -70,7 +77,24 @@ def make_buffer(
         for run in range(runs):
             set_layer_goals(buffer.writer, state.progress.layer_of(run), run=run)
         buffer.append_transform(ZeroPad(state.curriculum, state.progress))
+    if norm is not None:
+        buffer.append_transform(NormalizeBatch(norm))
     return buffer
+
+
+def _goals(recipe: Recipe) -> dict[str, Any]:
+    """How many virtual goals are drawn from where, as options of the writer."""
+    own = recipe.hindsight
+    if not get_algorithm(own.algo).hindsight:
+        return {"k": 0}
+    if own.goal_sources is not None:
+        return {"goal_sources": own.goal_sources}
+    return {"k": own.k, "strategy": own.strategy}
+
+
+def _counted_by(norm: RunningNorm, state: CurriculumState | None) -> OnWrite:
+    """What counts the transitions that are written."""
+    return norm.update if state is None else partial(count_inputs, norm, state.progress)
 
 
 def _make_sampler(recipe: Recipe, generators: Sequence[torch.Generator]) -> Sampler:

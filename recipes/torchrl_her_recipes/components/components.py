@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
@@ -15,9 +16,11 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
 from torchrl_her.goals.ibs import Instructiveness
+from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import Exploration
+from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.native.library import CannotCompile
-from torchrl_her.trainers.fused import FusedLearner
+from torchrl_her.trainers.fused import FusedLearner, Products
 from torchrl_her.trainers.fusing import is_plain_adam, why_not_fused
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.trainer import Trainer
@@ -38,7 +41,8 @@ class Components:
         recipe: what the components were made from.
         env: batched training environments: R equal blocks; where other processes collect, one of each run.
         eval_env: batched environments for evaluation, likewise.
-        actor: the greedy policy.
+        actor: the greedy policy. With ``normalize=true`` it is a
+            :class:`~torchrl_her.modules.NormalizedPolicy`, and losses take its ``actor``.
         critic: values of (observation, goal, action); what the loss's critics were made from, None if there
             is none. TD3 and SAC train others like it, see :func:`~torchrl_her.objectives.critic_value`.
         exploration: turns greedy into exploring actions.
@@ -53,12 +57,15 @@ class Components:
             measured; None if they are not counted.
         generators: sources of the random numbers of each run (exploration, relabeling, sampling).
         rewards: of a missed goal and of an achieved one.
+        norm: statistics of observations and goals by which actor and sampled transitions are normalized, or
+            None.
+        average: follows the actor, and is what is evaluated, filmed and kept in its place; or None.
     """
 
     recipe: Recipe
     env: EnvBase
     eval_env: EnvBase
-    actor: TensorDictModule
+    actor: TensorDictModuleBase
     critic: TensorDictModule | None
     exploration: Exploration
     policy: TensorDictModuleBase
@@ -71,6 +78,14 @@ class Components:
     generators: list[torch.Generator]
     rewards: tuple[float, float] = (-1.0, 0.0)
     curriculum: CurriculumState | None = None
+    norm: RunningNorm | None = None
+    average: PolicyAverage | None = None
+
+    @property
+    def greedy(self) -> TensorDictModuleBase:
+        """The greedy policy that is evaluated, filmed and kept: the average of the actor, or the actor."""
+        average = self.average
+        return self.actor if average is None or average.policy is not self.actor else average.module
 
     def learner(self) -> Learner:
         """Gradient steps on the loss: fused where that is possible, through the loss module elsewhere.
@@ -82,7 +97,13 @@ class Components:
         reason = None if choice == "never" else self._why_not_fused()
         if choice != "never" and reason is None:
             try:
-                return FusedLearner(self.loss, self.optimizer, self.target, max_grad_norm=norm)
+                return FusedLearner(
+                    self.loss,
+                    self.optimizer,
+                    self.target,
+                    max_grad_norm=norm,
+                    products=cast(Products, self.recipe.learner.products),
+                )
             except CannotCompile as error:
                 reason = str(error)
                 if choice == "auto":
@@ -119,6 +140,7 @@ class Components:
             warmup_frames=recipe.collection.warmup_frames,
             batch_size=recipe.replay.batch_size,
             batches_per_sample=min(replay.batches_per_sample, replay.buffer_size // replay.batch_size),
+            average=self.average,
         )
 
     def _goal_weights(self) -> list[Instructiveness]:

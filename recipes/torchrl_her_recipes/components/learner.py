@@ -13,7 +13,9 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
+from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import DecayingEpsilon, Exploration
+from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her_recipes.config.recipe import Recipe
 
 Networks = tuple[TensorDictModule, list[TensorDictModule]]
@@ -24,22 +26,26 @@ class Agent:
     """The components of a run that act and learn.
 
     Attributes:
-        actor: the greedy policy.
+        actor: the greedy policy, with its normalization.
         critic: values of (observation, goal, action); the first of several.
         exploration: turns greedy into exploring actions.
         policy: actor, then exploration.
         loss: of TorchRL.
         optimizer: over the loss module's parameters.
         target: moves the target networks.
+        norm: statistics by which actor and sampled transitions are normalized, or None.
+        average: follows the actor, and is played and kept in its place; or None.
     """
 
-    actor: TensorDictModule
+    actor: TensorDictModuleBase
     critic: TensorDictModule
     exploration: Exploration
     policy: TensorDictModuleBase
     loss: LossModule
     optimizer: torch.optim.Optimizer
     target: TargetNetUpdater
+    norm: RunningNorm | None = None
+    average: PolicyAverage | None = None
 
 
 class LearnerBuilder(ABC):
@@ -97,9 +103,16 @@ class LearnerBuilder(ABC):
             generators: of each run's random numbers.
         """
         spec = self.action_spec
-        return DecayingEpsilon(spec.low, spec.high, generators=generators, **self.epsilon())
+        return DecayingEpsilon(
+            spec.low, spec.high, generators=generators, **self.epsilon(), **self.action_noise()
+        )
 
     def epsilon(self) -> dict[str, float]:
         """The schedule of epsilon."""
         options = self.options
         return {"start": options.epsilon_start, "decay": options.epsilon_decay, "end": options.epsilon_end}
+
+    def action_noise(self) -> dict[str, float]:
+        """How exploring actions are drawn, where that is an option of the learner."""
+        names = {"noise": "action_noise", "uniform_share": "uniform_share"}
+        return {to: getattr(self.options, own) for to, own in names.items() if hasattr(self.options, own)}

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from torchrl_her_recipes.config.options import what_there_is
 
 STRATEGIES = ("future", "final", "episode")  # goal strategies that come with the library
+RECENT = ("actual", "achieved")  # sources of goals besides strategies: those of recent episodes
 _STRATEGY_REGISTRY = "torchrl_her.goals.strategies"
 
 Instructive = Literal["simultaneous", "sequential"]
@@ -122,7 +124,38 @@ def check_strategy(name: str) -> None:
     Raises:
         ValueError: it does not exist; the message lists those that do.
     """
-    registry = sys.modules.get(_STRATEGY_REGISTRY)
-    known = list(STRATEGIES if registry is None else registry.STRATEGIES)
+    known = _known_strategies()
     if name not in known:
-        raise ValueError(f"unknown goal strategy {name!r}{what_there_is(name, known, 'strategies')}")
+        hint = what_there_is(name, known, "strategies")
+        if name in RECENT:
+            hint = f", which looks beyond the own episode: write goal_sources='{{{name}: 4}}'"
+        raise ValueError(f"unknown goal strategy {name!r}{hint}")
+
+
+def check_goal_sources(sources: object) -> dict[str, int]:
+    """Checks how many virtual goals come from where.
+
+    Raises:
+        ValueError: these are no whole numbers of at least 1 by source, or a source does not exist.
+
+    Example:
+        >>> check_goal_sources({"future": 2, "actual": 2})
+        {'future': 2, 'actual': 2}
+    """
+    example = "as in goal_sources='{future: 2, actual: 2}'"
+    if not isinstance(sources, Mapping) or not sources:
+        raise ValueError(f"goal_sources must be numbers of goals by source, {example}, got {sources!r}")
+    known = [*_known_strategies(), *RECENT]
+    for name, number in sources.items():
+        if isinstance(name, str) and ":" in name and number is None:  # YAML took it for a name
+            raise ValueError(f"goal_sources needs a space behind each colon, {example}, got {dict(sources)}")
+        if name not in known:
+            raise ValueError(f"unknown goal source {name!r}{what_there_is(name, known, 'sources')}")
+        if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+            raise ValueError(f"goal_sources.{name} must be a whole number of at least 1, got {number!r}")
+    return dict(sources)
+
+
+def _known_strategies() -> list[str]:
+    registry = sys.modules.get(_STRATEGY_REGISTRY)
+    return list(STRATEGIES if registry is None else registry.STRATEGIES)

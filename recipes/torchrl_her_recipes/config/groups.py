@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 from torchrl_her_envs.registry import check_options as check_task_options
 from torchrl_her_envs.registry import check_task, get_task_spec
-from torchrl_her_recipes.config.algorithms import check_strategy, get_algorithm
+from torchrl_her_recipes.config.algorithms import check_goal_sources, check_strategy, get_algorithm
 from torchrl_her_recipes.config.options import check_options, option
 from torchrl_her_recipes.config.values import read_yaml
 
@@ -57,7 +58,12 @@ class CollectionConfig(Group):
     epoch_frames: int = option(20_480, "environment steps in an epoch", at_least=1)
     num_envs: int = option(64, "environments that are stepped together", at_least=1)
     steps_per_batch: int = option(10, "steps of each environment between two rounds of updates", at_least=1)
-    frames_per_update: float = option(20.0, "environment steps for each gradient step", above=0)
+    frames_per_update: float = option(
+        20.0,
+        "environment steps for each gradient step; 0.5: two gradient steps for each environment step",
+        above=0,
+        below=math.inf,
+    )
     warmup_frames: int = option(3_200, "environment steps before the first gradient step", at_least=0)
     processes: int = option(
         0,
@@ -114,12 +120,26 @@ class HindsightConfig(Group):
     strategy: str = option(
         "future", "where virtual goals come from: future, final, episode, or a registered name"
     )
+    goal_sources: Any = option(
+        None,
+        "in place of k and strategy, how many virtual goals come from where, as in '{future: 2, actual: 2}': "
+        "any strategy, actual (goals wanted in recent episodes), achieved (goals achieved in them)",
+    )
     n_steps: int = option(1, "steps that a transition spans, at most (n-step returns)", at_least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         get_algorithm(self.algo)
         check_strategy(self.strategy)
+        if self.goal_sources is not None:
+            object.__setattr__(self, "goal_sources", check_goal_sources(self.goal_sources))
+
+    @property
+    def sources(self) -> dict[str, int]:
+        """How many virtual goals of each transition come from where; empty if there are none."""
+        if self.goal_sources is not None:
+            return dict(self.goal_sources)
+        return {self.strategy: self.k} if self.k else {}
 
 
 @dataclass(frozen=True, kw_only=True)

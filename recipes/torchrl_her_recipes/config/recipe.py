@@ -172,6 +172,7 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     below["learner"] = {key: value for key, value in below.get("learner", {}).items() if key in known}
     _drop_options_of_another_task(below, given)
     _drop_another_curriculum(below, given)
+    _drop_other_goal_sources(below, given)
     for group, own in without_effect(_groups(over(below, given))):
         if own not in given.get(group, {}) and own in below.get(group, {}):
             del below[group][own]
@@ -200,6 +201,18 @@ def _drop_another_curriculum(below: Nested, given: Nested) -> None:
     if "name" in asked or "layers" in asked:
         below.get("curriculum", {}).pop("layers", None)
         below.get("curriculum", {}).pop("name", None)
+
+
+def _drop_other_goal_sources(below: Nested, given: Nested) -> None:
+    """Leaves out the goal sources of the base where k or the strategy is asked for."""
+    asked = given.get("hindsight", {})
+    short = {name: asked[name] for name in ("k", "strategy") if name in asked}
+    if not short:
+        return
+    if asked.get("goal_sources") is not None:
+        shown = " and ".join(f"{name}={value}" for name, value in short.items())
+        raise ValueError(f"{shown} and goal_sources={asked['goal_sources']} say the same: give one of them")
+    below.get("hindsight", {}).pop("goal_sources", None)
 
 
 def _assemble(values: Nested) -> Recipe:

@@ -29,9 +29,10 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
             idle[group, name] = f"with task={task}"
     with_algo = f"with algo={algorithm.name}"
     if not algorithm.hindsight:
-        idle["hindsight", "k"] = idle["hindsight", "strategy"] = with_algo
+        for name in ("k", "strategy", "goal_sources"):
+            idle["hindsight", name] = with_algo
         all_of("ibs", with_algo)
-    elif groups.hindsight.k == 0:
+    elif not groups.hindsight.sources:
         idle["hindsight", "strategy"] = "with k=0"
         all_of("ibs", "with k=0")
     elif algorithm.weights:
@@ -40,6 +41,8 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         all_of("ibs", with_algo, but=("cells",))  # the goals of HER are counted in cells, too
     elif algorithm.instructive == "sequential":
         idle["ibs", "floor"] = with_algo
+    if algorithm.hindsight and groups.hindsight.goal_sources is not None:
+        idle["hindsight", "k"] = idle["hindsight", "strategy"] = "with goal_sources"
     if not algorithm.curriculum:
         all_of("curriculum", with_algo)
     elif not groups.learner.has_epsilon:
@@ -49,6 +52,18 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
     if groups.replay.sampler != "prioritized":
         for name in ("priority_alpha", "priority_beta"):
             idle["replay", name] = f"with sampler={groups.replay.sampler}"
+    if not groups.learner.normalize:
+        idle["learner", "normalize_clip"] = "with normalize=false"
+    if groups.learner.compile == "never":
+        idle["learner", "products"] = "with compile=never"
+    elif groups.run.dtype == "float64":
+        idle["learner", "products"] = "with dtype=float64"
+    if getattr(groups.learner, "uniform_share", None) == 1.0:
+        idle["learner", "action_noise"] = "with uniform_share=1"
+    if getattr(groups.learner, "epsilon_start", None) == 0.0 and not algorithm.curriculum:
+        for name in ("action_noise", "uniform_share"):
+            if hasattr(groups.learner, name):
+                idle["learner", name] = "with epsilon_start=0"
     if groups.learner.hard_update_interval > 0:
         idle["learner", "tau"] = "with hard target updates"
     return idle

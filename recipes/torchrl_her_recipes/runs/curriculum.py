@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from torchrl_her.curriculum.normalization import restart_inputs
 from torchrl_her.curriculum.switch import enter_layer
 from torchrl_her.trainers.metrics import success
 from torchrl_her.trainers.trainer import evaluate
@@ -20,7 +21,7 @@ def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDic
     """Greedy episodes of each run, with starts and goals of their own in each epoch."""
     task = goal_env(env)
     task.set_seeds(eval_seeds(components.recipe, epoch))
-    return evaluate(env, components.policy, max_steps=task.max_steps)
+    return evaluate(env, components.greedy, max_steps=task.max_steps)
 
 
 def layer_success(
@@ -53,4 +54,6 @@ def move_on(components: Components, state: CurriculumState, samples: Tensor, fra
             epsilon=components.recipe.curriculum.layer_epsilon,
             run=run,
         )
+        if components.norm is not None:
+            restart_inputs(components.norm, old, new, run=run)
     return lines

@@ -23,8 +23,9 @@ from torchrl_her_recipes.runs.toy_values import measure_values
 def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor]:
     """What greedy episodes of each run show, [R] each.
 
-    ``q`` is the value of the first action as the loss's own critics see it, the least of them if there are
-    several, and ``q_bias`` is that minus the return. Both are missing if the loss has no such critics.
+    ``q`` is the value of the first action as the loss's own critics see it (see
+    :func:`~torchrl_her.objectives.critic_value`), and ``q_bias`` is that minus the return. Both are missing
+    if the loss has no such critics.
     """
     recipe = components.recipe
     missed, achieved = components.rewards
@@ -37,12 +38,13 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     if rollout["action"].is_floating_point():
         spec = components.env.action_spec_unbatched
         measured["saturation"] = saturation(rollout["action"], spec.low, spec.high).mean(1)
-    value = critic_value(components.loss, rollout[:, 0])
+    start = rollout[:, 0]
+    value = critic_value(components.loss, start if components.norm is None else components.norm(start))
     if value is not None:
         measured |= {"q": value.squeeze(-1), "q_bias": q_bias(value, returns)}
     means = {name: value.view(recipe.run.num_runs, -1).mean(1) for name, value in measured.items()}
     if components.curriculum is None:
-        means |= measure_values(components.actor, goal_env(components.eval_env), recipe.run.num_runs)
+        means |= measure_values(components.greedy, goal_env(components.eval_env), recipe.run.num_runs)
     return means | {"epsilon": components.exploration.epsilon}
 
 

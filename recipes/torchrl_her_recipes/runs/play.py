@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_her.modules.networks import take_run
@@ -14,7 +14,7 @@ from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_envs.common.rendering.recording import record_episodes
 from torchrl_her_envs.common.rendering.video import write_video
-from torchrl_her_recipes.components.agents import make_networks
+from torchrl_her_recipes.components.agents import make_player
 from torchrl_her_recipes.components.curricula import make_curriculum, make_played_env, played_rewards
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.imports import permit_task
@@ -24,7 +24,7 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.policies import load_trained
 
 
-def load_actor(folder: str | Path, *, run: int = 0, allow_import: bool = False) -> TensorDictModule:
+def load_actor(folder: str | Path, *, run: int = 0, allow_import: bool = False) -> TensorDictModuleBase:
     """The greedy policy that a run ended with.
 
     Args:
@@ -44,7 +44,7 @@ def load_actor(folder: str | Path, *, run: int = 0, allow_import: bool = False) 
     if allow_import:
         permit_task(recipe.task.name)
     env = make_played_env(recipe, 1, [0])
-    actor, _ = make_networks(recipe.replace(num_runs=1), env, curriculum=make_curriculum(recipe, env))
+    actor = make_player(recipe.replace(num_runs=1), env, curriculum=make_curriculum(recipe, env))
     actor.load_state_dict(take_run(load_checkpoint(home.policy)["actor"], run, recipe.run.num_runs))
     return actor
 
@@ -90,7 +90,7 @@ def play(
 
 def _played(
     source: str | Path, run: int, goals: int, seed: int, allow_import: bool
-) -> tuple[EnvBase, TensorDictModule, float]:
+) -> tuple[EnvBase, TensorDictModuleBase, float]:
     """Environments, the policy that plays in them, and the reward of an achieved goal."""
     if not Path(source).is_dir() and (str(source) in policy_names() or Path(source).is_file()):
         trained = load_trained(source, allow_import=allow_import)

@@ -7,16 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from torchrl_her.modules.networks import ActorNet, make_actor, take_run
+from torchrl_her.modules.networks import make_actor, take_run
 from torchrl_her.trainers.checkpoint import load_checkpoint, save_checkpoint
 from torchrl_her.trainers.metrics import success
 from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_recipes.components.curricula import make_curriculum
 from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.normalization import acting, make_norm
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.shipped import TRAINED, policy_names
@@ -39,7 +40,7 @@ class TrainedPolicy:
     """
 
     task: str
-    actor: TensorDictModule
+    actor: TensorDictModuleBase
     recipe: Recipe
     success: float
     frames: int
@@ -72,7 +73,7 @@ def load_trained(name: str | Path, *, allow_import: bool = False) -> TrainedPoli
     return policy
 
 
-def load_policy(name: str | Path) -> TensorDictModule:
+def load_policy(name: str | Path) -> TensorDictModuleBase:
     """The greedy policy of a task, trained: reads ``observation`` and ``desired_goal``, writes ``action``.
 
     Nothing is imported for it, whatever module the task of a file names: it is weights alone.
@@ -156,7 +157,7 @@ def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int =
 
 def _policy_of(state: dict[str, Any]) -> TrainedPolicy:
     recipe = Recipe.from_dict(state["recipe"])
-    actor = make_actor(state["widths"], state["actions"], in_keys=_KEYS, **recipe.learner.actor_shape)
+    actor = _actor_of(state, recipe)
     actor.load_state_dict(state["actor"])
     return TrainedPolicy(
         task=state["task"],
@@ -165,6 +166,13 @@ def _policy_of(state: dict[str, Any]) -> TrainedPolicy:
         success=state["success"],
         frames=state["frames"],
     )
+
+
+def _actor_of(state: dict[str, Any], recipe: Recipe) -> TensorDictModuleBase:
+    """The actor that the weights are loaded into, with its normalization if there is one."""
+    widths = state["widths"]
+    actor = make_actor(widths, state["actions"], in_keys=_KEYS, **recipe.learner.actor_shape)
+    return acting(actor, make_norm(recipe.replace(num_runs=1), dict(zip(_KEYS, widths, strict=True))))
 
 
 def _widths(env: EnvBase) -> tuple[list[int], int]:
@@ -187,8 +195,7 @@ def _check_seen(recipe: Recipe, env: EnvBase) -> None:
 
 def _check_state(recipe: Recipe, state: dict[str, Any]) -> None:
     """Raises a ValueError if these are not the weights of :func:`~torchrl_her.make_actor`."""
-    wanted = ActorNet(sum(state["widths"]), state["actions"], **recipe.learner.actor_shape)
-    shapes = {f"module.{name}": value.shape for name, value in wanted.state_dict().items()}
+    shapes = {name: value.shape for name, value in _actor_of(state, recipe).state_dict().items()}
     if {name: value.shape for name, value in state["actor"].items()} != shapes:
         raise ValueError(
             f"a policy of learner={recipe.learner.name} cannot be exported: its network is not one of "

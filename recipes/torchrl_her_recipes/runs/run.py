@@ -261,7 +261,7 @@ def _despite_a_full_disk(what: str, trainer: Trainer) -> Iterator[None]:
 def _finish(components: Components, rows: list[dict[str, float]], home: RunFolder) -> None:
     """Draws the pictures and then writes the policy, whose file tells that the run has ended."""
     _draw(components, rows, home)
-    save_checkpoint({"actor": dict(components.actor.state_dict())}, home.policy)
+    save_checkpoint({"actor": dict(components.greedy.state_dict())}, home.policy)
 
 
 def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder) -> None:

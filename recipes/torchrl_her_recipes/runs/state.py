@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from torchrl_her.curriculum.switch import set_layer_goals
+from torchrl_her.goals.sources import sources_name
 from torchrl_her.goals.strategies import strategy_name
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.checkpoint import (
@@ -31,6 +32,8 @@ def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
         "optimizer": components.optimizer.state_dict(),
         "target": None if components.target is None else components.target.state_dict(),
         "exploration": dict(components.exploration.state_dict()),
+        "norm": None if components.norm is None else dict(components.norm.state_dict()),
+        "average": None if components.average is None else dict(components.average.state_dict()),
         "buffer": buffer_state_dict(components.buffer, copy=False),
         "generators": [generator.get_state() for generator in components.generators],
         "torch_generator": torch.get_rng_state(),  # for losses that draw, as SAC's
@@ -57,6 +60,10 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
     if components.target is not None:
         components.target.load_state_dict(state["target"])
     components.exploration.load_state_dict(state["exploration"])
+    if components.norm is not None:
+        components.norm.load_state_dict(state["norm"])
+    if components.average is not None:
+        components.average.load_state_dict(state["average"])
     load_buffer_state_dict(components.buffer, state["buffer"])
     for generator, own in zip(components.generators, state["generators"], strict=True):
         generator.set_state(own)
@@ -87,9 +94,10 @@ def _made_of(components: Components) -> dict[str, str]:
     writer = components.buffer.writer
     hindsight: list[object] = []
     if isinstance(writer, HERWriter):
+        sources = writer.goal_sources
         hindsight = [
             writer.k,
-            strategy_name(writer.strategy),
+            strategy_name(writer.strategy) if sources is None else sources_name(sources),
             writer.filter_achieved,
             type(writer.goal_weights[0] if writer.goal_weights else None).__name__,
         ]

@@ -6,7 +6,7 @@ from functools import singledispatch
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_her_envs.common.goal_env import GoalEnv
@@ -17,7 +17,7 @@ _STATES = 256  # for each number of wrong bits
 
 
 @torch.no_grad()
-def action_values(actor: TensorDictModule, place: Tensor, goal: Tensor) -> Tensor:
+def action_values(actor: TensorDictModuleBase, place: Tensor, goal: Tensor) -> Tensor:
     """The values [..., actions] of all actions in places [..., g] when goals [..., g] are desired."""
     seen = {"observation": place, "desired_goal": goal}
     return actor(TensorDict(seen, place.shape[:-1]))["action_value"]
@@ -33,7 +33,7 @@ def some_wrong(
 
 
 def values_by_wrong_bits(
-    actor: TensorDictModule, bits: int, *, states: int = _STATES, generator: torch.Generator | None = None
+    actor: TensorDictModuleBase, bits: int, *, states: int = _STATES, generator: torch.Generator | None = None
 ) -> dict[str, Tensor]:
     """Mean values of each kind of action over the number of wrong bits, from 0 to ``bits``.
 
@@ -65,12 +65,12 @@ def true_values(wrong: Tensor, gamma: float) -> Tensor:
     return -(1.0 - gamma ** (wrong - 1.0)) / (1.0 - gamma)
 
 
-def values_on_the_line(actor: TensorDictModule, env: TreasureHunt) -> Tensor:
+def values_on_the_line(actor: TensorDictModuleBase, env: TreasureHunt) -> Tensor:
     """The values [places, treasures, 2] of going left and right, for all places and treasures."""
     return action_values(actor, *_all_pairs(env))
 
 
-def measure_values(actor: TensorDictModule, env: GoalEnv, runs: int) -> dict[str, Tensor]:
+def measure_values(actor: TensorDictModuleBase, env: GoalEnv, runs: int) -> dict[str, Tensor]:
     """What the values of R runs are worth, where that can be said; [R] each.
 
     Args:
@@ -88,13 +88,13 @@ def measure_values(actor: TensorDictModule, env: GoalEnv, runs: int) -> dict[str
 
 
 @singledispatch
-def _measure(_env: GoalEnv, _actor: TensorDictModule, _runs: int) -> dict[str, Tensor]:
+def _measure(_env: GoalEnv, _actor: TensorDictModuleBase, _runs: int) -> dict[str, Tensor]:
     """Another environment takes part by a function that is registered for its class."""
     return {}
 
 
 @_measure.register
-def _measure_useless(env: BitFlip, actor: TensorDictModule, runs: int) -> dict[str, Tensor]:
+def _measure_useless(env: BitFlip, actor: TensorDictModuleBase, runs: int) -> dict[str, Tensor]:
     if not env.useless_action:
         return {}
     bits = env.bits
@@ -112,7 +112,7 @@ def _measure_useless(env: BitFlip, actor: TensorDictModule, runs: int) -> dict[s
 
 
 @_measure.register
-def _right_way(env: TreasureHunt, actor: TensorDictModule, runs: int) -> dict[str, Tensor]:
+def _right_way(env: TreasureHunt, actor: TensorDictModuleBase, runs: int) -> dict[str, Tensor]:
     place, goal = (points.reshape(-1, 1) for points in _all_pairs(env))
     apart = (place != goal).squeeze(-1)
     place, goal = place[apart], goal[apart]

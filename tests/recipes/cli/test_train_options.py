@@ -60,6 +60,18 @@ def test_options_of_a_task_are_given_as_the_guide_says() -> None:
     assert "task_options" not in guide
 
 
+def test_goal_sources_are_given_as_a_mapping_or_one_by_one() -> None:
+    mixed = make_recipe(goal_sources={"future": 2, "actual": 2})
+    single = "hindsight.goal_sources."
+    for written in (["goal_sources={future: 2, actual: 2}"], [f"{single}future=2", f"{single}actual=2"]):
+        (one,) = requests(tuple(written), multirun=False)
+        assert one.recipe == mixed
+    several = list(requests(("goal_sources={future: 4},{actual: 1}",), multirun=True))
+    assert [each.recipe.hindsight.sources for each in several] == [{"future": 4}, {"actual": 1}]
+    with pytest.raises(ValueError, match="goal_sources needs a space behind each colon"):
+        list(requests(("goal_sources={future:2,actual:2}",), multirun=False))
+
+
 def test_folders_have_names_that_every_file_system_takes() -> None:
     tasks = ("task=gym:my.module:Mine/Walk-v0",)
     (one,) = requests(tasks, multirun=False)

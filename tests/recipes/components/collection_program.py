@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from copy import deepcopy
 from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,11 @@ def tagged(**options: Any) -> Recipe:
 
 def _sync() -> dict[str, Any]:
     return _run(tagged())
+
+
+def _often() -> dict[str, Any]:
+    """Two gradient steps for each frame, of another learner, with options of exploration."""
+    return _run(tagged(learner="td3", critics=3, target_critics=2, frames_per_update=0.5, action_noise=0.1))
 
 
 def _async() -> dict[str, Any]:
@@ -141,6 +147,27 @@ def _weights() -> dict[str, Any]:
     return {"actions": [batch["action"].clone() for batch in batches]}
 
 
+def _normalized() -> dict[str, Any]:
+    """What processes play after statistics changed; what this one would play, and would have before."""
+    components = build(tagged(epsilon_start=0.0, epsilon_end=0.0, normalize=True))
+    collector, norm, found = components.collector, components.norm, []
+    assert norm is not None
+    for parameter in components.actor.parameters():
+        parameter.data.mul_(3.0)  # so that inputs matter
+    collector.reset()
+    for scale in (1.0, 30.0):
+        before = deepcopy(components.actor)
+        for key, width in norm.widths.items():
+            values = torch.linspace(-scale, scale, 7).unsqueeze(-1).expand(7, width)
+            for number in range(RUNS):
+                norm.count(key, values + number, run=number)
+        batch, actors = collector.next(), (components.actor, before)
+        seen = batch.select(*norm.keys)
+        found.append([batch["action"].clone(), *(own(seen.clone())["action"].detach() for own in actors)])
+    components.close()
+    return {"actions": found}
+
+
 def _curriculum() -> dict[str, Any]:
     """The desired goals before and after all runs came to the last layer."""
     components = build(small(task="hand_v1", algo="cher", num_runs=RUNS, processes=2, success_threshold=0.01))
@@ -184,11 +211,13 @@ def _killed() -> dict[str, Any]:
 
 JOBS = {
     "sync": _sync,
+    "often": _often,
     "again": _sync,
     "resumed": _resumed,
     "stopped": _stopped,
     "async": _async,
     "weights": _weights,
+    "normalized": _normalized,
     "curriculum": _curriculum,
     "breaks": _breaks,
     "cannot start": _cannot_start,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_her_recipes import build, run
-from torchrl_her_recipes.components.agents import find_learner, make_networks
+from torchrl_her_recipes.components.agents import find_learner, make_agent, make_networks
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.learners import LEARNERS
 
@@ -36,7 +37,10 @@ def test_auto_follows_the_actions(options: dict[str, Any], name: str) -> None:
             {"task": "bit_flip", "learner": "td3"},
             "not be used on bit_flip, .* discrete actions: choose dqn",
         ),
-        ({"task": "hand_v0", "learner": "dqn"}, "continuous actions: choose ddpg or td3 or sac"),
+        (
+            {"task": "hand_v0", "learner": "dqn"},
+            "continuous actions: choose ddpg or td3 or sac or redq or tqc",
+        ),
         (
             {"task": "bit_flip", "action_penalty": 0.5},
             "with learner=dqn: leave it out or write learner=dqn",
@@ -69,6 +73,41 @@ def test_a_learner_that_explores_by_itself_gets_no_epsilon_when_a_layer_begins(
     run(components, progress=False)
     assert progress.layers == (1,)
     assert components.exploration.epsilon.tolist() == [0.0]
+
+
+def test_options_reach_the_loss_and_the_exploration() -> None:
+    td3 = build(
+        small(
+            task="hand_v0",
+            learner="td3",
+            critics=5,
+            target_critics=2,
+            action_noise=0.1,
+            uniform_share=0.3,
+            epsilon_end=1.0,
+        )
+    )
+    assert (td3.loss.num_qvalue_nets, td3.loss.target_critics) == (5, 2)
+    assert (td3.exploration.noise, td3.exploration.uniform_share) == (0.1, 0.3)
+    redq = build(small(task="hand_v0", learner="redq", clamp_targets=True, gamma=0.9))
+    assert (redq.loss.num_qvalue_nets, redq.loss.target_critics) == (10, 2)
+    assert [redq.loss.value_estimator.low, redq.loss.value_estimator.high] == pytest.approx([-10.0, 0.0])
+    tqc = build(small(task="hand_v0", learner="tqc", quantiles=7, dropped_quantiles=3))
+    assert tqc.loss.top_quantiles_to_drop_per_net == 3
+    assert tqc.critic.module.outputs == 7
+    assert not hasattr(tqc.loss.value_estimator, "low")
+
+
+def test_by_default_exploration_is_that_of_the_thesis() -> None:
+    exploration = build(small(task="hand_v0")).exploration
+    assert (exploration.noise, exploration.uniform_share) == (0.05, 0.2)
+
+
+def test_targets_cannot_be_clamped_where_rewards_have_no_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = small(task="hand_v0", learner="sac", clamp_targets=True)
+    env, draw = make_task_envs(recipe, 1, [0]), [torch.Generator()]
+    with pytest.raises(ValueError, match="clamp_targets=true has no effect on hand_v0, whose rewards have"):
+        make_agent(recipe, env, draw, rewards=(-math.inf, 0.0))
 
 
 def test_a_learner_may_be_for_one_run_only(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from torchrl_her_recipes import build
 from ..small import small
 
 
-@pytest.mark.parametrize("learner", ["ddpg", "td3", "sac"])
+@pytest.mark.parametrize("learner", ["ddpg", "td3", "sac", "redq", "tqc"])
 def test_priorities_are_schaul_s_power_of_the_absolute_td_error(learner: str) -> None:
     """The loss gives the error or its square: alpha makes up for that."""
     components = build(small(learner=learner, priority_alpha=0.8))
@@ -31,3 +31,13 @@ def test_steps_and_their_discount_are_the_recipe_s(n_steps: int) -> None:
     components = build(small(n_steps=n_steps, gamma=0.9))
     options = components.buffer.writer.options
     assert (options.n_steps, options.gamma) == (n_steps, 0.9)
+
+
+def test_goals_are_drawn_from_where_the_recipe_says() -> None:
+    for values, expected in (
+        ({}, {"future": 4}),
+        ({"k": 2, "strategy": "final"}, {"final": 2}),
+        ({"goal_sources": {"future": 2, "actual": 3}}, {"future": 2, "actual": 3}),
+        ({"algo": "no_hindsight"}, {}),
+    ):
+        assert build(small(**values)).buffer.writer.options.sources == expected

@@ -36,7 +36,7 @@ def together() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def apart() -> dict[str, Any]:
-    return results_of("async", "weights", "curriculum")
+    return results_of("async", "often", "weights", "normalized", "curriculum")
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +115,14 @@ def test_a_seed_repeats_a_run(together: dict[str, Any]) -> None:
         assert (one == other).all()
 
 
+def test_several_gradient_steps_for_each_frame(apart: dict[str, Any]) -> None:
+    audit(apart["often"])
+    assert [row["updates"] for row in apart["often"]["table"]] == [
+        2 * epoch * FRAMES for epoch in (1, 2) for _ in range(RUNS)
+    ]
+    assert all(row["loss_qvalue"] > 0 for row in apart["often"]["table"])
+
+
 def test_a_run_that_stopped_between_epochs_goes_on_as_if_it_had_not(together: dict[str, Any]) -> None:
     assert together["sync"]["table"] == together["resumed"]["table"]
     for one, other in zip(together["sync"]["rows"], together["resumed"]["rows"], strict=True):
@@ -138,6 +146,12 @@ def test_the_policy_is_one_batch_old(apart: dict[str, Any]) -> None:
     assert (then > 0.9).all()
     share = (exploring < 0.9).float().mean()  # epsilon 1: a fifth is uniform, a few noises are large
     assert 0.1 < share < 0.6
+
+
+def test_statistics_of_normalized_inputs_reach_the_processes(apart: dict[str, Any]) -> None:
+    for action, expected, before in apart["normalized"]["actions"]:
+        torch.testing.assert_close(action, expected)
+        assert not torch.allclose(action, before, atol=1e-3)
 
 
 def test_layers_reach_the_processes(apart: dict[str, Any]) -> None:

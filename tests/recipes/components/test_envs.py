@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from torchrl.objectives import DQNLoss, SACLoss, TD3Loss
+from torchrl.objectives import DQNLoss, SACLoss, TD3Loss, TQCLoss
 
 from torchrl_her import DecayingEpsilonGreedy
 from torchrl_her.goals import GoalHistogram
@@ -75,7 +75,9 @@ def test_goals_on_a_line_may_be_preferred_and_bits_may_not() -> None:
         build(small(task="bit_flip", algo="her_ibs"))
 
 
-@pytest.mark.parametrize(("learner", "loss"), [("td3", TD3Loss), ("sac", SACLoss)])
+@pytest.mark.parametrize(
+    ("learner", "loss"), [("td3", TD3Loss), ("sac", SACLoss), ("redq", SACLoss), ("tqc", TQCLoss)]
+)
 def test_other_learners_train_by_name(learner: str, loss: type, tmp_path: Path) -> None:
     recipe = small(algo="filtered_her", learner=learner)
     components = build(recipe)
@@ -93,7 +95,10 @@ def test_other_learners_train_by_name(learner: str, loss: type, tmp_path: Path) 
     ("options", "message"),
     [
         ({"task": "bit_flip", "learner": "sac"}, "discrete actions: choose dqn"),
-        ({"task": "hand_v0", "learner": "dqn"}, "continuous actions: choose ddpg or td3 or sac"),
+        (
+            {"task": "hand_v0", "learner": "dqn"},
+            "continuous actions: choose ddpg or td3 or sac or redq or tqc",
+        ),
         (
             {"task": "bit_flip", "options": {"bots": 3}},
             "bit_flip takes no option 'bots'; its options are bits",
@@ -118,7 +123,7 @@ def test_unknown_names_list_what_there_is() -> None:
     ):
         small(task="hand_v9")
     with pytest.raises(
-        ValueError, match="unknown learner 'ppo'.*; the learners are auto, ddpg, td3, sac, dqn"
+        ValueError, match="unknown learner 'ppo'.*; the learners are auto, ddpg, td3, sac, redq, tqc, dqn"
     ):
         small(learner="ppo")
     with pytest.raises(ValueError, match="curriculum must be 'task' or a YAML file with a list of layers"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from torchrl_her_recipes import LEARNERS, LearnerBuilder, LearnerSpec, Recipe, make_recipe, register_learner
@@ -26,6 +28,33 @@ def test_the_name_and_the_class_of_options_must_agree() -> None:
     assert Recipe(learner=SACConfig(name="sac", gamma=0.9)).learner.gamma == 0.9
     with pytest.raises(ValueError, match="learner=auto takes a DDPGConfig, got a SACConfig: name"):
         Recipe(learner=SACConfig())
+
+
+def test_redq_is_sac_with_other_defaults() -> None:
+    redq = make_recipe(learner="redq").learner
+    sac = make_recipe(learner="sac", critics=10, target_critics=2).learner
+    assert {**vars(redq), "name": "sac"} == vars(sac)
+    assert LEARNERS["redq"].builder == LEARNERS["sac"].builder
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"learner": "sac", "target_critics": 3}, "target_critics=3 must be at most critics=2"),
+        ({"learner": "td3", "critics": 4, "target_critics": 5}, "target_critics=5 must be at most critics=4"),
+        ({"learner": "redq", "target_critics": -1}, "target_critics must be at least 0, got -1"),
+        ({"learner": "tqc", "quantiles": 2}, "dropped_quantiles=2 must be below quantiles=2"),
+        ({"learner": "tqc", "target_critics": 1}, "learner=tqc has no option target_critics"),
+        ({"learner": "sac", "action_noise": 0.1}, "learner=sac has no option action_noise"),
+        ({"action_noise": -0.1}, "action_noise must be at least 0, got -0.1"),
+        ({"uniform_share": 1.1}, "uniform_share must be at least 0 and at most 1, got 1.1"),
+        ({"frames_per_update": "inf"}, "frames_per_update must be above 0 and below inf, got inf"),
+        ({"frames_per_update": 0}, "frames_per_update must be above 0 and below inf, got 0.0"),
+    ],
+)
+def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_recipe(**options)
 
 
 def test_an_unknown_learner_gets_a_hint() -> None:

@@ -31,6 +31,13 @@ from ..small import small
         ),
         ({"algo": "sarsa"}, "unknown algorithm 'sarsa'; the algorithms are no_hindsight, her, filtered_her"),
         ({"strategy": "past"}, "unknown goal strategy 'past'; the strategies are future, final, episode"),
+        ({"strategy": "actual"}, r"'actual', .*: write goal_sources='\{actual: 4\}'"),
+        ({"goal_sources": {"actul": 2}}, "unknown goal source 'actul'; did you mean actual. The sources are"),
+        ({"goal_sources": {"future": 0}}, "goal_sources.future must be a whole number of at least 1, got 0"),
+        ({"goal_sources": {"future": True}}, "goal_sources.future must be a whole number .*, got True"),
+        ({"goal_sources": "actual"}, r"must be numbers of goals by source, as in .*, got 'actual'"),
+        ({"goal_sources": {}}, r"must be numbers of goals by source, .*, got \{\}"),
+        ({"goal_sources": {"actual:2": None}}, "goal_sources needs a space behind each colon, as in "),
         ({"sampler": "best"}, "sampler must be one of prioritized, uniform, got 'best'"),
         ({"threshold": -0.1}, "threshold must be above 0, got -0.1"),
         ({"batch_size": 256, "buffer_size": 100}, "batch_size=256 must fit buffer_size=100"),
@@ -86,6 +93,16 @@ def test_every_algorithm_runs_with_every_sampler(algo: str, sampler: str) -> Non
     assert (result.rows[-1]["rows_virtual"] > 0) == (algo != "no_hindsight")
     filtered = {"filtered_her", "filtered_her_ibs", "cher", "cher_ibs"}
     assert components.buffer.writer.filter_achieved == (algo in filtered)
+
+
+@pytest.mark.parametrize("algo", ["filtered_her_ibs", "cher"])
+def test_goals_of_other_episodes_are_written(algo: str) -> None:
+    sources = {"actual": 1, "achieved": 2}
+    components = build(small(algo=algo, goal_sources=sources, num_runs=2, task="hand_v1"))
+    writer = components.buffer.writer
+    assert writer.options.sources == sources
+    assert run(components, progress=False).rows[-1]["rows_virtual"] > 0
+    assert all(goals is not None for own in writer.state_dict()["recent"].values() for goals in own)
 
 
 @pytest.mark.parametrize("strategy", ["future", "final", "episode"])

@@ -10,6 +10,7 @@ from torchrl_her_recipes import ALGORITHMS, Algorithm, Recipe, make_recipe
 
 IDLE = [
     ({"algo": "no_hindsight"}, {"k": 8}),
+    ({"algo": "no_hindsight"}, {"goal_sources": {"actual": 2}}),
     ({"algo": "no_hindsight"}, {"cells": 8}),
     ({"k": 0}, {"strategy": "final"}),
     ({"k": 0, "algo": "her_ibs"}, {"sigma": 0.3}),
@@ -21,7 +22,13 @@ IDLE = [
     ({"sampler": "uniform"}, {"priority_alpha": 0.5}),
     ({"sampler": "uniform"}, {"priority_beta": 0.5}),
     ({"hard_update_interval": 3}, {"tau": 0.5}),
+    ({"uniform_share": 1.0}, {"action_noise": 0.1}),
+    ({"epsilon_start": 0.0, "epsilon_end": 0.0}, {"action_noise": 0.1}),
+    ({"epsilon_start": 0.0, "epsilon_end": 0.0}, {"uniform_share": 0.5}),
+    ({"normalize": False}, {"normalize_clip": 3.0}),
     ({"processes": 0}, {"sync": False}),
+    ({"compile": "never"}, {"products": "bfloat16"}),
+    ({"dtype": "float64"}, {"products": "bfloat16"}),
     ({"task": "bit_flip"}, {"threshold": 0.5}),
     ({"task": "chain"}, {"dtype": "float64"}),
     ({"task": "gym:FetchReach-v4"}, {"dtype": "float64"}),
@@ -46,12 +53,34 @@ def test_what_has_no_effect_is_dropped_from_a_preset(options: dict[str, Any], id
         {"algo": "her", "cells": 8},  # goals are counted
         {"algo": "her_ibs_sequential", "sigma": 0.3},
         {"algo": "cher", "layer_epsilon": 0.5},
+        {"algo": "cher", "epsilon_start": 0.0, "epsilon_end": 0.0, "action_noise": 0.1},
         {"task": "hand_v0", "threshold": 0.5, "dtype": "float64"},
     ],
 )
 def test_what_has_an_effect_is_kept(options: dict[str, Any]) -> None:
     recipe = make_recipe(**options)
     assert Recipe.from_dict(recipe.to_dict()) == recipe != make_recipe(task=recipe.task.name)
+
+
+def test_goal_sources_take_the_place_of_k_and_strategy_and_the_other_way_round() -> None:
+    mixed = {"future": 2, "actual": 2}
+    base = make_recipe(k=8, strategy="final")
+    recipe = base.replace(goal_sources=mixed)
+    assert recipe == make_recipe(goal_sources=mixed)
+    assert recipe.hindsight.sources == mixed
+    assert recipe.replace(k=8) == make_recipe(k=8)
+    assert recipe.replace(strategy="final").hindsight.sources == {"final": 4}
+    assert recipe.replace(k=0).hindsight.sources == {}
+    more = recipe.replace(**{"hindsight.goal_sources.actual": 6})
+    assert more.hindsight.sources == {"future": 2, "actual": 6}
+    assert Recipe.from_dict(recipe.to_dict()) == recipe
+    for short, shown in (({"k": 4}, "k=4"), ({"k": 2, "strategy": "future"}, "k=2 and strategy=future")):
+        with pytest.raises(ValueError, match=rf"^{shown} and goal_sources=\{{.*\}} say the same: give one"):
+            make_recipe(goal_sources=mixed, **short)
+    values = {"hindsight": {"k": 8, "goal_sources": mixed}}
+    with pytest.raises(ValueError, match="k=8 has no effect with goal_sources: leave it out"):
+        Recipe.from_dict(values)
+    assert make_recipe(algo="her_ibs", goal_sources=mixed, sigma=0.3).ibs.sigma == 0.3
 
 
 def test_weights_of_ones_own_may_read_every_option_of_ibs(monkeypatch: pytest.MonkeyPatch) -> None:

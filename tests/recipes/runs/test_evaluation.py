@@ -34,6 +34,8 @@ def set_last_biases(components: Components, change: Any) -> None:
         ({"learner": "ddpg", "num_runs": 2}, [-1.0, -2.0], [-1.0, -2.0]),
         ({"learner": "td3"}, [-1.0, -1.0], [-1.0]),
         ({"learner": "sac"}, [-1.0, -1.0], [-1.0]),
+        ({"learner": "tqc"}, [-1.0, -1.0], [-1.0]),
+        ({"learner": "redq", "critics": 4}, [-1.0, -2.0, -3.0, -2.0], [-2.0]),
     ],
 )
 def test_q_is_that_of_the_critics_that_are_trained(

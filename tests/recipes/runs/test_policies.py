@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -17,10 +18,19 @@ from torchrl_her_recipes.config.shipped import policy_names
 from ..small import small
 
 
-@pytest.mark.parametrize("algo", ["filtered_her", "cher"])
-def test_an_exported_policy_acts_as_its_run_does(algo: str, tmp_path: Path) -> None:
-    recipe = small(task="hand_v1", algo=algo, num_runs=2, epochs=1)
-    run(build(recipe), tmp_path / "run", progress=False)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"algo": "filtered_her"},
+        {"algo": "cher"},
+        {"algo": "her", "normalize": True},
+        {"algo": "cher", "normalize": True},
+    ],
+)
+def test_an_exported_policy_acts_as_its_run_does(options: dict[str, Any], tmp_path: Path) -> None:
+    recipe = small(task="hand_v1", num_runs=2, epochs=1, **options)
+    components = build(recipe)
+    run(components, tmp_path / "run", progress=False)
     written = export_policy(tmp_path / "run", tmp_path / "policy.pt", run=1)
     assert written.recipe.run.seed == 1
     assert written.frames == 1_600
@@ -28,6 +38,8 @@ def test_an_exported_policy_acts_as_its_run_does(algo: str, tmp_path: Path) -> N
     shown = make_played_env(recipe, 4, [7]).reset()
     own = load_actor(tmp_path / "run", run=1)(shown)["action"]
     torch.testing.assert_close(load_policy(tmp_path / "policy.pt")(seen)["action"], own)
+    played = components.greedy(torch.cat((shown, shown)))["action"]  # of two runs
+    torch.testing.assert_close(played[4:], own)
 
 
 def test_export_takes_the_median_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -116,7 +116,21 @@ def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not
             # The arm may hold the ball beyond the screen, which the grid over the screen says once.
             marks=pytest.mark.filterwarnings("ignore:goal .* lies outside"),
         ),
+        pytest.param({**ALL, "normalize": True}, id="normalized in a curriculum"),
+        pytest.param({"task": "hand_v1", "num_runs": 2, "normalize": True}, id="normalized"),
+        pytest.param(
+            {"task": "hand_v1", "num_runs": 2, "goal_sources": {"future": 1, "actual": 2, "achieved": 2}},
+            id="goals of other episodes",
+        ),
         pytest.param({"sampler": "uniform", "hard_update_interval": 7, "norm": "batch"}, id="hard updates"),
+        *(
+            pytest.param(
+                {"learner": name, "critics": 3, "frames_per_update": 0.7, "epoch_frames": 240}
+                | {"warmup_frames": 160, "hidden": 16, "num_runs": 2},
+                id=f"{name}, several steps for each frame",
+            )
+            for name in ("redq", "tqc")
+        ),
     ],
 )
 def test_ctrl_c_at_any_batch_changes_nothing(

@@ -1,0 +1,28 @@
+"""Normalization of what the networks of a recipe see."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_her.modules.normalization import RunningNorm
+from torchrl_her.modules.normalized import NormalizedPolicy
+from torchrl_her_recipes.config.recipe import Recipe
+
+
+def make_norm(recipe: Recipe, widths: Mapping[str, int]) -> RunningNorm | None:
+    """The statistics of each run, before anything was counted; None if the recipe does not normalize.
+
+    Args:
+        recipe: of the runs.
+        widths: of what the networks see.
+    """
+    if not recipe.learner.normalize:
+        return None
+    return RunningNorm(dict(widths), runs=recipe.run.num_runs, clip=recipe.learner.normalize_clip)
+
+
+def acting(actor: TensorDictModuleBase, norm: RunningNorm | None) -> TensorDictModuleBase:
+    """An actor as it plays, on what environments show."""
+    return actor if norm is None else NormalizedPolicy(actor, norm)

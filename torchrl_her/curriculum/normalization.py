@@ -1,0 +1,85 @@
+"""Running normalization of the networks' input in a curriculum, whose layers see different things."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import zip_longest
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+
+from torchrl_her.curriculum.layers import CurriculumLayer, CurriculumProgress
+from torchrl_her.modules.normalization import RunningNorm
+
+
+def count_inputs(
+    norm: RunningNorm,
+    progress: CurriculumProgress,
+    rows: TensorDictBase,
+    runs: Sequence[int],
+    counts: Sequence[int],
+    *,
+    observation_key: NestedKey = "observation",
+    desired_goal_key: NestedKey = "desired_goal",
+    input_key: NestedKey = "input",
+) -> None:
+    """Counts the networks' input of transitions that are written, as :class:`~torchrl_her.ZeroPad` makes it.
+
+    Hand it to the writer as ``HERWriter(on_write=functools.partial(count_inputs, norm, progress))``. Inputs
+    that a layer does not use are left out. In the buffer, :class:`~torchrl_her.modules.NormalizeBatch` comes
+    behind ``ZeroPad``.
+
+    Args:
+        norm: of the input.
+        progress: tells the layer of each run.
+        rows: [n], run after run, as the layers show them.
+        runs: which runs these are.
+        counts: how many rows each of them has.
+
+    Keyword Args:
+        observation_key, desired_goal_key: read.
+        input_key: of the input, in ``norm``.
+    """
+    for run, own in zip(runs, rows.split(list(counts)), strict=True):
+        shown = len(progress.layer_of(run).observation)
+        seen = (own.get(observation_key)[..., :shown], own.get(desired_goal_key))
+        norm.count(input_key, torch.cat(seen, -1), run=run)
+
+
+def restart_inputs(
+    norm: RunningNorm,
+    before: CurriculumLayer,
+    after: CurriculumLayer,
+    *,
+    run: int = 0,
+    input_key: NestedKey = "input",
+) -> None:
+    """Forgets the statistics of those inputs of a run that mean something else in its new layer.
+
+    The others go on, so that at first the networks do in the new layer what they did in the old one.
+
+    Args:
+        norm: of the input.
+        before: the layer that the run was in.
+        after: the one that it enters.
+
+    Keyword Args:
+        run: which one.
+        input_key: of the input, in ``norm``.
+
+    Example:
+        >>> near = CurriculumLayer(
+        ...     name="near", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=1.0
+        ... )
+        >>> far = CurriculumLayer(
+        ...     name="far", observation=[0, 1], achieved_goal=[1], desired_goal=[2], threshold=1.0
+        ... )
+        >>> norm = RunningNorm({"input": 3})
+        >>> norm.count("input", torch.tensor([[4.0, 5.0], [6.0, 7.0]]))
+        >>> restart_inputs(norm, near, far)  # the second input was the goal and is an observation: both of 1
+        >>> norm.moments_of("input").n.tolist()
+        [2.0, 2.0, 0.0]
+    """
+    columns = ([*layer.observation, *layer.desired_goal] for layer in (before, after))
+    places = [place for place, (old, new) in enumerate(zip_longest(*columns)) if old != new]
+    norm.restart(run, key=input_key, places=places)

@@ -1,0 +1,295 @@
+"""Running normalization: what networks see has about mean 0 and standard deviation 1, in each entry.
+
+Statistics are those of all transitions that were written, virtual ones included. Andrychowicz et al.,
+Hindsight experience replay, 2017, appendix A.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import accumulate, pairwise
+from typing import NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor, nn
+
+from torchrl_her.modules.networks import by_run
+
+
+class Moments(NamedTuple):
+    """How many values there were, and their mean and variance; of each entry, [...] of float64 all three.
+
+    Attributes:
+        n: how many; weights need not be whole numbers.
+        mean: their mean.
+        var: the mean squared deviation from it.
+    """
+
+    n: Tensor
+    mean: Tensor
+    var: Tensor
+
+
+def moments(values: Tensor) -> Moments:
+    """Number, mean and variance of values [n, width], n at least 1.
+
+    Example:
+        >>> n, mean, var = moments(torch.tensor([[1.0, 5.0], [3.0, 5.0]]))
+        >>> n.tolist(), mean.tolist(), var.tolist()
+        ([2.0, 2.0], [2.0, 5.0], [1.0, 0.0])
+    """
+    wide = values.double()
+    mean = wide.mean(0)
+    var = (wide - mean).square_().mean(0)  # several times as fast as torch.var_mean
+    return Moments(torch.full_like(mean, len(values)), mean, var)
+
+
+def merge(one: Moments, other: Moments) -> Moments:
+    """Number, mean and variance of all values of two sets; either may have none.
+
+    Chan, Golub and LeVeque, Updating formulae and a pairwise algorithm for computing sample variances, 1979.
+
+    Example:
+        >>> merge(moments(torch.tensor([[1.0]])), moments(torch.tensor([[3.0], [5.0]]))).mean.tolist()
+        [3.0]
+    """
+    n = one.n + other.n
+    share = other.n / n.clamp(min=torch.finfo(torch.float64).tiny)
+    gap = other.mean - one.mean
+    mean = one.mean + gap * share
+    var = one.var * (1.0 - share) + other.var * share + gap.square() * share * (1.0 - share)
+    return Moments(n, mean, var)
+
+
+def normalize(values: Tensor, mean: Tensor, std: Tensor, limit: Tensor) -> Tensor:
+    """``(values - mean) / std``, clipped to [-limit, limit]; arguments are broadcast against each other.
+
+    Example:
+        >>> normalize(torch.tensor([4.0, 90.0]), torch.tensor(2.0), torch.tensor(4.0), torch.tensor(5.0))
+        tensor([0.5000, 5.0000])
+    """
+    return ((values - mean) / std).clamp(-limit, limit)
+
+
+class RunningNorm(nn.Module):
+    """Running mean and variance of observations and goals, and the normalization by them.
+
+    Raw values are what is collected, relabeled and stored. They are normalized where networks read them: in
+    what is sampled, by :class:`~torchrl_her.modules.NormalizeBatch`, and while acting, by
+    :class:`~torchrl_her.modules.NormalizedPolicy`. So virtual goals are normalized like desired ones, and old
+    transitions by the same statistics as new ones.
+
+    Only :meth:`update` and :meth:`count` change the statistics; a :class:`~torchrl_her.HERWriter` calls the
+    first one with all that it writes (``on_write=norm.update``), virtual transitions included. Acting,
+    evaluating and learning leave them as they are. Before anything was counted, normalization changes
+    nothing.
+
+    R independent runs have statistics of their own; batches are R equal blocks, in the order of the runs.
+    ``state_dict`` holds all statistics, as does that of a policy with this normalization. Each number is
+    normalized by itself, so statistics of a concatenation are those of its parts, side by side.
+
+    Args:
+        widths: of the entries that are normalized, by their keys.
+
+    Keyword Args:
+        runs: R.
+        clip: normalized values are clipped to [-clip, clip].
+        least_std: standard deviations below this count as this, so that entries that hardly ever change are
+            not blown up.
+
+    Attributes:
+        widths: as given.
+        runs: R.
+        n, mean, var: [R, W] of float64, the moments of all numbers of all entries, in their order.
+        frozen: whether :meth:`update` and :meth:`count` do nothing. It is no part of ``state_dict``.
+
+    Raises:
+        ValueError: there is no entry, or a number is too small.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> norm = RunningNorm({"observation": 1, "desired_goal": 1}, clip=5.0)
+        >>> seen, goals = torch.tensor([[1.0], [5.0]]), torch.tensor([[0.0], [0.2]])
+        >>> rows = TensorDict({"observation": seen, "desired_goal": goals}, [2])
+        >>> norm.update(rows)  # means 3 and 0.1, standard deviations 2 and 0.1
+        >>> norm(rows)["observation"].tolist()
+        [[-1.0], [1.0]]
+        >>> norm.normalize("desired_goal", torch.tensor([[0.15], [7.0]]))
+        tensor([[0.5000],
+                [5.0000]])
+    """
+
+    n: Tensor
+    mean: Tensor
+    var: Tensor
+
+    def __init__(
+        self,
+        widths: Mapping[NestedKey, int],
+        *,
+        runs: int = 1,
+        clip: float = 5.0,
+        least_std: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if not widths:
+            raise ValueError("widths must name at least one entry to normalize, got none")
+        for name, value in [("runs", runs), *((f"the width of {key!r}", own) for key, own in widths.items())]:
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        for name, number in (("clip", clip), ("least_std", least_std)):
+            if not number > 0:
+                raise ValueError(f"{name} must be above 0, got {number}")
+        self.widths = {unravel_key(key): width for key, width in widths.items()}
+        self.runs, self.clip, self.least_std, self.frozen = runs, clip, least_std, False
+        ends = list(accumulate(self.widths.values(), initial=0))
+        self._columns = {key: slice(*own) for key, own in zip(self.widths, pairwise(ends), strict=True)}
+        # Without values, mean 0 and variance 1 leave all as it is.
+        for name, start in (("n", 0.0), ("mean", 0.0), ("var", 1.0)):
+            self.register_buffer(name, torch.full((runs, ends[-1]), start, dtype=torch.float64))
+
+    @property
+    def keys(self) -> list[NestedKey]:
+        """The entries that are normalized."""
+        return list(self.widths)
+
+    def moments_of(self, key: NestedKey, run: int = 0) -> Moments:
+        """Number, mean and variance of an entry's values so far, [width] each; a view."""
+        columns = self._columns_of(key)
+        return Moments(*(own[run, columns] for own in (self.n, self.mean, self.var)))
+
+    def restart(
+        self, run: int | None = None, *, key: NestedKey | None = None, places: Sequence[int] | None = None
+    ) -> None:
+        """Forgets the values of one run, or of all.
+
+        Args:
+            run: which one; None for all.
+
+        Keyword Args:
+            key: the entry; None for all.
+            places: which numbers of the entry; None for all.
+        """
+        columns = torch.arange(self.n.shape[-1], device=self.n.device)
+        columns = columns if key is None else columns[self._columns_of(key)]
+        columns = columns if places is None else columns[list(places)]
+        for own, start in ((self.n, 0.0), (self.mean, 0.0), (self.var, 1.0)):
+            (own if run is None else own[run : run + 1])[:, columns] = start
+
+    def update(
+        self, rows: TensorDictBase, runs: Sequence[int] | None = None, counts: Sequence[int] | None = None
+    ) -> None:
+        """Counts transitions, by what is in their root.
+
+        Args:
+            rows: of any shape; with ``runs`` they are run after run, otherwise R equal blocks.
+            runs: which runs they are of; None for all R of them.
+            counts: how many each of these runs has; None for equally many.
+
+        Raises:
+            KeyError: an entry is missing.
+            ValueError: it has another width or is not finite, or rows cannot be divided among the runs.
+        """
+        if self.frozen:
+            return
+        if runs is None:
+            self._check_blocks(rows.shape)
+            runs = range(self.runs)
+        shares = [rows.numel() // len(runs)] * len(runs) if counts is None else list(counts)
+        for key in self.widths:
+            values = _entry(rows, key)
+            self._check(key, values)
+            for run, part in zip(runs, values.flatten(0, -2).split(shares), strict=True):
+                self.count(key, part, run=run)
+
+    @torch.no_grad()
+    def count(self, key: NestedKey, values: Tensor, *, run: int = 0, weight: float = 1.0) -> None:
+        """Counts values of one entry.
+
+        Args:
+            key: of the entry.
+            values: [..., width], or less wide: then they are the first numbers of the entry.
+
+        Keyword Args:
+            run: which they are of.
+            weight: how often each value counts.
+
+        Raises:
+            ValueError: the values are wider, or are not finite, which would spoil the statistics for good.
+        """
+        width, own = values.shape[-1], self.moments_of(key, run)
+        if width > len(own.mean):
+            raise ValueError(f"{key!r} must have a width of at most {len(own.mean)}, got {width}")
+        if self.frozen or values.numel() == 0 or weight == 0:
+            return
+        new = moments(values.reshape(-1, width).to(self.mean.device))
+        if not bool(new.var.isfinite().all()):  # one NaN or infinity among the values is enough for that
+            raise ValueError(f"{key!r} must be finite to be counted, got NaN or infinity in it")
+        old = Moments(*(each[:width] for each in own))
+        for each, value in zip(old, merge(old, new._replace(n=new.n * weight)), strict=True):
+            each.copy_(value)  # in place: other processes may share this memory
+
+    def normalize(self, key: NestedKey, values: Tensor) -> Tensor:
+        """Normalized values of one entry.
+
+        Args:
+            key: of the entry.
+            values: [..., width], R equal blocks in the order of the runs.
+
+        Raises:
+            ValueError: the values have another width, or cannot be divided among the runs.
+        """
+        columns = self._columns_of(key)
+        self._check(key, values)
+        self._check_blocks(values.shape[:-1])
+        n, mean, var = (own[:, columns] for own in (self.n, self.mean, self.var))
+        std = var.sqrt().clamp(min=self.least_std)
+        limit = torch.where(n > 0, self.clip, torch.inf)  # nothing is changed before the first update
+        mean, std, limit = (own.to(values).unsqueeze(1) for own in (mean, std, limit))
+        return normalize(by_run(values, self.runs), mean, std, limit).view(values.shape)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """A shallow copy with normalized entries, in the root and, as far as they are there, under ``next``.
+
+        Raises:
+            KeyError: an entry is missing in the root.
+        """
+        out = tensordict.copy()
+        for key in self.widths:
+            out.set(key, self.normalize(key, _entry(out, key)))
+            after = unravel_key(("next", key))
+            value = out.get(after, None)
+            if value is not None:
+                out.set(after, self.normalize(key, value))
+        return out
+
+    def _columns_of(self, key: NestedKey) -> slice:
+        """Where an entry's numbers are among those of all."""
+        columns = self._columns.get(unravel_key(key))
+        if columns is None:
+            raise KeyError(f"{key!r} is not normalized, only {', '.join(map(repr, self.widths))}")
+        return columns
+
+    def _check(self, key: NestedKey, values: Tensor) -> None:
+        """Raises if an entry has another width."""
+        if values.shape[-1] != (width := self.widths[unravel_key(key)]):
+            raise ValueError(f"{key!r} must have a width of {width}, got {values.shape[-1]}")
+
+    def _check_blocks(self, shape: torch.Size) -> None:
+        """Raises if a batch of this shape is not one equal block for each run."""
+        if self.runs > 1 and (len(shape) == 0 or shape[0] % self.runs):
+            raise ValueError(
+                f"the first dimension of a batch must be {self.runs} equal blocks, one for each run, got a "
+                f"batch of {list(shape)}"
+            )
+
+    def extra_repr(self) -> str:
+        return f"{self.widths}, runs={self.runs}, clip={self.clip}, least_std={self.least_std}"
+
+
+def _entry(rows: TensorDictBase, key: NestedKey) -> Tensor:
+    entry = rows.get(key, None)
+    if entry is None:
+        raise KeyError(f"normalization needs the entry {key!r}, got {list(rows.keys(True, True))}")
+    return entry

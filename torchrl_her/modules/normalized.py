@@ -1,0 +1,128 @@
+"""Where running normalization is applied: to what is sampled, and to what a policy sees."""
+
+from __future__ import annotations
+
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Transform
+
+from torchrl_her.modules.normalization import RunningNorm
+
+
+class NormalizeBatch(Transform):
+    """Normalizes what a replay buffer samples: put it there with ``buffer.append_transform``.
+
+    Relabeling comes before: a :class:`~torchrl_her.HERWriter` stores transitions with their virtual goals,
+    and a :class:`~torchrl_her.HERSampleUnit` puts them in before all transforms. So losses see normalized
+    virtual goals, in the root and under ``next``. What is stored stays raw: read it from
+    ``buffer.storage[...]``, as ``buffer[...]`` goes through this transform, too.
+
+    TorchRL's own transforms do not fit. ``VecNormV2`` works in environments only, before relabeling: goals
+    that were normalized at different times cannot be compared, and virtual goals are not counted. The
+    statistics of ``ObservationNorm`` are fixed.
+
+    Args:
+        norm: the statistics, shared with the policy (:class:`~torchrl_her.modules.NormalizedPolicy`).
+
+    Keyword Args:
+        counted_k: None if somebody else counts what is written, as ``HERWriter(on_write=norm.update)`` does.
+            In a buffer with a plain writer and a :class:`~torchrl_her.HERSampleUnit`, the k of that unit:
+            then all that is written counts here, and each achieved goal under ``next`` as k desired goals.
+        achieved_goal_key, desired_goal_key: goals, for ``counted_k``.
+
+    Raises:
+        ValueError: ``counted_k`` is negative, or the desired goal is not normalized.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from torchrl_her.modules import RunningNorm
+        >>> norm = RunningNorm({"observation": 1})
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(9), batch_size=4)
+        >>> _ = buffer.append_transform(NormalizeBatch(norm))
+        >>> rows = TensorDict({"observation": torch.tensor([[1.0], [5.0]])}, [2])
+        >>> _ = buffer.extend(rows)
+        >>> norm.update(rows)
+        >>> buffer.sample()["observation"].abs().unique().tolist()
+        [1.0]
+        >>> buffer.storage[:]["observation"].tolist()
+        [[1.0], [5.0]]
+    """
+
+    def __init__(
+        self,
+        norm: RunningNorm,
+        *,
+        counted_k: float | None = None,
+        achieved_goal_key: NestedKey = "achieved_goal",
+        desired_goal_key: NestedKey = "desired_goal",
+    ) -> None:
+        if counted_k is not None and counted_k < 0:
+            raise ValueError(f"counted_k must be None or at least 0, got {counted_k}")
+        if counted_k is not None and unravel_key(desired_goal_key) not in norm.widths:
+            raise ValueError(f"counted_k needs {desired_goal_key!r} to be normalized, got {norm}")
+        super().__init__(in_keys=norm.keys, out_keys=norm.keys)
+        self.norm, self.counted_k = norm, counted_k
+        self.achieved_goal_key, self.desired_goal_key = achieved_goal_key, desired_goal_key
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Normalizes sampled transitions."""
+        return self.norm(tensordict)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Sees what is written, and leaves it as it is."""
+        if self.counted_k is not None:
+            self.norm.update(tensordict)
+            achieved = tensordict.get(unravel_key(("next", self.achieved_goal_key)))
+            for run, goals in enumerate(achieved.flatten(0, -2).chunk(self.norm.runs)):
+                self.norm.count(self.desired_goal_key, goals, run=run, weight=self.counted_k)
+        return tensordict
+
+
+class NormalizedPolicy(TensorDictModuleBase):
+    """A policy that sees normalized entries, while everybody else sees them as they were.
+
+    Only what the actor writes is put into the tensordict, so collectors yield raw observations and goals,
+    which is what has to be stored. Exploration belongs behind this module, or within the actor. The
+    statistics are part of this module's ``state_dict``, so checkpoints have them, and collectors in other
+    processes get them with the weights.
+
+    Args:
+        actor: trained on batches of :class:`~torchrl_her.modules.NormalizeBatch`. Losses take the actor
+            itself.
+        norm: the same statistics.
+
+    Raises:
+        ValueError: the actor reads no normalized entry, or writes one.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_her import make_actor
+        >>> from torchrl_her.modules import RunningNorm
+        >>> norm = RunningNorm({"observation": 9, "desired_goal": 2})
+        >>> policy = NormalizedPolicy(make_actor((9, 2), 3), norm)
+        >>> seen = TensorDict({"observation": torch.ones(4, 9), "desired_goal": torch.ones(4, 2)}, [4])
+        >>> played = policy(seen)
+        >>> played["action"].shape, bool((played["observation"] == 1).all())
+        (torch.Size([4, 3]), True)
+    """
+
+    def __init__(self, actor: TensorDictModuleBase, norm: RunningNorm) -> None:
+        super().__init__()
+        reads, writes = ({unravel_key(key) for key in keys} for keys in (actor.in_keys, actor.out_keys))
+        self._normalized = [key for key in norm.keys if key in reads]
+        if not self._normalized:
+            raise ValueError(f"the actor reads {actor.in_keys}, of which none is normalized: {norm.keys}")
+        if both := [key for key in norm.keys if key in writes]:
+            raise ValueError(f"the actor must not write what is normalized, got {both}")
+        self.in_keys, self.out_keys = actor.in_keys, actor.out_keys
+        self.actor, self.norm = actor, norm
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Runs the actor on normalized entries; writes what it wrote."""
+        seen = tensordict.copy()
+        for key in self._normalized:
+            seen.set(key, self.norm.normalize(key, tensordict.get(key)))
+        return tensordict.update(self.actor(seen).select(*self.out_keys, strict=False))
