@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from copy import deepcopy
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
-from torch.optim.swa_utils import AveragedModel
+from torch import Tensor, nn
 
 
-class PolicyAverage(AveragedModel):
+class PolicyAverage(nn.Module):
     """The exponential moving average of a policy's weights over gradient steps.
 
     While a policy learns, its success swings from one evaluation to the next. Their average, which does not
@@ -18,7 +17,8 @@ class PolicyAverage(AveragedModel):
     averaging, 1992. So play, evaluate and export ``module``, and collect with the policy itself.
 
     At first the decay is ``(1 + n) / (10 + n)`` after n steps, so that the first weights are soon forgotten.
-    Buffers, such as running statistics, are copied.
+    Buffers, such as running statistics, are copied. Other than torch's ``AveragedModel`` it takes many
+    gradient steps at once, and next to no time, since it is called every few milliseconds.
 
     Args:
         policy: the one that learns.
@@ -28,7 +28,6 @@ class PolicyAverage(AveragedModel):
 
     Attributes:
         module: a copy of the policy, with the average weights.
-        policy: the one that learns.
         steps: gradient steps so far.
 
     Raises:
@@ -51,24 +50,24 @@ class PolicyAverage(AveragedModel):
     def __init__(self, policy: TensorDictModuleBase, *, decay: float = 0.999) -> None:
         if not 0 < decay < 1:
             raise ValueError(f"decay must be between 0 and 1, got {decay}")
-        super().__init__(policy, multi_avg_fn=self._mix)
-        self.module.requires_grad_(False)
-        self.decay, self._rest = decay, 1.0
-        self._policy = (policy,)  # in a tuple, it is no submodule of this one
-        self.n_averaged.fill_(1)  # else the first call copies the weights
+        super().__init__()
+        self.module = deepcopy(policy).requires_grad_(False)
+        self.decay, self._policy = decay, (policy,)  # in a tuple, it is no submodule of this one
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
+        self._averaged = [list(own.parameters()) for own in (self.module, policy)]
+        self._copied = [list(own.buffers()) for own in (self.module, policy)]
 
     @property
     def policy(self) -> TensorDictModuleBase:
+        """The one that learns."""
         return self._policy[0]
 
+    @torch.no_grad()
     def follow(self, steps: int = 1) -> None:
         """Moves the average towards the policy, which has made some gradient steps since the last call."""
         self.steps += steps
         done = int(self.steps)
-        self._rest = min(self.decay, (1 + done) / (10 + done)) ** steps
-        self.update_parameters(self.policy)
-
-    @torch.no_grad()
-    def _mix(self, average: Sequence[Tensor], now: Sequence[Tensor], count: Tensor | int) -> None:
-        torch._foreach_lerp_(list(average), list(now), 1.0 - self._rest)
+        kept = min(self.decay, (1 + done) / (10 + done)) ** steps
+        torch._foreach_lerp_(*self._averaged, 1.0 - kept)
+        for own, now in zip(*self._copied, strict=True):
+            own.copy_(now)

@@ -42,6 +42,7 @@ from torchrl_her_envs.gym.check import (
     spec_of,
     try_steps,
 )
+from torchrl_her_envs.gym.fetch import fetch_layers, fetch_names
 from torchrl_her_envs.gym.goal_functions import GoalFunction
 from torchrl_her_envs.gym.layout import Layout
 
@@ -213,12 +214,17 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         """Whether it was made with ``render_mode="rgb_array"``."""
         return self._reference_env.render_mode == "rgb_array"
 
+    def layers(self) -> list[dict[str, Any]]:
+        """The layers of the Fetch tasks; an error for other environments, which have none of their own."""
+        return fetch_layers(spec_of(self._reference_env).id) or super().layers()
+
     def state_names(self) -> dict[str, list[int]]:
         """Names for entries of the state: ``observation`` and ``desired_goal``, and what is nested in them.
 
-        That is named with dots between their keys, as in ``observation.arm.angles``.
+        That is named with dots between their keys, as in ``observation.arm.angles``. The Fetch tasks have
+        names for more, such as ``object``.
         """
-        names, first = super().state_names(), 0
+        names, first = super().state_names() | fetch_names(spec_of(self._reference_env).id), 0
         for key in ("observation", "desired_goal"):
             layout = self._layouts[key]
             inner = {f"{key}.{name}": [first + at for at in own] for name, own in layout.places.items()}

@@ -1,0 +1,80 @@
+"""The Fetch tasks of gymnasium-robotics: names for what they show, and the layers of a curriculum.
+
+A Fetch robot's gripper has to be brought to a point, or an object, which the gripper pushes, slides or
+carries: Plappert et al., Multi-goal reinforcement learning, 2018.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+_THRESHOLD = 0.05  # m, as in the environments themselves
+# What is shown, in order, and how many numbers it has.
+_GRIPPER = {"grip": 3, "fingers": 2, "grip_speed": 3, "fingers_speed": 2}
+_OBJECT = {
+    "grip": 3,
+    "object": 3,
+    "object_from_grip": 3,
+    "fingers": 2,
+    "object_angles": 3,
+    "object_speed": 3,
+    "object_turning": 3,
+    "grip_speed": 3,
+    "fingers_speed": 2,
+}
+_TASK = re.compile(r"Fetch(Reach|Push|Slide|PickAndPlace)(Dense)?-v\d+")
+
+
+def _shown(id: str) -> dict[str, int] | None:
+    task = _TASK.fullmatch(id)
+    if task is None:
+        return None
+    return _GRIPPER if task[1] == "Reach" else _OBJECT
+
+
+def fetch_names(id: str) -> dict[str, list[int]]:
+    """Names for entries of the state of a Fetch task; none for another environment.
+
+    Args:
+        id: gymnasium's.
+
+    Example:
+        >>> fetch_names("FetchPush-v4")["object"], fetch_names("FetchReach-v4")["place"]
+        ([3, 4, 5], [10, 11, 12])
+    """
+    shown, names, first = _shown(id), {}, 0
+    for name, width in ({} if shown is None else shown | {"place": 3}).items():
+        names[name], first = list(range(first, first + width)), first + width
+    return names
+
+
+def fetch_layers(id: str) -> list[dict[str, Any]]:
+    """The layers of a Fetch task: to reach the object, and then to move it; none for another environment.
+
+    What the first layer wants, the place of the object, is what the second one observes at the same inputs.
+    To reach a point is a single layer.
+
+    Args:
+        id: gymnasium's.
+
+    Example:
+        >>> [layer["name"] for layer in fetch_layers("FetchPush-v4")]
+        ['reach', 'move']
+    """
+    shown = _shown(id)
+    if shown is None:
+        return []
+    gripper = list(_GRIPPER)
+    reach = {"name": "reach", "observation": gripper, "achieved_goal": "grip", "threshold": _THRESHOLD}
+    if shown is _GRIPPER:
+        return [reach | {"desired_goal": "place"}]
+    rest = [name for name in shown if name not in (*gripper, "object")]
+    move = {
+        "name": "move",
+        "observation": [*gripper, "object", *rest],
+        "achieved_goal": "object",
+        "desired_goal": "place",
+        "threshold": _THRESHOLD,
+    }
+    return [reach | {"desired_goal": "object", "instructive": False}, move]

@@ -1,0 +1,78 @@
+"""The Fetch tasks' names and layers are those of what gymnasium-robotics shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from torchrl_her import Curriculum, CurriculumLayer
+from torchrl_her_envs import make_gym_env
+from torchrl_her_envs.gym.fetch import fetch_layers, fetch_names
+from torchrl_her_envs.gym.from_gym import GymGoalEnv
+
+OBJECTS = ("FetchPush-v4", "FetchSlide-v4", "FetchPickAndPlace-v4")
+
+
+@pytest.fixture
+def env(request: pytest.FixtureRequest) -> Iterator[GymGoalEnv]:
+    pytest.importorskip("gymnasium_robotics")
+    made = make_gym_env(request.param, num_envs=2, seed=3)
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("env", ["FetchReach-v4", "FetchPush-v4", "FetchPickAndPlace-v4"], indirect=True)
+def test_names_are_of_what_they_say(env: GymGoalEnv) -> None:
+    def part(name: str) -> torch.Tensor:
+        return state[:, env.state_names()[name]]
+
+    rollout = env.rollout(5)
+    states = torch.cat((rollout["observation"], rollout["desired_goal"]), -1)
+    state, before = states[:, -1], states[:, -2]
+    last = rollout[:, -1]
+    torch.testing.assert_close(part("place"), last["desired_goal"])
+    moved = "grip" if "Reach" in env.task_name else "object"
+    torch.testing.assert_close(part(moved), last["achieved_goal"])
+    way = part("grip") - before[:, env.state_names()["grip"]]
+    assert bool((way.sign() == part("grip_speed").sign())[way.abs() > 1e-3].all())
+    assert sorted(index for name in fetch_names(env.task_name[4:]) for index in env.state_names()[name]) == [
+        *range(states.shape[-1])
+    ]
+    if moved == "object":
+        torch.testing.assert_close(part("object_from_grip"), part("object") - part("grip"))
+
+
+@pytest.mark.parametrize("env", ["FetchPush-v4"], indirect=True)
+def test_inputs_keep_their_meaning_from_layer_to_layer(env: GymGoalEnv) -> None:
+    layers = [CurriculumLayer(**layer) for layer in env.layers()]
+    curriculum = Curriculum(layers, state_width=28, names=env.state_names())
+    reach, move = curriculum.layers
+    assert (*reach.observation, *reach.desired_goal) == move.observation[: curriculum.first_inputs]
+    assert sorted((*move.observation, *move.desired_goal)) == [*range(28)]
+
+
+@pytest.mark.parametrize("id", OBJECTS)
+def test_the_object_is_reached_before_it_is_moved(id: str) -> None:
+    reach, move = fetch_layers(id)
+    assert (reach["achieved_goal"], reach["desired_goal"]) == ("grip", "object")
+    assert (move["achieved_goal"], move["desired_goal"]) == ("object", "place")
+    assert fetch_layers(id.replace("-v4", "Dense-v2")) == [reach, move]
+
+
+def test_to_reach_is_a_single_layer() -> None:
+    (layer,) = fetch_layers("FetchReach-v4")
+    assert (layer["achieved_goal"], layer["desired_goal"]) == ("grip", "place")
+
+
+@pytest.mark.parametrize("id", ["FetchPushFar-v4", "MyFetchPush-v4", "HandReach-v2", "FetchPush"])
+def test_other_environments_have_none(id: str) -> None:
+    assert fetch_layers(id) == []
+    assert fetch_names(id) == {}
+
+
+@pytest.mark.parametrize("env", ["torchrl_her_envs:torchrl_her/HandReach-v0"], indirect=True)
+def test_they_say_so(env: GymGoalEnv) -> None:
+    with pytest.raises(ValueError, match="has no curriculum: give its layers as curriculum=FILE.yaml"):
+        env.layers()
