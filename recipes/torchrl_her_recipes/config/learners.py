@@ -50,7 +50,7 @@ class LearnerConfig(Group):
     normalize_clip: float = option(5.0, "normalized values are clipped to plus and minus this", above=0)
     tau: float = option(0.02, "rate of the soft target update", at_least=0, at_most=1)
     average_decay: float = option(
-        0.999,
+        0.9995,
         "what stays, in a gradient step, of the average of the actor's weights that is evaluated and kept; "
         "0: no average",
         at_least=0,
