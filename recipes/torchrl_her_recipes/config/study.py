@@ -35,17 +35,20 @@ class Study:
         recipe: options that all runs have in common; ``num_runs`` is the number of seeds.
         vary: the values that are compared, by the name of their option. All combinations are run. The
             figure has a panel for each task, and in it a curve for each combination of the others.
+        for_task: options of the runs on some of the tasks alone, by the task's name.
         figure: the metrics that are drawn over environment steps, or "times" for the steps until the
             task ``chain`` is solved.
 
     Raises:
-        ValueError: there is nothing to compare, the values of an option are no list, or a metric is unknown.
+        ValueError: there is nothing to compare, the values of an option are no list, there are options for a
+            task that is not compared, or a metric is unknown.
     """
 
     name: str
     summary: str = ""
     recipe: dict[str, Any] = field(default_factory=dict)
     vary: dict[str, Sequence[Any]] = field(default_factory=dict)
+    for_task: dict[str, dict[str, Any]] = field(default_factory=dict)
     figure: str | Sequence[str] = ("success",)
 
     def __post_init__(self) -> None:
@@ -56,6 +59,14 @@ class Study:
             raise ValueError(f"vary of {self.name} must hold lists of values by option, got {self.vary!r}")
         if strange := [name for name in (*self.recipe, *self.vary) if not isinstance(name, str)]:
             raise ValueError(f"options of {self.name} must be names, got {strange[0]!r}")
+        tasks = self.vary.get("task", ())
+        if not isinstance(self.for_task, Mapping) or not all(
+            task in tasks and isinstance(own, Mapping) for task, own in self.for_task.items()
+        ):
+            raise ValueError(
+                f"for_task of {self.name} must hold options by one of the tasks that vary "
+                f"({', '.join(map(str, tasks)) or 'none'}), got {self.for_task!r}"
+            )
         drawn = [self.figure] if isinstance(self.figure, str) else list(self.figure)
         if drawn != ["times"] and (not drawn or not set(drawn) <= set(metric_names())):
             known = ", ".join(metric_names())
@@ -76,7 +87,7 @@ class Study:
             if label in labels:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
             labels.add(label)
-            recipe = compose(self.recipe, own)
+            recipe = compose(merge(self.recipe, self.for_task.get(own.get("task"), {})), own)
             if self.figure == "times" and recipe.task.name != "chain":
                 task = recipe.task.name
                 raise ValueError(f"the figure times of {self.name} is for the task chain, not {task}")
@@ -137,13 +148,13 @@ def load_study(
     if unknown := [key for key in values if key not in known]:
         raise ValueError(f"{path}: a study has no {', '.join(unknown)}; it has preset, {', '.join(known)}")
     study = Study(name=path.stem, **values)
-    recipe = merge(load_preset(preset) if preset else {}, study.recipe, _QUICK if quick else {})
-    if seeds is not None:
-        recipe = merge(recipe, {"num_runs": seeds})
+    recipe = merge(load_preset(preset) if preset else {}, study.recipe)
+    asked = merge(_QUICK if quick else {}, {} if seeds is None else {"num_runs": seeds})
     if frames is not None:
-        epoch_frames = compose(recipe, _first(study)).collection.epoch_frames
-        recipe = merge(recipe, {"epochs": -(-frames // epoch_frames)})
-    return replace(study, recipe=recipe)
+        epoch_frames = compose(merge(recipe, asked), _first(study)).collection.epoch_frames
+        asked = merge(asked, {"epochs": -(-frames // epoch_frames)})
+    for_task = {task: merge(own, asked) for task, own in study.for_task.items()}
+    return replace(study, recipe=merge(recipe, asked), for_task=for_task)
 
 
 def _first(study: Study) -> dict[str, Any]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 
 from torchrl_her_recipes import Study, load_study, study_names
@@ -24,6 +27,28 @@ def test_frames_are_rounded_up_to_whole_epochs() -> None:
     assert (recipe.run.epochs, recipe.collection.epoch_frames) == (2, 8_000)
 
 
+def test_some_tasks_have_options_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text(
+        "recipe: {epochs: 3, k: 2}\nvary: {task: [hand_v0, hand_v1], algo: [her, filtered_her]}\n"
+        "for_task:\n  hand_v1: {run: {epochs: 7}}\n"
+    )
+
+    def lengths(**options: Any) -> dict[str, int]:
+        return {label: own.run.epochs for label, own in load_study(str(path), **options).cells()}
+
+    assert lengths() == {
+        "hand_v0_her": 3,
+        "hand_v0_filtered_her": 3,
+        "hand_v1_her": 7,
+        "hand_v1_filtered_her": 7,
+    }
+    assert {own.hindsight.k for _, own in load_study(str(path)).cells()} == {2}
+    assert set(lengths(quick=True).values()) == {2}
+    assert set(lengths(frames=30_000).values()) == {2}
+    assert {own.run.num_runs for _, own in load_study(str(path), seeds=4).cells()} == {4}
+
+
 def test_mappings_are_named_by_what_differs() -> None:
     options = [{"bits": 4, "max_steps": 9}, {"bits": 8, "max_steps": 9}]
     study = Study(name="own", recipe={"task": "bit_flip", "algo": "her"}, vary={"task.options": options})
@@ -38,6 +63,11 @@ def test_mappings_are_named_by_what_differs() -> None:
         ({"vary": {"k": [1]}, "figure": "speed"}, "figure of own must be times, or some of success"),
         ({"vary": {"k": [1, 1]}}, "two combinations that are called k=1"),
         ({"vary": {"kk": [1]}}, "no option 'kk'"),
+        (
+            {"vary": {"task": ["hand_v0"]}, "for_task": {"hand_v1": {"k": 2}}},
+            r"for_task of own must hold options by one of the tasks that vary \(hand_v0\), got",
+        ),
+        ({"vary": {"k": [1]}, "for_task": {"hand_v1": {}}}, r"the tasks that vary \(none\), got"),
     ],
 )
 def test_mistakes_are_named(values: dict[str, object], message: str) -> None:
