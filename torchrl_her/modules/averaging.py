@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import deepcopy
 
 import torch
@@ -24,19 +25,20 @@ class PolicyAverage(nn.Module):
         policy: the one that learns.
 
     Keyword Args:
-        decay: what stays of the average in a gradient step: 0.999 averages over about 1,000 steps.
+        decay: what stays of the average in a gradient step: 0.9995 averages over about 2,000 steps.
+        runs: R independent ones, whose weights are stacked: the first dimension of each parameter.
 
     Attributes:
         module: a copy of the policy, with the average weights.
-        steps: gradient steps so far.
+        steps: [R], gradient steps of each run so far.
 
     Raises:
-        ValueError: the decay is not between 0 and 1.
+        ValueError: the decay is not between 0 and 1, or a parameter is not stacked.
 
     Example:
         >>> from torchrl_her import make_actor
         >>> actor = make_actor((9, 2), 3)
-        >>> average = PolicyAverage(actor, decay=0.999)
+        >>> average = PolicyAverage(actor)
         >>> for parameter in actor.parameters():  # in place of a gradient step
         ...     parameter.data += 1.0
         >>> average.follow()
@@ -47,15 +49,18 @@ class PolicyAverage(nn.Module):
 
     steps: Tensor
 
-    def __init__(self, policy: TensorDictModuleBase, *, decay: float = 0.999) -> None:
+    def __init__(self, policy: TensorDictModuleBase, *, decay: float = 0.9995, runs: int = 1) -> None:
         if not 0 < decay < 1:
             raise ValueError(f"decay must be between 0 and 1, got {decay}")
         super().__init__()
         self.module = deepcopy(policy).requires_grad_(False)
         self.decay, self._policy = decay, (policy,)  # in a tuple, it is no submodule of this one
-        self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
-        self._averaged = [list(own.parameters()) for own in (self.module, policy)]
-        self._copied = [list(own.buffers()) for own in (self.module, policy)]
+        self.register_buffer("steps", torch.zeros(runs, dtype=torch.int64))
+        self._weights = [list(own.parameters()) for own in (self.module, policy)]
+        self._copies = next(self.module.buffers(), None) is not None
+        wrong = [own.shape for own in self._weights[0] if runs > 1 and own.shape[:1] != (runs,)]
+        if wrong:
+            raise ValueError(f"the weights of {runs} runs must be stacked, got a parameter {list(wrong[0])}")
 
     @property
     def policy(self) -> TensorDictModuleBase:
@@ -63,11 +68,38 @@ class PolicyAverage(nn.Module):
         return self._policy[0]
 
     @torch.no_grad()
-    def follow(self, steps: int = 1) -> None:
-        """Moves the average towards the policy, which has made some gradient steps since the last call."""
-        self.steps += steps
-        done = int(self.steps)
-        kept = min(self.decay, (1 + done) / (10 + done)) ** steps
-        torch._foreach_lerp_(*self._averaged, 1.0 - kept)
-        for own, now in zip(*self._copied, strict=True):
+    def follow(self, steps: int = 1, *, idle: Sequence[int] = ()) -> None:
+        """Moves the average towards the policy, which has made some gradient steps since the last call.
+
+        Args:
+            steps: how many.
+            idle: the runs that made none.
+        """
+        made = [0 if run in idle else steps for run in range(len(self.steps))]
+        self.steps += torch.tensor(made)
+        kept = [self._kept(done) ** own for done, own in zip(self.steps.tolist(), made, strict=True)]
+        averaged, learned = self._weights
+        if len(set(kept)) == 1:
+            torch._foreach_lerp_(averaged, learned, 1.0 - kept[0])
+        else:
+            for own, now in zip(averaged, learned, strict=True):
+                share = torch.tensor([1.0 - each for each in kept], dtype=own.dtype)
+                own.lerp_(now, share.view(-1, *[1] * (own.ndim - 1)))
+        if self._copies:
+            self._copy_buffers()
+
+    @torch.no_grad()
+    def restart(self) -> None:
+        """Forgets what the weights were: begins with those that the policy has now."""
+        self.steps.zero_()
+        for own, now in zip(*self._weights, strict=True):
+            own.copy_(now)
+        self._copy_buffers()
+
+    def _kept(self, done: int) -> float:
+        """The decay of one gradient step after so many."""
+        return min(self.decay, (1 + done) / (10 + done))
+
+    def _copy_buffers(self) -> None:
+        for own, now in zip(self.module.buffers(), self.policy.buffers(), strict=True):
             own.copy_(now)

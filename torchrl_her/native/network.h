@@ -86,7 +86,7 @@ inline real sum_of(int n, Term term) {
 
 class Network {
   public:
-    // `bfloat16`: products between hidden layers are of numbers in bfloat16; those of inputs and outputs never are.
+    // `bfloat16`: products between hidden layers are of numbers in bfloat16; those of the first and the last layer never are.
     Network(const Layer* layers, int count, bool bfloat16)
         : layers_(layers, layers + count), bfloat16_(bfloat16 && sizeof(real) == sizeof(float)) {}
 

@@ -231,7 +231,7 @@ class Trainer:
         rows = drawn.view(self.runs, -1)
         measured = self.learner.update(rows, steps, idle=idle)
         if self.average is not None:
-            self.average.follow(steps)
+            self.average.follow(steps, idle=idle)
         self._set_priorities(drawn, rows, idle)
         nothing = torch.tensor(idle, dtype=torch.int64)
         return {key: value.index_fill(1, nothing, _IDLE) for key, value in measured.items()}

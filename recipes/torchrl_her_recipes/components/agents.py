@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl_her.curriculum.layers import Curriculum, zero_unused_inputs
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.networks import StackedLinear, stack_runs
+from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her_recipes.components.learner import Agent, LearnerBuilder, Networks
 from torchrl_her_recipes.components.normalization import acting, make_norm
@@ -47,7 +48,7 @@ def make_agent(
     actor, critics = _networks(builder, recipe, curriculum)
     exploration, options = builder.exploration(generators), recipe.learner
     loss = builder.loss(actor, critics, rewards, generators)
-    norm = make_norm(recipe, dict(zip(builder.in_keys, builder.widths, strict=True)))
+    norm = _norm_for(builder)
     player = acting(actor, norm)
     return Agent(
         actor=player,
@@ -58,7 +59,7 @@ def make_agent(
         optimizer=torch.optim.Adam(loss.parameters(), lr=options.learning_rate, fused=True),
         target=make_target_updater(loss, tau=options.tau, hard_interval=options.hard_update_interval),
         norm=norm,
-        average=PolicyAverage(player, decay=options.average_decay) if options.average_decay > 0 else None,
+        average=_average_of(player, recipe),
     )
 
 
@@ -92,21 +93,26 @@ def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:
     return spec
 
 
-def make_networks(recipe: Recipe, env: EnvBase, *, curriculum: Curriculum | None = None) -> Networks:
-    """The actor and the critics; the weights of each run depend on its own seed alone."""
-    return _networks(_builder(recipe, env, curriculum), recipe, curriculum)
-
-
 def make_player(
     recipe: Recipe, env: EnvBase, *, curriculum: Curriculum | None = None
 ) -> TensorDictModuleBase:
     """The greedy policy with its normalization, whose weights and statistics can be loaded."""
     builder = _builder(recipe, env, curriculum)
     actor, _ = _networks(builder, recipe, curriculum)
-    return acting(actor, make_norm(recipe, dict(zip(builder.in_keys, builder.widths, strict=True))))
+    return acting(actor, _norm_for(builder))
+
+
+def _norm_for(builder: LearnerBuilder) -> RunningNorm | None:
+    return make_norm(builder.recipe, dict(zip(builder.in_keys, builder.widths, strict=True)))
+
+
+def _average_of(policy: TensorDictModuleBase, recipe: Recipe) -> PolicyAverage | None:
+    decay = recipe.learner.average_decay
+    return PolicyAverage(policy, decay=decay, runs=recipe.run.num_runs) if decay > 0 else None
 
 
 def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | None) -> Networks:
+    """The actor and the critics; the weights of each run depend on its own seed alone."""
     with torch.random.fork_rng(devices=[]):
         alone = []
         for seed in recipe.seeds:

@@ -12,7 +12,7 @@ from torchrl_her_recipes.config.metrics import metric_names
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.recipe import Recipe, compose
 from torchrl_her_recipes.config.shipped import CONF, load_preset
-from torchrl_her_recipes.config.shortcuts import merge
+from torchrl_her_recipes.config.shortcuts import locate, merge, place
 from torchrl_her_recipes.config.values import read_mapping
 
 _STUDIES = CONF / "study"
@@ -59,7 +59,7 @@ class Study:
             raise ValueError(f"vary of {self.name} must hold lists of values by option, got {self.vary!r}")
         if strange := [name for name in (*self.recipe, *self.vary) if not isinstance(name, str)]:
             raise ValueError(f"options of {self.name} must be names, got {strange[0]!r}")
-        tasks = self.vary.get("task", ())
+        tasks = [_task_of(task) for task in self.vary.get("task", ())]
         if not isinstance(self.for_task, Mapping) or not all(
             task in tasks and isinstance(own, Mapping) for task, own in self.for_task.items()
         ):
@@ -67,6 +67,11 @@ class Study:
                 f"for_task of {self.name} must hold options by one of the tasks that vary "
                 f"({', '.join(map(str, tasks)) or 'none'}), got {self.for_task!r}"
             )
+        varied = {locate(name) for name in self.vary}
+        for task, own in self.for_task.items():
+            both = [name for group, names in place(own).items() for name in names if (group, name) in varied]
+            if both:
+                raise ValueError(f"for_task of {self.name} sets {both[0]} for {task}, which varies")
         drawn = [self.figure] if isinstance(self.figure, str) else list(self.figure)
         if drawn != ["times"] and (not drawn or not set(drawn) <= set(metric_names())):
             known = ", ".join(metric_names())
@@ -87,7 +92,7 @@ class Study:
             if label in labels:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
             labels.add(label)
-            recipe = compose(merge(self.recipe, self.for_task.get(own.get("task"), {})), own)
+            recipe = compose(merge(self.recipe, self.for_task.get(_task_of(own.get("task")), {})), own)
             if self.figure == "times" and recipe.task.name != "chain":
                 task = recipe.task.name
                 raise ValueError(f"the figure times of {self.name} is for the task chain, not {task}")
@@ -150,12 +155,19 @@ def load_study(
     study = Study(name=path.stem, **values)
     recipe = merge(load_preset(preset) if preset else {}, study.recipe)
     asked = merge(_QUICK if quick else {}, {} if seeds is None else {"num_runs": seeds})
-    if frames is not None:
-        epoch_frames = compose(merge(recipe, asked), _first(study)).collection.epoch_frames
-        asked = merge(asked, {"epochs": -(-frames // epoch_frames)})
-    for_task = {task: merge(own, asked) for task, own in study.for_task.items()}
-    return replace(study, recipe=merge(recipe, asked), for_task=for_task)
+
+    def shortened(own: Mapping[str, Any]) -> dict[str, Any]:
+        """Options with those that were asked for, and as many epochs as hold the frames."""
+        if frames is None:
+            return merge(own, asked)
+        first = {name: values[0] for name, values in study.vary.items()}
+        epoch_frames = compose(merge(recipe, own, asked), first).collection.epoch_frames
+        return merge(own, asked, {"epochs": -(-frames // epoch_frames)})
+
+    for_task = {task: shortened(own) for task, own in study.for_task.items()}
+    return replace(study, recipe=merge(recipe, shortened({})), for_task=for_task)
 
 
-def _first(study: Study) -> dict[str, Any]:
-    return {name: values[0] for name, values in study.vary.items()}
+def _task_of(task: Any) -> Any:
+    """The name of a task that varies, which may be given with its options."""
+    return task.get("name") if isinstance(task, Mapping) else task

@@ -24,8 +24,8 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     """What greedy episodes of each run show, [R] each.
 
     ``q`` is the value of the first action as the loss's own critics see it (see
-    :func:`~torchrl_her.objectives.critic_value`), and ``q_bias`` is that minus the return. Both are missing
-    if the loss has no such critics.
+    :func:`~torchrl_her.objectives.critic_value`), and ``q_bias`` is that minus the return of the policy that
+    played: the average of the actor, if there is one. Both are missing if the loss has no such critics.
     """
     recipe = components.recipe
     missed, achieved = components.rewards
@@ -44,7 +44,7 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
         measured |= {"q": value.squeeze(-1), "q_bias": q_bias(value, returns)}
     means = {name: value.view(recipe.run.num_runs, -1).mean(1) for name, value in measured.items()}
     if components.curriculum is None:
-        means |= measure_values(components.greedy, goal_env(components.eval_env), recipe.run.num_runs)
+        means |= measure_values(components.actor, goal_env(components.eval_env), recipe.run.num_runs)
     return means | {"epsilon": components.exploration.epsilon}
 
 

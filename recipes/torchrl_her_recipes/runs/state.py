@@ -63,7 +63,10 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
     if components.norm is not None:
         components.norm.load_state_dict(state["norm"])
     if components.average is not None:
-        components.average.load_state_dict(state["average"])
+        if state.get("average") is None:  # of a run from before there were averages
+            components.average.restart()
+        else:
+            components.average.load_state_dict(state["average"])
     load_buffer_state_dict(components.buffer, state["buffer"])
     for generator, own in zip(components.generators, state["generators"], strict=True):
         generator.set_state(own)

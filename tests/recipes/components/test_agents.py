@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_her_recipes import build, run
-from torchrl_her_recipes.components.agents import find_learner, make_agent, make_networks
+from torchrl_her_recipes.components.agents import find_learner, make_agent, make_player
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.learners import LEARNERS
 
@@ -56,8 +56,8 @@ def test_what_does_not_fit_is_refused(options: dict[str, Any], message: str) -> 
 def test_the_weights_of_a_run_depend_on_its_own_seed_alone() -> None:
     recipe = small(task="hand_v0", num_runs=2, seed=3)
     env = make_task_envs(recipe, 1, recipe.seeds)
-    both, _ = make_networks(recipe, env)
-    alone, _ = make_networks(small(task="hand_v0", seed=4), env)
+    both = make_player(recipe, env)
+    alone = make_player(small(task="hand_v0", seed=4), env)
     for stacked, own in zip(both.parameters(), alone.parameters(), strict=True):
         assert torch.equal(stacked[1], own.view_as(stacked[1]))
 

@@ -46,7 +46,15 @@ def test_some_tasks_have_options_of_their_own(tmp_path: Path) -> None:
     assert {own.hindsight.k for _, own in load_study(str(path)).cells()} == {2}
     assert set(lengths(quick=True).values()) == {2}
     assert set(lengths(frames=30_000).values()) == {2}
+    path.write_text(path.read_text().replace("{epochs: 7}", "{epochs: 7}, collection: {epoch_frames: 1000}"))
+    assert lengths(frames=30_000)["hand_v1_her"] == 30
     assert {own.run.num_runs for _, own in load_study(str(path), seeds=4).cells()} == {4}
+
+
+def test_tasks_may_vary_with_their_options() -> None:
+    tasks = [{"name": "bit_flip", "options": {"bits": bits}} for bits in (5, 6)]
+    study = Study(name="own", vary={"task": tasks}, for_task={"bit_flip": {"epochs": 2}})
+    assert [recipe.run.epochs for _, recipe in study.cells()] == [2, 2]
 
 
 def test_mappings_are_named_by_what_differs() -> None:
@@ -68,6 +76,10 @@ def test_mappings_are_named_by_what_differs() -> None:
             r"for_task of own must hold options by one of the tasks that vary \(hand_v0\), got",
         ),
         ({"vary": {"k": [1]}, "for_task": {"hand_v1": {}}}, r"the tasks that vary \(none\), got"),
+        (
+            {"vary": {"task": ["hand_v1"], "k": [1, 2]}, "for_task": {"hand_v1": {"hindsight": {"k": 2}}}},
+            "for_task of own sets k for hand_v1, which varies",
+        ),
     ],
 )
 def test_mistakes_are_named(values: dict[str, object], message: str) -> None:

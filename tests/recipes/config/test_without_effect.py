@@ -29,6 +29,8 @@ IDLE = [
     ({"processes": 0}, {"sync": False}),
     ({"compile": "never"}, {"products": "bfloat16"}),
     ({"dtype": "float64"}, {"products": "bfloat16"}),
+    ({"norm": "batch"}, {"products": "bfloat16"}),
+    ({"hidden": 31}, {"products": "bfloat16"}),
     ({"task": "bit_flip"}, {"threshold": 0.5}),
     ({"task": "chain"}, {"dtype": "float64"}),
     ({"task": "gym:FetchReach-v4"}, {"dtype": "float64"}),

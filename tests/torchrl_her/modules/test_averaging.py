@@ -96,6 +96,58 @@ def test_it_goes_on_from_its_state() -> None:
     assert weight_of(average) == weight_of(other) != 1.0
 
 
+def moved(average: PolicyAverage, steps: int, *, idle: tuple[int, ...] = ()) -> None:
+    """As if the policy's weights had grown by 1 in some gradient steps."""
+    for parameter in average.policy.parameters():
+        parameter.data += 1.0
+    average.follow(steps, idle=idle)
+
+
+def test_each_run_is_averaged_over_its_own_steps() -> None:
+    both, alone = (PolicyAverage(make_actor((4, 2), 3, runs=runs), decay=0.99, runs=runs) for runs in (2, 1))
+    for stacked, own in zip(both.policy.parameters(), alone.policy.parameters(), strict=True):
+        stacked.data[1:] = own.data
+    for average in (both, alone):
+        average.restart()
+    before = next(both.module.parameters())[1].clone()
+    moved(both, 500, idle=(1,))
+    assert torch.equal(next(both.module.parameters())[1], before)
+    for stacked, own in zip(both.policy.parameters(), alone.policy.parameters(), strict=True):
+        stacked.data[1:] = own.data
+    moved(both, 3)
+    moved(alone, 3)
+    assert both.steps.tolist() == [503, 3]
+    for stacked, own in zip(both.module.parameters(), alone.module.parameters(), strict=True):
+        torch.testing.assert_close(stacked[1:], own)
+        assert not torch.equal(stacked[:1], own)
+
+
+def test_weights_that_are_not_stacked_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"the weights of 3 runs must be stacked, got a parameter \[1, 1\]"):
+        PolicyAverage(make_policy(0.0), runs=3)
+
+
+def test_a_restart_forgets_what_was() -> None:
+    policy = make_policy(0.0)
+    average = PolicyAverage(policy)
+    set_weight(policy, 1.0)
+    average.follow(2)
+    set_weight(policy, 5.0)
+    average.restart()
+    assert (weight_of(average), average.steps.tolist()) == (5.0, [0])
+
+
+def test_statistics_follow_a_policy_that_was_cast() -> None:
+    policy = make_policy(0.0)
+    policy.register_buffer("seen", torch.zeros(()))
+    average = PolicyAverage(policy)
+    policy.double()
+    average.double()
+    policy.seen.fill_(5.0)  # type: ignore[union-attr, operator]
+    average.follow()
+    assert float(average.module.seen) == 5.0
+
+
 @pytest.mark.parametrize("decay", [0.0, 1.0, -0.1, float("nan")])
 def test_a_decay_that_cannot_be(decay: float) -> None:
     with pytest.raises(ValueError, match=f"decay must be between 0 and 1, got {decay}"):
