@@ -6,6 +6,7 @@ Hindsight experience replay, 2017, appendix A.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import accumulate, pairwise
 from typing import NamedTuple
@@ -177,10 +178,11 @@ class RunningNorm(nn.Module):
         for own, start in ((self.n, 0.0), (self.mean, 0.0), (self.var, 1.0)):
             (own if run is None else own[run : run + 1])[:, columns] = start
 
+    @torch.no_grad()
     def update(
         self, rows: TensorDictBase, runs: Sequence[int] | None = None, counts: Sequence[int] | None = None
     ) -> None:
-        """Counts transitions, by what is in their root.
+        """Counts transitions, by what is in their root: all entries, or none if one of them cannot be counted.
 
         Args:
             rows: of any shape; with ``runs`` they are run after run, otherwise R equal blocks.
@@ -197,11 +199,17 @@ class RunningNorm(nn.Module):
             self._check_blocks(rows.shape)
             runs = range(self.runs)
         shares = [rows.numel() // len(runs)] * len(runs) if counts is None else list(counts)
-        for key in self.widths:
-            values = _entry(rows, key)
+        entries = {key: entry_to_normalize(rows, key) for key in self.widths}
+        for key, values in entries.items():
             self._check(key, values)
-            for run, part in zip(runs, values.flatten(0, -2).split(shares), strict=True):
-                self.count(key, part, run=run)
+        new = [
+            (self.moments_of(key, run), self._finite_moments(key, part))
+            for key, values in entries.items()
+            for run, part in zip(runs, values.flatten(0, -2).split(shares), strict=True)
+            if len(part) > 0
+        ]
+        for own, moments_of_part in new:
+            _add(own, moments_of_part)
 
     @torch.no_grad()
     def count(self, key: NestedKey, values: Tensor, *, run: int = 0, weight: float = 1.0) -> None:
@@ -216,19 +224,18 @@ class RunningNorm(nn.Module):
             weight: how often each value counts.
 
         Raises:
-            ValueError: the values are wider, or are not finite, which would spoil the statistics for good.
+            ValueError: the values are wider, or are not finite, which would spoil the statistics for good;
+                or the weight is negative or not finite.
         """
         width, own = values.shape[-1], self.moments_of(key, run)
         if width > len(own.mean):
             raise ValueError(f"{key!r} must have a width of at most {len(own.mean)}, got {width}")
+        if not 0 <= weight < math.inf:
+            raise ValueError(f"weight must be at least 0 and finite, got {weight}")
         if self.frozen or values.numel() == 0 or weight == 0:
             return
-        new = moments(values.reshape(-1, width).to(self.mean.device))
-        if not bool(new.var.isfinite().all()):  # one NaN or infinity among the values is enough for that
-            raise ValueError(f"{key!r} must be finite to be counted, got NaN or infinity in it")
-        old = Moments(*(each[:width] for each in own))
-        for each, value in zip(old, merge(old, new._replace(n=new.n * weight)), strict=True):
-            each.copy_(value)  # in place: other processes may share this memory
+        new = self._finite_moments(key, values)
+        _add(Moments(*(each[:width] for each in own)), new._replace(n=new.n * weight))
 
     def normalize(self, key: NestedKey, values: Tensor) -> Tensor:
         """Normalized values of one entry.
@@ -237,12 +244,18 @@ class RunningNorm(nn.Module):
             key: of the entry.
             values: [..., width], R equal blocks in the order of the runs.
 
+        Returns:
+            [..., width], of the type of the values; of torch's default type if they are whole numbers or
+            flags.
+
         Raises:
             ValueError: the values have another width, or cannot be divided among the runs.
         """
         columns = self._columns_of(key)
         self._check(key, values)
         self._check_blocks(values.shape[:-1])
+        if not values.is_floating_point():  # means and deviations would be rounded to whole numbers, too
+            values = values.to(torch.get_default_dtype())
         n, mean, var = (own[:, columns] for own in (self.n, self.mean, self.var))
         std = var.sqrt().clamp(min=self.least_std)
         limit = torch.where(n > 0, self.clip, torch.inf)  # nothing is changed before the first update
@@ -257,7 +270,7 @@ class RunningNorm(nn.Module):
         """
         out = tensordict.copy()
         for key in self.widths:
-            out.set(key, self.normalize(key, _entry(out, key)))
+            out.set(key, self.normalize(key, entry_to_normalize(out, key)))
             after = unravel_key(("next", key))
             value = out.get(after, None)
             if value is not None:
@@ -270,6 +283,13 @@ class RunningNorm(nn.Module):
         if columns is None:
             raise KeyError(f"{key!r} is not normalized, only {', '.join(map(repr, self.widths))}")
         return columns
+
+    def _finite_moments(self, key: NestedKey, values: Tensor) -> Moments:
+        """Number, mean and variance of values [..., width]; raises if one of them is not finite."""
+        new = moments(values.reshape(-1, values.shape[-1]).to(self.mean.device))
+        if not bool(new.var.isfinite().all()):  # one NaN or infinity among the values is enough for that
+            raise ValueError(f"{key!r} must be finite to be counted, got NaN or infinity in it")
+        return new
 
     def _check(self, key: NestedKey, values: Tensor) -> None:
         """Raises if an entry has another width."""
@@ -288,8 +308,24 @@ class RunningNorm(nn.Module):
         return f"{self.widths}, runs={self.runs}, clip={self.clip}, least_std={self.least_std}"
 
 
-def _entry(rows: TensorDictBase, key: NestedKey) -> Tensor:
+def _add(own: Moments, new: Moments) -> None:
+    """Merges moments into others, in place: other processes may share their memory."""
+    for each, value in zip(own, merge(own, new), strict=True):
+        each.copy_(value)
+
+
+def entry_to_normalize(rows: TensorDictBase, key: NestedKey, *, who: str = "normalization") -> Tensor:
+    """An entry.
+
+    Raises:
+        KeyError: it is missing.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> entry_to_normalize(TensorDict({"observation": torch.ones(1, 2)}, [1]), "observation")
+        tensor([[1., 1.]])
+    """
     entry = rows.get(key, None)
     if entry is None:
-        raise KeyError(f"normalization needs the entry {key!r}, got {list(rows.keys(True, True))}")
+        raise KeyError(f"{who} needs the entry {key!r}, got {list(rows.keys(True, True))}")
     return entry

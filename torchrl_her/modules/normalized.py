@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Transform
 
-from torchrl_her.modules.normalization import RunningNorm
+from torchrl_her.modules.normalization import RunningNorm, entry_to_normalize
 
 
 class NormalizeBatch(Transform):
@@ -31,7 +33,9 @@ class NormalizeBatch(Transform):
         achieved_goal_key, desired_goal_key: goals, for ``counted_k``.
 
     Raises:
-        ValueError: ``counted_k`` is negative, or the desired goal is not normalized.
+        ValueError: ``counted_k`` is negative or not finite, or the desired goal is not normalized; or, when
+            writing, what is to be counted is not finite or has another width.
+        KeyError: when writing, an entry that is to be counted is missing.
 
     Example:
         >>> import torch
@@ -58,8 +62,8 @@ class NormalizeBatch(Transform):
         achieved_goal_key: NestedKey = "achieved_goal",
         desired_goal_key: NestedKey = "desired_goal",
     ) -> None:
-        if counted_k is not None and counted_k < 0:
-            raise ValueError(f"counted_k must be None or at least 0, got {counted_k}")
+        if counted_k is not None and not 0 <= counted_k < math.inf:
+            raise ValueError(f"counted_k must be None or a finite number of at least 0, got {counted_k}")
         if counted_k is not None and unravel_key(desired_goal_key) not in norm.widths:
             raise ValueError(f"counted_k needs {desired_goal_key!r} to be normalized, got {norm}")
         super().__init__(in_keys=norm.keys, out_keys=norm.keys)
@@ -72,9 +76,16 @@ class NormalizeBatch(Transform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Sees what is written, and leaves it as it is."""
-        if self.counted_k is not None:
+        if self.counted_k is not None and not self.norm.frozen:
+            # Checked first, so that rows which cannot be counted leave the statistics as they were.
+            key = unravel_key(("next", self.achieved_goal_key))
+            achieved = entry_to_normalize(tensordict, key, who="counted_k")
+            width = self.norm.widths[unravel_key(self.desired_goal_key)]
+            if achieved.shape[-1] > width:
+                raise ValueError(f"{key!r} must have a width of at most {width}, got {achieved.shape[-1]}")
+            if not bool(achieved.isfinite().all()):
+                raise ValueError(f"{key!r} must be finite to be counted, got NaN or infinity in it")
             self.norm.update(tensordict)
-            achieved = tensordict.get(unravel_key(("next", self.achieved_goal_key)))
             for run, goals in enumerate(achieved.flatten(0, -2).chunk(self.norm.runs)):
                 self.norm.count(self.desired_goal_key, goals, run=run, weight=self.counted_k)
         return tensordict
@@ -121,8 +132,12 @@ class NormalizedPolicy(TensorDictModuleBase):
         self.actor, self.norm = actor, norm
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Runs the actor on normalized entries; writes what it wrote."""
+        """Runs the actor on normalized entries; writes what it wrote.
+
+        Raises:
+            KeyError: an entry that the actor reads normalized is missing.
+        """
         seen = tensordict.copy()
         for key in self._normalized:
-            seen.set(key, self.norm.normalize(key, tensordict.get(key)))
+            seen.set(key, self.norm.normalize(key, entry_to_normalize(tensordict, key)))
         return tensordict.update(self.actor(seen).select(*self.out_keys, strict=False))

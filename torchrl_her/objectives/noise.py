@@ -46,5 +46,9 @@ class RunNoise:
             torch.Size([3, 2])
         """
         sources: Sequence[torch.Generator | None] = self.generators or [None]
-        drawn = [torch.randperm(of, generator=own)[:count] for own in sources]
+        devices = [None if own is None else own.device for own in sources]  # draws elsewhere are refused
+        drawn = [
+            torch.randperm(of, generator=own, device=device)[:count]
+            for own, device in zip(sources, devices, strict=True)
+        ]
         return torch.stack(drawn).sort(-1).values

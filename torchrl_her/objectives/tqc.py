@@ -29,8 +29,20 @@ class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
 
     Args:
         *args: of :class:`torchrl.objectives.TQCLoss`.
-        **kwargs: of the same, and of :class:`~torchrl_her.objectives.PenalizedSACLoss`.
+        **kwargs: of the same, and of :class:`~torchrl_her.objectives.PenalizedSACLoss`, but for
+            ``target_critics``.
+
+    Raises:
+        TypeError: ``target_critics`` is given.
     """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        if "target_critics" in kwargs:
+            raise TypeError(
+                "TQC's targets have the quantiles of all critics, of which none are drawn at random: leave out "
+                f"target_critics={kwargs['target_critics']!r}"
+            )
+        super().__init__(*args, **kwargs)
 
     def _value_for_actor(self, values: Tensor) -> Tensor:
         return values.mean((0, -1))
@@ -92,7 +104,8 @@ def make_tqc_loss(
 
     Raises:
         ValueError: ``gamma`` is outside of [0, 1), ``temperature`` is not positive, ``critics`` is below 1 or
-            not their number, or ``dropped_quantiles`` is negative or leaves none.
+            not their number, critics do not say how many quantiles they have, as those of ``make_critic``
+            do, or ``dropped_quantiles`` is negative or leaves none.
 
     Example:
         >>> from torchrl_her import make_critic, make_stochastic_actor
@@ -103,11 +116,17 @@ def make_tqc_loss(
     """
     own = as_critics(critic, critics)
     first = own[0] if isinstance(own, list) else own
-    quantiles = first.module.outputs
-    if not 0 <= dropped_quantiles < quantiles:
+    quantiles = getattr(first.module, "outputs", None)
+    if not isinstance(quantiles, int):
         raise ValueError(
-            f"dropped_quantiles must be from 0 to {quantiles - 1}, since critics have {quantiles} quantiles, "
-            f"got {dropped_quantiles}"
+            "critic must come from make_critic(..., outputs=M) with M quantiles, or its module must have their "
+            f"number as the attribute `outputs`, got {type(first.module).__name__} without it"
+        )
+    if not 0 <= dropped_quantiles < quantiles:
+        hint = "" if quantiles > 1 else "; make_critic(..., outputs=M) gives critics with M quantiles"
+        raise ValueError(
+            f"dropped_quantiles must be from 0 to {quantiles - 1}, since critics have {quantiles} "
+            f"quantile{'s' * (quantiles != 1)}, got {dropped_quantiles}{hint}"
         )
     options: dict[str, Any] = {"scalar_output_mode": "exclude" if reduction == "none" else None}
     loss = PenalizedTQCLoss(

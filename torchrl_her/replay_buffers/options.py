@@ -20,6 +20,10 @@ T = TypeVar("T")
 Per = Literal["transition", "episode"]
 
 
+class _NotGiven(int):
+    """The default of a number, which tells that none was given."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class HindsightOptions:
     """How transitions are relabeled, and under which keys their entries are.
@@ -36,7 +40,8 @@ class HindsightOptions:
             filter act on all alike. None: ``k`` and ``strategy`` count.
         recent_actual, recent_achieved: how many of the newest goals these two sources remember: one that was
             wanted for each episode, and one that was achieved for each transition. Those of the episodes
-            that are just written are among them. A sample unit looks at as many of the newest episodes, and
+            that are just written are among them. If these alone have more, goals are taken from all of
+            them, evenly spread over environments and time. A sample unit looks at as many of the newest episodes, and
             newest transitions, that are stored. Where the filter refuses nearly all, large numbers cost time.
         per: what gets a goal of its own. ``"transition"``: each transition, for learning from single
             transitions. ``"episode"``: each copy of a whole episode, for learning from sequences, as
@@ -75,7 +80,7 @@ class HindsightOptions:
         (4, {'future': 2, 'actual': 2})
     """
 
-    k: int = 4
+    k: int = _NotGiven(4)
     strategy: Strategy = "future"
     goal_sources: GoalSources | None = None
     recent_actual: int = 1_000
@@ -118,8 +123,13 @@ class HindsightOptions:
         if self.goal_sources is not None:
             sources = check_goal_sources(self.goal_sources)
             k = sum(sources.values())
-            if self.k not in (HindsightOptions.k, k) or self.strategy != HindsightOptions.strategy:
-                raise ValueError(_twice(self.goal_sources, k=self.k, strategy=self.strategy))
+            given: dict[str, Any] = {}
+            if not isinstance(self.k, _NotGiven) and self.k != k:
+                given["k"] = self.k
+            if self.strategy != HindsightOptions.strategy:
+                given["strategy"] = self.strategy
+            if given:
+                raise ValueError(_twice(self.goal_sources, **given))
             object.__setattr__(self, "goal_sources", sources)
             object.__setattr__(self, "k", k)
 
@@ -128,7 +138,7 @@ class HindsightOptions:
         """How many virtual goals of each transition come from where; empty if there are none."""
         if self.goal_sources is not None:
             return dict(self.goal_sources)
-        return {self.strategy: self.k} if self.k > 0 else {}
+        return {self.strategy: int(self.k)} if self.k > 0 else {}
 
     @property
     def remembered(self) -> dict[str, int]:
@@ -137,6 +147,8 @@ class HindsightOptions:
 
     def changed(self, changes: dict[str, Any]) -> HindsightOptions:
         """The same options, some of them changed. Goal sources take the place of ``k`` and ``strategy``.
+
+        Without the sources that there were, ``k`` and ``strategy`` are the defaults, unless they are given.
 
         Raises:
             TypeError: there is no option of one of these names.
@@ -156,6 +168,7 @@ class HindsightOptions:
         if sources is not None:
             if given := {name: changes[name] for name in ("k", "strategy") if name in changes}:
                 raise ValueError(_twice(sources, **given))
+        if sources is not None or self.goal_sources is not None:  # then k is the sum of the sources
             changes = {"k": HindsightOptions.k, "strategy": HindsightOptions.strategy, **changes}
         return replace(self, **changes)
 

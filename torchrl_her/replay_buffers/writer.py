@@ -86,8 +86,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         runs: R.
         generators: R sources of random numbers; None for the buffer's, with one run only.
         on_write: called with all that is written, real and virtual transitions, as ``(rows, runs, counts)``:
-            rows run after run, which runs these are, and how many rows each has. It may come several times
-            for one batch. See :class:`~torchrl_her.modules.RunningNorm`.
+            rows run after run, which runs these are, and how many rows each has. It comes when they are
+            stored, and may come several times for one batch. See :class:`~torchrl_her.modules.RunningNorm`.
         **changes: options by name, as in the example; all are listed in
             :class:`~torchrl_her.HindsightOptions`.
 
@@ -312,8 +312,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         super().load_state_dict(state_dict)
         self._rings.cursors, self._rings.sizes = list(state_dict["cursors"]), list(state_dict["sizes"])
         self._held = Batch.from_state(state_dict, runs=self.runs)
-        if "recent" in state_dict:  # states from before there were goals of other episodes have none
-            self._recent = RecentGoals.from_state(state_dict["recent"])
+        recent = state_dict.get("recent")  # states from before there were goals of other episodes have none
+        self._recent = RecentGoals.none(self.runs) if recent is None else RecentGoals.from_state(recent)
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
         self._counts.load_state_dict(state_dict)
@@ -391,10 +391,10 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         counts = real.counts
         if virtual is not None:
             counts = [sum(both) for both in zip(real.counts, virtual.counts, strict=True)]
-        if self.on_write is not None:
-            self.on_write(out, runs, counts)
         self._store(out, runs, counts)
         places.note(runs, real.copies.root.split(real.counts), counts)
+        if self.on_write is not None:  # not before: rows that could not be stored would be counted, too
+            self.on_write(out, runs, counts)
 
     def _new_ids(self, count: int) -> int:
         """The first of so many trajectory ids that no stored episode has, real or virtual."""

@@ -223,3 +223,38 @@ def test_batches_that_cannot_be() -> None:
             use(wide)
     with pytest.raises(KeyError, match="'action' is not normalized, only 'observation', 'desired_goal'"):
         norm.normalize("action", torch.ones(2, 1))
+
+
+def test_whole_numbers_are_normalized_to_numbers_with_digits() -> None:
+    norm = make_norm()
+    norm.update(rows(1.0, 2.0))
+    batch = rows(0.0, 0.0).set("observation", torch.tensor([[1], [2]]))
+    out = norm(batch)["observation"]
+    assert out.dtype is torch.get_default_dtype()
+    assert out.tolist() == [[-1.0], [1.0]]
+    assert norm.normalize("observation", torch.tensor([[True]])).tolist() == [[-1.0]]
+    assert norm.normalize("observation", torch.tensor([[2.0]]).half()).dtype is torch.float16
+
+
+@pytest.mark.parametrize("runs", [1, 2])
+def test_rows_that_cannot_be_counted_leave_the_statistics_as_they_were(runs: int) -> None:
+    norm = make_norm(runs=runs)
+    norm.update(rows(1.0, 5.0))
+    before = norm.state_dict()["n"].clone()
+    with pytest.raises(ValueError, match="'desired_goal' must be finite"):
+        norm.update(rows(1.0, 5.0, goals=[0.0, math.inf]))
+    with pytest.raises(KeyError, match="needs the entry 'desired_goal'"):
+        norm.update(rows(1.0, 5.0).exclude("desired_goal"))
+    with pytest.raises(ValueError, match="'desired_goal' must have a width of 1, got 3"):
+        norm.update(rows(1.0, 5.0).set("desired_goal", torch.ones(2, 3)))
+    assert torch.equal(norm.n, before)
+    norm.update(rows(1.0, 5.0))
+    assert torch.equal(norm.n, 2 * before)
+
+
+@pytest.mark.parametrize("weight", [-1.0, math.nan, math.inf])
+def test_weights_of_values_that_cannot_be(weight: float) -> None:
+    norm = make_norm()
+    with pytest.raises(ValueError, match=f"weight must be at least 0 and finite, got {weight}"):
+        norm.count("observation", torch.ones(2, 1), weight=weight)
+    assert norm.n.tolist() == [[0.0, 0.0]]

@@ -177,8 +177,48 @@ def test_torchrl_saves_the_statistics_with_the_buffer() -> None:
     assert torch.equal(other.moments_of("desired_goal").var, norm.moments_of("desired_goal").var)
 
 
+def test_statistics_of_rows_that_could_not_be_stored_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    norm = make_norm()
+    buffer = in_a_buffer(norm, k=1)
+    buffer.extend(make_batch([[4]]))
+
+    def full(*_: object) -> None:
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(buffer.storage, "set", full)
+        with pytest.raises(OSError, match="no space left"):
+            buffer.extend(make_batch([[5]]))
+    assert norm.moments_of("observation").n.tolist() == [8.0, 8.0]
+    buffer.extend(make_batch([[5]]))
+    assert norm.moments_of("observation").n.tolist() == [18.0, 18.0]
+
+
+@pytest.mark.parametrize("runs", [1, 2])
+def test_achieved_goals_that_cannot_be_counted_are_named_before_anything_is(runs: int) -> None:
+    norm = make_norm(runs)
+    counting, batch = NormalizeBatch(norm, counted_k=4), make_batch([[3], [3]])
+    key = ("next", "achieved_goal")
+    with pytest.raises(KeyError, match=r"counted_k needs the entry \('next', 'achieved_goal'\), got \["):
+        counting.inv(batch.exclude(key))
+    broken = batch.clone()
+    broken[key][-1, -1] = torch.inf
+    with pytest.raises(ValueError, match=r"\('next', 'achieved_goal'\) must be finite to be counted"):
+        counting.inv(broken)
+    with pytest.raises(ValueError, match=r"'achieved_goal'\) must have a width of at most 2, got 3"):
+        counting.inv(batch.clone().set(key, torch.ones(2, 3, 3)))
+    assert norm.n.sum() == 0
+    norm.frozen = True
+    counting.inv(broken)  # nothing is counted
+
+
 def test_what_a_batch_cannot_be_counted_by() -> None:
-    with pytest.raises(ValueError, match=r"counted_k must be None or at least 0, got -1"):
+    for weight in (float("nan"), float("inf")):
+        with pytest.raises(
+            ValueError, match=rf"counted_k must be None or a finite number of at least 0, got {weight}"
+        ):
+            NormalizeBatch(make_norm(), counted_k=weight)
+    with pytest.raises(ValueError, match=r"counted_k must be None or a finite number of at least 0, got -1"):
         NormalizeBatch(make_norm(), counted_k=-1)
     with pytest.raises(ValueError, match=r"counted_k needs 'desired_goal' to be normalized"):
         NormalizeBatch(RunningNorm({"observation": 2}), counted_k=4)
@@ -281,3 +321,19 @@ def test_a_policy_may_read_some_of_what_is_normalized() -> None:
     policy = NormalizedPolicy(TensorDictModule(double, in_keys=["observation"], out_keys=["action"]), norm)
     raw: TensorDictBase = seen().exclude("desired_goal")
     assert torch.equal(policy(raw)["action"], 2.0 * norm.normalize("observation", raw["observation"]))
+
+
+def test_an_entry_that_a_policy_misses_is_named() -> None:
+    policy = NormalizedPolicy(make_actor((2, 2), 3), counted_norm())
+    with pytest.raises(
+        KeyError, match=r"normalization needs the entry 'desired_goal', got \['observation'\]"
+    ):
+        policy(seen().exclude("desired_goal"))
+
+
+def test_a_policy_may_see_whole_numbers() -> None:
+    actor, norm = make_actor((2, 2), 3), counted_norm()
+    raw = seen().set("observation", torch.arange(12).view(6, 2))
+    policy = NormalizedPolicy(actor, norm)
+    expected = policy(raw.clone().set("observation", raw["observation"].float()))["action"]
+    assert torch.equal(policy(raw)["action"], expected)

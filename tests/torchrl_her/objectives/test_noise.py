@@ -42,3 +42,10 @@ def test_shape_and_type_are_kept() -> None:
     drawn = RunNoise([torch.Generator()])(torch.zeros(4, 2, dtype=torch.float64).t())
     assert drawn.shape == (2, 4)
     assert drawn.dtype == torch.float64
+
+
+def test_subsets_are_drawn_where_the_generator_is() -> None:
+    expected = RunNoise([torch.Generator().manual_seed(7)]).subsets(2, 10)
+    with torch.device("meta"):  # another one than that of the generator
+        drawn = RunNoise([torch.Generator("cpu").manual_seed(7)]).subsets(2, 10)
+    assert torch.equal(drawn, expected)

@@ -6,10 +6,13 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate, TQCLoss
 
 from torchrl_her import LossLearner, make_critic, make_stochastic_actor, make_tqc_loss
 from torchrl_her.objectives import critic_value
+from torchrl_her.objectives.tqc import PenalizedTQCLoss
 
 from ..lost_game import SPEC, rows, say
 
@@ -141,3 +144,28 @@ def test_it_learns_the_value_of_a_lost_game(runs: int) -> None:
 def test_what_cannot_be_is_named(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_loss(**options)
+
+
+def test_targets_of_some_critics_are_refused() -> None:
+    actor = make_stochastic_actor((4, 2), SPEC)
+    critic = make_critic((4, 2), 3, outputs=3)
+    with pytest.raises(
+        TypeError, match=r"TQC's targets have the quantiles of all critics.* target_critics=1"
+    ):
+        PenalizedTQCLoss(actor, critic, action_spec=SPEC, num_qvalue_nets=2, target_critics=1)
+
+
+class OwnCritic(nn.Module):
+    def forward(self, observation: Tensor, desired_goal: Tensor, action: Tensor) -> Tensor:
+        return torch.cat((observation, desired_goal, action), -1)[..., :5]
+
+
+def test_critics_without_quantiles_are_told_how_to_get_them() -> None:
+    actor = make_stochastic_actor((4, 2), SPEC)
+    keys = ["observation", "desired_goal", "action"]
+    own = TensorDictModule(OwnCritic(), in_keys=keys, out_keys=["state_action_value"])
+    with pytest.raises(ValueError, match=r"from make_critic\(\.\.\., outputs=M\) .* got OwnCritic"):
+        make_tqc_loss(actor, own, action_spec=SPEC)
+    one = make_critic((4, 2), 3)
+    with pytest.raises(ValueError, match=r"critics have 1 quantile, .*make_critic\(\.\.\., outputs=M\)"):
+        make_tqc_loss(actor, one, action_spec=SPEC)

@@ -124,10 +124,10 @@ def test_only_the_newest_goals_are_remembered(kind: type) -> None:
     ):
         buffer = make_buffer(kind, goal_sources={source: 200}, **options)
         whole = tagged([[2, 3, 2]])
-        extend(buffer, whole[:, :2])
-        extend(buffer, whole[:, 2:])
+        for begin, end in ((0, 2), (2, 5), (5, 7)):
+            extend(buffer, whole[:, begin:end])
         rows = virtual(buffer)
-        last = rows[rows["observation"][:, 0] >= 100]
+        last = rows[rows["observation"][:, 0] >= 200]
         assert goals_of(last) == expected
 
 
@@ -411,6 +411,17 @@ def test_a_state_of_a_writer_without_a_memory_can_be_loaded() -> None:
     buffer.writer.load_state_dict(state)
     buffer.extend(tagged([[2]]))
     assert goals_of(virtual(buffer)) == {wanted_by(0, 0)}
+
+
+def test_a_state_without_a_memory_makes_a_writer_forget_its_own() -> None:
+    state = make_buffer(HERWriter).writer.state_dict()
+    del state["recent"]
+    buffer = make_buffer(HERWriter, goal_sources={"actual": 50})
+    buffer.extend(tagged([[3], [2]]))
+    buffer.writer.load_state_dict(state)
+    buffer.extend(tagged([[2] * 9], steps=2, first=[(7, 0)]))
+    tags = virtual(buffer)["observation"][:, 0]
+    assert goals_of(virtual(buffer)[(tags >= 700) & (tags < 1000)]) == {wanted_by(0, 7)}
 
 
 def test_an_emptied_buffer_forgets_goals() -> None:

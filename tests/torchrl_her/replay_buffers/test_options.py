@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import FrozenInstanceError, fields, replace
 from typing import Any
@@ -153,6 +154,30 @@ def test_two_ways_to_say_which_goals_are_drawn_are_refused(make: Callable[..., A
         part.strategy = "final"
     with pytest.raises(ValueError, match=rf"k=2 and strategy='final' and goal_sources=.* {both}"):
         HindsightOptions(k=2, strategy="final", goal_sources={"future": 2, "actual": 2})
+
+
+@both
+def test_without_sources_k_is_what_it_was_by_default(make: Callable[..., Any]) -> None:
+    part = make(REWARD, goal_sources={"final": 1, "actual": 1})
+    part.goal_sources = None
+    assert part.options == HindsightOptions()
+    part.goal_sources = {"actual": 2}
+    assert part.options.changed({"goal_sources": None, "k": 7}).sources == {"future": 7}
+    part = make(REWARD, k=7)
+    part.goal_sources = None
+    assert part.k == 7
+
+
+def test_a_k_that_was_given_is_refused_beside_sources_even_if_it_is_the_default() -> None:
+    sources = {"future": 2, "actual": 1}
+    with pytest.raises(ValueError, match=r"^k=4 and goal_sources=\{future: 2, actual: 1\} say the same"):
+        HindsightOptions(k=4, goal_sources=sources)
+    with pytest.raises(ValueError, match=r"^strategy='final' and goal_sources="):
+        HindsightOptions(strategy="final", goal_sources=sources)
+    assert HindsightOptions(k=3, goal_sources=sources).k == 3  # as `replace` gives it
+    for options in (HindsightOptions(), pickle.loads(pickle.dumps(HindsightOptions()))):
+        assert replace(options, goal_sources=sources).k == 3
+        assert repr(options).startswith("HindsightOptions(k=4, ")
 
 
 @pytest.mark.parametrize(

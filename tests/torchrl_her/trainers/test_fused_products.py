@@ -62,7 +62,7 @@ def make(kind: Callable[..., Any], loss: LossModule, **options: Any) -> Any:
     return kind(loss, optimizer, SoftUpdate(loss, tau=0.1), max_grad_norm=1e9, **options)
 
 
-@pytest.mark.parametrize("algorithm", ["ddpg", "td3", "sac", "dqn"])
+@pytest.mark.parametrize("algorithm", ["ddpg", "td3", "sac", "redq", "tqc", "dqn"])
 @pytest.mark.parametrize("norm", ["none", "layer"])
 def test_factors_between_hidden_layers_are_rounded(
     algorithm: str, norm: str, monkeypatch: pytest.MonkeyPatch

@@ -15,6 +15,7 @@ from torchrl_her.replay_buffers.episodes import Episodes
 from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
 
 Goals = tuple[Tensor | None, ...]
+_GOLDEN = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class RecentGoals:
         >>> keys = HindsightOptions().transition_keys()
         >>> recent = RecentGoals.none(1).after(rows, episodes, None, keys, sizes={"actual": 9, "achieved": 2})
         >>> [recent.goals[name][0].flatten().tolist() for name in ("actual", "achieved")]
-        [[9.0, 8.0], [2.0, 3.0]]
+        [[9.0, 8.0], [1.0, 3.0]]
     """
 
     goals: Mapping[str, Goals]
@@ -62,7 +63,8 @@ class RecentGoals:
             keys: where goals are.
 
         Keyword Args:
-            sizes: how many goals a run keeps, of each kind that is to be remembered.
+            sizes: how many goals a run keeps, of each kind that is to be remembered. If the episodes have
+                more, those that are kept are spread over all of them.
         """
         if len(episodes.lengths) == 0 or not sizes:
             return self
@@ -108,9 +110,28 @@ class RecentGoals:
 
 
 def _last(before: Tensor | None, new: Tensor, size: int) -> Tensor | None:
-    """The last goals, at most so many, of some [m, g] and new ones."""
+    """The last goals, at most so many, of some [m, g] and new ones; of too many new ones, some of all."""
     if len(new) == 0:
         return before
-    if before is None or len(new) >= size:
-        return new[-size:].clone()  # not a view of the whole batch
+    if len(new) > size:
+        # They are environment after environment, so the last of them would be those of few environments.
+        return new[_spread(len(new), size, new.device)]
+    if before is None:
+        return new.clone()  # not a view of the whole batch
     return torch.cat((before[max(0, len(before) + len(new) - size) :].to(new), new))
+
+
+def _spread(count: int, size: int, device: torch.device) -> Tensor:
+    """So many places below ``count``, in order of size, one in each of as many equal parts.
+
+    Where in its part a place is changes from part to part. Always at its begin, with one part for each
+    episode, say, all places would be those of first transitions.
+
+    Example:
+        >>> _spread(12, 4, torch.device("cpu")).tolist()
+        [0, 4, 6, 11]
+    """
+    part = torch.arange(size, device=device)
+    begin, end = part * count // size, (part + 1) * count // size
+    share = (part.double() * _GOLDEN).frac()  # of neighbors as different as can be, and even over many parts
+    return begin + ((end - begin) * share).long()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from torchrl_her import HindsightOptions
@@ -35,8 +36,26 @@ def test_only_what_is_asked_for_is_remembered_and_of_it_the_newest() -> None:
     assert remembered(recent, "actual") == [None, None]
     recent = after(recent, achieved=4)
     assert remembered(recent, "achieved") == [[1.0, 2.0, 1.0, 2.0], [1003.0, 1001.0, 1002.0, 1003.0]]
-    assert remembered(after(recent, achieved=2), "achieved") == [[1.0, 2.0], [1002.0, 1003.0]]
-    assert remembered(after(RecentGoals.none(1), None, achieved=3), "achieved") == [[1001.0, 1002.0, 1003.0]]
+
+
+def test_of_more_goals_than_are_kept_those_of_all_environments_are_remembered() -> None:
+    recent = after(after(RecentGoals.none(2), achieved=9), achieved=2)
+    assert remembered(recent, "achieved") == [[1.0, 2.0], [1001.0, 1003.0]]  # of the newest batch only
+    assert remembered(after(RecentGoals.none(1), None, achieved=3), "achieved") == [[1.0, 1001.0, 1002.0]]
+    rows = make_batch([[50]] * 64).reshape(-1)
+    episodes = Episodes(torch.arange(3_200).view(64, 50), torch.full((64,), 50))
+    for size, least in ((2_000, 28), (64, 1), (128, 2)):
+        recent = RecentGoals.none(1).after(rows, episodes, None, KEYS, sizes={"achieved": size})
+        (own,) = recent.goals["achieved"]
+        assert own is not None
+        tags = own[:, 0].long()
+        assert len(tags.unique()) == size
+        counts = (tags // 1000).bincount(minlength=64)
+        assert counts.min() >= least
+        assert counts.max() <= size / 64 + 3
+        steps = (tags % 1000).float()
+        assert steps.mean().item() == pytest.approx(25.5, abs=1.0)  # at all times of an episode
+        assert len(steps.unique()) > 30
 
 
 def test_a_run_without_new_episodes_keeps_what_it_has() -> None:
