@@ -182,7 +182,7 @@ class RunningNorm(nn.Module):
     def update(
         self, rows: TensorDictBase, runs: Sequence[int] | None = None, counts: Sequence[int] | None = None
     ) -> None:
-        """Counts transitions, by what is in their root: all entries, or none if one of them cannot be counted.
+        """Counts transitions, by what is in their root; nothing of them if an entry cannot be counted.
 
         Args:
             rows: of any shape; with ``runs`` they are run after run, otherwise R equal blocks.

@@ -39,8 +39,8 @@ class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if "target_critics" in kwargs:
             raise TypeError(
-                "TQC's targets have the quantiles of all critics, of which none are drawn at random: leave out "
-                f"target_critics={kwargs['target_critics']!r}"
+                "TQC's targets have the quantiles of all critics, of which none are drawn at random: "
+                f"leave out target_critics={kwargs['target_critics']!r}"
             )
         super().__init__(*args, **kwargs)
 
@@ -119,8 +119,8 @@ def make_tqc_loss(
     quantiles = getattr(first.module, "outputs", None)
     if not isinstance(quantiles, int):
         raise ValueError(
-            "critic must come from make_critic(..., outputs=M) with M quantiles, or its module must have their "
-            f"number as the attribute `outputs`, got {type(first.module).__name__} without it"
+            "critic must come from make_critic(..., outputs=M) with M quantiles, or its module must have "
+            f"their number as the attribute `outputs`, got {type(first.module).__name__} without it"
         )
     if not 0 <= dropped_quantiles < quantiles:
         hint = "" if quantiles > 1 else "; make_critic(..., outputs=M) gives critics with M quantiles"

@@ -41,8 +41,9 @@ class HindsightOptions:
         recent_actual, recent_achieved: how many of the newest goals these two sources remember: one that was
             wanted for each episode, and one that was achieved for each transition. Those of the episodes
             that are just written are among them. If these alone have more, goals are taken from all of
-            them, evenly spread over environments and time. A sample unit looks at as many of the newest episodes, and
-            newest transitions, that are stored. Where the filter refuses nearly all, large numbers cost time.
+            them, evenly spread over environments and time. A sample unit looks at as many of the newest
+            episodes, and newest transitions, that are stored. Where the filter refuses nearly all, large
+            numbers cost time.
         per: what gets a goal of its own. ``"transition"``: each transition, for learning from single
             transitions. ``"episode"``: each copy of a whole episode, for learning from sequences, as
             recurrent policies do; see :class:`~torchrl_her.HERWriter`.
@@ -165,9 +166,9 @@ class HindsightOptions:
                 hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
                 raise TypeError(f"there is no option {name!r}{hint} The options are {', '.join(known)}")
         sources = changes.get("goal_sources", self.goal_sources)
-        if sources is not None:
-            if given := {name: changes[name] for name in ("k", "strategy") if name in changes}:
-                raise ValueError(_twice(sources, **given))
+        given = {name: changes[name] for name in ("k", "strategy") if name in changes}
+        if sources is not None and given:
+            raise ValueError(_twice(sources, **given))
         if sources is not None or self.goal_sources is not None:  # then k is the sum of the sources
             changes = {"k": HindsightOptions.k, "strategy": HindsightOptions.strategy, **changes}
         return replace(self, **changes)
