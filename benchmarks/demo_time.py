@@ -63,13 +63,14 @@ class Parts:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--epochs", type=int, default=30, help="of the run (%(default)s)")
+    parser.add_argument("--epochs", type=int, help="of the run (default: those of the demo)")
     parser.add_argument("--out", type=Path, help="a file for the table")
     options = parser.parse_args(arguments)
+    asked = {} if options.epochs is None else {"epochs": options.epochs}
     parts = Parts()
     with tempfile.TemporaryDirectory() as folder, parts.part("everything else"):
         with parts.part("making environments, networks and buffer"):
-            components = build(make_recipe(load_preset("demo"), epochs=options.epochs))
+            components = build(make_recipe(load_preset("demo"), **asked))
         trainer = components.trainer()
         loop = torchrl_her.trainers.trainer.Trainer
         for owner, name, part in (
