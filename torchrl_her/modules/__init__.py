@@ -18,7 +18,7 @@ from torchrl_her.modules.networks import (
     stack_runs,
     take_run,
 )
-from torchrl_her.modules.normalization import RunningNorm
+from torchrl_her.modules.normalization import Moments, RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch, NormalizedPolicy
 from torchrl_her.modules.q_actor import QNet, make_q_actor
 from torchrl_her.modules.stochastic_actor import StochasticActorNet, make_stochastic_actor
@@ -29,6 +29,7 @@ __all__ = [
     "DecayingEpsilon",
     "DecayingEpsilonGreedy",
     "Exploration",
+    "Moments",
     "NormalizeBatch",
     "NormalizedPolicy",
     "PolicyAverage",

@@ -208,7 +208,7 @@ def test_without_ray_its_name_and_the_remedy_are_given(
         (["nothing"], "there is no study 'nothing'; the studies are bias, "),
         (["ibs", "--seeds", "0"], "Invalid value for '--seeds': 0 is not in the range x>=1"),
         (["ibs", "--frames", "-5"], "Invalid value for '--frames': -5 is not in the range x>=1"),
-        (["recipes: {}"], "a study has no recipes; it has preset, summary, recipe, vary, figure"),
+        (["recipes: {}"], "a study has no recipes; it has preset, summary, recipe, vary, for_task, figure"),
         ([""], "mine.yaml cannot be read: it must hold names and values, got None"),
         (["vary: {algo: ["], "mine.yaml cannot be read: while parsing"),
         (["recipe: {k: 2}"], "vary of mine must hold lists of values by option, got {}"),
