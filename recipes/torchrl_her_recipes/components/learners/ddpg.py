@@ -31,12 +31,18 @@ class DDPGBuilder(LearnerBuilder):
             **self.options.actor_shape,
         )
 
+    @property
+    def outputs(self) -> int:
+        """How many numbers a critic gives."""
+        return 1
+
     def critic(self, runs: int) -> TensorDictModule:
         """Their critic, or one of them."""
         return make_critic(
             self.widths,
             self.action_spec.shape[-1],
             runs=runs,
+            outputs=self.outputs,
             in_keys=self.in_keys,
             **self.options.critic_shape,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -32,17 +33,23 @@ class SACBuilder(DDPGBuilder):
         return make_sac_loss(
             actor,
             critics,
-            action_spec=self.action_spec,
-            critics=self.options.critics,
             target_critics=self.options.target_critics,
-            gamma=self.options.gamma,
-            reward_range=self.bounds(rewards),
-            temperature=self.options.temperature,
-            action_penalty=self.options.action_penalty,
-            runs=self.recipe.run.num_runs,
-            generators=generators,
-            reduction="none",
+            **self.soft(rewards, generators),
         )
+
+    def soft(self, rewards: tuple[float, float], generators: Sequence[torch.Generator]) -> dict[str, Any]:
+        """The options that losses with a stochastic policy share."""
+        return {
+            "action_spec": self.action_spec,
+            "critics": self.options.critics,
+            "gamma": self.options.gamma,
+            "reward_range": self.bounds(rewards),
+            "temperature": self.options.temperature,
+            "action_penalty": self.options.action_penalty,
+            "runs": self.recipe.run.num_runs,
+            "generators": generators,
+            "reduction": "none",
+        }
 
     def bounds(self, rewards: tuple[float, float]) -> tuple[float, float] | None:
         """The rewards whose returns targets are clamped to; None if they are not clamped.
