@@ -1,11 +1,13 @@
-"""Wall-clock and frames to a success rate, beside Stable-Baselines3's DDPG with HER: one curve a seed.
+"""Wall-clock and frames to a success rate, beside Stable-Baselines3 and SBX with HER: one curve a seed.
 
     python benchmarks/time_to_learn.py --out time_to_learn.md
-    python benchmarks/time_to_learn.py --preset fetch_push --aim 2 --repeats 1 --noise 0.2 --curves fetch_push
+    python benchmarks/time_to_learn.py --preset fetch_push --only SBX-SAC --aim 2 --repeats 5 \\
+        --epochs 12 --epoch-frames 10000 --curves push_sac
 
-Both train in as many worlds of the same task with the same networks, batches, discount and number of
-gradient steps; both are asked every epoch for the success of greedy episodes in the same environment, which
-is not timed. Runs are taken in turns, and end where the aim is reached (never, if it is above 1).
+All train in as many worlds of the same task with the same networks, batches, discount and number of
+gradient steps; all are asked every epoch for the success of greedy episodes in the same environment, which
+is not timed. Runs are taken in turns, and end where the aim is reached (never, if it is above 1). With
+``--curves`` a run is written when it ends, and is not made again.
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ import torch
 from machine import describe, publish, table
 from matplotlib.figure import Figure
 from peers.sb3 import make_sb3
+from peers.sbx_sac import make_sac
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tensordict import TensorDictBase
 
 from torchrl_her import evaluate, success
@@ -46,15 +50,25 @@ class Point(NamedTuple):
 def ours(recipe: Recipe, _noise: float) -> Iterator[Policy]:
     """Trains, and hands out the greedy policy after each epoch. Explores as the recipe says."""
     components = build(recipe)
+    if components.curriculum is not None:
+        raise ValueError(f"algo={recipe.hindsight.algo} climbs in torchrl-her train only, not here")
     trainer = components.trainer()
     while True:
         trainer.epoch()
         yield components.policy
 
 
-def peer(recipe: Recipe, noise: float) -> Iterator[Policy]:
-    """The same of Stable-Baselines3."""
-    model = make_sb3(recipe, noise=noise)
+def ddpg(recipe: Recipe, noise: float) -> Iterator[Policy]:
+    """The same of Stable-Baselines3's DDPG."""
+    return _learn(recipe, make_sb3(recipe, noise=noise))
+
+
+def sac(recipe: Recipe, _noise: float) -> Iterator[Policy]:
+    """The same of SBX's SAC, which explores by the entropy of its policy."""
+    return _learn(recipe, make_sac(recipe))
+
+
+def _learn(recipe: Recipe, model: OffPolicyAlgorithm) -> Iterator[Policy]:
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         keys = ("observation", "achieved_goal", "desired_goal")
@@ -67,8 +81,9 @@ def peer(recipe: Recipe, noise: float) -> Iterator[Policy]:
 
 
 Curves = Mapping[str, Sequence[Sequence[Point]]]  # of each seed, by contender
+Runs = dict[tuple[str, int], list[Point]]  # by contender and seed
 
-CONTENDERS = {"this": ours, "Stable-Baselines3": peer}
+CONTENDERS = {"this": ours, "Stable-Baselines3": ddpg, "SBX-SAC": sac}
 
 
 def race(name: str, recipe: Recipe, *, noise: float, aim: float) -> list[Point]:
@@ -109,13 +124,23 @@ def line(name: str, curves: Sequence[Sequence[Point]], aim: float) -> list[str]:
     ]
 
 
-def write_curves(curves: Curves, stem: Path) -> None:
-    with open(stem.with_suffix(".csv"), "w", newline="") as file:
+def write_runs(runs: Runs, path: Path) -> None:
+    with open(path, "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("contender", "seed", *Point._fields))
-        for name, seeds in curves.items():
-            for seed, curve in enumerate(seeds):
-                writer.writerows((name, seed, *(f"{value:.6g}" for value in point)) for point in curve)
+        for run, curve in runs.items():
+            writer.writerows((*run, *(f"{value:.6g}" for value in point)) for point in curve)
+
+
+def read_runs(path: Path) -> Runs:
+    """What was written before, if anything."""
+    runs: Runs = {}
+    if path.is_file():
+        with open(path, newline="") as file:
+            for row in csv.DictReader(file):
+                point = Point(int(float(row["frames"])), float(row["seconds"]), float(row["success"]))
+                runs.setdefault((row["contender"], int(row["seed"])), []).append(point)
+    return runs
 
 
 def draw_curves(curves: Curves, path: Path, *, title: str) -> None:
@@ -123,7 +148,7 @@ def draw_curves(curves: Curves, path: Path, *, title: str) -> None:
     figure = Figure(figsize=(9.4, 3.8), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, field in zip(panels, ("frames", "seconds"), strict=True):
-        for name, color in zip(curves, ("#2b6cb0", "#dd6b20"), strict=False):
+        for name, color in zip(curves, ("#2b6cb0", "#dd6b20", "#2f855a"), strict=False):
             for seed, curve in enumerate(curves[name]):
                 label = name if seed == 0 else None
                 places = [getattr(point, field) for point in curve]
@@ -142,22 +167,30 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--preset", help="of torchrl-her (default: HER on hand_v0)")
-    parser.add_argument("--only", choices=CONTENDERS, help="one of the two")
+    parser.add_argument("--only", nargs="+", choices=CONTENDERS, default=["this", "Stable-Baselines3"])
     parser.add_argument("--aim", type=float, default=0.8, help="success at which a run ends")
     parser.add_argument("--noise", type=float, default=0.1, help="of Stable-Baselines3's actions")
     parser.add_argument("--repeats", type=int, default=3, help="seeds")
+    parser.add_argument("--epochs", type=int, help="in place of the preset's")
+    parser.add_argument("--epoch-frames", type=int, help="likewise")
     parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
     parser.add_argument("--curves", type=Path, help="write all points to this name with .csv, and draw .png")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     values: dict[str, Any] = load_preset(options.preset) if options.preset else HAND
-    names = [options.only] if options.only else list(CONTENDERS)
-    curves: dict[str, list[list[Point]]] = {name: [] for name in names}
+    asked = {"epochs": options.epochs, "epoch_frames": options.epoch_frames}
+    asked = {name: value for name, value in asked.items() if value is not None}
+    kept = options.curves and options.curves.with_suffix(".csv")
+    runs = read_runs(kept) if kept else {}
     for seed in range(options.repeats):
-        recipe = make_recipe(values, seed=seed)
-        for name in names:
-            curves[name].append(race(name, recipe, noise=options.noise, aim=options.aim))
+        recipe = make_recipe(values, seed=seed, **asked)
+        for name in options.only:
+            if (name, seed) not in runs:
+                runs[name, seed] = race(name, recipe, noise=options.noise, aim=options.aim)
+                if kept:
+                    write_runs(runs, kept)
+    curves = {name: [runs[name, seed] for seed in range(options.repeats)] for name in options.only}
     header = (
         recipe.task.name,
         f"reached {options.aim:.0%}",
@@ -166,11 +199,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "last",
         "best",
     )
-    rows = [line(name, curves[name], options.aim) for name in names]
+    rows = [line(name, curves[name], options.aim) for name in options.only]
     text = "\n\n".join((describe("torch", "torchrl", "stable-baselines3"), table(header, rows)))
     publish(text, options.out)
     if options.curves is not None:
-        write_curves(curves, options.curves)
         draw_curves(curves, options.curves.with_suffix(".png"), title=recipe.task.name)
 
 

@@ -26,7 +26,7 @@ from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_recipes import Components, Recipe, build, make_recipe
 from torchrl_her_recipes.config.values import read_yaml
 
-PRESET = Path(__file__).parents[2] / "recipes/torchrl_her_recipes/conf/preset/fetch_push.yaml"
+PRESET = Path(__file__).parents[1] / "presets" / "fetch_push.yaml"
 BATCHES = 50  # of a timed piece: an epoch of the preset, whose first batch the learner waits for
 KINDS: dict[str, dict[str, Any]] = {
     "one process": {},
@@ -133,9 +133,9 @@ def report(cases: dict[str, tuple[Shares, dict[str, list[float]]]]) -> str:
     more = ["at most, times", "sync, times", "async, times"]
     repeats = len(next(iter(cases.values()))[1]["one process"])
     return (
-        f"FetchPush-v4 with the options of `preset=fetch_push`; medians of {repeats} pieces of {BATCHES} "
-        f"batches, taken in turns. {describe('torch', 'torchrl', 'gymnasium-robotics', 'mujoco')}\n\n"
-        + table([*header, *more], rows)
+        f"FetchPush-v4 with the options of `benchmarks/presets/fetch_push.yaml`; medians of {repeats} "
+        f"pieces of {BATCHES} batches, taken in turns. "
+        f"{describe('torch', 'torchrl', 'gymnasium-robotics', 'mujoco')}\n\n" + table([*header, *more], rows)
     )
 
 

@@ -12,7 +12,7 @@ import yaml
 
 import torchrl_her_recipes
 from torchrl_her_recipes import cli
-from torchrl_her_recipes.config.shipped import CONF
+from torchrl_her_recipes.config.shipped import CONF, load_preset
 
 from .small import overrides
 
@@ -87,7 +87,7 @@ def test_every_preset_runs(preset: Path) -> None:
     ]
     assert cli.main(["train", f"preset={preset.stem}", *shrunk, "num_runs=1"]) == 0
     config = yaml.safe_load(Path("out/config.yaml").read_text())
-    for group, own in yaml.safe_load(preset.read_text()).items():
+    for group, own in load_preset(preset.stem).items():
         for name, value in own.items():
             if f"{name}=" not in " ".join([*shrunk, "num_runs="]):
                 assert config[group][name] == value

@@ -10,6 +10,7 @@ import re
 from typing import Any
 
 _THRESHOLD = 0.05  # m, as in the environments themselves
+_AROUND = 0.025  # m: open fingers go around a block; closed ones stay 0.038 from its middle
 # What is shown, in order, and how many numbers it has.
 _GRIPPER = {"grip": 3, "fingers": 2, "grip_speed": 3, "fingers_speed": 2}
 _OBJECT = {
@@ -53,7 +54,7 @@ def fetch_layers(id: str) -> list[dict[str, Any]]:
     """The layers of a Fetch task: to reach the object, and then to move it; none for another environment.
 
     What the first layer wants, the place of the object, is what the second one observes at the same inputs.
-    To reach a point is a single layer.
+    To reach a point is a single layer. A block that is to be picked up has to be between the fingers.
 
     Args:
         id: gymnasium's.
@@ -77,4 +78,5 @@ def fetch_layers(id: str) -> list[dict[str, Any]]:
         "desired_goal": "place",
         "threshold": _THRESHOLD,
     }
-    return [reach | {"desired_goal": "object", "instructive": False}, move]
+    near = _AROUND if "PickAndPlace" in id else _THRESHOLD
+    return [reach | {"desired_goal": "object", "threshold": near, "instructive": False}, move]

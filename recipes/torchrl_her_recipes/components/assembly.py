@@ -19,7 +19,7 @@ from torchrl_her_recipes.components.curricula import (
     make_played_env,
     played_rewards,
 )
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.components.goal_space import goal_space
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.recipe import Recipe
@@ -58,7 +58,7 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     return Components(
         recipe=recipe,
         env=env,
-        eval_env=make_played_env(recipe, recipe.evaluation.episodes, eval_seeds(recipe, 0)),
+        eval_env=make_played_env(recipe, evaluation_envs(recipe), eval_seeds(recipe, 0)),
         collector=collector,
         buffer=make_buffer(
             recipe, task, generators, rewards=rewards, space=space, state=state, norm=agent.norm

@@ -11,7 +11,7 @@ from torchrl.envs import CatTensors, Compose, EnvBase, TransformedEnv
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -101,7 +101,7 @@ def make_curriculum_state(recipe: Recipe, curriculum: Curriculum, seeds: Sequenc
         window=options.window,
         success_threshold=options.success_threshold,
     )
-    layer_env = make_task_envs(recipe, recipe.evaluation.episodes, seeds)
+    layer_env = make_task_envs(recipe, evaluation_envs(recipe), seeds)
     return CurriculumState(progress, in_layers(layer_env, progress))
 
 

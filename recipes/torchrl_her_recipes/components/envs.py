@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torchrl.envs import EnvBase
 
-from torchrl_her_envs.registry import get_task_spec, make_env
+from torchrl_her_envs.registry import GYM, get_task_spec, make_env
 from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
+
+_AT_ONCE = 20  # environments of gymnasium's in an evaluation: each is a simulation of 10 MB and more
+
+
+def evaluation_envs(recipe: Recipe) -> int:
+    """How many environments each run is evaluated in, some of them several times.
+
+    Example:
+        >>> from torchrl_her_recipes import make_recipe
+        >>> evaluation_envs(make_recipe(episodes=45))
+        45
+        >>> evaluation_envs(make_recipe(task="gym:FetchPush-v4", episodes=45))
+        15
+    """
+    episodes = recipe.evaluation.episodes
+    rounds = math.ceil(episodes / _AT_ONCE) if recipe.task.name.startswith(GYM) else 1
+    return math.ceil(episodes / rounds)
 
 
 def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictures: bool = False) -> EnvBase:

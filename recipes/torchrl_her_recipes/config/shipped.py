@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_her_recipes.config.options import what_there_is
+from torchrl_her_recipes.config.shortcuts import merge
 from torchrl_her_recipes.config.values import read_mapping
 
 CONF = Path(__file__).parent.parent / "conf"
@@ -20,13 +21,24 @@ def preset_names() -> list[str]:
 def load_preset(name: str) -> dict[str, Any]:
     """The values of a preset, by the names of options.
 
+    A preset may begin with another one, ``preset: demo``, whose values hold where it has none of its own.
+
     Args:
         name: of ``preset_names()``, or the path of a YAML file.
 
     Raises:
-        ValueError: there is no such preset.
+        ValueError: there is no such preset, or it begins with itself.
     """
-    return read_mapping(_path(name))
+    return _load(name, ())
+
+
+def _load(name: str, above: tuple[Path, ...]) -> dict[str, Any]:
+    path = _path(name)
+    if path in above:
+        raise ValueError(f"the preset {name!r} begins with itself")
+    values = read_mapping(path)
+    first = values.pop("preset", None)
+    return values if first is None else merge(_load(first, (*above, path)), values)
 
 
 def preset_summary(name: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -18,10 +20,15 @@ from torchrl_her_recipes.components.curricula import CurriculumState
 
 
 def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDictBase:
-    """Greedy episodes of each run, with starts and goals of their own in each epoch."""
-    task = goal_env(env)
-    task.set_seeds(eval_seeds(components.recipe, epoch))
-    return evaluate(env, components.greedy, max_steps=task.max_steps)
+    """Greedy episodes of each run, run after run, with starts and goals of their own in each epoch."""
+    task, recipe = goal_env(env), components.recipe
+    runs, episodes = recipe.run.num_runs, recipe.evaluation.episodes
+    task.set_seeds(eval_seeds(recipe, epoch))
+    rounds = math.ceil(episodes * runs / env.batch_size[0])
+    played = [evaluate(env, components.greedy, max_steps=task.max_steps) for _ in range(rounds)]
+    if rounds == 1:
+        return played[0]
+    return torch.cat([own.unflatten(0, (runs, -1)) for own in played], 1)[:, :episodes].flatten(0, 1)
 
 
 def layer_success(

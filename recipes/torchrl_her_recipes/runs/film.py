@@ -15,6 +15,7 @@ from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.components.assembly import eval_seeds
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import make_played_env
+from torchrl_her_recipes.components.envs import evaluation_envs
 
 FPS = 12  # half the true speed of the throwing tasks, as a throw takes half a second
 _FILMED = 6  # environments
@@ -35,10 +36,10 @@ def film_policy(components: Components, out: Path, *, run: int, epoch: int) -> N
         epoch: the evaluation whose episodes are shown.
     """
     recipe = components.recipe
-    episodes = recipe.evaluation.episodes
-    shown = min(_FILMED, episodes)
+    worlds = evaluation_envs(recipe)
+    shown = min(_FILMED, worlds)
     if goal_env(components.eval_env).can_render:
-        _film(components, components.eval_env, out, run * episodes, shown)
+        _film(components, components.eval_env, out, run * worlds, shown)
     elif get_task_spec(recipe.task.name).for_pictures:
         try:
             env = make_played_env(recipe, shown, eval_seeds(recipe, epoch), pictures=True)

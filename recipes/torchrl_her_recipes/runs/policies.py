@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_her.modules.networks import make_actor, take_run
@@ -108,9 +110,8 @@ def export_policy(
         What was written.
 
     Raises:
-        ValueError: this is no folder of a run, it has no such run, its policy needs more than the
-            observation and the desired goal as they are, the task is one that it cannot play, or the run's
-            names a module that must not be imported.
+        ValueError: this is no folder of a run, it has no such run, its policy is not one of ``make_actor``,
+            the task is one that it cannot play, or the run's names a module that must not be imported.
         OSError: the run has not saved a policy yet.
     """
     home = RunFolder(folder)
@@ -125,13 +126,13 @@ def export_policy(
             permit_task(named)
     played = recipe.replace(task=task or recipe.task.name)
     env = make_task_envs(recipe, 1, [0])
-    _check_seen(recipe, env)
     widths, actions = _widths(env)
+    actor = take_run(load_checkpoint(home.policy)["actor"], chosen, recipe.run.num_runs)
     state = {
         "task": played.task.name,
         "widths": widths,
         "actions": actions,
-        "actor": take_run(load_checkpoint(home.policy)["actor"], chosen, recipe.run.num_runs),
+        "actor": _as_shown(actor, _seen(recipe, env), sum(widths)),
         "recipe": recipe.replace(num_runs=1, seed=recipe.run.seed + chosen).to_dict(),
         "success": math.nan,
         "frames": int(rows[-1]["frames"]),
@@ -180,17 +181,36 @@ def _widths(env: EnvBase) -> tuple[list[int], int]:
     return [goal_env(env).observation_spec[key].shape[-1] for key in _KEYS], env.action_spec.shape[-1]
 
 
-def _check_seen(recipe: Recipe, env: EnvBase) -> None:
-    """Raises a ValueError if a curriculum's last layer does not see observation and goal as they are."""
+def _seen(recipe: Recipe, env: EnvBase) -> tuple[int, ...]:
+    """Where each input of a run's policy is in the observation and the desired goal behind it."""
     curriculum = make_curriculum(recipe, env)
     if curriculum is None:
-        return
-    last, (widths, _) = curriculum.layers[-1], _widths(env)
-    if (*last.observation, *last.desired_goal) != tuple(range(sum(widths))):
-        raise ValueError(
-            f"the last layer of {recipe.task.name}'s curriculum must see the observation "
-            "and the desired goal as they are, for its policy to be exported"
-        )
+        return tuple(range(sum(_widths(env)[0])))
+    last = curriculum.layers[-1]
+    return (*last.observation, *last.desired_goal)
+
+
+def _as_shown(actor: dict[str, Tensor], places: tuple[int, ...], width: int) -> dict[str, Tensor]:
+    """The weights of an actor with its inputs in other places; it does not see the rest.
+
+    Args:
+        actor: the weights, and its normalization if there is one.
+        places: of each input.
+        width: how many inputs there are then.
+    """
+    index, moved = torch.tensor(places), dict(actor)
+    for key, value in actor.items():
+        if key.endswith("layers.0.0.weight"):
+            moved[key] = _wider(value, -2, width).index_add(-2, index, value)
+        elif key in ("norm.n", "norm.mean", "norm.var"):
+            moved[key] = _wider(value, -1, width, key == "norm.var").index_copy(-1, index, value)
+    return moved
+
+
+def _wider(value: Tensor, dim: int, width: int, fill: float = 0.0) -> Tensor:
+    shape = list(value.shape)
+    shape[dim] = width
+    return value.new_full(shape, fill)
 
 
 def _check_state(recipe: Recipe, state: dict[str, Any]) -> None:

@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from heapq import heapreplace
 
+from torchrl_her_envs import TASKS
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.studies.jobs import Job, Progress, kept_progress
 
-# Seconds on one of two busy cores of an Intel Xeon. What a study's own runs take soon outweighs them.
+# Seconds on one of two busy cores. What a study's own runs take soon outweighs them.
 _FRAME = 25e-6  # an environment step of a run: collecting, writing
 _CALL = 45e-6  # the same, once for all runs side by side
+_WORLD = 0.8e-3  # a step of an environment that is not one of this package's, where each steps alone
+_EPISODE = 50  # steps of its evaluation's episodes: those of the Fetch tasks
 _UPDATE = 0.3e-3  # a gradient step of a run
-_ROW = 3.5e-6  # each row of it
+_ROW = 2.6e-6  # each row of it
+_WEIGHT = 0.1e-9  # each row and weight between hidden layers, with an actor and a critic
+_NARROW = 0.6  # what a weight takes if products=bfloat16
 _AROUND = 8.0  # a worker's start, and the pictures at the end
 _PRIOR = 30.0  # how many measured seconds it takes to count as much as all of the above
 
@@ -27,8 +32,19 @@ def expected_seconds(recipe: Recipe, epochs: int) -> float:
         13
     """
     frames = epochs * recipe.collection.epoch_frames
-    step = _UPDATE + _ROW * recipe.replay.batch_size
-    return frames * (_CALL + recipe.run.num_runs * (_FRAME + step / recipe.collection.frames_per_update))
+    played = frames * recipe.run.num_runs
+    own = recipe.task.name in TASKS
+    worlds = 0 if own else played + epochs * recipe.run.num_runs * recipe.evaluation.episodes * _EPISODE
+    steps = played / recipe.collection.frames_per_update
+    return frames * _CALL + played * _FRAME + worlds * _WORLD + steps * _step(recipe)
+
+
+def _step(recipe: Recipe) -> float:
+    """Seconds of a gradient step of a run."""
+    learner = recipe.learner
+    weights = (learner.depth - 1) * learner.hidden**2 * (1 + getattr(learner, "critics", 1)) / 2
+    weight = _WEIGHT * (_NARROW if learner.products == "bfloat16" else 1)
+    return _UPDATE + recipe.replay.batch_size * (_ROW + weights * weight)
 
 
 def wall_clock(seconds: Iterable[float], at_once: int) -> float:

@@ -61,6 +61,20 @@ def test_the_object_is_reached_before_it_is_moved(id: str) -> None:
     assert fetch_layers(id.replace("-v4", "Dense-v2")) == [reach, move]
 
 
+@pytest.mark.parametrize("env", ["FetchPickAndPlace-v4"], indirect=True)
+@pytest.mark.parametrize("fingers", [-1.0, 1.0], ids=["closed", "open"])
+def test_what_is_picked_up_is_reached_with_open_fingers_only(env: GymGoalEnv, fingers: float) -> None:
+    threshold, nearest = fetch_layers("FetchPickAndPlace-v4")[0]["threshold"], []
+    shown = env.reset()
+    for step in range(25):  # above the block, then down
+        way = shown["observation"][:, 6:9] + torch.tensor([0.0, 0.0, 0.1 if step < 10 else 0.0])
+        action = torch.cat(((10 * way).clamp(-1, 1), torch.full((2, 1), fingers)), -1)
+        shown = env.step(shown.set("action", action))["next"]
+        nearest.append(shown["observation"][:, 6:9].norm(dim=-1))
+    reached = torch.stack(nearest).amin(0) < threshold
+    assert reached.tolist() == [fingers > 0] * 2
+
+
 def test_to_reach_is_a_single_layer() -> None:
     (layer,) = fetch_layers("FetchReach-v4")
     assert (layer["achieved_goal"], layer["desired_goal"]) == ("grip", "place")

@@ -26,3 +26,23 @@ def test_a_file_of_ones_own(tmp_path: Path) -> None:
     assert preset_summary(str(file)) == ""
     with pytest.raises(ValueError, match="there is no preset 'demoo'; did you mean demo. The presets are"):
         load_preset("demoo")
+
+
+def test_a_preset_begins_with_another_one(tmp_path: Path) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text("preset: fetch\ntau: 0.01\nrun: {epochs: 3}\n")
+    values, fetch = load_preset(str(file)), load_preset("fetch")
+    assert values["learner"] == fetch["learner"] | {"tau": 0.01}
+    assert values["run"] == fetch["run"] | {"epochs": 3}
+    assert values["hindsight"] == fetch["hindsight"]
+
+
+@pytest.mark.parametrize("other", ["a.yaml", "b.yaml"])
+def test_a_preset_cannot_begin_with_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a.yaml").write_text(f"preset: {other}\n")
+    Path("b.yaml").write_text("preset: a.yaml\n")
+    with pytest.raises(ValueError, match=r"the preset 'a\.yaml' begins with itself"):
+        load_preset("a.yaml")

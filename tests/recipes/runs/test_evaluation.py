@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from torchrl_her_envs import make_env
 from torchrl_her_recipes import Components, build
 from torchrl_her_recipes.runs.curriculum import play_greedily
 from torchrl_her_recipes.runs.evaluation import measure
@@ -67,3 +68,22 @@ def test_q_is_not_logged_if_nobody_knows_it() -> None:
     components.loss = torch.nn.Module()  # type: ignore[assignment]
     components.loss.tensor_keys = None
     assert not {"q", "q_bias"} & measured(components).keys()
+
+
+@pytest.mark.parametrize("algo", ["her", "cher"])
+def test_few_worlds_play_as_many_episodes_as_asked(algo: str) -> None:
+    options: dict[str, Any] = {"task": "gym:torchrl_her/HandThrow-v1", "algo": algo, "episodes": 25}
+    if algo == "cher":
+        options["curriculum"] = make_env("hand_v1", num_envs=1).layers()
+    components, alone = build(small(num_runs=2, **options)), build(small(seed=1, **options))
+    for each in (components, alone):
+        each.actor.load_state_dict({name: value * 0 for name, value in each.actor.state_dict().items()})
+    assert components.eval_env.batch_size == (2 * 13,)
+    played = play_greedily(components, components.eval_env, 3)
+    assert played.batch_size[0] == 2 * 25
+    goals = played["desired_goal"][:, 0]
+    assert len(goals.unique(dim=0)) == 2 * 25
+    other = play_greedily(alone, alone.eval_env, 3)
+    assert torch.equal(other["desired_goal"], played["desired_goal"][25:])  # as if it were alone
+    assert torch.equal(other["observation"], played["observation"][25:])
+    assert measure(components, played)["success"].shape == (2,)

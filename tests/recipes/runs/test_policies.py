@@ -18,6 +18,13 @@ from torchrl_her_recipes.config.shipped import policy_names
 from ..small import small
 
 
+def backwards() -> list[dict[str, Any]]:
+    """A layer of hand_v1 that sees its observation from the end, and not all of it."""
+    (*_, last) = make_env("hand_v1", num_envs=1).layers()
+    observation = last["observation"][:0:-1]
+    return [last | {"observation": observation}]
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -25,7 +32,10 @@ from ..small import small
         {"algo": "cher"},
         {"algo": "her", "normalize": True},
         {"algo": "cher", "normalize": True},
+        {"algo": "cher", "curriculum": backwards()},
+        {"algo": "cher", "curriculum": backwards(), "normalize": True},
     ],
+    ids=lambda options: "_".join(options),
 )
 def test_an_exported_policy_acts_as_its_run_does(options: dict[str, Any], tmp_path: Path) -> None:
     recipe = small(task="hand_v1", num_runs=2, epochs=1, **options)
