@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
@@ -16,6 +17,7 @@ from torchrl_her_recipes.config.shortcuts import locate, merge, place
 from torchrl_her_recipes.config.values import read_mapping
 
 _STUDIES = CONF / "study"
+_LENGTHS = ("num_runs", "epochs", "epoch_frames")
 _QUICK: dict[str, Any] = {
     "num_runs": 2,
     "epochs": 2,
@@ -35,30 +37,41 @@ class Study:
         recipe: options that all runs have in common; ``num_runs`` is the number of seeds.
         vary: the values that are compared, by the name of their option. All combinations are run. The
             figure has a panel for each task, and in it a curve for each combination of the others.
+        cases: other options that are compared, by a name of one's own: each case has some of them, and none
+            is crossed with another case, only with what varies. An ablation has a case for each part that
+            it takes away. They may not set how many runs there are, or how long they are.
         for_task: options of the runs on some of the tasks alone, by the task's name.
         figure: the metrics that are drawn over environment steps, or "times" for the steps until the
             task ``chain`` is solved.
 
     Raises:
         ValueError: there is nothing to compare, the values of an option are no list, there are options for a
-            task that is not compared, or a metric is unknown.
+            task that is not compared, a case or a task sets what varies, or a metric is unknown.
     """
 
     name: str
     summary: str = ""
     recipe: dict[str, Any] = field(default_factory=dict)
     vary: dict[str, Sequence[Any]] = field(default_factory=dict)
+    cases: dict[str, dict[str, Any]] = field(default_factory=dict)
     for_task: dict[str, dict[str, Any]] = field(default_factory=dict)
     figure: str | Sequence[str] = ("success",)
 
     def __post_init__(self) -> None:
         if not isinstance(self.recipe, Mapping):
             raise ValueError(f"recipe of {self.name} must hold names and values, got {self.recipe!r}")
-        wrong = not isinstance(self.vary, Mapping) or not self.vary
+        wrong = not isinstance(self.vary, Mapping) or not (self.vary or self.cases)
         if wrong or not all(isinstance(values, list | tuple) and values for values in self.vary.values()):
             raise ValueError(f"vary of {self.name} must hold lists of values by option, got {self.vary!r}")
         if strange := [name for name in (*self.recipe, *self.vary) if not isinstance(name, str)]:
             raise ValueError(f"options of {self.name} must be names, got {strange[0]!r}")
+        if not isinstance(self.cases, Mapping) or not all(
+            isinstance(name, str) and re.fullmatch(r"[\w.=+-]+", name) and isinstance(own, Mapping)
+            for name, own in self.cases.items()
+        ):
+            raise ValueError(
+                f"cases of {self.name} must hold options by name, such as no_filter; got {self.cases!r}"
+            )
         tasks = [_task_of(task) for task in self.vary.get("task", ())]
         if not isinstance(self.for_task, Mapping) or not all(
             task in tasks and isinstance(own, Mapping) for task, own in self.for_task.items()
@@ -67,16 +80,25 @@ class Study:
                 f"for_task of {self.name} must hold options by one of the tasks that vary "
                 f"({', '.join(map(str, tasks)) or 'none'}), got {self.for_task!r}"
             )
-        varied = {locate(name) for name in self.vary}
         for task, own in self.for_task.items():
-            both = [name for group, names in place(own).items() for name in names if (group, name) in varied]
-            if both:
+            if both := _set_in(own, self.vary):
                 raise ValueError(f"for_task of {self.name} sets {both[0]} for {task}, which varies")
+        for case, own in self.cases.items():
+            if both := _set_in(own, self.vary):
+                raise ValueError(f"cases of {self.name} set {both[0]} in {case}, which varies")
+            if long := _set_in(own, _LENGTHS):
+                raise ValueError(f"cases of {self.name} set {long[0]} in {case}: it must be the same in all")
         drawn = [self.figure] if isinstance(self.figure, str) else list(self.figure)
         if drawn != ["times"] and (not drawn or not set(drawn) <= set(metric_names())):
             known = ", ".join(metric_names())
             raise ValueError(f"figure of {self.name} must be times, or some of {known}; got {self.figure!r}")
         object.__setattr__(self, "figure", "times" if drawn == ["times"] else drawn)
+
+    def combinations(self) -> Iterator[dict[str, Any]]:
+        """What each combination has of its own, in the order of :meth:`cells`; ``case`` names one."""
+        for values in product(*self.vary.values()):
+            own = dict(zip(self.vary, values, strict=True))
+            yield from ({**own, "case": case} for case in self.cases) if self.cases else (own,)
 
     def cells(self) -> Iterator[tuple[str, Recipe]]:
         """The names and recipes of all combinations; the runs of a recipe are its seeds.
@@ -85,14 +107,15 @@ class Study:
             ValueError: a recipe cannot work, or two combinations have the same name.
         """
         labels = set()
-        for values in product(*self.vary.values()):
-            own = dict(zip(self.vary, values, strict=True))
-            words = (_word(name, value, self.vary[name]) for name, value in own.items())
-            label = "_".join(word for word in words if word).replace("/", "_") or self.name
+        for own in self.combinations():
+            case = own.pop("case", "")
+            words = [_word(name, value, self.vary[name]) for name, value in own.items()]
+            label = "_".join(word for word in (*words, case) if word).replace("/", "_") or self.name
             if label in labels:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
             labels.add(label)
-            recipe = compose(merge(self.recipe, self.for_task.get(_task_of(own.get("task")), {})), own)
+            for_task = self.for_task.get(_task_of(own.get("task")), {})
+            recipe = compose(merge(self.recipe, for_task, self.cases.get(case, {})), own)
             if self.figure == "times" and recipe.task.name != "chain":
                 task = recipe.task.name
                 raise ValueError(f"the figure times of {self.name} is for the task chain, not {task}")
@@ -166,6 +189,12 @@ def load_study(
 
     for_task = {task: shortened(own) for task, own in study.for_task.items()}
     return replace(study, recipe=merge(recipe, shortened({})), for_task=for_task)
+
+
+def _set_in(own: Mapping[str, Any], names: Iterable[str]) -> list[str]:
+    """Which of some options are set, by their names within their groups."""
+    places = {locate(name) for name in names}
+    return [name for group, values in place(own).items() for name in values if (group, name) in places]
 
 
 def _task_of(task: Any) -> Any:

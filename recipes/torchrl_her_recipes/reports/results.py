@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -100,11 +99,9 @@ def read_combinations(study: Study, folder: Path) -> list[Combination]:
     """
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; `torchrl-her study {study.name}` makes its runs")
-    # The combinations come in the order of the product of what is varied.
-    varied = (dict(zip(study.vary, values, strict=True)) for values in product(*study.vary.values()))
     cells = [
         _read(label, recipe, options, Batches(folder / label))
-        for options, (label, recipe) in zip(varied, study.cells(), strict=True)
+        for options, (label, recipe) in zip(study.combinations(), study.cells(), strict=True)
     ]
     if all(cell.missing for cell in cells):
         labels = ", ".join(cell.label for cell in cells)

@@ -99,6 +99,7 @@ def write_results(
         **_origin([folder / cell.label for cell in cells]),
         "recipe": dict(study.recipe),
         "vary": {name: list(values) for name, values in study.vary.items()},
+        **({"cases": dict(study.cases)} if study.cases else {}),
         **({"for_task": dict(study.for_task)} if study.for_task else {}),
     }
     return write_files(about, cells, out)

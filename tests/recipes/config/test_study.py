@@ -10,6 +10,8 @@ import pytest
 from torchrl_her_recipes import Study, load_study, study_names
 from torchrl_her_recipes.config.study import curve_label
 
+ROOT = Path(__file__).parents[3]
+
 
 @pytest.mark.parametrize("name", study_names())
 @pytest.mark.parametrize("quick", [False, True])
@@ -57,6 +59,32 @@ def test_tasks_may_vary_with_their_options() -> None:
     assert [recipe.run.epochs for _, recipe in study.cells()] == [2, 2]
 
 
+def test_cases_are_crossed_with_what_varies_and_not_with_each_other(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text(
+        "preset: demo\nvary: {task: [hand_v0, hand_v1]}\nfor_task: {hand_v1: {k: 3}}\n"
+        "cases:\n  all_parts: {}\n  no_filter: {algo: unfiltered_cher}\n  one: {k: 1}\n"
+    )
+    study = load_study(str(path), seeds=2, frames=100)
+    cells = dict(study.cells())
+    assert list(cells) == [f"hand_v{v}_{case}" for v in (0, 1) for case in ("all_parts", "no_filter", "one")]
+    assert [own.hindsight.algo for own in cells.values()] == ["cher_ibs", "unfiltered_cher", "cher_ibs"] * 2
+    assert [own.hindsight.k for own in cells.values()] == [4, 4, 1, 3, 3, 1]
+    assert {(own.run.num_runs, own.run.epochs) for own in cells.values()} == {(2, 1)}
+    assert [curve_label(label, own) for label, own in cells.items()] == ["all_parts", "no_filter", "one"] * 2
+    assert list(study.combinations())[1] == {"task": "hand_v0", "case": "no_filter"}
+
+
+def test_cases_alone_are_enough() -> None:
+    cells = dict(Study(name="own", cases={"few": {"k": 1}, "many": {"k": 8}}).cells())
+    assert {label: own.hindsight.k for label, own in cells.items()} == {"few": 1, "many": 8}
+
+
+@pytest.mark.parametrize("path", (ROOT / "docs" / "studies").glob("*.yaml"), ids=lambda path: path.stem)
+def test_the_studies_of_the_results_are_made_of_recipes_that_work(path: Path) -> None:
+    assert len(dict(load_study(str(path)).cells())) > 1
+
+
 def test_mappings_are_named_by_what_differs() -> None:
     options = [{"bits": 4, "max_steps": 9}, {"bits": 8, "max_steps": 9}]
     study = Study(name="own", recipe={"task": "bit_flip", "algo": "her"}, vary={"task.options": options})
@@ -67,6 +95,14 @@ def test_mappings_are_named_by_what_differs() -> None:
     ("values", "message"),
     [
         ({"vary": {}}, "vary of own must hold lists of values by option"),
+        ({"cases": {"a/b": {}}}, "cases of own must hold options by name, such as no_filter; got"),
+        ({"cases": {"few": 3}}, "cases of own must hold options by name, such as no_filter; got"),
+        ({"cases": {"few": {"kk": 3}}}, "no option 'kk'"),
+        ({"cases": {"few": {"k": 3}}, "vary": {"k": [1, 2]}}, "cases of own set k in few, which varies"),
+        (
+            {"cases": {"long": {"run": {"epochs": 3}}}},
+            "cases of own set epochs in long: it must be the same in all",
+        ),
         ({"vary": {"k": 3}}, "vary of own must hold lists of values by option"),
         ({"vary": {"k": [1]}, "figure": "speed"}, "figure of own must be times, or some of success"),
         ({"vary": {"k": [1, 1]}}, "two combinations that are called k=1"),
