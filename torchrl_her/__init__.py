@@ -6,6 +6,7 @@ The names that most scripts need are here; all others are in the sub-packages ``
 
 from importlib.metadata import version
 
+from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
 from torchrl_her.curriculum.switch import enter_layer
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
@@ -46,6 +47,7 @@ __all__ = [
     "GoalGrid",
     "GoalReward",
     "GoalWeights",
+    "GuidedExploration",
     "HERSampleUnit",
     "HERWriter",
     "HindsightOptions",

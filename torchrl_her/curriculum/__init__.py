@@ -1,5 +1,6 @@
 """Curriculum-HER: layers, their transforms, and how a run moves from one to the next."""
 
+from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress, zero_unused_inputs
 from torchrl_her.curriculum.normalization import count_inputs, restart_inputs
 from torchrl_her.curriculum.switch import enter_layer, set_layer_goals
@@ -9,6 +10,7 @@ __all__ = [
     "Curriculum",
     "CurriculumLayer",
     "CurriculumProgress",
+    "GuidedExploration",
     "StateToObs",
     "ZeroPad",
     "count_inputs",

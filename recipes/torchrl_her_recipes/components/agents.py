@@ -11,11 +11,13 @@ from torch import nn
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
+from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import Curriculum, zero_unused_inputs
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.networks import StackedLinear, stack_runs
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.objectives.targets import make_target_updater
+from torchrl_her_recipes.components.curricula import is_guided
 from torchrl_her_recipes.components.learner import Agent, LearnerBuilder, Networks
 from torchrl_her_recipes.components.normalization import acting, make_norm
 from torchrl_her_recipes.config.learners import AUTO, LEARNERS, Actions, LearnerSpec
@@ -50,16 +52,18 @@ def make_agent(
     loss = builder.loss(actor, critics, rewards, generators)
     norm = _norm_for(builder)
     player = acting(actor, norm)
+    guide = _guide_of(player, recipe, curriculum, generators)
     return Agent(
         actor=player,
         critic=critics[0],
         exploration=exploration,
-        policy=TensorDictSequential(player, exploration),
+        policy=TensorDictSequential(player, *([] if guide is None else [guide]), exploration),
         loss=loss,
         optimizer=torch.optim.Adam(loss.parameters(), lr=options.learning_rate, fused=True),
         target=make_target_updater(loss, tau=options.tau, hard_interval=options.hard_update_interval),
         norm=norm,
         average=_average_of(player, recipe),
+        guide=guide,
     )
 
 
@@ -109,6 +113,23 @@ def _norm_for(builder: LearnerBuilder) -> RunningNorm | None:
 def _average_of(policy: TensorDictModuleBase, recipe: Recipe) -> PolicyAverage | None:
     decay = recipe.learner.average_decay
     return PolicyAverage(policy, decay=decay, runs=recipe.run.num_runs) if decay > 0 else None
+
+
+def _guide_of(
+    policy: TensorDictModuleBase,
+    recipe: Recipe,
+    curriculum: Curriculum | None,
+    generators: Sequence[torch.Generator],
+) -> GuidedExploration | None:
+    if curriculum is None or not is_guided(recipe, curriculum):
+        return None
+    return GuidedExploration(
+        policy,
+        curriculum,
+        share=recipe.curriculum.guided_share,
+        runs=recipe.run.num_runs,
+        generators=generators,
+    )
 
 
 def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | None) -> Networks:

@@ -14,6 +14,7 @@ from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import (
     in_layers,
+    is_guided,
     make_curriculum,
     make_curriculum_state,
     make_played_env,
@@ -45,7 +46,9 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
     curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
     state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
-    env = task if state is None else in_layers(task, state.progress)
+    env = (
+        task if state is None else in_layers(task, state.progress, begins=is_guided(recipe, state.curriculum))
+    )
     generators = [torch.Generator().manual_seed(seed) for seed in recipe.seeds]
     rewards = played_rewards(recipe, task)
     bounds = reward_bounds(goal_env(task)) if curriculum is None else rewards

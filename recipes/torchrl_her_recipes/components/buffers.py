@@ -27,7 +27,7 @@ from torchrl_her_recipes.config.learners import priority_power
 from torchrl_her_recipes.config.recipe import Recipe
 
 # Entries of a collected batch that no loss reads: not stored.
-_NOT_STORED = ("state", "achieved_goal", "input", "collector")
+_NOT_STORED = ("state", "achieved_goal", "input", "is_init", "collector")
 
 
 def make_buffer(

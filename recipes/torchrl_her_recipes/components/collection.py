@@ -23,6 +23,7 @@ from torchrl.collectors import BaseCollector, MultiAsyncCollector, MultiSyncColl
 from torchrl.envs.utils import ExplorationType
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
+from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import CurriculumProgress
 from torchrl_her.modules.exploration import Exploration
 from torchrl_her_recipes.components.collection_worker import (
@@ -302,7 +303,7 @@ def _to_send(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     """
     copy = deepcopy(policy)
     for module in copy.modules():
-        if isinstance(module, Exploration):
+        if isinstance(module, Exploration | GuidedExploration):
             module.generators = [None] * len(module.generators)
     return copy
 

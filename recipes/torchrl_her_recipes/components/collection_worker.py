@@ -13,12 +13,13 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, TransformedEnv
 
+from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import CurriculumProgress
 from torchrl_her.curriculum.transforms import StateToObs
 from torchrl_her.modules.exploration import Exploration
 from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her_envs.common.goal_env import goal_env
-from torchrl_her_recipes.components.curricula import in_layers, make_curriculum
+from torchrl_her_recipes.components.curricula import in_layers, is_guided, make_curriculum
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.imports import import_modules, permit_task
 from torchrl_her_recipes.config.recipe import Recipe
@@ -41,7 +42,11 @@ def make_worker_env(recipe: Recipe, modules: Sequence[str] = ()) -> EnvBase:
     env = make_task_envs(recipe, share_of_envs(recipe), recipe.seeds)
     curriculum = make_curriculum(recipe, env)
     if curriculum is not None:
-        env = in_layers(env, CurriculumProgress(curriculum, runs=recipe.run.num_runs))
+        env = in_layers(
+            env,
+            CurriculumProgress(curriculum, runs=recipe.run.num_runs),
+            begins=is_guided(recipe, curriculum),
+        )
     if not recipe.collection.sync:  # only ids tell then which environment a row of a batch belongs to
         env = env if isinstance(env, TransformedEnv) else TransformedEnv(env)
         env.append_transform(EnvIds())
@@ -82,7 +87,7 @@ class WorkerCollector(Collector):
         np.random.seed(first % (1 << 32))
         random.seed(first)
         for exploration in self.policy.modules():
-            if isinstance(exploration, Exploration):
+            if isinstance(exploration, Exploration | GuidedExploration):
                 exploration.generators = [torch.Generator().manual_seed(seed) for seed in beginning.seeds]
         if beginning.progress is not None:
             _progress_of(self.env).load_state_dict(beginning.progress)

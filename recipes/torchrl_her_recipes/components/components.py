@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
+from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.goals.ibs import Instructiveness
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import Exploration
@@ -46,7 +47,7 @@ class Components:
         critic: values of (observation, goal, action); what the loss's critics were made from, None if there
             is none. TD3 and SAC train others like it, see :func:`~torchrl_her.objectives.critic_value`.
         exploration: turns greedy into exploring actions.
-        policy: actor, then exploration.
+        policy: actor, then the guide if there is one, then exploration.
         collector: runs the policy in the environments.
         buffer: of all runs, with the writer that relabels and the sampler.
         loss: any TorchRL loss module.
@@ -60,6 +61,7 @@ class Components:
         norm: statistics of observations and goals by which actor and sampled transitions are normalized, or
             None.
         average: follows the actor, and is what is evaluated, filmed and kept in its place; or None.
+        guide: begins episodes as the layer below has learned it, see ``guided_share``; or None.
     """
 
     recipe: Recipe
@@ -80,6 +82,7 @@ class Components:
     curriculum: CurriculumState | None = None
     norm: RunningNorm | None = None
     average: PolicyAverage | None = None
+    guide: GuidedExploration | None = None
 
     @property
     def greedy(self) -> TensorDictModuleBase:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from torchrl.envs import CatTensors, Compose, EnvBase, TransformedEnv
+from torchrl.envs import CatTensors, Compose, EnvBase, InitTracker, Transform, TransformedEnv
 
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
@@ -114,13 +114,28 @@ def make_played_env(
     return env if curriculum is None else in_layers(env, at_the_top(curriculum, len(seeds)))
 
 
-def in_layers(env: EnvBase, progress: CurriculumProgress) -> TransformedEnv:
-    """An environment as the layers of its runs see it, with the networks' input."""
+def is_guided(recipe: Recipe, curriculum: Curriculum) -> bool:
+    """Whether some episodes are begun by what was learned in the layer below."""
+    return recipe.curriculum.guided_share > 0 and len(curriculum) > 1
+
+
+def in_layers(env: EnvBase, progress: CurriculumProgress, *, begins: bool = False) -> TransformedEnv:
+    """An environment as the layers of its runs see it, with the networks' input.
+
+    Args:
+        env: of the full task.
+        progress: of the runs.
+
+    Keyword Args:
+        begins: whether steps say if they are the first of an episode, as ``is_init``.
+    """
     curriculum = progress.curriculum
     shown = StateToObs(curriculum, progress, goes_on=goal_env(env).goes_on)
-    transforms = [shown, ZeroPad(curriculum, progress)]
+    transforms: list[Transform] = [shown, ZeroPad(curriculum, progress)]
     if "state" not in env.observation_spec:
         transforms.insert(0, CatTensors(_STATE, "state", del_keys=False, sort=False))
+    if begins:
+        transforms.append(InitTracker())
     return TransformedEnv(env, Compose(*transforms))
 
 

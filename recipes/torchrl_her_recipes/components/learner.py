@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
+from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import DecayingEpsilon, Exploration
 from torchrl_her.modules.normalization import RunningNorm
@@ -35,6 +36,7 @@ class Agent:
         target: moves the target networks.
         norm: statistics by which actor and sampled transitions are normalized, or None.
         average: follows the actor, and is played and kept in its place; or None.
+        guide: begins episodes as the layer below has learned it; or None.
     """
 
     actor: TensorDictModuleBase
@@ -46,6 +48,7 @@ class Agent:
     target: TargetNetUpdater
     norm: RunningNorm | None = None
     average: PolicyAverage | None = None
+    guide: GuidedExploration | None = None
 
 
 class LearnerBuilder(ABC):

@@ -168,6 +168,12 @@ class CurriculumConfig(Group):
     window: int = option(20, "a layer ends by the mean success of this many greedy episodes", at_least=1)
     success_threshold: float = option(0.9, "mean success at which a layer ends", above=0, at_most=1)
     layer_epsilon: float = option(1.0, "epsilon of exploration when a layer begins", at_least=0, at_most=1)
+    guided_share: float = option(
+        0.0,
+        "share of the episodes that the policy of the layer below begins, until its goal is achieved",
+        at_least=0,
+        at_most=1,
+    )
     alpha_actor: float = option(
         0.0, "scale of the actor's initial weights for inputs that the first layer hides", at_least=0
     )

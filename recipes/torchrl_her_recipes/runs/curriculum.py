@@ -24,11 +24,12 @@ def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDic
     task, recipe = goal_env(env), components.recipe
     runs, episodes = recipe.run.num_runs, recipe.evaluation.episodes
     task.set_seeds(eval_seeds(recipe, epoch))
-    rounds = math.ceil(episodes * runs / env.batch_size[0])
+    worlds = env.batch_size[0] // runs
+    rounds = math.ceil(episodes / worlds)
     played = [evaluate(env, components.greedy, max_steps=task.max_steps) for _ in range(rounds)]
     if rounds == 1:
         return played[0]
-    return torch.cat([own.unflatten(0, (runs, -1)) for own in played], 1)[:, :episodes].flatten(0, 1)
+    return torch.cat([own.unflatten(0, (runs, worlds)) for own in played], 1)[:, :episodes].flatten(0, 1)
 
 
 def layer_success(
@@ -54,6 +55,8 @@ def move_on(components: Components, state: CurriculumState, samples: Tensor, fra
         old, new = state.curriculum.layers[before[run]], state.progress.layer_of(run)
         seed = components.recipe.seeds[run]
         lines.append(f"seed {seed}: {old.name!r} learned after {frames:,} frames, {new.name!r} begins")
+        if components.guide is not None:
+            components.guide.follow(components.greedy, before[run], run=run)
         enter_layer(
             components.buffer,
             new,

@@ -34,6 +34,8 @@ def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
         "exploration": dict(components.exploration.state_dict()),
         "norm": None if components.norm is None else dict(components.norm.state_dict()),
         "average": None if components.average is None else dict(components.average.state_dict()),
+        "guide": None if components.guide is None else components.guide.state_dict(),
+        "guided": None if components.guide is None else components.guide.guided,
         "buffer": buffer_state_dict(components.buffer, copy=False),
         "generators": [generator.get_state() for generator in components.generators],
         "torch_generator": torch.get_rng_state(),  # for losses that draw, as SAC's
@@ -67,6 +69,9 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
             components.average.restart()
         else:
             components.average.load_state_dict(state["average"])
+    if components.guide is not None:
+        components.guide.load_state_dict(state["guide"])
+        components.guide.guided = state["guided"]
     load_buffer_state_dict(components.buffer, state["buffer"])
     for generator, own in zip(components.generators, state["generators"], strict=True):
         generator.set_state(own)

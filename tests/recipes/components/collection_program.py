@@ -170,7 +170,11 @@ def _normalized() -> dict[str, Any]:
 
 def _curriculum() -> dict[str, Any]:
     """The desired goals before and after all runs came to the last layer."""
-    components = build(small(task="hand_v1", algo="cher", num_runs=RUNS, processes=2, success_threshold=0.01))
+    components = build(
+        small(
+            task="hand_v1", algo="cher", num_runs=RUNS, processes=2, success_threshold=0.01, guided_share=0.5
+        )
+    )
     collector, shown = components.collector, []
     for layer in range(2):
         for number in range(RUNS):
@@ -179,6 +183,31 @@ def _curriculum() -> dict[str, Any]:
         shown.append(collector.next().clone())
     trained = run(components, progress=False)
     return {"batches": shown, "layers": [row["layer"] for row in trained.rows]}
+
+
+def _guided() -> dict[str, Any]:
+    """What processes do where one of the runs is guided, and its policy would not move."""
+    recipe = small(
+        task="hand_v1",
+        algo="cher",
+        num_runs=RUNS,
+        processes=2,
+        guided_share=1.0,
+        epsilon_start=0.0,
+        epsilon_end=0.0,
+    )
+    components = build(recipe)
+    components.collector.reset()
+    components.collector.next()  # the processes are there, and nothing guides them
+    for number in range(RUNS):
+        components.curriculum.progress.set_layer(number, 1)  # type: ignore[union-attr]
+    components.guide.follow(components.actor, 0, run=1)  # type: ignore[union-attr]
+    for weight in components.actor.parameters():
+        weight.data.zero_()
+    components.collector.reset()
+    batch = components.collector.next()
+    components.close()
+    return {"moved": (batch["action"] != 0).flatten(1).any(1).chunk(RUNS)}
 
 
 def _failure(**options: Any) -> dict[str, Any]:
@@ -219,6 +248,7 @@ JOBS = {
     "weights": _weights,
     "normalized": _normalized,
     "curriculum": _curriculum,
+    "guided": _guided,
     "breaks": _breaks,
     "cannot start": _cannot_start,
     "killed": _killed,

@@ -36,7 +36,7 @@ def together() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def apart() -> dict[str, Any]:
-    return results_of("async", "often", "weights", "normalized", "curriculum")
+    return results_of("async", "often", "weights", "normalized", "curriculum", "guided")
 
 
 @pytest.fixture(scope="module")
@@ -161,6 +161,12 @@ def test_layers_reach_the_processes(apart: dict[str, Any]) -> None:
     assert (throw["observation"][..., 5:] != 0).any()
     assert (reach["desired_goal"][..., 0] < 0).any()  # the ball lies in the left half
     assert (throw["desired_goal"][..., 0] > 0).all()
+
+
+def test_processes_are_guided_by_what_a_run_has_learned(apart: dict[str, Any]) -> None:
+    other, own = apart["guided"]["moved"]
+    assert own.all()
+    assert not other.any()
 
 
 @pytest.mark.parametrize(

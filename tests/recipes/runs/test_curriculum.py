@@ -203,6 +203,32 @@ def test_a_run_that_was_stopped_after_a_change_goes_on_as_if_it_had_not(tmp_path
     assert part.curriculum.progress.layers == (1,)
 
 
+def test_runs_are_guided_by_the_layer_that_they_have_learned() -> None:
+    components = build(climbing(num_runs=2, guided_share=1.0, epsilon_start=0.0, epsilon_end=0.0))
+    guide = components.guide
+    assert guide is not None
+    trainer = components.trainer()
+    trainer.epoch()
+    learned = {name: value.clone() for name, value in components.greedy.state_dict().items()}
+    move(components, run=1)
+    assert guide.layer.tolist() == [-1, 0]
+    for name, value in guide.module.state_dict().items():
+        assert torch.equal(value.chunk(2)[1], learned[name].chunk(2)[1])
+    rows = next(iter(components.collector))
+    assert not {"state", "input", "is_init"} & set(components.buffer.storage[:].keys())
+    assert guide.guided is not None
+    assert not guide.guided.chunk(2)[0].any()
+    assert guide.guided.chunk(2)[1].any()
+    greedy = components.actor(rows.select("input").clone())["action"]
+    differs = (greedy != rows["action"]).any(-1).flatten(1).any(1).chunk(2)
+    assert not differs[0].any()
+
+
+def test_nobody_is_guided_unless_it_is_asked_for() -> None:
+    assert build(climbing()).guide is None
+    assert "is_init" not in build(climbing()).env.observation_spec.keys()
+
+
 def test_its_policy_plays_the_full_task(tmp_path: Path) -> None:
     run(build(climbing()), tmp_path / "run", progress=False)
     actor = load_actor(tmp_path / "run")

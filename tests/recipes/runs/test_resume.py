@@ -35,6 +35,7 @@ ALL: dict[str, Any] = {
     "episodes": 10,
     "window": 10,
     "success_threshold": 0.01,
+    "guided_share": 0.5,
 }
 
 

@@ -1,0 +1,167 @@
+"""Guided exploration: whose policy acts, where, and until when."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_her import (
+    Curriculum,
+    CurriculumLayer,
+    CurriculumProgress,
+    GuidedExploration,
+    StateToObs,
+    ZeroPad,
+    make_actor,
+)
+from torchrl_her_envs import make_env
+
+# The state is [own place, block, wanted place]; the first layer wants the block to be reached.
+REACH = CurriculumLayer(name="reach", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.5)
+MOVE = CurriculumLayer(name="move", observation=[0, 1], achieved_goal=[1], desired_goal=[2], threshold=0.5)
+CURRICULUM = Curriculum([REACH, MOVE], 3)
+
+
+class Scaled(nn.Module):
+    """Acts by what it sees first and last of its input, times a weight of each run."""
+
+    def __init__(self, *weights: float) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor(weights))
+
+    def forward(self, seen: Tensor) -> Tensor:
+        weight = self.weight.repeat_interleave(len(seen) // len(self.weight))
+        return weight.unsqueeze(-1) * (seen[:, :1] + 10.0 * seen[:, 1:2] + 100.0 * seen[:, 2:])
+
+
+def policy(*weights: float) -> TensorDictModule:
+    return TensorDictModule(Scaled(*weights), in_keys=["input"], out_keys=["action"])
+
+
+def rows(state: list[list[float]], *, begun: bool | list[bool] = True) -> TensorDict:
+    flags = torch.tensor(begun).expand(len(state)).unsqueeze(-1)
+    return TensorDict(
+        {
+            "state": torch.tensor(state),
+            "is_init": flags,
+            "action": torch.full((len(state), 1), -1.0),
+        },
+        [len(state)],
+    )
+
+
+def acts(guide: GuidedExploration, *args: object, **options: object) -> list[float]:
+    return guide(rows(*args, **options))["action"].flatten().tolist()  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def guide() -> GuidedExploration:
+    made = GuidedExploration(policy(1.0), CURRICULUM, share=1.0)
+    made.follow(policy(2.0), 0)
+    return made
+
+
+def test_it_sees_what_the_layer_below_sees(guide: GuidedExploration) -> None:
+    # [own place, block, 0], times the weight that was learned
+    assert acts(guide, [[3.0, 5.0, 7.0]]) == [2.0 * (3.0 + 50.0)]
+
+
+def test_it_acts_until_the_goal_below_is_achieved_and_not_again(guide: GuidedExploration) -> None:
+    assert acts(guide, [[3.0, 5.0, 7.0], [0.0, 0.5, 0.0]]) == [106.0, 10.0]  # at 0.5 it is not achieved
+    assert acts(guide, [[4.6, 5.0, 7.0], [0.0, 1.0, 0.0]], begun=False) == [-1.0, 20.0]
+    assert acts(guide, [[0.0, 5.0, 7.0], [0.0, 1.0, 0.0]], begun=False) == [-1.0, 20.0]
+    assert acts(guide, [[0.0, 5.0, 7.0], [0.0, 1.0, 0.0]], begun=[True, False]) == [100.0, 20.0]
+
+
+def test_without_a_layer_below_it_does_nothing() -> None:
+    guide = GuidedExploration(policy(1.0), CURRICULUM, share=1.0)
+    assert acts(guide, [[3.0, 5.0, 7.0]]) == [-1.0]
+    assert guide.guided is None
+
+
+def test_greedy_episodes_are_not_guided(guide: GuidedExploration) -> None:
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert acts(guide, [[3.0, 5.0, 7.0]]) == [-1.0]
+
+
+def test_it_follows_a_copy(guide: GuidedExploration) -> None:
+    learning = policy(4.0)
+    guide.follow(learning, 0)
+    learning.module.weight.data.zero_()
+    assert acts(guide, [[3.0, 5.0, 7.0]]) == [4.0 * 53.0]
+    assert not any(weight.requires_grad for weight in guide.parameters())
+
+
+def test_runs_are_guided_by_what_they_have_learned_themselves() -> None:
+    guide = GuidedExploration(policy(1.0, 1.0, 1.0), CURRICULUM, share=1.0, runs=3)
+    guide.follow(policy(5.0, 6.0, 7.0), 0, run=2)
+    assert acts(guide, [[3.0, 5.0, 7.0]] * 6) == [-1.0] * 4 + [7.0 * 53.0] * 2
+    guide.follow(policy(5.0, 6.0, 7.0), 0, run=0)
+    assert acts(guide, [[3.0, 5.0, 7.0]] * 6) == [5.0 * 53.0] * 2 + [-1.0] * 2 + [7.0 * 53.0] * 2
+    with pytest.raises(ValueError, match="4 rows cannot be shared out among 3 runs"):
+        acts(guide, [[3.0, 5.0, 7.0]] * 4)
+
+
+def test_runs_beside_others_draw_as_they_would_alone() -> None:
+    def drawn(seeds: list[int]) -> Tensor:
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        guide = GuidedExploration(
+            policy(*[1.0] * len(seeds)), CURRICULUM, runs=len(seeds), generators=generators
+        )
+        for run in range(len(seeds)):
+            guide.follow(policy(*[1.0] * len(seeds)), 0, run=run)
+        states = [[3.0, 5.0, 7.0]] * (20 * len(seeds))
+        return torch.tensor([acts(guide, states) for _ in range(3)]).view(3, len(seeds), 20)
+
+    both = drawn([1, 2])
+    assert torch.equal(both[:, 1], drawn([2])[:, 0])
+    assert not torch.equal(both[:, 0], both[:, 1])
+    assert 0.3 < (both > 0).double().mean() < 0.7
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
+def test_impossible_shares_are_refused(share: float) -> None:
+    with pytest.raises(ValueError, match=r"share must be in \[0, 1\], got"):
+        GuidedExploration(policy(1.0), CURRICULUM, share=share)
+
+
+@pytest.fixture
+def collected() -> Iterator[TensorDict]:
+    env = make_env("hand_v1", num_envs=6, seed=1)
+    curriculum = Curriculum([CurriculumLayer(**layer) for layer in env.layers()], 11)
+    progress = CurriculumProgress(curriculum)
+    progress.set_layer(0, 1)
+    shown = TransformedEnv(
+        env, Compose(StateToObs(curriculum, progress), ZeroPad(curriculum, progress), InitTracker())
+    )
+    actor = make_actor([curriculum.input_width], 3, in_keys=["input"])
+    guide = GuidedExploration(actor, curriculum, share=1.0)
+    guide.follow(actor, 0)
+    for weight in actor.parameters():
+        weight.data.zero_()
+    collector = Collector(shown, TensorDictSequential(actor, guide), frames_per_batch=6 * 60, total_frames=-1)
+    yield next(iter(collector))
+    collector.shutdown()
+
+
+def test_a_collector_begins_episode_after_episode_with_it(collected: TensorDict) -> None:
+    guided = (collected["action"] != 0).any(-1)
+    near = (collected["state"][..., :2] - collected["state"][..., 5:7]).norm(dim=-1)
+    threshold = make_env("hand_v1", num_envs=1).layers()[0]["threshold"]
+    begun = collected["is_init"].squeeze(-1)
+    assert begun.sum() > 6  # more than one episode each
+    for env in range(6):
+        for start in begun[env].nonzero().flatten().tolist():
+            ends = begun[env, start + 1 :].nonzero().flatten()
+            stop = start + 1 + int(ends[0]) if len(ends) else 60
+            reached = (near[env, start:stop] < threshold).nonzero().flatten()
+            first = int(reached[0]) if len(reached) else stop - start
+            assert guided[env, start:stop].tolist() == [True] * first + [False] * (stop - start - first)

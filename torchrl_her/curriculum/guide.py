@@ -1,0 +1,163 @@
+"""Exploring by what was learned before: episodes that begin as the layer below has learned it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer
+from torchrl_her.curriculum.transforms import take_columns
+
+
+class GuidedExploration(TensorDictModuleBase):
+    """Lets the policy that has learned a layer begin some of the next layer's episodes.
+
+    When a layer begins, nothing in its buffer was achieved yet, and a policy that learns of failure alone
+    soon forgets what it could do: a gripper no longer reaches the block that it should push. In a share of
+    the episodes, a copy of the policy that had learned the layer below acts until that layer's goal is
+    achieved, and then the present policy. That is the self-guided exploration of Luo et al., Relay Hindsight
+    Experience Replay, 2022 (arXiv 2208.00843), here with the layers one after another.
+
+    Put it behind the policy and before noise, and an InitTracker of TorchRL's into the environment. The
+    environments of R runs are R equal blocks of the batch, in the order of the runs. Under
+    ``set_exploration_type(ExplorationType.DETERMINISTIC)`` it does nothing.
+
+    Args:
+        policy: that learns; it reads the network's input alone. It is copied.
+        curriculum: the layers.
+
+    Keyword Args:
+        share: of the episodes that are begun so.
+        runs: R; the weights of R runs are stacked, along the first dimension of each parameter.
+        generators: sources of the random numbers, one for each run, or None for torch's own.
+        state_key, input_key, action_key, init_key: of the state vector, which is read, of what the policy
+            reads and writes, and of the flag at the beginning of an episode.
+
+    Attributes:
+        layer: [R], which layer's policy begins a run's episodes; -1 as long as there is none.
+        guided: [B, 1], the environments in which it acts at the moment; None before the first step.
+
+    Raises:
+        ValueError: the share is outside of [0, 1].
+
+    Example:
+        >>> from tensordict.nn import TensorDictModule, TensorDictSequential
+        >>> from torchrl_her import CurriculumLayer, make_actor
+        >>> near, far = (
+        ...     CurriculumLayer(
+        ...         name=name, observation=[0, 1], achieved_goal=[place], desired_goal=[2], threshold=0.5
+        ...     )
+        ...     for place, name in enumerate(("near", "far"))
+        ... )
+        >>> actor = make_actor([3], 1, in_keys=["input"])
+        >>> guide = GuidedExploration(actor, Curriculum([near, far], 3), share=1.0)
+        >>> policy = TensorDictSequential(actor, guide)
+        >>> guide.follow(actor, 0)  # the first layer was learned
+        >>> _ = [weight.data.zero_() for weight in actor.parameters()]  # what is learned then
+        >>> state = torch.tensor([[1.0, 0.0, 3.0], [3.0, 0.0, 3.0]])  # the second one is near
+        >>> begun = torch.ones(2, 1, dtype=torch.bool)
+        >>> rows = TensorDict({"state": state, "input": state, "is_init": begun}, [2])
+        >>> (policy(rows)["action"] != 0).tolist()
+        [[True], [False]]
+    """
+
+    layer: Tensor
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        curriculum: Curriculum,
+        *,
+        share: float = 0.5,
+        runs: int = 1,
+        generators: Sequence[torch.Generator] | None = None,
+        state_key: NestedKey = "state",
+        input_key: NestedKey = "input",
+        action_key: NestedKey = "action",
+        init_key: NestedKey = "is_init",
+    ) -> None:
+        if not 0.0 <= share <= 1.0:
+            raise ValueError(f"share must be in [0, 1], got {share}")
+        super().__init__()
+        self.in_keys, self.out_keys = [action_key, state_key, init_key], [action_key]
+        self.module, self.input_key = deepcopy(policy).requires_grad_(False), input_key
+        self.curriculum, self.share = curriculum, share
+        self.generators = [None] * runs if generators is None else list(generators)
+        self.register_buffer("layer", torch.full((runs,), -1))
+        self.guided: Tensor | None = None
+        # For each layer: its inputs, its achieved and its desired goal, in the state with a zero appended.
+        self._columns = torch.tensor([self._columns_of(layer) for layer in curriculum.layers])
+        self._squares = torch.tensor([layer.threshold**2 for layer in curriculum.layers])
+
+    @torch.no_grad()
+    def follow(self, policy: TensorDictModuleBase, layer: int, *, run: int = 0) -> None:
+        """Takes over the weights of a run that has learned a layer.
+
+        Args:
+            policy: like the one that this was made with.
+            layer: which one.
+
+        Keyword Args:
+            run: which one.
+        """
+        runs = len(self.generators)
+        learned = policy.state_dict()
+        for name, own in self.module.state_dict().items():
+            own.chunk(runs)[run].copy_(learned[name].chunk(runs)[run])
+        self.layer[run] = layer
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replaces the actions of those environments that are guided.
+
+        Raises:
+            KeyError: an entry is missing.
+            ValueError: the batch cannot be cut into R equal blocks.
+        """
+        layers = self.layer.tolist()
+        if exploration_type() not in (ExplorationType.RANDOM, None) or max(layers) < 0:
+            return tensordict
+        action_key, state_key, init_key = self.in_keys
+        state, begun = tensordict.get(state_key), tensordict.get(init_key)
+        if len(state) % len(layers):
+            raise ValueError(f"{len(state)} rows cannot be shared out among {len(layers)} runs")
+        guided = self._begin(begun, layers)
+        if not bool(guided.any()):
+            return tensordict
+        seen, achieved, desired = self._look(state, layers)
+        squares = self._squares.to(state)[self.layer.clamp(min=0)]  # of each run
+        away = (achieved - desired).square().sum(-1).view(len(layers), -1) >= squares.unsqueeze(-1)
+        guided &= away.view(guided.shape)
+        guide = self.module(TensorDict({self.input_key: seen}, tensordict.batch_size)).get(action_key)
+        own = tensordict.get(action_key)
+        chosen = guided if own.ndim == guided.ndim else guided.squeeze(-1)
+        return tensordict.set(action_key, torch.where(chosen, guide, own))
+
+    def _begin(self, begun: Tensor, layers: list[int]) -> Tensor:
+        """Draws which of the episodes that begin are guided; the others are as they were."""
+        if self.guided is None or self.guided.shape != begun.shape:
+            self.guided = torch.zeros_like(begun)
+        blocks = zip(self.guided.chunk(len(layers)), begun.chunk(len(layers)), strict=True)
+        for (guided, new), layer, generator in zip(blocks, layers, self.generators, strict=True):
+            if bool(new.any()):
+                drawn = torch.rand(new.shape, generator=generator, device=new.device) < self.share
+                guided.copy_(torch.where(new, drawn & (layer >= 0), guided))
+        return self.guided
+
+    def _look(self, state: Tensor, layers: list[int]) -> tuple[Tensor, ...]:
+        """What the layers below show: the network's input, the achieved and the desired goal."""
+        index = self._columns.to(state.device)[[max(layer, 0) for layer in layers]]
+        entries = take_columns(torch.nn.functional.pad(state, (0, 1)), index)
+        goal = self.curriculum.goal_width
+        return entries.split([self.curriculum.input_width, goal, goal], -1)
+
+    def _columns_of(self, layer: CurriculumLayer) -> list[int]:
+        shown = [*layer.observation, *layer.desired_goal]
+        zeros = [self.curriculum.state_width] * (self.curriculum.input_width - len(shown))
+        return [*shown, *zeros, *layer.achieved_goal, *layer.desired_goal]
