@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 import torch
 from torchrl.envs.utils import exploration_type
+
+from .emulated import DEVICE, DeviceGenerator, emulated_device
 
 # Small tensors are fastest in one thread, and the workers of pytest-xdist share the cores. The second line is
 # for the processes that tests start.
@@ -26,3 +28,26 @@ def _seed() -> Iterator[None]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests that take long begin first, so that no worker is left alone with one of them at the end."""
     items.sort(key=lambda item: item.get_closest_marker("long") is None)
+
+
+@pytest.fixture(params=["cpu", "emulated", "cuda"])
+def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
+    """Where a part is tried: on the CPU, on a device that is emulated, and on a GPU if there is one."""
+    if request.param == "emulated":
+        with emulated_device() as emulated:
+            yield emulated
+    elif request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("needs a GPU")
+    else:
+        yield torch.device(request.param, *([0] if request.param == "cuda" else []))
+
+
+@pytest.fixture
+def make_generator(device: torch.device) -> Callable[[int], torch.Generator]:
+    """Makes sources of random numbers on the device."""
+
+    def make(seed: int) -> torch.Generator:
+        emulated = device == DEVICE and not torch.cuda.is_available()
+        return (DeviceGenerator() if emulated else torch.Generator(device)).manual_seed(seed)
+
+    return make

@@ -31,7 +31,9 @@ class RunsSampler(Sampler):
 
     Keyword Args:
         runs: R.
-        generators: R sources of random numbers; None for the buffer's (``buffer.set_rng``), with one run.
+        generators: R sources of random numbers, on the device; None for the buffer's (``buffer.set_rng``),
+            with one run.
+        device: where rows are drawn. The storage may be elsewhere.
 
     Raises:
         ValueError: there is no run, or not a generator for each of several; when sampling, the batch cannot
@@ -39,24 +41,34 @@ class RunsSampler(Sampler):
     """
 
     def __init__(
-        self, capacity: int, *, runs: int = 1, generators: Sequence[torch.Generator] | None = None
+        self,
+        capacity: int,
+        *,
+        runs: int = 1,
+        generators: Sequence[torch.Generator] | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.capacity, self.runs = capacity, runs
         self.generators = check_generators(runs, generators)
-        self._sizes = torch.zeros(runs, dtype=torch.int64)
+        self._sizes = torch.zeros(runs, dtype=torch.int64, device=device)
+
+    @property
+    def device(self) -> torch.device:
+        """Where rows are drawn."""
+        return self._sizes.device
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
         """Indices [batch_size] of rows: R equal blocks."""
         n, sizes = _share(self, storage, batch_size), self._sizes.tolist()
-        place = torch.zeros(self.runs, n, dtype=torch.int64)
+        place = torch.zeros(self.runs, n, dtype=torch.int64, device=self.device)
         for own, size, generator in zip(place, sizes, generators_of(self), strict=True):
             if size:
-                torch.randint(size, (n,), generator=generator, out=own)
+                own.random_(size, generator=generator)
         return rows_of(place, [size > 0 for size in sizes], self.capacity), {}
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Notes rows that were written."""
-        note_sizes(self._sizes, *run_and_place(index, self.capacity))
+        note_sizes(self._sizes, *run_and_place(index, self.capacity, self.device))
 
     def empty_run(self, run: int) -> None:
         """Forgets the transitions of a run."""
@@ -99,7 +111,9 @@ class RunsPrioritizedSampler(PrioritizedSampler):
 
     Keyword Args:
         runs: R.
-        generators: R sources of random numbers; None for the buffer's (``buffer.set_rng``), with one run.
+        generators: R sources of random numbers, on the device; None for the buffer's (``buffer.set_rng``),
+            with one run.
+        device: where rows are drawn. The storage may be elsewhere.
         eps: added to priorities.
         reduction: of priorities that come as several numbers for a row.
 
@@ -130,22 +144,24 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         generators: Sequence[torch.Generator] | None = None,
         eps: float = 1e-8,
         reduction: str = "max",
+        device: torch.device | str = "cpu",
     ) -> None:
-        self.capacity, self.runs = capacity, runs
+        self.capacity, self.runs, self._home = capacity, runs, torch.device(device)
         self.generators = check_generators(runs, generators)
         super().__init__(runs * capacity, alpha, beta, eps=eps, reduction=reduction)
 
     def _init(self) -> None:
         """Makes the trees, for TorchRL's own constructor."""
-        self._trees = SumTrees(self.capacity, runs=self.runs)
-        self._sizes = torch.zeros(self.runs, dtype=torch.int64)
-        self._most = torch.ones(self.runs)  # the largest priority of each run
+        device = self._home
+        self._trees = SumTrees(self.capacity, runs=self.runs, device=device)
+        self._sizes = torch.zeros(self.runs, dtype=torch.int64, device=device)
+        self._most = torch.ones(self.runs, device=device)  # the largest priority of each run
         self._warned: set[int] = set()  # runs that had priorities that are not finite
 
     @property
     def device(self) -> torch.device:
-        """Where priorities are kept."""
-        return self._most.device
+        """Where priorities are kept, and rows drawn."""
+        return self._home
 
     @property
     def alpha(self) -> float:
@@ -169,11 +185,11 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         """Indices [batch_size] of rows, R equal blocks, and their weights."""
         n = _share(self, storage, batch_size)
         filled = (self._sizes > 0).tolist()
-        u = uniform([n * own for own in filled], 1, generators_of(self), dtype=torch.float64)
+        counts = [n * own for own in filled]
+        u = uniform(counts, 1, generators_of(self), dtype=torch.float64, device=self.device)
         if not all(filled):
-            u = torch.zeros(self.runs, n, 1, dtype=u.dtype).masked_scatter_(
-                torch.tensor(filled).view(-1, 1, 1).expand(-1, n, 1), u
-            )
+            drawn = torch.tensor(filled, device=u.device).view(-1, 1, 1).expand(-1, n, 1)
+            u = u.new_zeros(self.runs, n, 1).masked_scatter_(drawn, u)
         u = u.view(self.runs, n)
         place, p = self._trees.draw(u)
         least = p.amin(-1, keepdim=True)
@@ -209,7 +225,7 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         priority = torch.as_tensor(priority, dtype=torch.float32, device=self.device).detach().abs().flatten()
         if priority.numel() not in (1, index.numel()):
             raise RuntimeError(f"got {priority.numel()} priorities for {index.numel()} rows")
-        run, place = run_and_place(index, self.capacity)
+        run, place = run_and_place(index, self.capacity, self.device)
         priority = priority.expand(index.shape)
         if len(run) < len(index):
             priority = priority[index >= 0]
@@ -245,7 +261,7 @@ class RunsPrioritizedSampler(PrioritizedSampler):
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Gives rows that were written the largest priority of their run."""
-        run, place = run_and_place(index, self.capacity)
+        run, place = run_and_place(index, self.capacity, self.device)
         note_sizes(self._sizes, run, place)
         value = (self._most + self._eps).pow(self._alpha)
         self._trees.set(run, place, value.index_select(0, run), sorted=True)
@@ -281,8 +297,8 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         self._most.copy_(state_dict["most"])
         self._alpha, self._beta, self._eps = (state_dict[key] for key in ("alpha", "beta", "eps"))
         for run, value in enumerate(state_dict["values"]):
-            leaf = torch.arange(len(value))
-            self._trees.set(torch.full_like(leaf, run), leaf, value, sorted=True)
+            leaf = torch.arange(len(value), device=self.device)
+            self._trees.set(torch.full_like(leaf, run), leaf, value.to(self.device), sorted=True)
 
     def dumps(self, path: str | Path) -> None:
         _dump(self, path)
@@ -327,9 +343,11 @@ def rows_of(place: Tensor, filled: Sequence[bool], capacity: int) -> Tensor:
     return row.flatten()
 
 
-def run_and_place(index: int | Tensor, capacity: int) -> tuple[Tensor, Tensor]:
-    """The run of each row that was written, and its place in that run's block."""
-    index = torch.as_tensor(index, dtype=torch.int64).flatten()
+def run_and_place(
+    index: int | Tensor, capacity: int, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """The run of each row that was written, and its place in that run's block, on a device."""
+    index = torch.as_tensor(index, dtype=torch.int64, device=device).flatten()
     if len(index) and int(index.min()) < 0:
         index = index[index >= 0]  # writers give -1 for rows that they did not write
     run = index.div(capacity, rounding_mode="floor")

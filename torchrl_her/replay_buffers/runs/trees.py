@@ -29,6 +29,7 @@ class SumTrees:
     Keyword Args:
         runs: R.
         native: whether draws and updates are made in C++ where that can be compiled, with the same result.
+        device: where the leaves are.
 
     Raises:
         MemoryError: there is not enough memory for so many leaves.
@@ -43,14 +44,18 @@ class SumTrees:
         ([[0, 3], [2, 2]], [[1.0, 1.0], [5.0, 5.0]])
     """
 
-    def __init__(self, capacity: int, *, runs: int = 1, native: bool = True) -> None:
+    def __init__(
+        self, capacity: int, *, runs: int = 1, native: bool = True, device: torch.device | str = "cpu"
+    ) -> None:
         self.capacity, self.runs, self.native = capacity, runs, native
         height = 0
         while -(-capacity // _FAN**height) > _TOPS:
             height += 1
         tops = -(-capacity // _FAN**height)
         try:
-            self._levels = [torch.zeros(runs, tops * _FAN**level) for level in range(height, -1, -1)]
+            self._levels = [
+                torch.zeros(runs, tops * _FAN**level, device=device) for level in range(height, -1, -1)
+            ]
         except RuntimeError as error:  # which torch raises in place of a MemoryError
             raise MemoryError(f"there is not enough memory for {runs} x {capacity:,} priorities") from error
 

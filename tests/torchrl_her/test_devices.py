@@ -1,0 +1,374 @@
+"""Every part on another device: nothing is in the wrong place, and the numbers are those of the CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import LossModule
+
+from torchrl_her import (
+    Curriculum,
+    CurriculumLayer,
+    CurriculumProgress,
+    DecayingEpsilon,
+    DecayingEpsilonGreedy,
+    GoalGrid,
+    GoalReward,
+    GuidedExploration,
+    HERSampleUnit,
+    HERWriter,
+    Instructiveness,
+    LossLearner,
+    ZeroPad,
+    box_target,
+    load_checkpoint,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    make_dqn_loss,
+    make_q_actor,
+    make_sac_loss,
+    make_stochastic_actor,
+    make_target_updater,
+    make_td3_loss,
+    make_tqc_loss,
+    sampled_target,
+    save_checkpoint,
+    success,
+)
+from torchrl_her.goals.grid import kl_divergence
+from torchrl_her.modules import NormalizeBatch, NormalizedPolicy, PolicyAverage, RunningNorm
+from torchrl_her.objectives import critic_value
+from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler, empty_run
+from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
+from torchrl_her.trainers.metrics import discounted_return, final_distance
+
+from .ddpg_data import batch as random_rows
+from .her_data import make_batch
+
+CPU = torch.device("cpu")
+Generators = Callable[[int], torch.Generator]
+
+
+def check(value: Any, device: torch.device) -> None:
+    """All tensors of a tensordict, or one tensor, are on the device."""
+    if isinstance(value, TensorDictBase):
+        assert {entry.device for entry in value.values(True, True)} == {device}
+    else:
+        assert value.device == device
+
+
+def collected(*lengths: list[int]) -> TensorDict:
+    return make_batch(list(lengths) or [[5, 6], [4, 7]])
+
+
+def instructive() -> Instructiveness:
+    grid = GoalGrid((0.0, -1.0), (3000.0, 1.0), (4, 4), warn=False)
+    return Instructiveness(grid, lambda sigma: box_target(grid, (0.0, -1.0), (3000.0, 1.0), sigma), sigma=9.0)
+
+
+WAYS: dict[str, dict[str, Any]] = {
+    "HER": {"k": 3},
+    "filter": {"k": 3, "filter_achieved": True},
+    "sources": {"goal_sources": {"future": 2, "actual": 1, "achieved": 1}},
+    "n steps": {"k": 3, "n_steps": 3, "gamma": 0.9},
+}
+
+
+@pytest.mark.parametrize("rows_at", ["cpu", "device"])
+@pytest.mark.parametrize("storage_at", ["cpu", "device"])
+@pytest.mark.parametrize("way", [*WAYS, "whole episodes", "IBS"])
+def test_the_writer_works_where_the_rows_are(
+    way: str, rows_at: str, storage_at: str, device: torch.device, make_generator: Generators
+) -> None:
+    rows = collected().to(device if rows_at == "device" else CPU)
+    place = device if storage_at == "device" else CPU
+    options = {**WAYS, "whole episodes": {"k": 3, "per": "episode"}, "IBS": {"k": 3}}[way]
+    generator = make_generator(0) if rows_at == "device" else torch.Generator()
+    writer = HERWriter(
+        GoalReward(0.1),
+        generators=[generator],
+        weights=instructive() if way == "IBS" else None,
+        **options,
+    )
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(300, device=place), writer=writer, batch_size=8)
+    buffer.extend(rows)
+    check(buffer.storage[:], place)
+    check(buffer.sample(), place)
+    virtual = buffer.storage[:]["virtual"].squeeze(-1)
+    assert len(buffer) - int(virtual.sum()) == rows.numel()
+    assert int(virtual.sum()) == writer.totals.virtual > 0
+
+
+@pytest.mark.parametrize("way", [*WAYS, "IBS"])
+@pytest.mark.parametrize("storage_at", ["cpu", "device"])
+def test_the_sample_unit_works_where_the_storage_is(
+    way: str, storage_at: str, device: torch.device, make_generator: Generators
+) -> None:
+    place = device if storage_at == "device" else CPU
+    unit = HERSampleUnit(
+        GoalReward(0.1),
+        generator=make_generator(0) if storage_at == "device" else torch.Generator(),
+        weights=instructive() if way == "IBS" else None,
+        **WAYS.get(way, {"k": 3}),
+    )
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(300, device=place),
+        batch_size=64,
+        sample_unit=unit,
+        transform=unit.relabel,
+    )
+    rows = collected()
+    buffer.extend(rows.reshape(-1).exclude("state"))
+    sampled = buffer.sample()
+    check(sampled, place)
+    assert (sampled["desired_goal"][:, 0] != -7.0).any()
+
+
+@pytest.mark.parametrize("prioritized", [False, True])
+@pytest.mark.parametrize("rows_at", ["cpu", "device"])
+def test_buffers_of_several_runs(
+    prioritized: bool, rows_at: str, device: torch.device, make_generator: Generators
+) -> None:
+    here = [make_generator(run) for run in range(2)]
+    sources = here if rows_at == "device" else [torch.Generator(), torch.Generator()]
+    sampler = (
+        RunsPrioritizedSampler(200, alpha=0.6, beta=0.4, runs=2, generators=here, device=device)
+        if prioritized
+        else RunsSampler(200, runs=2, generators=here, device=device)
+    )
+    writer = HERWriter(
+        GoalReward(0.1),
+        k=3,
+        filter_achieved=True,
+        runs=2,
+        generators=sources,
+        weights=[instructive(), instructive()],
+    )
+    buffer = TensorDictReplayBuffer(
+        storage=PackedStorage(400, device=device),
+        sampler=sampler,
+        writer=writer,
+        batch_size=16,
+        priority_key="td_error",
+    )
+    rows = collected([5, 6], [4, 7], [5, 5], [6, 6])
+    buffer.extend(rows.to(device) if rows_at == "device" else rows)
+    sampled = buffer.sample()
+    check(sampled, device)
+    if prioritized:
+        sampled["td_error"] = torch.rand(16, device=device)
+        buffer.update_tensordict_priority(sampled)
+        check(buffer.sample(), device)
+    state = buffer_state_dict(buffer)
+    before = buffer.storage[:].clone()
+    for run in range(2):
+        empty_run(buffer, run)
+    load_buffer_state_dict(buffer, state)
+    assert bool((buffer.storage[:] == before).all())
+    check(buffer.sample(), device)
+
+
+def test_targets_of_goals(device: torch.device) -> None:
+    grid = GoalGrid((0.0,), (1.0,), (4,), warn=False)
+    goals = torch.rand(50, 1)
+    cells = grid.cell(goals.to(device))
+    check(cells, device)
+    assert cells.tolist() == grid.cell(goals).tolist()
+    target = sampled_target(grid, goals.to(device), 0.1)
+    torch.testing.assert_close(target.cpu(), sampled_target(grid, goals, 0.1))
+    q = torch.full((4,), 0.25, device=device)
+    assert float(kl_divergence(q, target.to(device))) > 0
+
+
+def test_weights_follow_the_goals(device: torch.device) -> None:
+    weights, goals = instructive(), torch.rand(30, 2) * torch.tensor([3000.0, 1.0])
+    elsewhere = instructive()
+    for _ in range(2):
+        weights.update(goals.to(device))
+        elsewhere.update(goals)
+    weight = weights(goals.to(device))
+    check(weight, device)
+    torch.testing.assert_close(weight.cpu(), elsewhere(goals))
+    again = instructive()
+    again.load_state_dict(weights.state_dict())
+    torch.testing.assert_close(again(goals.to(device)), weight)
+
+
+REACH = CurriculumLayer(name="reach", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.5)
+MOVE = CurriculumLayer(name="move", observation=[0, 1], achieved_goal=[1], desired_goal=[2], threshold=0.5)
+
+
+def test_layers_of_several_runs(device: torch.device, make_generator: Generators) -> None:
+    curriculum = Curriculum([REACH, MOVE], 3)
+    progress = CurriculumProgress(curriculum, runs=2)
+    rows = TensorDict({"observation": torch.rand(4, 2), "desired_goal": torch.rand(4, 1)}, [4])
+    for layer in range(2):  # of the second run: the same as the first one's, and another
+        progress.set_layer(1, layer)
+        pad = ZeroPad(curriculum, progress)
+        seen = pad(rows.to(device))["input"]
+        check(seen, device)
+        assert seen.tolist() == pad(rows.clone())["input"].tolist()
+    actor = make_actor([3], 1, in_keys=["input"], runs=2).to(device)
+    guide = GuidedExploration(
+        actor, curriculum, runs=2, share=1.0, generators=[make_generator(0), make_generator(1)]
+    ).to(device)
+    guide.follow(actor, 0, run=1)
+    shown = TensorDict(
+        {
+            "state": torch.tensor([[0.0, 9.0, 0.0]] * 4),
+            "is_init": torch.ones(4, 1, dtype=torch.bool),
+            "action": torch.full((4, 1), 5.0),
+        },
+        [4],
+    )
+    action = guide(shown.to(device))["action"]
+    check(action, device)
+    assert (action == 5.0).flatten().tolist() == [True, True, False, False]
+
+
+def test_exploration(device: torch.device, make_generator: Generators) -> None:
+    generators = [make_generator(0), make_generator(1)]
+    ends = torch.ones(3, device=device)
+    exploring = DecayingEpsilon(-ends, ends, generators=generators).to(device)
+    rows = TensorDict({"action": torch.zeros(4, 3)}, [4]).to(device)
+    check(exploring(rows.clone())["action"], device)
+    exploring.step()
+    exploring.restart(0.5, run=1)
+    choosing = DecayingEpsilonGreedy(3, generators=generators).to(device)
+    check(choosing(TensorDict({"action": torch.tensor([1, 2])}, [2]).to(device))["action"], device)
+
+
+def test_normalization_and_averages(device: torch.device) -> None:
+    rows = random_rows()
+    widths = {"observation": 4, "desired_goal": 2}
+    elsewhere = RunningNorm(widths)
+    norm = RunningNorm(widths).to(device)
+    policy = NormalizedPolicy(make_actor((4, 2), 3).to(device), norm)
+    average = PolicyAverage(policy)
+    for each, own in ((norm, rows.to(device)), (elsewhere, rows), (norm, rows), (elsewhere, rows)):
+        each.update(own)  # from the CPU, too, where environments are
+    normal = NormalizeBatch(norm)(rows.to(device))
+    check(normal, device)
+    torch.testing.assert_close(
+        normal["observation"].cpu(), NormalizeBatch(elsewhere)(rows.clone())["observation"]
+    )
+    average.follow(3)
+    check(average.module(rows.to(device))["action"], device)
+    for parameter in [*average.module.parameters(), *average.module.buffers()]:
+        check(parameter, device)
+
+
+def networks() -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
+    return make_actor((4, 2), 3, norm="layer"), make_critic((4, 2), 3, norm="layer")
+
+
+SPEC = Bounded(-1.0, 1.0, shape=(3,))
+
+
+def make_loss(name: str, generators: list[torch.Generator], device: torch.device) -> LossModule:
+    actor, critic = networks()
+    spec = SPEC.to(device)
+    if name == "ddpg":
+        return make_ddpg_loss(actor.to(device), critic.to(device), action_penalty=0.1)
+    if name == "td3":
+        return make_td3_loss(
+            actor.to(device), critic.to(device), action_spec=spec, generators=generators, action_penalty=0.1
+        )
+    stochastic = make_stochastic_actor((4, 2), spec).to(device)
+    if name == "sac":
+        return make_sac_loss(stochastic, critic.to(device), action_spec=spec, generators=generators)
+    if name == "redq":
+        return make_sac_loss(
+            stochastic,
+            critic.to(device),
+            action_spec=spec,
+            critics=4,
+            target_critics=2,
+            generators=generators,
+        )
+    quantiles = make_critic((4, 2), 3, outputs=5).to(device)
+    return make_tqc_loss(stochastic, quantiles, action_spec=spec, generators=generators)
+
+
+@pytest.mark.parametrize("name", ["ddpg", "td3", "sac", "redq", "tqc"])
+def test_gradient_steps(name: str, device: torch.device, make_generator: Generators) -> None:
+    loss = make_loss(name, [make_generator(0)], device)
+    learner = LossLearner(
+        loss,
+        torch.optim.Adam(loss.parameters()),
+        make_target_updater(loss, tau=0.1, hard_interval=0),
+        max_grad_norm=1.0,
+    )
+    before = [parameter.detach().clone() for parameter in loss.parameters()]
+    rows = random_rows(64).to(device)
+    for value in learner.update(rows, 2).values():
+        assert bool(value.isfinite().all())
+    for parameter, old in zip(loss.parameters(), before, strict=True):
+        check(parameter, device)
+        assert not torch.equal(parameter, old)
+    check(rows["td_error"], device)
+    value = critic_value(loss, random_rows(4).to(device))
+    assert value is not None
+    check(value, device)
+
+
+def test_gradient_steps_of_dqn(device: torch.device) -> None:
+    actor, _ = make_q_actor((4, 2), 3)
+    loss = make_dqn_loss(actor.to(device))
+    rows = random_rows(32).set("action", torch.randint(3, (32,))).to(device)
+    learner = LossLearner(
+        loss, torch.optim.Adam(loss.parameters()), make_target_updater(loss, tau=0.1, hard_interval=0)
+    )
+    learner.update(rows)
+    check(rows["td_error"], device)
+
+
+def test_steps_on_a_device_are_those_of_the_cpu(device: torch.device) -> None:
+    actor, critic = networks()
+    rows = random_rows(64)
+    found = []
+    for place in (CPU, device):
+        own = networks()
+        for network, weights in zip(own, (actor, critic), strict=True):
+            network.load_state_dict(weights.state_dict())
+        loss = make_ddpg_loss(*(network.to(place) for network in own))
+        learner = LossLearner(
+            loss, torch.optim.Adam(loss.parameters()), make_target_updater(loss, tau=0.1, hard_interval=0)
+        )
+        learner.update(rows.to(place), 2)
+        found.append(nn.utils.parameters_to_vector([p.detach().cpu() for p in loss.parameters()]))
+    torch.testing.assert_close(found[0], found[1], atol=1e-5, rtol=1e-4)
+
+
+def test_metrics(device: torch.device) -> None:
+    rollout = collected([6], [6]).to(device)
+    rollout["next", "reward"] = rollout["next", "reward"].float()
+    for value in (
+        success(rollout),
+        discounted_return(rollout, 0.9, tail_reward=-1.0),
+        final_distance(rollout),
+    ):
+        check(value, device)
+
+
+def test_checkpoints_move(device: torch.device, tmp_path: Path) -> None:
+    actor = make_actor((4, 2), 3).to(device)
+    save_checkpoint({"actor": actor.state_dict()}, tmp_path / "state.pt")
+    other = make_actor((4, 2), 3)
+    state: dict[str, Tensor] = load_checkpoint(tmp_path / "state.pt")["actor"]
+    for value in state.values():
+        check(value, CPU)
+    other.load_state_dict(state)
+    actor.load_state_dict(state)
+    rows = random_rows(4)
+    acted = TensorDictSequential(actor)(rows.to(device))["action"]
+    torch.testing.assert_close(acted.cpu(), other(rows.clone())["action"])
