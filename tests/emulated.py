@@ -1,8 +1,8 @@
 """A device that is not there: tensors on the CPU, under the placement rules of CUDA.
 
 Within :func:`emulated_device`, tensors and modules can be moved to :data:`DEVICE`. Operations on tensors of
-several devices are refused where CUDA refuses them, and so are generators that are elsewhere and conversions to
-numpy. The numbers are those of the CPU.
+several devices are refused where CUDA refuses them, and so are generators that are elsewhere and
+conversions to numpy. The numbers are those of the CPU.
 """
 
 from __future__ import annotations
@@ -190,6 +190,8 @@ def _problem(
         return "a tensor on the device"
     if func in _MOVES or func in _FACTORIES or all(there) or not any(there):
         return ""
+    if func is Tensor.__setitem__ and not any(isinstance(own, Tensor) for own in tree_leaves(args[1])):
+        return ""  # a copy into a slice
     if func in _INDEXING and there[0]:  # by an index from anywhere
         new = args[2] if func is Tensor.__setitem__ else None
         if not isinstance(new, Tensor) or isinstance(new, OnDevice) or new.ndim == 0:

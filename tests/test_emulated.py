@@ -26,6 +26,11 @@ def there() -> Tensor:
     return torch.arange(3, device=DEVICE)
 
 
+def _with_new_values(value: Tensor, index: slice, new: Tensor) -> Tensor:
+    value[index] = new
+    return value
+
+
 REFUSED: dict[str, Callable[[], object]] = {
     "sum": lambda: here() + there(),
     "in place": lambda: there().add_(here()),
@@ -48,6 +53,7 @@ ALLOWED: dict[str, Callable[[], Tensor]] = {
     "to": lambda: here().to(DEVICE),
     "to another": lambda: here().to(there()),
     "copy": lambda: there().copy_(here()),
+    "new values of a slice": lambda: _with_new_values(there(), slice(0, 2), here()[:2]),
     "new": lambda: there().new_zeros(2),
     "generator": lambda: torch.rand(3, device=DEVICE, generator=DeviceGenerator()),
     "linear": lambda: nn.Linear(3, 1).to(DEVICE)(there().float()),

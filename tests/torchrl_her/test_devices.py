@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import DeviceCastTransform
 from torchrl.objectives import LossModule
 
 from torchrl_her import (
@@ -27,6 +28,7 @@ from torchrl_her import (
     HERWriter,
     Instructiveness,
     LossLearner,
+    Trainer,
     ZeroPad,
     box_target,
     load_checkpoint,
@@ -347,6 +349,70 @@ def test_steps_on_a_device_are_those_of_the_cpu(device: torch.device) -> None:
         learner.update(rows.to(place), 2)
         found.append(nn.utils.parameters_to_vector([p.detach().cpu() for p in loss.parameters()]))
     torch.testing.assert_close(found[0], found[1], atol=1e-5, rtol=1e-4)
+
+
+class Played:
+    """A collector that gives batches which were played before."""
+
+    def __init__(self, batches: list[TensorDict]) -> None:
+        self.batches = iter(batches)
+
+    def next(self) -> TensorDict:
+        return next(self.batches)
+
+    def reset(self) -> None:
+        """Nothing goes on."""
+
+
+def played(device: torch.device) -> TensorDict:
+    """Transitions [8, 10] of two runs."""
+    rows = collected(*[[5, 5]] * 8)
+    for part in (rows, rows["next"]):
+        part["observation"] = torch.rand(8, 10, 4)
+    rows["action"] = torch.rand(8, 10, 3)
+    return rows.to(device)
+
+
+@pytest.mark.parametrize("rows_at", ["cpu", "device"])
+@pytest.mark.parametrize("storage_at", ["cpu", "device"])
+def test_the_loop(rows_at: str, storage_at: str, device: torch.device, make_generator: Generators) -> None:
+    place = device if storage_at == "device" else CPU
+    at = {"cpu": [torch.Generator(), torch.Generator()], "device": [make_generator(0), make_generator(1)]}
+    # A cast to the learner's device casts what is written to the storage's.
+    writes_at = "cpu" if storage_at == "cpu" else rows_at
+    writer = HERWriter(GoalReward(0.1), k=2, runs=2, generators=at[writes_at], exclude=("state",))
+    sampler = RunsPrioritizedSampler(
+        400, alpha=0.6, beta=0.4, runs=2, generators=at[storage_at], device=place
+    )
+    buffer = TensorDictReplayBuffer(
+        storage=PackedStorage(800, device=place), sampler=sampler, writer=writer, priority_key="td_error"
+    )
+    if storage_at == "cpu":
+        buffer.append_transform(DeviceCastTransform(device))
+    actor, critic = make_actor((4, 2), 3, runs=2).to(device), make_critic((4, 2), 3, runs=2).to(device)
+    loss = make_ddpg_loss(actor, critic, reduction="none")
+    trainer = Trainer(
+        collector=Played([played(device if rows_at == "device" else CPU) for _ in range(2)]),  # type: ignore[arg-type]
+        buffer=buffer,
+        learner=LossLearner(
+            loss,
+            torch.optim.Adam(loss.parameters()),
+            make_target_updater(loss, tau=0.1, hard_interval=0),
+            runs=2,
+        ),
+        runs=2,
+        epoch_frames=80,
+        frames_per_update=20.0,
+        batch_size=16,
+        average=PolicyAverage(actor, runs=2),
+    )
+    measured = trainer.epoch()
+    assert trainer.updates == 4
+    for value in measured.values():
+        check(value, device)
+        assert bool(value.isfinite().all())
+    for parameter in loss.parameters():
+        check(parameter, device)
 
 
 def test_metrics(device: torch.device) -> None:

@@ -137,11 +137,15 @@ def _sync_folder(folder: Path) -> None:
             os.close(number)
 
 
-def load_checkpoint(path: str | Path) -> dict[str, Any]:
+def load_checkpoint(path: str | Path, *, map_location: torch.device | str = "cpu") -> dict[str, Any]:
     """Reads a checkpoint. Nothing in the file is executed.
 
     Args:
         path: a file that :func:`~torchrl_her.save_checkpoint` wrote.
+
+    Keyword Args:
+        map_location: where its tensors come, wherever they were; ``load_state_dict`` brings them to the
+            device of what they are loaded into.
 
     Raises:
         CheckpointError: the file is damaged, not a checkpoint, or holds more than tensors and plain data.
@@ -155,7 +159,7 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
             raise CheckpointError(f"{path} is damaged: its checksum does not match")
         file.seek(_BODY)
         try:
-            return torch.load(file, weights_only=True)
+            return torch.load(file, map_location=map_location, weights_only=True)
         except pickle.UnpicklingError as error:
             raise CheckpointError(f"{path} holds more than tensors and plain data") from error
         except Exception as error:  # of any type: a file with a right checksum may still hold anything

@@ -233,8 +233,7 @@ class Trainer:
         if self.average is not None:
             self.average.follow(steps, idle=idle)
         self._set_priorities(drawn, rows, idle)
-        nothing = torch.tensor(idle, dtype=torch.int64)
-        return {key: value.index_fill(1, nothing, _IDLE) for key, value in measured.items()}
+        return {key: _without(value, idle) for key, value in measured.items()}
 
     def _set_priorities(self, drawn: TensorDictBase, rows: TensorDictBase, idle: list[int]) -> None:
         """Gives the sampler the new priorities of the transitions that were learned from."""
@@ -267,6 +266,11 @@ class Trainer:
         self._credit, self._outside = state["credit"], state["outside"]
         measured = state.get("measured")
         self._measured = None if measured is None else [measured] if measured else []
+
+
+def _without(value: Tensor, idle: list[int]) -> Tensor:
+    """What was measured [S, R], marked where runs were idle."""
+    return value.index_fill(1, torch.tensor(idle, dtype=torch.int64, device=value.device), _IDLE)
 
 
 def _joined(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:

@@ -583,3 +583,9 @@ def test_a_collector_goes_on_in_the_middle_of_episodes(tmp_path: Path) -> None:
     expected = batches(unbroken, 2)
     assert same(batches(other, 2), expected)
     assert expected["collector", "traj_ids"].unique().tolist() == list(range(4, 12))  # of 150 steps
+
+
+def test_tensors_come_where_they_are_wanted(tmp_path: Path) -> None:
+    save_checkpoint({"weight": torch.ones(3)}, tmp_path / "state.pt")
+    assert load_checkpoint(tmp_path / "state.pt", map_location="meta")["weight"].is_meta
+    assert load_checkpoint(tmp_path / "state.pt")["weight"].tolist() == [1.0, 1.0, 1.0]
