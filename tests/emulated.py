@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from tensordict import TensorDictBase
@@ -22,6 +23,7 @@ from torchrl.objectives import utils
 DEVICE = torch.device("cuda", 0)
 CPU = torch.device("cpu")
 
+_GENERATOR = torch.Generator
 _FACTORIES = {
     getattr(torch, name)
     for name in [
@@ -49,7 +51,7 @@ _FACTORIES = {
         "zeros_like",
     ]
 }
-_MOVES = {Tensor.to, Tensor.cpu, Tensor.copy_, Tensor.type_as}
+_MOVES = {Tensor.to, Tensor.cpu, Tensor.copy_, Tensor.type_as, Tensor.__deepcopy__}
 _INDEXING = {Tensor.__getitem__, Tensor.__setitem__, Tensor.index_put, Tensor.index_put_}
 _ON_THE_CPU_ONLY = {Tensor.numpy, Tensor.__array__}
 
@@ -86,16 +88,30 @@ class DeviceGenerator(torch.Generator):
     device = DEVICE
 
 
+class _Made(type):
+    """Makes generators on the device they are asked for, and takes both kinds for generators."""
+
+    def __call__(cls, device: Any = "cpu") -> torch.Generator:
+        return DeviceGenerator() if torch.device(device).type == DEVICE.type else _GENERATOR(device)
+
+    def __instancecheck__(cls, instance: object) -> bool:
+        return isinstance(instance, _GENERATOR)
+
+
+class _Generator(metaclass=_Made):
+    pass
+
+
 @contextmanager
 def emulated_device() -> Iterator[torch.device]:
     """Lets tensors and modules be moved to :data:`DEVICE`."""
-    emulation, own = _Emulation(), utils.vmap
-    utils.vmap = emulation.vmap  # of TorchRL's losses
-    try:
-        with emulation:
-            yield DEVICE
-    finally:
-        utils.vmap = own
+    emulation = _Emulation()
+    with (
+        patch.object(utils, "vmap", emulation.vmap),  # of TorchRL's losses
+        patch.object(torch, "Generator", _Generator),
+        emulation,
+    ):
+        yield DEVICE
 
 
 class _Emulation(TorchFunctionMode):
@@ -163,7 +179,7 @@ def _is_there_after(func: Any, args: Any, options: dict[str, Any], there: list[b
     """Whether what comes out is on the device."""
     if func is Tensor.cpu:
         return False
-    if func is Tensor.copy_ or func in _INDEXING:
+    if func in (Tensor.copy_, Tensor.__deepcopy__) or func in _INDEXING:
         return there[0]
     asked = options.get("device")
     if func is Tensor.to:

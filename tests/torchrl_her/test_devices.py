@@ -365,12 +365,12 @@ class Played:
 
 
 def played(device: torch.device) -> TensorDict:
-    """Transitions [8, 10] of two runs."""
+    """Transitions [8, 10] of two runs, in a batch that does not say where it is."""
     rows = collected(*[[5, 5]] * 8)
     for part in (rows, rows["next"]):
         part["observation"] = torch.rand(8, 10, 4)
     rows["action"] = torch.rand(8, 10, 3)
-    return rows.to(device)
+    return rows.to(device).clear_device_()
 
 
 @pytest.mark.parametrize("rows_at", ["cpu", "device"])

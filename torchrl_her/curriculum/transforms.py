@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from torchrl_her.curriculum.layers import Curriculum, CurriculumProgress
+from torchrl_her.replay_buffers.keys import device_of
 
 
 def take_columns(rows: Tensor, index: Tensor) -> Tensor:
@@ -88,7 +89,7 @@ class _LayerTransform(Transform):
         if not changed or any(root.get(key, None) is None for key in self.out_keys):
             return None
         again = self._call(root.select(*self.in_keys, strict=False))
-        differs = torch.zeros(root.shape, dtype=torch.bool, device=root.device)
+        differs = torch.zeros(root.shape, dtype=torch.bool, device=device_of(root))
         for key in self.out_keys:
             shown, new = root.get(key), again.get(key)
             differs |= (shown != new).any(-1)

@@ -145,7 +145,7 @@ def virtual_episodes(
     own_terminated = terminated[used].view(-1, 1)
     truncated = entry_of(rows, keys.truncated)[root].view(-1, 1) | (stop[used].view(-1, 1) & ~own_terminated)
     changes = keys.changes(wanted[used], reward[used].view(-1, 1), own_terminated, truncated)
-    copy = torch.arange(len(source), device=root.device).unsqueeze(-1).expand_as(table)
+    copy = torch.arange(len(source), device=table.device).unsqueeze(-1).expand_as(table)
     return Copies(root, root, {**changes, keys.truncated: truncated}, reward[used].flatten()), copy[used]
 
 

@@ -12,6 +12,8 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
+from torchrl_her.replay_buffers.keys import device_of
+
 
 class EnvIds(Transform):
     """Gives each environment an id that no other one has, in this process or another.
@@ -44,7 +46,7 @@ class EnvIds(Transform):
     def _own_ids(self, tensordict: TensorDictBase) -> Tensor:
         shape = (*tensordict.batch_size, 1)
         if self._ids is None or self._ids.shape != shape or self._process != os.getpid():
-            ids = torch.arange(torch.Size(shape).numel(), device=tensordict.device).view(shape)
+            ids = torch.arange(torch.Size(shape).numel(), device=device_of(tensordict)).view(shape)
             # 62 random bits: two processes draw overlapping ranges with a probability of about 1e-15
             self._ids, self._process = ids + secrets.randbits(62), os.getpid()
         return self._ids.clone()  # a collector writes into what it got, in place, when it is reset

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
@@ -105,6 +106,19 @@ def in_root_and_next(keys: Sequence[NestedKey]) -> list[NestedKey]:
     if isinstance(keys, str):  # a sequence of letters
         raise TypeError(f"keys must be given as a list, got {keys!r}: write [{keys!r}]")
     return [twin for key in keys for twin in (unravel_key(key), under_next(key))]
+
+
+def device_of(transitions: TensorDictBase) -> torch.device:
+    """Where transitions are. A batch that a collector put together may not say so, but its entries do.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> device_of(TensorDict({"reward": torch.zeros(3)}, [3]))
+        device(type='cpu')
+    """
+    if transitions.device is not None:
+        return transitions.device
+    return next((entry.device for entry in transitions.values(True, True)), torch.device("cpu"))
 
 
 def entry_of(transitions: TensorDictBase, key: NestedKey) -> Tensor:

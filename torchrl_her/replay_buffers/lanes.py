@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_her.replay_buffers.keys import TransitionKeys
+from torchrl_her.replay_buffers.keys import TransitionKeys, device_of
 
 BY_ENV, BY_TRAJECTORY, BY_PLACE = "environment ids", "trajectory ids", "places in the batch"
 
@@ -41,7 +41,7 @@ def find_lanes(data: TensorDictBase, keys: TransitionKeys) -> tuple[str, Tensor]
     if data.ndim == 1 and (trajectory := data.get(keys.trajectory, None)) is not None:
         return BY_TRAJECTORY, trajectory.reshape(-1)
     steps = max(data.shape[-1], 1)
-    places = torch.arange(data.numel() // steps, device=data.device)
+    places = torch.arange(data.numel() // steps, device=device_of(data))
     return BY_PLACE, places.repeat_interleave(steps)
 
 

@@ -32,7 +32,7 @@ from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
-from torchrl_her.replay_buffers.keys import entry_of, failed
+from torchrl_her.replay_buffers.keys import device_of, entry_of, failed
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_return, windows
 from torchrl_her.replay_buffers.neighbors import (
     MASK,
@@ -237,7 +237,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             raise RuntimeError(f"{chosen.size} rows were drawn, but a batch {list(data.shape)} was read")
         out, rows = data.exclude(*self._exclude), chosen.rows
         if self.options.virtual_key is not None:
-            marks = torch.zeros(chosen.size, 1, dtype=torch.bool, device=rows.device)
+            marks = torch.zeros(chosen.size, 1, dtype=torch.bool, device=device_of(rows))
             out.set(self.options.virtual_key, marks.index_fill_(0, rows, True))
         if chosen.ahead is not None:
             after, returns = chosen.ahead

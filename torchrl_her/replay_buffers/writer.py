@@ -18,7 +18,7 @@ from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 from torchrl_her.replay_buffers.draw import draw_for_runs
 from torchrl_her.replay_buffers.episodes import find_episodes, time_order
-from torchrl_her.replay_buffers.keys import entry_of, in_root_and_next
+from torchrl_her.replay_buffers.keys import device_of, entry_of, in_root_and_next
 from torchrl_her.replay_buffers.lanes import broken, ends_of_held
 from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
@@ -249,7 +249,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             raise RuntimeError(f"HERWriter writes only in the process that made its buffer: {SHARED}")
         refuse_beside_writer("HERWriter", self._storage, data, self.options, runs=self.runs)
         if data.batch_size.numel() == 0:
-            return torch.empty(data.shape, dtype=torch.int64, device=data.device)
+            return torch.empty(data.shape, dtype=torch.int64, device=device_of(data))
         held = self._held
         batch = Batch.of(data, self._keys, runs=self.runs).after(held)
         rows, run, lanes = batch.rows, batch.run, batch.lanes()
@@ -443,7 +443,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
                 self._storage.set(move.to, rows[move.source])
         else:
             write_slices(self._storage, rows, moves)
-        index = [torch.arange(move.to.start, move.to.stop, device=rows.device) for move in moves]
+        index = [torch.arange(move.to.start, move.to.stop, device=device_of(rows)) for move in moves]
         if self.tracks_generations:
             for move, written in zip(moves, index, strict=True):
                 self._bump_generation(written, rows[move.source])

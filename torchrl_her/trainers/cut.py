@@ -6,6 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_her.replay_buffers.keys import device_of
+
 _TRAJECTORY = ("collector", "traj_ids")
 
 
@@ -44,7 +46,7 @@ def cut_episodes(batch: TensorDictBase) -> TensorDictBase:
 
 def _last(batch: TensorDictBase) -> Tensor:
     """Which transitions are the last ones, in the shape of the batch."""
-    last = torch.zeros(batch.shape, dtype=torch.bool, device=batch.device)
+    last = torch.zeros(batch.shape, dtype=torch.bool, device=device_of(batch))
     ids = batch.get(_TRAJECTORY, None)
     if batch.ndim > 1 or ids is None:
         last[..., -1:] = True

@@ -108,5 +108,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return fail(error.format_message().rstrip("."))
     except BAD_INPUT_ERRORS as error:
         return fail(one_line(error))
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":  # torch's, which is not imported for every command
+            raise
+        return fail(f"there is not enough memory on the device: {one_line(error)}")
     finally:
         environments.removeHandler(notices)

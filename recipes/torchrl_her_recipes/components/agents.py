@@ -18,6 +18,7 @@ from torchrl_her.modules.networks import StackedLinear, stack_runs
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her_recipes.components.curricula import is_guided
+from torchrl_her_recipes.components.devices import CPU
 from torchrl_her_recipes.components.learner import Agent, LearnerBuilder, Networks
 from torchrl_her_recipes.components.normalization import acting, make_norm
 from torchrl_her_recipes.config.learners import AUTO, LEARNERS, Actions, LearnerSpec
@@ -33,24 +34,29 @@ def make_agent(
     *,
     rewards: tuple[float, float] = (-1.0, 0.0),
     curriculum: Curriculum | None = None,
+    device: torch.device = CPU,
 ) -> Agent:
     """The agent that a recipe asks for.
 
     Args:
         recipe: of the run, or of several.
         env: tells the widths of observations and actions.
-        generators: of the exploration of each run.
+        generators: of the exploration of each run, on the device.
         rewards: the least and the greatest that there can be.
         curriculum: whose layers the networks see, or None.
+        device: where it learns.
 
     Raises:
         ValueError: the learner cannot choose such actions, or cannot train several runs.
     """
     builder = _builder(recipe, env, curriculum)
-    actor, critics = _networks(builder, recipe, curriculum)
-    exploration, options = builder.exploration(generators), recipe.learner
+    actor, critics = _networks(builder, recipe, curriculum)  # the same on all devices
+    builder.device, actor = device, actor.to(device)
+    critics = [critic.to(device) for critic in critics]
+    exploration, options = builder.exploration(generators).to(device), recipe.learner
     loss = builder.loss(actor, critics, rewards, generators)
     norm = _norm_for(builder)
+    norm = None if norm is None else norm.to(device)
     player = acting(actor, norm)
     guide = _guide_of(player, recipe, curriculum, generators)
     return Agent(
@@ -123,13 +129,14 @@ def _guide_of(
 ) -> GuidedExploration | None:
     if curriculum is None or not is_guided(recipe, curriculum):
         return None
-    return GuidedExploration(
+    guide = GuidedExploration(
         policy,
         curriculum,
         share=recipe.curriculum.guided_share,
         runs=recipe.run.num_runs,
         generators=generators,
     )
+    return guide.to(next(policy.parameters()).device)
 
 
 def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | None) -> Networks:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
@@ -20,6 +19,7 @@ from torchrl_her_recipes.components.curricula import (
     make_played_env,
     played_rewards,
 )
+from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.components.goal_space import goal_space
 from torchrl_her_recipes.config.imports import permit_task
@@ -49,14 +49,21 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     env = (
         task if state is None else in_layers(task, state.progress, begins=is_guided(recipe, state.curriculum))
     )
-    generators = [torch.Generator().manual_seed(seed) for seed in recipe.seeds]
+    devices = devices_of(recipe)
+    generators = make_generators(recipe.seeds, devices.replay)
+    own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
     rewards = played_rewards(recipe, task)
     bounds = reward_bounds(goal_env(task)) if curriculum is None else rewards
-    agent = make_agent(recipe, env, generators, rewards=bounds, curriculum=curriculum)
+    agent = make_agent(recipe, env, own, rewards=bounds, curriculum=curriculum, device=devices.learner)
     collector = (
-        ProcessCollector(recipe, agent.policy, None if state is None else state.progress)
+        ProcessCollector(
+            recipe,
+            agent.policy,
+            None if state is None else state.progress,
+            storing_device=devices.replay,
+        )
         if processes
-        else make_collector(recipe, env, agent.policy)
+        else make_collector(recipe, env, agent.policy, devices)
     )
     return Components(
         recipe=recipe,
@@ -64,24 +71,42 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
         eval_env=make_played_env(recipe, evaluation_envs(recipe), eval_seeds(recipe, 0)),
         collector=collector,
         buffer=make_buffer(
-            recipe, task, generators, rewards=rewards, space=space, state=state, norm=agent.norm
+            recipe,
+            task,
+            generators,
+            rewards=rewards,
+            space=space,
+            state=state,
+            norm=agent.norm,
+            devices=devices,
         ),
         goal_target=None if space is None else space.target,
-        generators=generators,
+        generators=generators if own is generators else [*generators, *own],
         rewards=rewards,
         curriculum=state,
         **vars(agent),
     )
 
 
-def make_collector(recipe: Recipe, env: EnvBase, policy: TensorDictModuleBase) -> Collector:
+def make_collector(
+    recipe: Recipe, env: EnvBase, policy: TensorDictModuleBase, devices: Devices = ON_THE_CPU
+) -> Collector:
     """Runs a policy in the training environments, a few steps of each at a time."""
+    if devices == ON_THE_CPU:
+        # All of it: where the policy's is left open, every entry is copied at every step.
+        places = {"device": env.device}
+    else:
+        places = {
+            "env_device": env.device,
+            "policy_device": devices.learner,
+            "storing_device": devices.replay,
+        }
     return Collector(
         env,
         policy,
         frames_per_batch=env.batch_size.numel() * recipe.collection.steps_per_batch,
         total_frames=-1,
-        device=env.device,  # all of it: where the policy's is left open, every entry is copied at every step
+        **places,
         auto_register_policy_transforms=False,
     )
 

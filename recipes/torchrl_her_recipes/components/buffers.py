@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
-from torchrl.envs import EnvBase
+from torchrl.envs import DeviceCastTransform, EnvBase
 
 from torchrl_her.curriculum.normalization import count_inputs
 from torchrl_her.curriculum.switch import set_layer_goals
@@ -21,6 +21,7 @@ from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSample
 from torchrl_her.replay_buffers.writer import HERWriter, OnWrite
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
+from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
 from torchrl_her_recipes.components.goal_space import GoalSpace, make_goal_weights
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.learners import priority_power
@@ -39,24 +40,26 @@ def make_buffer(
     space: GoalSpace | None = None,
     state: CurriculumState | None = None,
     norm: RunningNorm | None = None,
+    devices: Devices = ON_THE_CPU,
 ) -> TensorDictReplayBuffer:
     """The replay buffer of all runs, with the hindsight writer and the sampler.
 
     Args:
         recipe: of the runs.
         env: of their task.
-        generators: sources of random numbers, one of each run.
+        generators: sources of random numbers, one of each run, where the buffer is.
 
     Keyword Args:
         rewards: of a missed goal and of an achieved one.
         space: of the goals; None where they are not counted.
         state: the curriculum, if there is one.
         norm: counts what is written and normalizes what is sampled; None for raw transitions.
+        devices: where the buffer is, and the learner that samples from it.
     """
     algorithm, task, runs = get_algorithm(recipe.hindsight.algo), goal_env(env), len(generators)
     own = [make_goal_weights(recipe, task, space) for _ in range(runs if algorithm.hindsight else 0)]
     buffer = TensorDictReplayBuffer(
-        storage=PackedStorage(runs * recipe.replay.buffer_size),
+        storage=PackedStorage(runs * recipe.replay.buffer_size, device=devices.replay),
         writer=HERWriter(
             EnvReward(task.compute_reward, task.compute_terminated),
             **_goals(recipe),
@@ -70,9 +73,11 @@ def make_buffer(
             generators=generators,
             on_write=None if norm is None else _counted_by(norm, state),
         ),
-        sampler=_make_sampler(recipe, generators),
+        sampler=_make_sampler(recipe, generators, devices.replay),
         priority_key="td_error",
     )
+    if devices.learner != devices.replay:
+        buffer.append_transform(DeviceCastTransform(devices.learner, orig_device=devices.replay))
     if state is not None:
         for run in range(runs):
             set_layer_goals(buffer.writer, state.progress.layer_of(run), run=run)
@@ -97,10 +102,10 @@ def _counted_by(norm: RunningNorm, state: CurriculumState | None) -> OnWrite:
     return norm.update if state is None else partial(count_inputs, norm, state.progress)
 
 
-def _make_sampler(recipe: Recipe, generators: Sequence[torch.Generator]) -> Sampler:
+def _make_sampler(recipe: Recipe, generators: Sequence[torch.Generator], device: torch.device) -> Sampler:
     options = recipe.replay
     if options.sampler == "uniform":
-        return RunsSampler(options.buffer_size, runs=len(generators), generators=generators)
+        return RunsSampler(options.buffer_size, runs=len(generators), generators=generators, device=device)
     # Alpha is Schaul's, for absolute TD errors; most of TorchRL's losses give their squares.
     return RunsPrioritizedSampler(
         options.buffer_size,
@@ -108,4 +113,5 @@ def _make_sampler(recipe: Recipe, generators: Sequence[torch.Generator]) -> Samp
         beta=options.priority_beta,
         runs=len(generators),
         generators=generators,
+        device=device,
     )

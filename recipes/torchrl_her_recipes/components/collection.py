@@ -33,6 +33,7 @@ from torchrl_her_recipes.components.collection_worker import (
     make_worker_env,
     share_of_envs,
 )
+from torchrl_her_recipes.components.devices import CPU
 from torchrl_her_recipes.config.imports import imported_modules
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -144,16 +145,23 @@ class ProcessCollector(BaseCollector):
         recipe: of the runs.
         policy: whose weights, epsilon of exploration included, are sent to the processes.
         progress: the layers of the runs, which are sent with each reset; None without a curriculum.
+        storing_device: where batches come. The processes are on the CPU.
 
     Raises:
         RuntimeError: a process failed, when asked for a batch.
     """
 
     def __init__(
-        self, recipe: Recipe, policy: TensorDictModuleBase, progress: CurriculumProgress | None = None
+        self,
+        recipe: Recipe,
+        policy: TensorDictModuleBase,
+        progress: CurriculumProgress | None = None,
+        *,
+        storing_device: torch.device = CPU,
     ) -> None:
         super().__init__()
         self.recipe, self.policy, self.progress = recipe, policy, progress
+        self.storing_device = storing_device
         self.requested_frames_per_batch = (
             len(recipe.seeds) * recipe.collection.num_envs * recipe.collection.steps_per_batch
         )
@@ -167,7 +175,8 @@ class ProcessCollector(BaseCollector):
             self.reset()
         assert self._workers is not None
         with self._ended_by_errors():
-            return _in_blocks(self._workers.take(self._weights()), len(self.recipe.seeds))
+            batch = _in_blocks(self._workers.take(self._weights()), len(self.recipe.seeds))
+        return batch if self.storing_device == CPU else batch.to(self.storing_device)
 
     def collect_ahead(self) -> None:
         """Lets the next batch be collected meanwhile, with the present weights of the policy."""
@@ -245,7 +254,7 @@ class ProcessCollector(BaseCollector):
         )
 
     def _weights(self) -> TensorDictBase:
-        return TensorDict.from_module(self.policy).data
+        return TensorDict.from_module(self.policy).data.to(CPU)
 
     @contextmanager
     def _ended_by_errors(self) -> Iterator[None]:
@@ -301,7 +310,7 @@ def _to_send(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     It has no generators of random numbers: each process makes its own, and two of them cannot be sent
     together.
     """
-    copy = deepcopy(policy)
+    copy = deepcopy(policy).to(CPU)
     for module in copy.modules():
         if isinstance(module, Exploration | GuidedExploration):
             module.generators = [None] * len(module.generators)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import cast
 
@@ -90,6 +91,14 @@ class Components:
         average = self.average
         return self.actor if average is None or average.policy is not self.actor else average.module
 
+    @property
+    def player(self) -> TensorDictModuleBase:
+        """The greedy policy where the environments are: a copy of it, if it learns elsewhere."""
+        weight = next(self.greedy.parameters(), None)
+        if weight is None or weight.device == self.eval_env.device:
+            return self.greedy
+        return deepcopy(self.greedy).to(self.eval_env.device)
+
     def learner(self) -> Learner:
         """Gradient steps on the loss: fused where that is possible, through the loss module elsewhere.
 
@@ -120,6 +129,8 @@ class Components:
         )
 
     def _why_not_fused(self) -> str | None:
+        if self.recipe.learner.device != "cpu":
+            return f"learner.device={self.recipe.learner.device}: fused steps are for the CPU"
         if not is_plain_adam(self.optimizer, self.loss):
             return f"an optimizer that is not a plain Adam over the loss's parameters, {self.optimizer}"
         return why_not_fused(self.loss, self.target)

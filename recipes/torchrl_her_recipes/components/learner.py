@@ -61,7 +61,10 @@ class LearnerBuilder(ABC):
 
     Attributes:
         options: the recipe's group of the learner's own options.
+        device: where networks and losses are.
     """
+
+    device = torch.device("cpu")
 
     def __init__(self, recipe: Recipe, env: EnvBase, in_keys: Sequence[str]) -> None:
         self.recipe, self.env, self.in_keys = recipe, env, in_keys
@@ -76,7 +79,7 @@ class LearnerBuilder(ABC):
     @property
     def action_spec(self) -> Any:
         """The actions of one environment."""
-        return self.env.action_spec_unbatched
+        return self.env.action_spec_unbatched.to(self.device)
 
     @abstractmethod
     def networks(self, runs: int) -> Networks:

@@ -99,6 +99,10 @@ class ReplayConfig(Group):
         0.6, "exponent of priorities, for absolute TD errors (Schaul et al.)", at_least=0
     )
     priority_beta: float = option(0.4, "exponent of importance weights (Schaul et al.)", at_least=0)
+    device: str = option(
+        "learner",
+        "where transitions are stored and relabeled: learner (where the networks are), cpu, cuda, ...",
+    )
     buffer_size: int = option(
         1_000_000, "capacity in transitions, real and virtual ones together", at_least=1
     )

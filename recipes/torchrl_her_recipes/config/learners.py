@@ -33,6 +33,7 @@ class LearnerConfig(Group):
         "auto: ddpg, or dqn where actions are discrete; or a learner of `torchrl-her list`",
         shown_as="learner",
     )
+    device: str = option("cpu", "where the networks are: cpu, cuda, cuda:1, ..., or auto")
     gamma: float = option(0.98, "discount factor", above=0, below=1)
     learning_rate: float = option(1e-3, "learning rate of Adam", above=0)
     max_grad_norm: float = option(3.0, "gradients of each network are clipped to this norm", above=0)

@@ -26,7 +26,8 @@ def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDic
     task.set_seeds(eval_seeds(recipe, epoch))
     worlds = env.batch_size[0] // runs
     rounds = math.ceil(episodes / worlds)
-    played = [evaluate(env, components.greedy, max_steps=task.max_steps) for _ in range(rounds)]
+    player = components.player
+    played = [evaluate(env, player, max_steps=task.max_steps) for _ in range(rounds)]
     if rounds == 1:
         return played[0]
     return torch.cat([own.unflatten(0, (runs, worlds)) for own in played], 1)[:, :episodes].flatten(0, 1)

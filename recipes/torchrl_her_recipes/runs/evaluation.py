@@ -38,9 +38,10 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     if rollout["action"].is_floating_point():
         spec = components.env.action_spec_unbatched
         measured["saturation"] = saturation(rollout["action"], spec.low, spec.high).mean(1)
-    start = rollout[:, 0]
+    start = rollout[:, 0].to(next(components.loss.parameters()).device)
     value = critic_value(components.loss, start if components.norm is None else components.norm(start))
     if value is not None:
+        value = value.to(returns.device)
         measured |= {"q": value.squeeze(-1), "q_bias": q_bias(value, returns)}
     means = {name: value.view(recipe.run.num_runs, -1).mean(1) for name, value in measured.items()}
     if components.curriculum is None:

@@ -54,7 +54,7 @@ def film_policy(components: Components, out: Path, *, run: int, epoch: int) -> N
 def _film(components: Components, env: EnvBase, out: Path, first: int, count: int) -> None:
     frames = record_episodes(
         env,
-        components.greedy,
+        components.player,
         worlds=range(first, first + count),
         achieved_reward=components.rewards[1],
     )

@@ -1,0 +1,72 @@
+"""Where networks learn and transitions are stored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+
+from torchrl_her_recipes.config.recipe import Recipe
+
+CPU = torch.device("cpu")
+_WORTH_IT = 1e9  # multiplications of a gradient step of all runs, from which on a GPU is worth its calls
+
+
+class Devices(NamedTuple):
+    """Where the parts of a run are. Environments are on the CPU.
+
+    Attributes:
+        learner: networks, losses, optimizer and the policy that plays.
+        replay: storage, priorities and relabeling.
+    """
+
+    learner: torch.device
+    replay: torch.device
+
+
+ON_THE_CPU = Devices(CPU, CPU)
+
+
+def devices_of(recipe: Recipe) -> Devices:
+    """The devices that a recipe asks for.
+
+    Raises:
+        ValueError: one of them is not there.
+    """
+    learner = _choose(recipe) if recipe.learner.device == "auto" else recipe.learner.device
+    replay = recipe.replay.device
+    return Devices(
+        _find(learner, "learner.device"),
+        _find(learner if replay == "learner" else replay, "replay.device"),
+    )
+
+
+def make_generators(seeds: Sequence[int], device: torch.device) -> list[torch.Generator]:
+    """Sources of random numbers on a device, one for each run."""
+    return [torch.Generator(device).manual_seed(seed) for seed in seeds]
+
+
+def _choose(recipe: Recipe) -> str:
+    """A GPU if there is one and the gradient steps are large enough for it."""
+    learner = recipe.learner
+    weights = (learner.depth - 1) * learner.hidden**2 * (1 + getattr(learner, "critics", 1))
+    work = 6 * weights * recipe.replay.batch_size * recipe.run.num_runs
+    return "cuda" if torch.cuda.is_available() and work >= _WORTH_IT else "cpu"
+
+
+def _find(name: str, option: str) -> torch.device:
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise ValueError(
+            f"{option} must be cpu, auto, or a device such as cuda or cuda:1, got {name!r}"
+        ) from None
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", 0)
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = " ".join(str(error).split()).partition(". ")[0]
+        raise ValueError(f"{option}={name} is not there: {reason}; cpu always is") from error
+    return device

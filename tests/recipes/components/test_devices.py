@@ -1,0 +1,118 @@
+"""Recipes on other devices: tried on an emulated one, and on a GPU where there is one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_her import FusedLearner, LossLearner, load_checkpoint
+from torchrl_her_recipes import Components, build, cli, load_actor, resume, run
+from torchrl_her_recipes.components.devices import devices_of
+
+from ..small import assert_same, small
+
+CURRICULUM = {
+    "task": "hand_v1",
+    "algo": "cher_ibs",
+    "normalize": True,
+    "guided_share": 0.5,
+    "window": 4,
+    "success_threshold": 0.01,
+}
+
+
+@pytest.fixture
+def name(device: torch.device) -> str:
+    return device.type
+
+
+def places(components: Components) -> tuple[set[str], set[str]]:
+    """Where the parts of the learner are, and those of the buffer."""
+    learner = [*components.loss.parameters(), *components.policy.parameters(), *components.policy.buffers()]
+    for state in components.optimizer.state.values():
+        learner += [value for value in state.values() if value.ndim]
+    rows: TensorDictBase = components.buffer.storage[:]
+    replay = {own.device.type for own in rows.values(True, True)}
+    return {own.device.type for own in learner}, replay | {components.buffer.sampler.device.type}
+
+
+@pytest.mark.parametrize("options", [{}, CURRICULUM], ids=["filtered_her", "curriculum"])
+@pytest.mark.parametrize("learner", ["here", "there"])
+@pytest.mark.parametrize("replay", ["here", "there"])
+def test_each_part_is_where_it_should_be(
+    options: dict[str, Any], learner: str, replay: str, name: str
+) -> None:
+    at = {"here": "cpu", "there": name}
+    recipe = small(
+        num_runs=2, epochs=2, **options, **{"learner.device": at[learner], "replay.device": at[replay]}
+    )
+    components = build(recipe)
+    result = run(components, progress=False)
+    assert places(components) == ({at[learner]}, {at[replay]})
+    assert len(result.rows) == 4
+    assert components.eval_env.reset()["observation"].device.type == "cpu"
+
+
+@pytest.mark.parametrize("learner", ["td3", "sac", "redq", "tqc"])
+def test_every_learner(learner: str, name: str) -> None:
+    components = build(small(learner=learner, epochs=1, **{"learner.device": name}))
+    run(components, progress=False)
+    assert places(components) == ({name}, {name})
+
+
+def test_dqn(name: str) -> None:
+    components = build(small(task="bit_flip", epochs=1, **{"learner.device": name}))
+    run(components, progress=False)
+    assert places(components)[0] == {name}
+
+
+def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> None:
+    options = {**CURRICULUM, "learner.device": name, "num_runs": 2, "checkpoint_interval": 1}
+    whole = run(build(small(epochs=3, **options)), tmp_path / "whole", progress=False)
+    run(build(small(epochs=2, **options)), tmp_path / "parts", progress=False)
+    again = resume(tmp_path / "parts", options={"epochs": 3}, progress=False)
+    assert [row["success"] for row in again.rows] == [row["success"] for row in whole.rows]
+    ends = [load_checkpoint(tmp_path / own / "checkpoint.pt")["loss"] for own in ("whole", "parts")]
+    assert_same(*ends)
+
+
+def test_policies_are_played_without_the_device(name: str, tmp_path: Path) -> None:
+    run(build(small(epochs=1, **{"learner.device": name})), tmp_path / "run", progress=False)
+    assert {own.device.type for own in load_actor(tmp_path / "run").parameters()} == {"cpu"}
+
+
+def test_steps_are_fused_on_the_cpu_only(device: torch.device) -> None:
+    learner = build(small(**{"learner.device": device.type})).learner()
+    assert isinstance(learner, FusedLearner if device.type == "cpu" else LossLearner)
+
+
+def test_the_replay_is_where_the_learner_is_if_nothing_else_is_asked_for(name: str) -> None:
+    assert {own.type for own in devices_of(small(**{"learner.device": name}))} == {name}
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_auto_is_the_cpu_where_there_is_no_gpu() -> None:
+    large = small(num_runs=50, hidden=256, **{"learner.device": "auto"})
+    assert {own.type for own in devices_of(large)} == {"cpu"}
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize(
+    ("option", "line"),
+    [
+        ("learner.device=cuda", "torchrl-her: learner.device=cuda is not there: "),
+        ("replay.device=cuda:3", "torchrl-her: replay.device=cuda:3 is not there: "),
+        ("learner.device=gpu", "torchrl-her: learner.device must be cpu, auto, or a device such as cuda or "),
+    ],
+)
+def test_what_is_not_there_is_said_in_a_line(
+    option: str, line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["train", option, f"folder={tmp_path / 'run'}"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert said.startswith(line)
+    assert "\n" not in said
