@@ -55,6 +55,8 @@ def train(options: tuple[str, ...], multirun: bool, resume: Path | None, show: b
 def _train(wanted: RunRequest) -> recipes.RunResult:
     components = recipes.build(wanted.recipe)
     _say_start(wanted.folder)
+    if wanted.recipe.learner.device == "auto":
+        click.echo(f"learner.device=auto: {next(components.loss.parameters()).device}")
     return recipes.run(components, wanted.folder)
 
 

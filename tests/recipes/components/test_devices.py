@@ -13,7 +13,7 @@ from torchrl_her import FusedLearner, LossLearner, load_checkpoint
 from torchrl_her_recipes import Components, build, cli, load_actor, resume, run
 from torchrl_her_recipes.components.devices import devices_of
 
-from ..small import assert_same, small
+from ..small import assert_same, overrides, small
 
 CURRICULUM = {
     "task": "hand_v1",
@@ -98,6 +98,12 @@ def test_the_replay_is_where_the_learner_is_if_nothing_else_is_asked_for(name: s
 def test_auto_is_the_cpu_where_there_is_no_gpu() -> None:
     large = small(num_runs=50, hidden=256, **{"learner.device": "auto"})
     assert {own.type for own in devices_of(large)} == {"cpu"}
+
+
+def test_what_auto_took_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = overrides(epochs=1, folder=tmp_path / "run")
+    assert cli.main(["train", *options, "learner.device=auto"]) == 0
+    assert "learner.device=auto: cpu\n" in capsys.readouterr().out
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
