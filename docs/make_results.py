@@ -21,7 +21,7 @@ from torchrl_her_envs import make_env
 from torchrl_her_recipes.config.study import load_study
 from torchrl_her_recipes.reports.results import Combination, at_the_end
 from torchrl_her_recipes.reports.tidy import is_results, read_results, write_results
-from torchrl_her_recipes.runs.plots import draw_goals, plot_comparison
+from torchrl_her_recipes.runs.plots import draw_curves, draw_goals, plot_comparison
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results"
@@ -34,10 +34,18 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "draws": str(HERE / "studies" / "draws.yaml"),
     "learners": str(HERE / "studies" / "learners.yaml"),
     "n_steps": "n_steps",
+    "fetch": "fetch",
     "window": "window",
     "initialisation": "initialisation",
 }
 MAPS = ("ibs", "bias")  # studies whose maps of virtual goals are drawn
+# What others have published on the Fetch tasks: environment steps, and success read off their plots.
+PUBLISHED = {
+    "gym:FetchReach-v4": {"MRL": [(10_000, 1.0)]},
+    "gym:FetchPush-v4": {"MRL": [(250_000, 0.90), (450_000, 0.99)]},
+    "gym:FetchPickAndPlace-v4": {"MRL": [(550_000, 0.90), (750_000, 0.97)]},
+    "gym:FetchSlide-v4": {"MRL": [(770_000, 0.80)]},
+}
 
 Rows = list[dict[str, float]]
 
@@ -74,6 +82,18 @@ def draw_success(cells: Sequence[Combination], path: Path) -> None:
     plot_comparison(panels, path)
 
 
+def draw_beside_published(cells: Sequence[Combination], path: Path) -> None:
+    """A panel for each task: our curve, and what others have published."""
+    figure = Figure(figsize=(1.0 + 4.2 * len(cells), 3.8), layout="constrained")
+    for axes, cell in zip(figure.subplots(1, len(cells), squeeze=False)[0], cells, strict=True):
+        draw_curves(axes, {"torchrl-her": cell.rows}, "success", {"torchrl-her": "#2b6cb0"})
+        for name, points in PUBLISHED.get(cell.task, {}).items():
+            axes.plot(*zip(*points, strict=True), "o--", color="#dd6b20", label=f"{name} (published)")
+        axes.set(title=cell.task.removeprefix("gym:"), xlabel="environment steps of each run")
+        axes.legend(fontsize=8, loc="lower right")
+    figure.savefig(path, dpi=110)
+
+
 def draw_maps(cells: Sequence[Combination], path: Path) -> None:
     """Where virtual goals lie: a row for each task, q of each algorithm, and q* at the right."""
     tasks = list(dict.fromkeys(cell.task for cell in cells))
@@ -107,9 +127,15 @@ def main() -> None:
         export(options.runs)
     for name in STUDIES:
         if is_results(RESULTS / name):
-            cells = [cell for cell in read_results(RESULTS / name).cells if cell.done]
+            every = read_results(RESULTS / name).cells
+            cells = [cell for cell in every if cell.done]
             print(f"\n### {name}\n")
             print_table(cells)
+            if name == "fetch":
+                draw_beside_published(
+                    [cell for cell in every if not cell.missing], options.images / "fetch.png"
+                )
+                continue
             draw_success(cells, options.images / f"{name}.png")
             if name in MAPS and any(cell.goals is not None for cell in cells):
                 draw_maps(cells, options.images / f"{name}_goals.png")
