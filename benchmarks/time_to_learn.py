@@ -7,7 +7,7 @@
 All train in as many worlds of the same task with the same networks, batches, discount and number of
 gradient steps; all are asked every epoch for the success of greedy episodes in the same environment, which
 is not timed. Runs are taken in turns, and end where the aim is reached (never, if it is above 1). With
-``--curves`` a run is written when it ends, and is not made again.
+``--curves`` a run is written when it ends, and is not made again: each setting needs a file of its own.
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from machine import describe, publish, table
+from machine import describe, one_core, publish, table
 from matplotlib.figure import Figure
 from peers.sb3 import make_sb3
-from peers.sbx_sac import make_sac
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tensordict import TensorDictBase
 
@@ -65,6 +64,8 @@ def ddpg(recipe: Recipe, noise: float) -> Iterator[Policy]:
 
 def sac(recipe: Recipe, _noise: float) -> Iterator[Policy]:
     """The same of SBX's SAC, which explores by the entropy of its policy."""
+    from peers.sbx_sac import make_sac  # noqa: PLC0415  # only those who ask for it wait for JAX
+
     return _learn(recipe, make_sac(recipe))
 
 
@@ -125,11 +126,13 @@ def line(name: str, curves: Sequence[Sequence[Point]], aim: float) -> list[str]:
 
 
 def write_runs(runs: Runs, path: Path) -> None:
-    with open(path, "w", newline="") as file:
+    part = path.with_suffix(".part")  # so that a stop in between loses nothing
+    with open(part, "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("contender", "seed", *Point._fields))
         for run, curve in runs.items():
             writer.writerows((*run, *(f"{value:.6g}" for value in point)) for point in curve)
+    part.replace(path)
 
 
 def read_runs(path: Path) -> Runs:
@@ -207,4 +210,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_core():
+        main()

@@ -54,6 +54,11 @@ def options(recipe: Recipe) -> dict[str, Any]:
     }
 
 
+def steps_each(recipe: Recipe) -> int:
+    """Gradient steps for a step of all environments: whole ones, rounded down, and at least one."""
+    return max(1, int(recipe.collection.num_envs / recipe.collection.frames_per_update))
+
+
 def rounds(recipe: Recipe) -> dict[str, Any]:
     """The recipe's environment steps between two rounds of gradient steps, and gradient steps in a round.
 

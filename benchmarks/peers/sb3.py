@@ -9,7 +9,7 @@ from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from peers.baselines import Baseline, make_envs, options
+from peers.baselines import Baseline, make_envs, options, steps_each
 from torchrl_her_recipes import Recipe
 
 
@@ -49,8 +49,7 @@ def make_sb3(recipe: Recipe, *, noise: float = 0.0) -> DDPG:
     return DDPG(
         env=envs,
         train_freq=(1, "step"),
-        # as many whole ones for a step of all environments as the recipe says
-        gradient_steps=int(recipe.collection.num_envs / recipe.collection.frames_per_update),
+        gradient_steps=steps_each(recipe),
         learning_starts=recipe.collection.warmup_frames,
         action_noise=NormalActionNoise(np.zeros(actions), np.full(actions, noise)) if noise else None,
         **options(recipe),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sbx import SAC
 
-from peers.baselines import make_envs, options
+from peers.baselines import make_envs, options, steps_each
 from torchrl_her_recipes import Recipe
 
 ENTROPY = 0.05  # what the return of a step is worth beside its entropy: the fixed one that does best on Push
@@ -21,7 +21,7 @@ def make_sac(recipe: Recipe) -> SAC:
     return SAC(
         env=make_envs(recipe),
         train_freq=(1, "step"),
-        gradient_steps=int(recipe.collection.num_envs / recipe.collection.frames_per_update),
+        gradient_steps=steps_each(recipe),
         learning_starts=recipe.collection.warmup_frames,
         ent_coef=ENTROPY,
         **options(recipe),

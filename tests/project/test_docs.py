@@ -34,7 +34,13 @@ def conf() -> ModuleType:
 # The other guides have tests of their own: below, test_examples.py, test_extending.py, test_gym_guide.py.
 @pytest.mark.parametrize(
     ("page", "number"),
-    [("devices.md", 1), ("index.md", 1), ("normalization.md", 2), ("replay_buffers.md", 4), ("weights.md", 3)],
+    [
+        ("devices.md", 1),
+        ("index.md", 1),
+        ("normalization.md", 2),
+        ("replay_buffers.md", 4),
+        ("weights.md", 3),
+    ],
 )
 def test_a_page_s_python_runs_from_top_to_bottom(page: str, number: int) -> None:
     assert len(blocks(page)) == number

@@ -170,6 +170,7 @@ def test_buffers_of_several_runs(
         sampled["td_error"] = torch.rand(16, device=device)
         buffer.update_tensordict_priority(sampled)
         check(buffer.sample(), device)
+    assert buffer.storage.packed is not None
     state = buffer_state_dict(buffer)
     before = buffer.storage[:].clone()
     for run in range(2):

@@ -143,11 +143,12 @@ class GuidedExploration(TensorDictModuleBase):
         """Draws which of the episodes that begin are guided; the others are as they were."""
         if self.guided is None or self.guided.shape != begun.shape:
             self.guided = torch.zeros_like(begun)
+        self.guided = self.guided.to(begun.device)  # it may have come with a checkpoint
         blocks = zip(self.guided.chunk(len(layers)), begun.chunk(len(layers)), strict=True)
         for (guided, new), layer, generator in zip(blocks, layers, self.generators, strict=True):
-            if bool(new.any()):
+            if layer >= 0 and bool(new.any()):  # the others draw nothing, as when they are alone
                 drawn = torch.rand(new.shape, generator=generator, device=new.device) < self.share
-                guided.copy_(torch.where(new, drawn & (layer >= 0), guided))
+                guided.copy_(torch.where(new, drawn, guided))
         return self.guided
 
     def _look(self, state: Tensor, layers: list[int]) -> tuple[Tensor, ...]:

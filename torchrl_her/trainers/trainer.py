@@ -275,7 +275,10 @@ def _without(value: Tensor, idle: list[int]) -> Tensor:
 
 def _joined(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """All steps [..., R] of each entry, joined."""
-    return {key: torch.cat([own[key] for own in measured]) for key in (measured[0] if measured else {})}
+    if not measured:
+        return {}
+    # What was measured before a stop comes from a file, so perhaps from another device.
+    return {key: torch.cat([own[key].to(last) for own in measured]) for key, last in measured[-1].items()}
 
 
 def _means(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:

@@ -129,8 +129,9 @@ class Components:
         )
 
     def _why_not_fused(self) -> str | None:
-        if self.recipe.learner.device != "cpu":
-            return f"learner.device={self.recipe.learner.device}: fused steps are for the CPU"
+        device = next(self.loss.parameters()).device
+        if device.type != "cpu":
+            return f"networks on {device}: fused steps are for the CPU"
         if not is_plain_adam(self.optimizer, self.loss):
             return f"an optimizer that is not a plain Adam over the loss's parameters, {self.optimizer}"
         return why_not_fused(self.loss, self.target)

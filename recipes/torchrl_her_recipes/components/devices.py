@@ -37,8 +37,8 @@ def devices_of(recipe: Recipe) -> Devices:
     learner = _choose(recipe) if recipe.learner.device == "auto" else recipe.learner.device
     replay = recipe.replay.device
     return Devices(
-        _find(learner, "learner.device"),
-        _find(learner if replay == "learner" else replay, "replay.device"),
+        _find(learner, "learner.device", "auto"),
+        _find(learner if replay == "learner" else replay, "replay.device", "learner"),
     )
 
 
@@ -49,23 +49,25 @@ def make_generators(seeds: Sequence[int], device: torch.device) -> list[torch.Ge
 
 def _choose(recipe: Recipe) -> str:
     """A GPU if there is one and the gradient steps are large enough for it."""
-    learner = recipe.learner
-    weights = (learner.depth - 1) * learner.hidden**2 * (1 + getattr(learner, "critics", 1))
-    work = 6 * weights * recipe.replay.batch_size * recipe.run.num_runs
+    work = 6 * recipe.learner.hidden_weights * recipe.replay.batch_size * recipe.run.num_runs
     return "cuda" if torch.cuda.is_available() and work >= _WORTH_IT else "cpu"
 
 
-def _find(name: str, option: str) -> torch.device:
+def _find(name: str, option: str, word: str) -> torch.device:
+    """The device of a name, which must be there and draw random numbers."""
     try:
         device = torch.device(name)
     except RuntimeError:
         raise ValueError(
-            f"{option} must be cpu, auto, or a device such as cuda or cuda:1, got {name!r}"
+            f"{option} must be {word}, cpu, or a device such as cuda or cuda:1, got {name!r}"
         ) from None
-    if device.type == "cuda" and device.index is None:
-        device = torch.device("cuda", 0)
+    if device.type == "cpu":
+        return CPU
+    if device.index is None:
+        device = torch.device(device.type, 0)
     try:
         torch.empty(0, device=device)
+        torch.Generator(device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = " ".join(str(error).split()).partition(". ")[0]
         raise ValueError(f"{option}={name} is not there: {reason}; cpu always is") from error

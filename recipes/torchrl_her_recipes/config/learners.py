@@ -28,6 +28,11 @@ class LearnerConfig(Group):
 
     has_epsilon: ClassVar[bool] = False
 
+    @property
+    def hidden_weights(self) -> int:
+        """How many weights there are between hidden layers, of the actor and all critics."""
+        return (self.depth - 1) * self.hidden**2 * (1 + getattr(self, "critics", 1))
+
     name: str = option(
         "auto",
         "auto: ddpg, or dqn where actions are discrete; or a learner of `torchrl-her list`",

@@ -66,7 +66,7 @@ class Study:
         if strange := [name for name in (*self.recipe, *self.vary) if not isinstance(name, str)]:
             raise ValueError(f"options of {self.name} must be names, got {strange[0]!r}")
         if not isinstance(self.cases, Mapping) or not all(
-            isinstance(name, str) and re.fullmatch(r"[\w.=+-]+", name) and isinstance(own, Mapping)
+            isinstance(name, str) and re.fullmatch(r"\w[\w.=+-]*", name) and isinstance(own, Mapping)
             for name, own in self.cases.items()
         ):
             raise ValueError(

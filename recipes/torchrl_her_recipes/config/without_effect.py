@@ -56,6 +56,8 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         idle["learner", "normalize_clip"] = "with normalize=false"
     if groups.learner.compile == "never":
         idle["learner", "products"] = "with compile=never"
+    elif not groups.learner.device.startswith(("cpu", "auto")):
+        idle["learner", "products"] = f"with learner.device={groups.learner.device}"
     elif groups.run.dtype == "float64":
         idle["learner", "products"] = "with dtype=float64"
     elif groups.learner.norm == "batch":

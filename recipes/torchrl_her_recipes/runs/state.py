@@ -52,8 +52,7 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
         ValueError: the components are of other types or have other settings than those of the run.
     """
     for name, value in _made_of(components).items():
-        if value != state["made_of"][name]:
-            was = state["made_of"][name]
+        if value != (was := state["made_of"].get(name, value)):  # older runs did not say everything
             raise ValueError(
                 f"the run's {name} was {was}, not {value}: give resume() components made as its were"
             )
@@ -113,7 +112,10 @@ def _made_of(components: Components) -> dict[str, str]:
         name: type(getattr(components, name)).__name__
         for name in ("actor", "critic", "loss", "optimizer", "target")
     }
+    guide = components.guide
     return names | {
+        "guide": type(guide).__name__,
+        "device": str(next(components.loss.parameters()).device),
         "writer": " ".join(map(str, [type(writer).__name__, *hindsight])),
         "sampler": type(components.buffer.sampler).__name__,
     }

@@ -19,8 +19,8 @@ _STATES = 256  # for each number of wrong bits
 @torch.no_grad()
 def action_values(actor: TensorDictModuleBase, place: Tensor, goal: Tensor) -> Tensor:
     """The values [..., actions] of all actions in places [..., g] when goals [..., g] are desired."""
-    seen = {"observation": place, "desired_goal": goal}
-    return actor(TensorDict(seen, place.shape[:-1]))["action_value"]
+    seen = TensorDict({"observation": place, "desired_goal": goal}, place.shape[:-1])
+    return actor(seen.to(next(actor.parameters()).device))["action_value"].to(place.device)
 
 
 def some_wrong(

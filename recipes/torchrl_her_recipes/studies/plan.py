@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from heapq import heapreplace
 
-from torchrl_her_envs import TASKS
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.studies.jobs import Job, Progress, kept_progress
 
@@ -33,7 +32,7 @@ def expected_seconds(recipe: Recipe, epochs: int) -> float:
     """
     frames = epochs * recipe.collection.epoch_frames
     played = frames * recipe.run.num_runs
-    own = recipe.task.name in TASKS
+    own = ":" not in recipe.task.name
     worlds = 0 if own else played + epochs * recipe.run.num_runs * recipe.evaluation.episodes * _EPISODE
     steps = played / recipe.collection.frames_per_update
     return frames * _CALL + played * _FRAME + worlds * _WORLD + steps * _step(recipe)
@@ -42,7 +41,7 @@ def expected_seconds(recipe: Recipe, epochs: int) -> float:
 def _step(recipe: Recipe) -> float:
     """Seconds of a gradient step of a run."""
     learner = recipe.learner
-    weights = (learner.depth - 1) * learner.hidden**2 * (1 + getattr(learner, "critics", 1)) / 2
+    weights = learner.hidden_weights / 2
     weight = _WEIGHT * (_NARROW if learner.products == "bfloat16" else 1)
     return _UPDATE + recipe.replay.batch_size * (_ROW + weights * weight)
 

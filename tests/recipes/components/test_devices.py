@@ -64,8 +64,13 @@ def test_every_learner(learner: str, name: str) -> None:
     assert places(components) == ({name}, {name})
 
 
-def test_dqn(name: str) -> None:
-    components = build(small(task="bit_flip", epochs=1, **{"learner.device": name}))
+@pytest.mark.parametrize(
+    "options",
+    [{"task": "bit_flip", "task.options": {"bits": 4, "useless_action": True}}, {"task": "treasure_hunt"}],
+    ids=["bit_flip", "treasure_hunt"],
+)
+def test_dqn(name: str, options: dict[str, Any]) -> None:
+    components = build(small(epochs=1, **options, **{"learner.device": name}))
     run(components, progress=False)
     assert places(components)[0] == {name}
 
@@ -76,6 +81,8 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> No
     run(build(small(epochs=2, **options)), tmp_path / "parts", progress=False)
     again = resume(tmp_path / "parts", options={"epochs": 3}, progress=False)
     assert [row["success"] for row in again.rows] == [row["success"] for row in whole.rows]
+    layers = load_checkpoint(tmp_path / "parts" / "checkpoint.1.pt")["guide"]["layer"]
+    assert 0 in layers.tolist()  # so that guided episodes went on
     ends = [load_checkpoint(tmp_path / own / "checkpoint.pt")["loss"] for own in ("whole", "parts")]
     assert_same(*ends)
 
@@ -88,6 +95,8 @@ def test_policies_are_played_without_the_device(name: str, tmp_path: Path) -> No
 def test_steps_are_fused_on_the_cpu_only(device: torch.device) -> None:
     learner = build(small(**{"learner.device": device.type})).learner()
     assert isinstance(learner, FusedLearner if device.type == "cpu" else LossLearner)
+    small_steps = build(small(**{"learner.device": "auto"})).learner()
+    assert isinstance(small_steps, FusedLearner)
 
 
 def test_the_replay_is_where_the_learner_is_if_nothing_else_is_asked_for(name: str) -> None:
@@ -112,7 +121,9 @@ def test_what_auto_took_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[st
     [
         ("learner.device=cuda", "torchrl-her: learner.device=cuda is not there: "),
         ("replay.device=cuda:3", "torchrl-her: replay.device=cuda:3 is not there: "),
-        ("learner.device=gpu", "torchrl-her: learner.device must be cpu, auto, or a device such as cuda or "),
+        ("learner.device=gpu", "torchrl-her: learner.device must be auto, cpu, or a device such as cuda or "),
+        ("replay.device=auto", "torchrl-her: replay.device must be learner, cpu, or a device such as cuda "),
+        ("learner.device=meta", "torchrl-her: learner.device=meta is not there: "),
     ],
 )
 def test_what_is_not_there_is_said_in_a_line(

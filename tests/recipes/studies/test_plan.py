@@ -81,6 +81,11 @@ def test_what_costs_more_takes_longer(options: dict[str, Any]) -> None:
     assert expected_seconds(small(**options), 10) > expected_seconds(small(), 10)
 
 
+def test_our_own_worlds_step_all_at_once() -> None:
+    toy, throwing = small(task="bit_flip"), small(task="hand_v0")
+    assert expected_seconds(toy, 10) < 1.5 * expected_seconds(throwing, 10)
+
+
 def test_narrow_products_and_few_episodes_take_less() -> None:
     wide, fetch = small(hidden=256), small(task="gym:FetchPush-v4")
     assert expected_seconds(wide.replace(products="bfloat16"), 10) < expected_seconds(wide, 10)

@@ -127,6 +127,16 @@ def test_runs_beside_others_draw_as_they_would_alone() -> None:
     assert 0.3 < (both > 0).double().mean() < 0.7
 
 
+def test_a_run_without_a_layer_below_draws_nothing() -> None:
+    generators = [torch.Generator().manual_seed(seed) for seed in range(2)]
+    before = [generator.get_state() for generator in generators]
+    guide = GuidedExploration(policy(1.0, 1.0), CURRICULUM, runs=2, generators=generators)
+    guide.follow(policy(1.0, 1.0), 0, run=1)
+    acts(guide, [[3.0, 5.0, 7.0]] * 8)
+    assert torch.equal(generators[0].get_state(), before[0])
+    assert not torch.equal(generators[1].get_state(), before[1])
+
+
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_impossible_shares_are_refused(share: float) -> None:
     with pytest.raises(ValueError, match=r"share must be in \[0, 1\], got"):

@@ -72,8 +72,10 @@ class Batch:
                 f"episodes that are still open were told apart by {held.kind}, this batch by {self.kind}: "
                 "hand over all batches in one form, [N, T] or flat, and with the same ids"
             )
-        run = None if held.run is None or self.run is None else torch.cat((held.run, self.run))
-        return Batch(torch.cat((held.rows, self.rows)), self.kind, torch.cat((held.ids, self.ids)), run)
+        place = self.ids.device  # what is held may have come with a checkpoint
+        run = None if held.run is None or self.run is None else torch.cat((held.run.to(place), self.run))
+        ids = torch.cat((held.ids.to(place), self.ids))
+        return Batch(torch.cat((held.rows.to(place), self.rows)), self.kind, ids, run)
 
     def lanes(self) -> Tensor:
         """Numbers [n] of environments or trajectories, those of one run above those of the run before."""

@@ -94,7 +94,7 @@ class RecentGoals:
             ``(goals, lines)``: [p, g], and where those of each run lie in there, as those of an episode do.
         """
         own = [goals for run in runs if (goals := self.goals[name][run]) is not None]
-        goals = own[0] if len(own) == 1 else torch.cat(own)
+        goals = own[0] if len(own) == 1 else torch.cat([part.to(own[-1]) for part in own])
         lengths = torch.tensor([len(part) for part in own], device=goals.device)
         step = torch.arange(int(lengths.max()), device=goals.device).minimum(lengths.unsqueeze(-1) - 1)
         return goals, Episodes((lengths.cumsum(0) - lengths).unsqueeze(-1) + step, lengths)

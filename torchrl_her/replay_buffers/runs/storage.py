@@ -117,7 +117,7 @@ class PackedStorage(LazyTensorStorage):
     def restore(self, begin: int, packed: Tensor, fields: Sequence[Field]) -> bool:
         """Puts packed rows [n, m] at ``begin``; returns False if this storage holds rows in another way."""
         if not self.initialized:
-            self._allocate(tuple(fields), packed.device)
+            self._allocate(tuple(fields), packed.device if self.device == "auto" else self.device)
             self.initialized = True
         if self.packed is None or self._fields != tuple(fields):
             return False
@@ -178,7 +178,7 @@ def layout(rows: TensorDictBase) -> tuple[Field, ...]:
     """
     entries = []
     for key, entry in rows.items(True, is_leaf=is_leaf_nontensor):
-        if type(entry) is Tensor and entry.numel() > 0:
+        if isinstance(entry, Tensor) and entry.layout is torch.strided and entry.numel() > 0:
             entries.append((key, entry))
         elif not _is_plain_node(entry, rows.batch_size):
             return ()
