@@ -131,7 +131,7 @@ def main() -> None:
             cells = [cell for cell in every if cell.done]
             print(f"\n### {name}\n")
             print_table(cells)
-            if name == "fetch":
+            if name == "fetch" and any(not cell.missing for cell in every):
                 draw_beside_published(
                     [cell for cell in every if not cell.missing], options.images / "fetch.png"
                 )

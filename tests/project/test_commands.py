@@ -35,7 +35,8 @@ def _nothing_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(torchrl_her_recipes, "build", build)
     monkeypatch.chdir(tmp_path)
-    Path("docs").symlink_to(ROOT / "docs")
+    for folder in ("docs", "benchmarks"):
+        Path(folder).symlink_to(ROOT / folder)
     for page in PAGES:  # files that the commands name
         for name, text in re.findall(r"```yaml\n# (\S+\.yaml)\n(.*?)```", page.read_text(), re.DOTALL):
             Path(name).write_text(text)

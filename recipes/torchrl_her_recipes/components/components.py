@@ -28,6 +28,7 @@ from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.curricula import CurriculumState
+from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.goal_space import histograms
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -94,10 +95,8 @@ class Components:
     @property
     def player(self) -> TensorDictModuleBase:
         """The greedy policy where the environments are: a copy of it, if it learns elsewhere."""
-        weight = next(self.greedy.parameters(), None)
-        if weight is None or weight.device == self.eval_env.device:
-            return self.greedy
-        return deepcopy(self.greedy).to(self.eval_env.device)
+        own, place = self.greedy, self.eval_env.device or CPU
+        return own if place_of(own) == place else deepcopy(own).to(place)
 
     def learner(self) -> Learner:
         """Gradient steps on the loss: fused where that is possible, through the loss module elsewhere.
@@ -129,7 +128,7 @@ class Components:
         )
 
     def _why_not_fused(self) -> str | None:
-        device = next(self.loss.parameters()).device
+        device = place_of(self.loss)
         if device.type != "cpu":
             return f"networks on {device}: fused steps are for the CPU"
         if not is_plain_adam(self.optimizer, self.loss):

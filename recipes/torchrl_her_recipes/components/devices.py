@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from torch import nn
 
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -40,6 +41,11 @@ def devices_of(recipe: Recipe) -> Devices:
         _find(learner, "learner.device", "auto"),
         _find(learner if replay == "learner" else replay, "replay.device", "learner"),
     )
+
+
+def place_of(module: nn.Module) -> torch.device:
+    """Where a module's parameters are; the CPU if it has none."""
+    return next((parameter.device for parameter in module.parameters()), CPU)
 
 
 def make_generators(seeds: Sequence[int], device: torch.device) -> list[torch.Generator]:

@@ -15,6 +15,7 @@ from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.metrics import discounted_return, final_distance, q_bias, success
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.components import Components
+from torchrl_her_recipes.components.devices import place_of
 from torchrl_her_recipes.runs.saturation import saturation
 from torchrl_her_recipes.runs.toy_values import measure_values
 
@@ -38,7 +39,7 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     if rollout["action"].is_floating_point():
         spec = components.env.action_spec_unbatched
         measured["saturation"] = saturation(rollout["action"], spec.low, spec.high).mean(1)
-    start = rollout[:, 0].to(next(components.loss.parameters()).device)
+    start = rollout[:, 0].to(place_of(components.loss))
     value = critic_value(components.loss, start if components.norm is None else components.norm(start))
     if value is not None:
         value = value.to(returns.device)

@@ -20,6 +20,7 @@ from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_envs.common.batched_env import BatchedEnv
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.components import Components
+from torchrl_her_recipes.components.devices import place_of
 
 
 def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
@@ -115,7 +116,7 @@ def _made_of(components: Components) -> dict[str, str]:
     guide = components.guide
     return names | {
         "guide": type(guide).__name__,
-        "device": str(next(components.loss.parameters()).device),
+        "device": str(place_of(components.loss)),
         "writer": " ".join(map(str, [type(writer).__name__, *hindsight])),
         "sampler": type(components.buffer.sampler).__name__,
     }

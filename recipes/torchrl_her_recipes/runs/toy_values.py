@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_her_envs.common.goal_env import GoalEnv
 from torchrl_her_envs.toy.bit_flip import BitFlip
 from torchrl_her_envs.toy.treasure_hunt import TreasureHunt
+from torchrl_her_recipes.components.devices import place_of
 
 _STATES = 256  # for each number of wrong bits
 
@@ -20,7 +21,7 @@ _STATES = 256  # for each number of wrong bits
 def action_values(actor: TensorDictModuleBase, place: Tensor, goal: Tensor) -> Tensor:
     """The values [..., actions] of all actions in places [..., g] when goals [..., g] are desired."""
     seen = TensorDict({"observation": place, "desired_goal": goal}, place.shape[:-1])
-    return actor(seen.to(next(actor.parameters()).device))["action_value"].to(place.device)
+    return actor(seen.to(place_of(actor)))["action_value"].to(place.device)
 
 
 def some_wrong(

@@ -152,7 +152,7 @@ def test_the_guide_s_study_is_planned_as_it_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     guide = (Path(__file__).parents[3] / "docs" / "studies.md").read_text()
-    (mine,) = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
+    mine, cases = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text(mine)
     assert main(["study", "mine.yaml", "--plan", "--jobs", "2"]) == 0
@@ -160,6 +160,9 @@ def test_the_guide_s_study_is_planned_as_it_says(
     assert len(lines) == 6
     for line in (first, lines[0], last):
         assert line in guide
+    Path("parts.yaml").write_text(f"vary: {{task: [hand_v1]}}\n{cases}")
+    assert main(["study", "parts.yaml", "--plan"]) == 0
+    assert "hand_v1_no_filter" in capsys.readouterr().out
 
 
 def test_a_combination_that_was_cut_short_goes_on(tmp_path: Path) -> None:
@@ -208,7 +211,10 @@ def test_without_ray_its_name_and_the_remedy_are_given(
         (["nothing"], "there is no study 'nothing'; the studies are bias, "),
         (["ibs", "--seeds", "0"], "Invalid value for '--seeds': 0 is not in the range x>=1"),
         (["ibs", "--frames", "-5"], "Invalid value for '--frames': -5 is not in the range x>=1"),
-        (["recipes: {}"], "a study has no recipes; it has preset, summary, recipe, vary, for_task, figure"),
+        (
+            ["recipes: {}"],
+            "a study has no recipes; it has preset, summary, recipe, vary, cases, for_task, figure",
+        ),
         ([""], "mine.yaml cannot be read: it must hold names and values, got None"),
         (["vary: {algo: ["], "mine.yaml cannot be read: while parsing"),
         (["recipe: {k: 2}"], "vary of mine must hold lists of values by option, got {}"),
