@@ -70,6 +70,7 @@ def sac(recipe: Recipe, _noise: float) -> Iterator[Policy]:
 
 
 def _learn(recipe: Recipe, model: OffPolicyAlgorithm) -> Iterator[Policy]:
+    """Trains a peer's model, and hands out its greedy policy after each epoch."""
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         keys = ("observation", "achieved_goal", "desired_goal")

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torchrl.envs.utils import exploration_type
 
-from .emulated import DEVICE, DeviceGenerator, emulated_device
+from .emulated import emulated_device
 
 # Small tensors are fastest in one thread, and the workers of pytest-xdist share the cores. The second line is
 # for the processes that tests start.
@@ -47,7 +47,6 @@ def make_generator(device: torch.device) -> Callable[[int], torch.Generator]:
     """Makes sources of random numbers on the device."""
 
     def make(seed: int) -> torch.Generator:
-        emulated = device == DEVICE and not torch.cuda.is_available()
-        return (DeviceGenerator() if emulated else torch.Generator(device)).manual_seed(seed)
+        return torch.Generator(device).manual_seed(seed)
 
     return make

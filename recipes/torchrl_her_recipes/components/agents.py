@@ -18,7 +18,7 @@ from torchrl_her.modules.networks import StackedLinear, stack_runs
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her_recipes.components.curricula import is_guided
-from torchrl_her_recipes.components.devices import CPU
+from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.learner import Agent, LearnerBuilder, Networks
 from torchrl_her_recipes.components.normalization import acting, make_norm
 from torchrl_her_recipes.config.learners import AUTO, LEARNERS, Actions, LearnerSpec
@@ -136,7 +136,7 @@ def _guide_of(
         runs=recipe.run.num_runs,
         generators=generators,
     )
-    return guide.to(next(policy.parameters()).device)
+    return guide.to(place_of(policy))
 
 
 def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | None) -> Networks:
