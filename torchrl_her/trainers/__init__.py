@@ -13,6 +13,7 @@ from torchrl_her.trainers.checkpoint import (
 from torchrl_her.trainers.cut import cut_episodes
 from torchrl_her.trainers.fused import FusedLearner
 from torchrl_her.trainers.fusing import can_fuse, is_plain_adam, why_not_fused
+from torchrl_her.trainers.graphs import GraphLearner, why_not_recorded
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.metrics import discounted_return, final_distance, first_episode, q_bias, success
 from torchrl_her.trainers.runs import clip_by_run, keep_runs
@@ -22,6 +23,7 @@ __all__ = [
     "CheckpointError",
     "CollectsAhead",
     "FusedLearner",
+    "GraphLearner",
     "Learner",
     "LossLearner",
     "Schedule",
@@ -45,4 +47,5 @@ __all__ = [
     "save_checkpoint",
     "success",
     "why_not_fused",
+    "why_not_recorded",
 ]

@@ -13,7 +13,7 @@ from torchrl.objectives.utils import TargetNetUpdater
 
 from torchrl_her.trainers.runs import clip_by_run, keep_runs, run_dims
 
-_WEIGHT = "priority_weight"  # of importance sampling, as TorchRL's samplers and losses call it
+WEIGHT = "priority_weight"  # of importance sampling, as TorchRL's samplers and losses call it
 
 
 class Learner(Protocol):
@@ -96,11 +96,11 @@ class LossLearner:
         return {key: torch.stack([step[key] for step in measured]) for key in measured[0]}
 
     def _update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        weight = batch.get(_WEIGHT, None)
+        weight = batch.get(WEIGHT, None)
         if weight is not None:
             # With reduction="mean" TorchRL divides by the sum of the weights, with "none" it does not.
             by_run = weight.reshape(self.runs, -1)
-            batch.set(_WEIGHT, (by_run / by_run.mean(1, keepdim=True)).view_as(weight))
+            batch.set(WEIGHT, (by_run / by_run.mean(1, keepdim=True)).view_as(weight))
         output = self.loss(batch)
         losses = {
             key: self._mean(key, value, batch) for key, value in output.items() if key.startswith("loss")

@@ -35,6 +35,12 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 @click.option("--plan", is_flag=True, help="only say what is to do, and how long it takes")
 @click.option("--jobs", type=click.IntRange(1), help="batched runs at once (default: one for each core)")
 @click.option("--ray", metavar="ADDRESS", help="over a Ray cluster: auto, or HOST:PORT")
+@click.option(
+    "--gpus-per-job",
+    type=click.FloatRange(0.0),
+    default=0.0,
+    help="with --ray, the share of a GPU that each batched run gets, as 0.25",
+)
 @allow_import
 def study(
     name: str,
@@ -45,16 +51,19 @@ def study(
     plan: bool,
     jobs: int | None,
     ray: str | None,
+    gpus_per_job: float,
 ) -> int:
     """Run the study NAME: one of torchrl-her list, or a .yaml file. The same command goes on with it."""
     if jobs is not None and ray is not None:
         raise click.UsageError("--jobs and --ray cannot be given together")
+    if gpus_per_job and ray is None:
+        raise click.UsageError("--gpus-per-job needs --ray: on one machine, jobs share its GPUs as they are")
     own = load_study(name, seeds=seeds, frames=frames, quick=quick)
     for _, recipe in own.cells():  # each combination is checked before torch is imported
         check_permitted(recipe.task.name)
     home = folder or Path("runs") / (own.name + ("_quick" if quick else ""))
     to_do = recipes.plan_study(own, home)
-    workers: Any = recipes.make_workers(jobs=jobs, ray=ray)
+    workers: Any = recipes.make_workers(jobs=jobs, ray=ray, gpus_per_job=gpus_per_job)
     _say_plan(own.name, home, to_do, workers.at_once)
     if plan:
         workers.close()

@@ -1,4 +1,4 @@
-"""Collecting in processes of their own, while this one learns."""
+"""Collecting in processes of their own, here or on the nodes of a cluster, while this one learns."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
+from importlib import import_module
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
 from queue import Empty
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
@@ -30,6 +31,7 @@ from torchrl_her_recipes.components.collection_worker import (
     Beginning,
     WorkerCollector,
     begin_process,
+    derive_seed,
     make_worker_env,
     share_of_envs,
 )
@@ -138,6 +140,9 @@ class ProcessCollector(BaseCollector):
     batches. With ``sync=false`` no process waits for another one: a batch [R * E / N, T] is that of the
     process that was ready first, and rows carry ids of their environments.
 
+    With ``ray=ADDRESS`` the processes are on the nodes of a Ray cluster, see
+    :class:`~torchrl_her_recipes.components.collection_ray.NodeWorkers`.
+
     All random numbers of a process follow from the seed of each run, the process's number and the number of
     resets.
 
@@ -222,9 +227,11 @@ class ProcessCollector(BaseCollector):
     def _start(self) -> Workers:
         """Starts the processes, which takes seconds: each of them imports torch."""
         recipe, config = self.recipe, self.recipe.collection
-        kind = SyncWorkers if config.sync else AsyncWorkers
         make = partial(make_worker_env, recipe, imported_modules())
         frames = len(recipe.seeds) * share_of_envs(recipe) * config.steps_per_batch
+        if config.ray is not None:
+            return _start_on_cluster(recipe, make, _to_send(self.policy), frames)
+        kind = SyncWorkers if config.sync else AsyncWorkers
         with _interrupts_later():  # processes that were interrupted while they start would say so at length
             workers = kind(
                 [make] * config.processes,
@@ -245,7 +252,7 @@ class ProcessCollector(BaseCollector):
 
     def _beginning(self, process: int) -> Beginning:
         def seeds(kind: int) -> list[int]:
-            return [_derive(seed, process, self.resets, kind) for seed in self.recipe.seeds]
+            return [derive_seed(seed, process, self.resets, kind) for seed in self.recipe.seeds]
 
         return Beginning(
             env_seeds=seeds(0),
@@ -272,6 +279,20 @@ class ProcessCollector(BaseCollector):
                     f"its own error stands above: {error}"
                 ) from error
             raise
+
+
+def _start_on_cluster(
+    recipe: Recipe, make: Callable[[], EnvBase], policy: TensorDictModuleBase, frames: int
+) -> Workers:
+    """Starts the processes on the nodes of a Ray cluster."""
+    config = recipe.collection
+    try:
+        module = import_module("torchrl_her_recipes.components.collection_ray")  # needs an extra
+    except ModuleNotFoundError as error:
+        raise ImportError(f"ray={config.ray} needs Ray: pip install '.[cluster]'") from error
+    return module.NodeWorkers(
+        config.ray, make, policy, processes=config.processes, frames=frames, sync=config.sync
+    )
 
 
 def _get(get: Callable[..., Any], processes: Sequence[BaseProcess]) -> Any:
@@ -315,11 +336,6 @@ def _to_send(policy: TensorDictModuleBase) -> TensorDictModuleBase:
         if isinstance(module, Exploration | GuidedExploration):
             module.generators = [None] * len(module.generators)
     return copy
-
-
-def _derive(*numbers: int) -> int:
-    """A seed that differs for different numbers, which are not negative."""
-    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def _end(workers: Workers) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, TransformedEnv
 
@@ -47,7 +48,8 @@ def make_worker_env(recipe: Recipe, modules: Sequence[str] = ()) -> EnvBase:
             CurriculumProgress(curriculum, runs=recipe.run.num_runs),
             begins=is_guided(recipe, curriculum),
         )
-    if not recipe.collection.sync:  # only ids tell then which environment a row of a batch belongs to
+    # Only ids tell there which environment a row belongs to: batches come one by one, or a node is replaced.
+    if not recipe.collection.sync or recipe.collection.ray is not None:
         env = env if isinstance(env, TransformedEnv) else TransformedEnv(env)
         env.append_transform(EnvIds())
     return env
@@ -75,6 +77,19 @@ class Beginning:
     seeds: list[int]
     progress: dict[str, Any] | None = None
 
+    def again(self, life: int) -> Beginning:
+        """How a process begins that takes the place of one that died, for the ``life``-th time."""
+        return replace(
+            self,
+            env_seeds=[derive_seed(seed, life) for seed in self.env_seeds],
+            seeds=[derive_seed(seed, life) for seed in self.seeds],
+        )
+
+
+def derive_seed(*numbers: int) -> int:
+    """A seed that differs for different numbers, which are not negative."""
+    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
 
 class WorkerCollector(Collector):
     """The collector in a process. Its random numbers begin anew with each reset: runs can go on there."""
@@ -92,6 +107,37 @@ class WorkerCollector(Collector):
         if beginning.progress is not None:
             _progress_of(self.env).load_state_dict(beginning.progress)
         self.reset()
+
+
+class NodeCollector(WorkerCollector):
+    """The collector in a process on a node of a cluster, which gets weights with each order.
+
+    Errors are given back as a line of text: Ray ends a process over some of those that are raised.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        torch.set_flush_denormal(True)  # as the learner does
+        torch.set_num_threads(1)
+        self._error = ""  # that kept it from being made
+        try:
+            super().__init__(*args, **options)
+        except Exception as error:
+            self._error = f"{type(error).__name__}: {error}"
+
+    def register_scheme_receiver(self, *args: Any, **options: Any) -> None:
+        """Nothing: weights come with each order."""
+
+    def collect(self, weights: TensorDictBase, beginning: Beginning | None = None) -> TensorDictBase | str:
+        """The next batch that a policy with these weights plays; of new episodes, if told how they begin."""
+        if self._error:
+            return self._error
+        try:
+            TensorDict.from_module(self.policy).data.update_(weights)
+            if beginning is not None:
+                self.begin(beginning)
+            return self.next()
+        except Exception as error:
+            return f"{type(error).__name__}: {error}"
 
 
 def _progress_of(env: TransformedEnv) -> CurriculumProgress:

@@ -24,6 +24,7 @@ from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.native.library import CannotCompile
 from torchrl_her.trainers.fused import FusedLearner, Products
 from torchrl_her.trainers.fusing import is_plain_adam, why_not_fused
+from torchrl_her.trainers.graphs import GraphLearner, why_not_recorded
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_recipes.components.collection import ProcessCollector
@@ -99,38 +100,45 @@ class Components:
         return own if place_of(own) == place else deepcopy(own).to(place)
 
     def learner(self) -> Learner:
-        """Gradient steps on the loss: fused where that is possible, through the loss module elsewhere.
+        """Gradient steps on the loss: compiled where that is possible, through the loss module elsewhere.
+
+        On the CPU they are in C++. On a GPU they are recorded as CUDA graphs, and ``compile=always`` applies
+        ``torch.compile`` to them first.
 
         Raises:
-            ValueError: ``compile=always``, and they cannot be fused.
+            ValueError: ``compile=always``, and they cannot be compiled.
         """
-        norm, choice = self.recipe.learner.max_grad_norm, self.recipe.learner.compile
-        reason = None if choice == "never" else self._why_not_fused()
-        if choice != "never" and reason is None:
+        choice = self.recipe.learner.compile
+        norm, runs = self.recipe.learner.max_grad_norm, self.recipe.run.num_runs
+        here = place_of(self.loss).type == "cpu"
+        reason = None
+        if choice != "never":
+            reason = (
+                self._why_not_fused() if here else why_not_recorded(self.loss, self.optimizer, self.target)
+            )
             try:
-                return FusedLearner(
-                    self.loss,
-                    self.optimizer,
-                    self.target,
-                    max_grad_norm=norm,
-                    products=cast(Products, self.recipe.learner.products),
-                )
+                if reason is None and here:
+                    return FusedLearner(
+                        self.loss,
+                        self.optimizer,
+                        self.target,
+                        max_grad_norm=norm,
+                        products=cast(Products, self.recipe.learner.products),
+                    )
             except CannotCompile as error:
                 reason = str(error)
                 if choice == "auto":
                     warnings.warn(
                         f"gradient steps are several times slower than they could be: {error}", stacklevel=2
                     )
-        if choice == "always":
+        if choice == "always" and reason is not None:
             raise ValueError(f"compile=always cannot be: {reason}; choose auto")
-        return LossLearner(
-            self.loss, self.optimizer, self.target, max_grad_norm=norm, runs=self.recipe.run.num_runs
-        )
+        parts = (self.loss, self.optimizer, self.target)
+        if choice == "never" or reason is not None:
+            return LossLearner(*parts, max_grad_norm=norm, runs=runs)
+        return GraphLearner(*parts, max_grad_norm=norm, runs=runs, compile=choice == "always")
 
     def _why_not_fused(self) -> str | None:
-        device = place_of(self.loss)
-        if device.type != "cpu":
-            return f"networks on {device}: fused steps are for the CPU"
         if not is_plain_adam(self.optimizer, self.loss):
             return f"an optimizer that is not a plain Adam over the loss's parameters, {self.optimizer}"
         return why_not_fused(self.loss, self.target)

@@ -73,9 +73,14 @@ class CollectionConfig(Group):
     sync: bool = option(
         True, "whether processes collect batches together, which a seed repeats, or each at its own pace"
     )
+    ray: str | None = option(
+        None, "address of a Ray cluster on whose nodes the processes collect: HOST:PORT or auto"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.ray is not None and self.processes == 0:
+            raise ValueError(f"ray={self.ray} needs to know how many processes collect there: processes=4")
         if self.processes and self.num_envs % self.processes:
             raise ValueError(
                 f"num_envs={self.num_envs} cannot be shared out among processes={self.processes}: "

@@ -65,7 +65,8 @@ class LearnerConfig(Group):
     hard_update_interval: int = option(0, "gradient steps between hard target updates; 0: soft", at_least=0)
     compile: str = option(
         "auto",
-        "gradient steps in C++, compiled for this machine; auto: where that is possible",
+        "compiled gradient steps, in C++ or, on a GPU, as CUDA graphs; auto: where that is possible; always: "
+        "on a GPU through torch.compile, too",
         choices=("auto", "always", "never"),
     )
     products: str = option(

@@ -40,6 +40,7 @@ def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
         "buffer": buffer_state_dict(components.buffer, copy=False),
         "generators": [generator.get_state() for generator in components.generators],
         "torch_generator": torch.get_rng_state(),  # for losses that draw, as SAC's
+        "cuda_generators": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
         "worlds": None if (worlds := _worlds(components)) is None else worlds.world_state_dict(),
         "progress": None if components.curriculum is None else components.curriculum.progress.state_dict(),
         "collector": collector_state_dict(components.collector),
@@ -76,6 +77,11 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
     for generator, own in zip(components.generators, state["generators"], strict=True):
         generator.set_state(own)
     torch.set_rng_state(state["torch_generator"])
+    if (
+        torch.cuda.is_initialized()
+        and len(own := state.get("cuda_generators", [])) == torch.cuda.device_count()
+    ):
+        torch.cuda.set_rng_state_all(own)
     if components.curriculum is not None:
         components.curriculum.progress.load_state_dict(state["progress"])
         for run in range(components.recipe.run.num_runs):

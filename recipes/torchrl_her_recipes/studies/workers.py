@@ -7,15 +7,17 @@ from importlib import import_module
 from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
 
 
-def make_workers(*, jobs: int | None = None, ray: str | None = None) -> Workers:
+def make_workers(*, jobs: int | None = None, ray: str | None = None, gpus_per_job: float = 0.0) -> Workers:
     """Worker processes on this machine, or the nodes of a Ray cluster.
 
     Args:
         jobs: how many at once on this machine; one for each core if None.
         ray: address of a cluster, ``auto`` or ``HOST:PORT``; None for this machine.
+        gpus_per_job: the share of a GPU that each job gets on a cluster.
 
     Raises:
         ImportError: Ray is not installed.
+        ValueError: no node of the cluster has so much of a GPU.
         ConnectionError: there is no cluster at the address.
     """
     if ray is None:
@@ -24,4 +26,4 @@ def make_workers(*, jobs: int | None = None, ray: str | None = None) -> Workers:
         module = import_module("torchrl_her_recipes.studies.workers_ray")  # needs an extra
     except ModuleNotFoundError as error:
         raise ImportError("--ray needs Ray: pip install '.[cluster]'") from error
-    return module.RayWorkers(ray)
+    return module.RayWorkers(ray, gpus_per_job=gpus_per_job)

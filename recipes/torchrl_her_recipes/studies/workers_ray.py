@@ -6,8 +6,6 @@ whichever node has a core free, and its files come home when it ends.
 
 from __future__ import annotations
 
-import logging
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -18,9 +16,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import ray
-from ray.exceptions import RayError, RayTaskError
+from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from torchrl_her_recipes.components.cluster import join, one_line, resource
 from torchrl_her_recipes.studies.jobs import (
     Job,
     Outcome,
@@ -32,7 +31,6 @@ from torchrl_her_recipes.studies.jobs import (
     unpack,
 )
 
-_PATIENCE = 5.0  # seconds until an address that does not answer is given up
 _RETRIES = 3  # of a job whose node died
 _REPORT = 0.5  # seconds between two looks at how far a run is
 
@@ -44,19 +42,20 @@ class RayWorkers:
 
     Args:
         address: of the cluster, HOST:PORT, or ``auto`` for the one that this machine is a node of.
+        gpus_per_job: the share of a GPU that each job gets, such as 0.25; 0 for none.
 
     Raises:
         ConnectionError: there is none.
+        ValueError: it has no node with so much of a GPU.
     """
 
-    def __init__(self, address: str = "auto") -> None:
-        try:
-            if ":" in address:  # Ray itself would try for minutes
-                host, port = address.rsplit(":", 1)
-                socket.create_connection((host, int(port)), timeout=_PATIENCE).close()
-            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-        except (OSError, RuntimeError, ValueError) as error:
-            raise ConnectionError(f"no Ray cluster at {address} lets us in: {_one_line(error)}") from error
+    def __init__(self, address: str = "auto", *, gpus_per_job: float = 0.0) -> None:
+        join(address)
+        if resource("GPU") < gpus_per_job:
+            raise ValueError(
+                f"gpus_per_job={gpus_per_job:g} cannot be: the cluster's nodes have {resource('GPU'):g} GPUs"
+            )
+        self._gpus = gpus_per_job
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
         board = ray.remote(num_cpus=0, scheduling_strategy=here)(Board)
         self._board = board.remote()
@@ -65,19 +64,21 @@ class RayWorkers:
 
     @property
     def at_once(self) -> int:
-        """How many cores the cluster has just now."""
-        return int(ray.cluster_resources().get("CPU", 0))
+        """How many jobs the cluster has cores and GPUs for just now."""
+        cores = int(resource("CPU"))
+        return min(cores, int(resource("GPU") / self._gpus)) if self._gpus else cores
 
     def run(self, job: Job) -> Outcome:
         """Has a job done where there is a core free, and fetches its files."""
-        task = _work.options(num_cpus=job.recipe.run.threads).remote(job.to_plain(), _begun(job), self._board)
+        needs = _work.options(num_cpus=job.recipe.run.threads, num_gpus=self._gpus)
+        task = needs.remote(job.to_plain(), _begun(job), self._board)
         self._tasks[job.label] = task  # from here on, stop() cancels it
         if self._stopped:
             ray.cancel(task)
         try:
             outcome, files = ray.get(task)
         except RayError as error:
-            return Outcome(interrupted=True) if self._stopped else Outcome(error=_one_line(error))
+            return Outcome(interrupted=True) if self._stopped else Outcome(error=one_line(error))
         finally:
             del self._tasks[job.label]
         if files:
@@ -161,9 +162,3 @@ def _reporting(job: Job, board: Any) -> Iterator[None]:
 def _begun(job: Job) -> dict[str, bytes]:
     """The files that a job goes on from, if there are any."""
     return pack(job.folder, checkpoints=True) if can_resume(job.folder) else {}
-
-
-def _one_line(error: Exception) -> str:
-    if isinstance(error, RayTaskError):
-        return f"{type(error.cause).__name__}: {error.cause}"
-    return next(iter(str(error).splitlines()), type(error).__name__)

@@ -69,10 +69,10 @@ def _async() -> dict[str, Any]:
 
 def _run(recipe: Recipe) -> dict[str, Any]:
     components = build(recipe)
-    return _shown(components, run(components, progress=False))
+    return shown(components, run(components, progress=False))
 
 
-def _shown(components: Components, result: RunResult) -> dict[str, Any]:
+def shown(components: Components, result: RunResult) -> dict[str, Any]:
     """The table of a run, its rows, and the numbers of each run's blocks of environments, for each reset."""
     collector, buffer = components.collector, components.buffer
     assert isinstance(collector, ProcessCollector)
@@ -98,7 +98,7 @@ def _resumed() -> dict[str, Any]:
         run(build(tagged(epochs=1)), f"{folder}/run", progress=False)
         components = build(tagged())
         _extend(folder, components)
-        return _shown(components, resume(f"{folder}/run", components=components, progress=False))
+        return shown(components, resume(f"{folder}/run", components=components, progress=False))
 
 
 def _extend(folder: str, components: Components) -> None:
@@ -121,7 +121,7 @@ def _stopped() -> dict[str, Any]:
         components.collector.next = next_batch  # type: ignore[method-assign]
         assert run(components, f"{folder}/run", progress=False).interrupted
         components = build(tagged())
-        return _shown(components, resume(f"{folder}/run", components=components, progress=False))
+        return shown(components, resume(f"{folder}/run", components=components, progress=False))
 
 
 def _weights() -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,11 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_her import FusedLearner, LossLearner, load_checkpoint
+from torchrl_her.trainers import GraphLearner
 from torchrl_her_recipes import Components, build, cli, load_actor, resume, run
 from torchrl_her_recipes.components.devices import devices_of
 
+from ...emulated_graphs import emulated_graphs
 from ..small import assert_same, overrides, small
 
 CURRICULUM = {
@@ -26,8 +30,10 @@ CURRICULUM = {
 
 
 @pytest.fixture
-def name(device: torch.device) -> str:
-    return device.type
+def name(device: torch.device) -> Iterator[str]:
+    emulated = device.type == "cuda" and not torch.cuda.is_available()
+    with emulated_graphs() if emulated else nullcontext():
+        yield device.type
 
 
 def places(components: Components) -> tuple[set[str], set[str]]:
@@ -92,9 +98,13 @@ def test_policies_are_played_without_the_device(name: str, tmp_path: Path) -> No
     assert {own.device.type for own in load_actor(tmp_path / "run").parameters()} == {"cpu"}
 
 
-def test_steps_are_fused_on_the_cpu_only(device: torch.device) -> None:
-    learner = build(small(**{"learner.device": device.type})).learner()
-    assert isinstance(learner, FusedLearner if device.type == "cpu" else LossLearner)
+def test_steps_are_compiled_for_their_device(name: str) -> None:
+    for choice in ("auto", "always"):
+        learner = build(small(compile=choice, **{"learner.device": name})).learner()
+        assert type(learner) is (FusedLearner if name == "cpu" else GraphLearner)
+    assert type(build(small(compile="never", **{"learner.device": name})).learner()) is LossLearner
+    hard = small(hard_update_interval=5, tau=0.0, **{"learner.device": name})
+    assert type(build(hard).learner()) is (FusedLearner if name == "cpu" else LossLearner)
     small_steps = build(small(**{"learner.device": "auto"})).learner()
     assert isinstance(small_steps, FusedLearner)
 

@@ -20,26 +20,17 @@ from ..small import SMALL
 
 pytest.importorskip("ray", exc_type=ImportError)
 
-from ray._private import ray_constants
+import ray
 from ray._private.node import Node
 from ray.cluster_utils import Cluster
 
 from torchrl_her_recipes.studies.workers_ray import RayWorkers
 
+from ..ray_cluster import cluster as cluster
+
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray's own files and processes
 ALGORITHMS = ("her", "filtered_her")
 LABELS = [f"{name}/seeds_0" for name in ALGORITHMS]
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
-    """A head that does no work."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)  # it then listens on the loopback alone
-        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-        yield cluster
-        cluster.shutdown()
 
 
 @pytest.fixture
@@ -50,7 +41,6 @@ def node(cluster: Cluster) -> Iterator[Node]:
         cluster.remove_node(node, allow_graceful=False)
 
 
-@pytest.mark.long
 def study(**recipe: Any) -> Study:
     common = {**SMALL, "task": "hand_v0", "compile": "never", **recipe}
     return Study(name="small", recipe=common, vary={"algo": ALGORITHMS})
@@ -101,6 +91,19 @@ def test_ctrl_c_brings_home_what_there_is(tmp_path: Path, cluster: Cluster) -> N
 def under_way(workers: RayWorkers) -> bool:
     """Whether a run has evaluated for the first time."""
     return any(progress.epochs for progress in workers.progress().values())
+
+
+def test_each_job_gets_its_share_of_a_gpu(cluster: Cluster) -> None:
+    node = cluster.add_node(num_cpus=6, num_gpus=1)  # Ray takes a node's word for it
+    try:
+        workers = RayWorkers(cluster.address, gpus_per_job=0.25)
+        assert workers.at_once == 4
+        workers.close()
+        with pytest.raises(ValueError, match="gpus_per_job=2 cannot be: the cluster's nodes have 1 GPUs"):
+            RayWorkers(cluster.address, gpus_per_job=2)
+    finally:
+        ray.shutdown()
+        cluster.remove_node(node, allow_graceful=False)
 
 
 def test_no_cluster_is_one_clear_line() -> None:

@@ -1,0 +1,152 @@
+"""Processes that collect on the nodes of a Ray cluster. Needs the extra `cluster`."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import ray
+import torch
+from ray.exceptions import ObjectLostError, RayActorError
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors.distributed import RayCollector
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+
+from torchrl_her_recipes.components.cluster import join, resource
+from torchrl_her_recipes.components.collection_worker import Beginning, NodeCollector
+
+_SECONDS = 1.0  # between two looks at whether there still are nodes
+_ON_A_CORE = {"num_cpus": 1, "num_gpus": 0, "scheduling_strategy": "SPREAD"}
+
+
+class NodeWorkers(RayCollector):
+    """Processes on the nodes of a Ray cluster, each with a core, which are sent weights and send batches.
+
+    Nothing is asked of the nodes but this package. Where one dies, a process elsewhere takes the place of
+    each that was lost, as soon as there is a core for it; it begins new episodes. So the episodes that were
+    open there are lost, and nothing else.
+
+    Args:
+        address: of the cluster, HOST:PORT, or ``auto`` for the one that this machine is a node of.
+        make_env: makes a process's environments.
+        policy: a copy for others, on the CPU.
+
+    Keyword Args:
+        processes: N.
+        frames: in a batch of one process.
+        sync: whether a batch [N, ...] is that of all processes, or of the one that was ready first.
+
+    Raises:
+        ConnectionError: there is no such cluster.
+        ValueError: it has fewer than N cores.
+        RuntimeError: a process failed for another reason than the death of its node.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        make_env: Callable[[], EnvBase],
+        policy: TensorDictModuleBase,
+        *,
+        processes: int,
+        frames: int,
+        sync: bool,
+    ) -> None:
+        join(address)
+        cores = int(resource("CPU"))
+        if cores < processes:
+            raise ValueError(f"processes={processes} need a core each, but the cluster has {cores}")
+        self._orders: dict[int, ray.ObjectRef] = {}  # the batch that each process is collecting
+        self._beginnings: list[Beginning] = []
+        self._to_begin: set[int] = set()  # processes that are to begin new episodes with their next batch
+        self._lives = [1] * processes
+        self._make_env, self._options = make_env, {"auto_register_policy_transforms": False}
+        try:
+            super().__init__(
+                [make_env] * processes,
+                policy,
+                frames_per_batch=frames * (processes if sync else 1),
+                device=torch.device("cpu"),
+                collector_class=NodeCollector,
+                collector_kwargs=self._options,
+                exploration_type=ExplorationType.RANDOM,
+                remote_configs=_ON_A_CORE,
+                sync=sync,
+                weight_sync_schemes={},  # TorchRL's would wait for a node that has died
+            )
+        except RayActorError as error:
+            raise _failure(error) from error
+
+    def begin(self, beginnings: Sequence[Beginning]) -> None:
+        """Drops what they are collecting, and begins new episodes in all of them."""
+        self._orders.clear()
+        self._beginnings, self._to_begin = list(beginnings), set(range(len(beginnings)))
+
+    def ahead(self, weights: TensorDictBase) -> None:
+        """Lets those that are idle collect the next batch with these weights."""
+        self._order(weights, range(self.num_collectors))
+
+    def take(self, weights: TensorDictBase) -> TensorDictBase:
+        """The next batch: [N, ...] of all processes, or that of the first that is ready."""
+        batches: dict[int, TensorDictBase] = {}
+        while len(batches) < (self.num_collectors if self._sync else 1):
+            self._order(weights, set(range(self.num_collectors)) - set(batches))
+            ready, _ = ray.wait(
+                list(self._orders.values()), timeout=_SECONDS
+            )  # the one first told, of several
+            if not ready and resource("CPU") == 0:
+                raise RuntimeError("no node that could collect is left in the cluster")
+            for process in [own for own, order in self._orders.items() if order in ready]:
+                batch = self._fetch(process)
+                if batch is not None:
+                    batches[process] = batch
+        if self._sync:
+            return torch.stack([batches[process] for process in range(self.num_collectors)])
+        return next(iter(batches.values()))
+
+    def _order(self, weights: TensorDictBase, processes: Iterable[int]) -> None:
+        """Tells those that have nothing to do to collect a batch."""
+        idle = [process for process in processes if process not in self._orders]
+        if not idle:
+            return
+        sent = ray.put(weights)
+        for process in idle:
+            beginning = self._beginnings[process] if process in self._to_begin else None
+            collector = self.remote_collectors[process]
+            self._orders[process] = collector.collect.remote(sent, beginning)
+            self._to_begin.discard(process)
+
+    def _fetch(self, process: int) -> TensorDictBase | None:
+        """The batch that a process has collected; None if it has died, and another one takes its place."""
+        order = self._orders.pop(process)
+        try:
+            batch = ray.get(order)
+        except (RayActorError, ObjectLostError) as error:
+            if getattr(error, "actor_init_failed", False):
+                raise _failure(error) from error
+            warnings.warn(
+                f"process {process} of those that collect died: its open episodes are lost, and a new "
+                "process takes its place",
+                stacklevel=2,
+            )
+            self._replace(process)
+            return None
+        if isinstance(batch, str):
+            raise RuntimeError(f"a process that collects failed on its node: {batch}")
+        return batch
+
+    def _replace(self, process: int) -> None:
+        self.add_collectors([self._make_env], 1, self.policy, [self.collector_kwargs[process]], [_ON_A_CORE])
+        self.remote_collectors[process] = self.remote_collectors.pop()
+        self._beginnings[process] = self._beginnings[process].again(self._lives[process])
+        self._lives[process] += 1
+        self._to_begin.add(process)
+
+
+def _failure(error: Any) -> RuntimeError:
+    """Why a process could not start."""
+    reason = next((line for line in reversed(str(error).splitlines()) if line.strip()), type(error).__name__)
+    return RuntimeError(f"a process that collects cannot start: {reason.strip()}")
