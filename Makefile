@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Each worker computes in one thread: more of them only wait for each other.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal --durations=15
 
-.PHONY: demo test test-full test-versions lint bench docs clean
+.PHONY: demo test test-full test-versions lint bench bench-gpu docs clean
 
 demo: $(VENV)/.ready  ## learn to pick up a ball and throw it, in a minute; ends with a curve and a GIF
 	$(BIN)/torchrl-her train preset=demo
@@ -28,6 +28,10 @@ lint: $(VENV)/.ready-test  ## style, formatting, who imports whom, types
 
 bench: $(VENV)/.ready-bench  ## all benchmarks, beside peers, in one report: runs/bench.md
 	$(BIN)/python benchmarks/run.py
+
+bench-gpu: $(VENV)/.ready  ## what a GPU gives, in less than ten minutes: runs/bench_gpu.md
+	mkdir -p runs
+	$(BIN)/python benchmarks/gpu.py --out runs/bench_gpu.md
 
 docs: $(VENV)/.ready-docs  ## the documentation as a site, with the studies' pages: build/docs/index.html
 	$(BIN)/python -m sphinx -W --keep-going docs build/docs

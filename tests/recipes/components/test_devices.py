@@ -10,12 +10,15 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from torchrl_her import FusedLearner, LossLearner, load_checkpoint
 from torchrl_her.trainers import GraphLearner
 from torchrl_her_recipes import Components, build, cli, load_actor, resume, run
 from torchrl_her_recipes.components.devices import devices_of
 
+from ...emulated import emulated_device
 from ...emulated_graphs import emulated_graphs
 from ..small import assert_same, overrides, small
 
@@ -103,10 +106,38 @@ def test_steps_are_compiled_for_their_device(name: str) -> None:
         learner = build(small(compile=choice, **{"learner.device": name})).learner()
         assert type(learner) is (FusedLearner if name == "cpu" else GraphLearner)
     assert type(build(small(compile="never", **{"learner.device": name})).learner()) is LossLearner
-    hard = small(hard_update_interval=5, tau=0.0, **{"learner.device": name})
+    hard = small(hard_update_interval=5, **{"learner.device": name})
     assert type(build(hard).learner()) is (FusedLearner if name == "cpu" else LossLearner)
     small_steps = build(small(**{"learner.device": "auto"})).learner()
     assert isinstance(small_steps, FusedLearner)
+
+
+class Waits(TorchFunctionMode):
+    """Notes where numbers are read from the device, for which a program has to wait."""
+
+    names = ("__bool__", "__float__", "__int__", "__index__", "item", "tolist", "nonzero", "cpu", "numpy")
+    reading = (*(getattr(Tensor, name) for name in names), torch.masked_select, torch.unique, torch.bincount)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[Any] = []
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in self.reading and args[0].device.type == "cuda":
+            self.found.append(func)
+        return func(*args, **(kwargs or {}))
+
+
+def test_gradient_steps_do_not_wait_for_the_device() -> None:
+    with emulated_device() as there, emulated_graphs():
+        trainer = build(small(num_runs=2, algo="her", **{"learner.device": there.type})).trainer()
+        trainer.run(400)
+        waits = {}
+        for steps in (2, 2, 16, 16):  # the first time, kernels are recorded
+            with Waits() as own:
+                trainer._learn_from([], steps)
+            waits[steps] = own.found
+        assert len(waits[2]) == len(waits[16]) < 10
 
 
 def test_the_replay_is_where_the_learner_is_if_nothing_else_is_asked_for(name: str) -> None:
