@@ -17,6 +17,7 @@ PARTS = {
     "replay_speed": "Replay of several runs in one buffer",
     "update_speed": "Gradient steps and the whole loop",
     "parallel.processes": "Collecting in processes",
+    "parallel.nodes": "Collecting on the nodes of a cluster",
     "ibs_update": "How often q is brought up to date",
     "memory": "Memory",
     "startup": "Start-up",

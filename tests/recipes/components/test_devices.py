@@ -17,6 +17,7 @@ from torchrl_her import FusedLearner, LossLearner, load_checkpoint
 from torchrl_her.trainers import GraphLearner
 from torchrl_her_recipes import Components, build, cli, load_actor, resume, run
 from torchrl_her_recipes.components.devices import devices_of
+from torchrl_her_recipes.runs.interrupt import Interrupted
 
 from ...emulated import emulated_device
 from ...emulated_graphs import emulated_graphs
@@ -92,6 +93,25 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> No
     assert [row["success"] for row in again.rows] == [row["success"] for row in whole.rows]
     layers = load_checkpoint(tmp_path / "parts" / "checkpoint.1.pt")["guide"]["layer"]
     assert 0 in layers.tolist()  # so that guided episodes went on
+    ends = [load_checkpoint(tmp_path / own / "checkpoint.pt")["loss"] for own in ("whole", "parts")]
+    assert_same(*ends)
+
+
+def test_a_run_goes_on_in_the_middle_of_an_epoch(name: str, tmp_path: Path) -> None:
+    recipe = small(**CURRICULUM, num_runs=2, **{"learner.device": name})
+    whole = run(build(recipe), tmp_path / "whole", progress=False)
+    components = build(recipe)
+    collect, left = components.collector.next, iter(range(7, -1, -1))
+
+    def next_batch() -> TensorDictBase:
+        if next(left) == 0:
+            raise Interrupted
+        return collect()
+
+    components.collector.next = next_batch  # type: ignore[method-assign]
+    assert run(components, tmp_path / "parts", progress=False).interrupted
+    again = resume(tmp_path / "parts", progress=False)
+    assert [row["success"] for row in again.rows] == [row["success"] for row in whole.rows]
     ends = [load_checkpoint(tmp_path / own / "checkpoint.pt")["loss"] for own in ("whole", "parts")]
     assert_same(*ends)
 

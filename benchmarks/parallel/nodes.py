@@ -1,0 +1,112 @@
+"""FetchPush collected on two nodes of a Ray cluster, one of which dies, and another one comes.
+
+    python benchmarks/run.py parallel.nodes
+
+Both nodes are made on this machine, so the speed is not that of two machines: what is shown is what goes over
+the network, what a node costs that dies, and that a run goes on. Needs the extras `cluster` and `robotics`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from machine import describe, publish, table
+from ray._private import ray_constants
+from ray._private.node import Node
+from ray.cluster_utils import Cluster
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_her_recipes import Components, build, make_recipe
+from torchrl_her_recipes.components.cluster import join, resource
+from torchrl_her_recipes.config.shipped import load_preset
+
+BATCHES = 30  # of a piece
+PIECES = ("two nodes", "one has died", "another one has come")
+
+
+def size(entries: TensorDictBase) -> int:
+    """Bytes that are sent."""
+    return sum(entry.nbytes for entry in entries.values(True, True) if isinstance(entry, torch.Tensor))
+
+
+def wait_for_cores(count: int) -> None:
+    while resource("CPU") != count:
+        time.sleep(0.1)
+
+
+def pieces(cluster: Cluster, nodes: Sequence[Node], components: Components) -> tuple[list[list[str]], str]:
+    """A row for each piece of the run, and what is sent."""
+    trainer, buffer = components.trainer(), components.buffer
+    trainer.run(trainer.warmup_frames)
+    rows = []
+    for name in PIECES:
+        if name == PIECES[1]:
+            cluster.remove_node(nodes[0], allow_graceful=False)
+            wait_for_cores(1)
+        elif name == PIECES[2]:
+            cluster.add_node(num_cpus=1)
+            wait_for_cores(2)
+        frames, began = trainer.frames, time.perf_counter()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            trainer.run(BATCHES * components.recipe.collection.num_envs)
+        seconds = time.perf_counter() - began
+        died = sum("died" in str(own.message) for own in caught)
+        written = buffer.writer.totals.real
+        rows.append(
+            [
+                name,
+                f"{trainer.frames:,}",
+                f"{(trainer.frames - frames) / seconds:,.0f}",
+                f"{written:,}",
+                f"{buffer.writer.held_back:,}",
+                str(died),
+            ]
+        )
+    trainer._reset_collector()
+    trainer.run(components.recipe.collection.num_envs)
+    batch = components.collector.next()
+    weights = TensorDict.from_module(components.policy).data
+    unwritten = trainer.frames - buffer.writer.totals.real
+    sent = (
+        f"After new episodes everywhere, {unwritten:,} frames are not written: those of episodes that are "
+        f"open now. A frame is {size(batch) / batch.numel():,.0f} bytes, the weights of the policy are "
+        f"{size(weights) / 1e6:.2f} MB."
+    )
+    return rows, sent
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
+    options = parser.parse_args(arguments)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    torch.set_num_threads(1)
+    ray_constants.ENABLE_RAY_CLUSTER = False  # nodes listen on the loopback alone
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
+    join(cluster.address)
+    wait_for_cores(2)
+    recipe = make_recipe(
+        load_preset("fetch_push"), algo="filtered_her", processes=2, sync=False, ray=cluster.address
+    )
+    components = build(recipe)
+    try:
+        rows, sent = pieces(cluster, nodes, components)
+    finally:
+        components.close()
+    header = ["", "frames", "frames/s", "written", "of open episodes", "processes that died"]
+    machine = describe("torch", "torchrl", "ray", "gymnasium-robotics", "mujoco")
+    publish(f"{machine}\n\n{table(header, rows)}\n\n{sent}", options.out)
+
+
+if __name__ == "__main__":
+    main()
