@@ -18,6 +18,7 @@ PARTS = {
     "update_speed": "Gradient steps and the whole loop",
     "parallel.processes": "Collecting in processes",
     "parallel.nodes": "Collecting on the nodes of a cluster",
+    "many_runs": "Many runs as one program",
     "ibs_update": "How often q is brought up to date",
     "memory": "Memory",
     "startup": "Start-up",
