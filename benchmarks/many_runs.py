@@ -20,7 +20,7 @@ from pathlib import Path
 from machine import describe, one_core, publish, table
 
 RUNS = (1, 15, 30, 60, 100)
-WARM, TIMED = 12_800, 10_240  # frames of each run
+WARM, TIMED = 6_400, 5_120  # frames of each run
 
 
 def measure(runs: int) -> dict[str, float]:

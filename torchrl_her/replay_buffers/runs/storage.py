@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor, is_non_tensor
 from torch import Tensor
@@ -129,8 +130,12 @@ class PackedStorage(LazyTensorStorage):
     def _allocate(self, fields: tuple[Field, ...], device: torch.device | None) -> None:
         width = -(-fields[-1].end // _ALIGNED)
         self._fields = fields
-        # Of zeros, so that also the bytes between rows are the same in every checkpoint.
-        self._packed = torch.zeros(self.max_size, width, dtype=torch.int64, device=device)
+        # Of zeros, so that also the bytes between rows are the same in every checkpoint. On the CPU they are
+        # NumPy's, which take no memory before rows come: those of torch are written at once.
+        if device is None or device.type == "cpu":
+            self._packed = torch.from_numpy(np.zeros((self.max_size, width), np.int64))
+        else:
+            self._packed = torch.zeros(self.max_size, width, dtype=torch.int64, device=device)
         self._storage = self._views = unpack(self._packed, fields)
         self._number = _number_of_keys(self._views)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import NonTensorData, TensorDict, TensorDictBase
@@ -204,17 +206,29 @@ def test_nested_tensordicts_come_back_as_they_were(rows: TensorDict) -> None:
 
 
 def test_the_capacity_is_allocated_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[torch.Size] = []
+    made: list[tuple[int, ...]] = []
 
     def noting(make: Callable[..., Any]) -> Callable[..., Any]:
         def make_and_note(*args: object, **options: object) -> Any:
             out = make(*args, **options)
-            made.append(out.shape[:1])
+            made.append(tuple(out.shape[:1]))
             return out
 
         return make_and_note
 
-    for name in ("empty_like", "zeros"):
-        monkeypatch.setattr(torch, name, noting(getattr(torch, name)))
+    for module, name in ((torch, "empty_like"), (torch, "zeros"), (np, "zeros")):
+        monkeypatch.setattr(module, name, noting(getattr(module, name)))
     PackedStorage(1_000).set(slice(0, 2), make_rows(2))
-    assert made.count(torch.Size([1_000])) == 1
+    assert made.count((1_000,)) == 1
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux for the memory in use")
+def test_memory_is_taken_when_rows_come() -> None:
+    def used() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
+
+    storage, before = PackedStorage(4_000_000), used()
+    storage.set(slice(0, 1_000), make_rows(1_000))
+    assert storage.packed is not None
+    assert storage.packed.nbytes > 100e6
+    assert used() - before < 50e6
