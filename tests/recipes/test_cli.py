@@ -6,6 +6,7 @@ import os
 import re
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -76,7 +77,13 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert max(len(line) for line in out.splitlines()) < 110
 
 
-@pytest.mark.parametrize("preset", PRESETS, ids=lambda path: path.stem)
+def _preset(path: Path) -> Any:
+    """A case of the test below; presets that are another one with another task are left for longer tests."""
+    marks = [pytest.mark.full] if path.stem in ("fetch_pick_and_place", "fetch_slide") else []
+    return pytest.param(path, id=path.stem, marks=marks)
+
+
+@pytest.mark.parametrize("preset", [_preset(path) for path in PRESETS])
 def test_every_preset_runs(preset: Path) -> None:
     if preset.stem.startswith("fetch") and not ROBOTICS:
         pytest.skip("needs the extra robotics")

@@ -270,6 +270,20 @@ def test_normalization_and_averages(device: torch.device) -> None:
         check(parameter, device)
 
 
+def test_averages_of_runs_some_of_which_are_idle(device: torch.device) -> None:
+    policy = make_actor((4, 2), 3, runs=2).to(device)
+    average = PolicyAverage(policy, runs=2)
+    before = [own.clone() for own in average.module.parameters()]
+    for parameter in policy.parameters():
+        parameter.data += 1.0
+    average.follow(2, idle=[1])
+    assert average.steps.tolist() == [2, 0]
+    for own, was in zip(average.module.parameters(), before, strict=True):
+        check(own, device)
+        assert bool((own[0] > was[0]).all())
+        assert torch.equal(own[1], was[1])
+
+
 def networks() -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
     return make_actor((4, 2), 3, norm="layer"), make_critic((4, 2), 3, norm="layer")
 

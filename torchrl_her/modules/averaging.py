@@ -76,14 +76,14 @@ class PolicyAverage(nn.Module):
             idle: the runs that made none.
         """
         made = [0 if run in idle else steps for run in range(len(self.steps))]
-        self.steps += torch.tensor(made)
+        self.steps += torch.tensor(made, device=self.steps.device)
         kept = [self._kept(done) ** own for done, own in zip(self.steps.tolist(), made, strict=True)]
         averaged, learned = self._weights
         if len(set(kept)) == 1:
             torch._foreach_lerp_(averaged, learned, 1.0 - kept[0])
         else:
             for own, now in zip(averaged, learned, strict=True):
-                share = torch.tensor([1.0 - each for each in kept], dtype=own.dtype)
+                share = torch.tensor([1.0 - each for each in kept], dtype=own.dtype, device=own.device)
                 own.lerp_(now, share.view(-1, *[1] * (own.ndim - 1)))
         if self._copies:
             self._copy_buffers()

@@ -31,6 +31,7 @@ CURRICULUM = {
     "window": 4,
     "success_threshold": 0.01,
 }
+SHORT = {"epoch_frames": 640, "warmup_frames": 160, "compile": "never"}
 
 
 @pytest.fixture
@@ -86,7 +87,7 @@ def test_dqn(name: str, options: dict[str, Any]) -> None:
 
 
 def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> None:
-    options = {**CURRICULUM, "learner.device": name, "num_runs": 2, "checkpoint_interval": 1}
+    options = {**CURRICULUM, **SHORT, "learner.device": name, "num_runs": 2, "checkpoint_interval": 1}
     whole = run(build(small(epochs=3, **options)), tmp_path / "whole", progress=False)
     run(build(small(epochs=2, **options)), tmp_path / "parts", progress=False)
     again = resume(tmp_path / "parts", options={"epochs": 3}, progress=False)
@@ -98,10 +99,10 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> No
 
 
 def test_a_run_goes_on_in_the_middle_of_an_epoch(name: str, tmp_path: Path) -> None:
-    recipe = small(**CURRICULUM, num_runs=2, **{"learner.device": name})
+    recipe = small(**CURRICULUM, **SHORT, num_runs=2, **{"learner.device": name})
     whole = run(build(recipe), tmp_path / "whole", progress=False)
     components = build(recipe)
-    collect, left = components.collector.next, iter(range(7, -1, -1))
+    collect, left = components.collector.next, iter(range(5, -1, -1))
 
     def next_batch() -> TensorDictBase:
         if next(left) == 0:

@@ -46,6 +46,8 @@ def study(**recipe: Any) -> Study:
     return Study(name="small", recipe=common, vary={"algo": ALGORITHMS})
 
 
+@pytest.mark.full
+@pytest.mark.long
 def test_a_node_that_dies_loses_only_its_run_which_is_done_again(
     tmp_path: Path, cluster: Cluster, node: Node
 ) -> None:
