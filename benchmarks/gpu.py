@@ -3,9 +3,9 @@
     python benchmarks/gpu.py --out bench_gpu.md
     python benchmarks/gpu.py --small
 
-Takes less than ten minutes. Where there is no GPU the tables say "not measured" and have the CPU's figures
-only, with fewer runs and frames. A gradient step is one of the training loop: transitions are drawn by their
-priorities, learned from, and get new priorities.
+It is meant to take less than ten minutes. Where there is no GPU the tables say "not measured" and have the
+CPU's figures only, with fewer runs and frames. A gradient step is one of the training loop: transitions are
+drawn by their priorities, learned from, and get new priorities.
 """
 
 from __future__ import annotations
@@ -119,16 +119,29 @@ def climb(options: Sequence[str]) -> tuple[float, float, str]:
         run = Path(folder) / "run"
         command = [sys.executable, "-m", "torchrl_her_recipes", "train", *options, f"folder={run}"]
         began, found, memory = time.perf_counter(), 0.0, 0
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as program:
+        others = memory_in_use()  # this program's
+        errors = Path(folder) / "errors"
+        with (
+            open(errors, "w") as said,
+            subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said) as program,
+        ):
             while program.poll() is None and found < AIM and time.perf_counter() - began < 60 * MINUTES:
                 time.sleep(0.5)
                 found = last_median(run / "metrics.csv")
-                if torch.cuda.is_available():
-                    free, every = torch.cuda.mem_get_info()
-                    memory = max(memory, every - free)
+                memory = max(memory, memory_in_use() - others)
             seconds = time.perf_counter() - began
+            if program.poll():
+                raise RuntimeError(f"the run failed: {errors.read_text()[-500:]}")
             program.kill()
     return seconds, found, f"{memory / 1e9:.1f} GB"
+
+
+def memory_in_use() -> int:
+    """Bytes of the GPU that all programs have together; 0 without one."""
+    if not torch.cuda.is_available():
+        return 0
+    free, every = torch.cuda.mem_get_info()
+    return every - free
 
 
 def last_median(path: Path) -> float:

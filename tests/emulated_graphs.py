@@ -119,6 +119,7 @@ def emulated_graphs() -> Iterator[type[Graph]]:
             "is_available": lambda: True,
             "is_current_stream_capturing": lambda: _Recording.under_way,
             "stream": lambda stream: nullcontext(),
+            "device": lambda device: nullcontext(),
             "CUDAGraph": Graph,
             "graph": _Recording,
         }.items():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -22,18 +23,19 @@ class GraphLearner(LossLearner):
     A gradient step of small networks is hundreds of small kernels, each of which takes longer to launch than
     to run. Here the kernels of several steps are recorded as a CUDA graph and then launched together. The
     first update with a number of steps is made without a graph. ``torch.compile`` makes fewer and larger
-    kernels of them before, which takes a minute.
+    kernels of them before.
 
-    What is recorded are kernels, and numbers that Python computed meanwhile: gamma, tau and all options of
-    the loss must stay as they are. A learning rate may change; the steps are then recorded anew. Runs that do
-    not learn, which happens only while buffers fill, are left out by steps without a graph. Steps that turn
-    out not to be recordable are made without one, too, after a warning.
+    A graph repeats kernels with the numbers that Python gave them when they were recorded. So gamma, tau, and
+    all other options of the loss, the targets and the optimizer must stay as they are, but for the learning
+    rate: with another one, the steps are recorded anew. If you load a state into the optimizer, make the
+    learner afterwards. Runs that do not learn (``idle``), which happens only while buffers fill, are left out
+    by steps without a graph.
 
     Args:
-        loss: as for :class:`~torchrl_her.LossLearner`.
-        optimizer: with ``capturable=True``.
+        loss: as for :class:`~torchrl_her.LossLearner`, on a GPU.
+        optimizer: as there; it is made ``capturable``.
         target: one that moves the targets in the same way in each step, such as ``SoftUpdate``.
-        max_grad_norm: likewise.
+        max_grad_norm: as there.
         runs: R.
 
     Keyword Args:
@@ -64,38 +66,50 @@ class GraphLearner(LossLearner):
         compile: bool = True,
         steps_per_graph: int = 32,
     ) -> None:
-        reason = why_not_recorded(loss, optimizer, target)
+        reason = why_not_recorded(loss, target)
         if reason is not None:
             raise ValueError(f"these gradient steps cannot be recorded: {reason}; use LossLearner")
         super().__init__(loss, optimizer, target, max_grad_norm=max_grad_norm, runs=runs)
         self.steps_per_graph = steps_per_graph
+        self._device = next(loss.parameters()).device
         self._step = torch.compile(self._update) if compile else self._update
         self._recorded: dict[Any, _Recorded] = {}
         self._keys = [*loss.in_keys, WEIGHT, STEPS_KEY]
         self._priority = getattr(loss.tensor_keys, "priority", None)
 
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
-        """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`."""
+        """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`.
+
+        Raises:
+            ValueError: the rows are not those of R runs or not a whole number of batches.
+            RuntimeError: the steps could not be recorded, for example because the loss reads a number from
+                the GPU.
+        """
+        for group in self.optimizer.param_groups:
+            if "capturable" in group:
+                group["capturable"] = True
         if idle:
-            return super().update(rows, steps, idle=idle)
+            with _uncaptured():
+                return super().update(rows, steps, idle=idle)
         check_rows(rows, steps, self.runs)
         last, batch = rows.ndim - 1, rows.shape[-1] // steps
         seen = rows.select(*self._keys, strict=False).split(self.steps_per_graph * batch, last)
-        made = [self._of(part, part.shape[-1] // batch)(part) for part in seen]
+        made = [self._recorded_for(part, part.shape[-1] // batch)(part) for part in seen]
         if self._priority is not None and "priority" in made[0]:
             rows.set(self._priority, torch.cat([own["priority"] for own in made], last))
         measured: TensorDictBase = torch.cat([own["measured"] for own in made])
         return dict(measured.items())
 
-    def _of(self, rows: TensorDictBase, steps: int) -> _Recorded:
-        """The recorded steps for such rows."""
+    def _recorded_for(self, rows: TensorDictBase, steps: int) -> _Recorded:
         rates = tuple(float(group["lr"]) for group in self.optimizer.param_groups)
         key = (steps, rows.shape, rates)
         if key not in self._recorded:
             self._recorded = {known: own for known, own in self._recorded.items() if known[-1] == rates}
             noise = getattr(self.loss, "noise", None)
             self._recorded[key] = _Recorded(
-                lambda rows: self._steps(rows, steps), generators=getattr(noise, "generators", None) or ()
+                lambda rows: self._steps(rows, steps),
+                device=self._device,
+                generators=getattr(noise, "generators", None) or (),
             )
         return self._recorded[key]
 
@@ -116,41 +130,39 @@ class _Recorded:
 
     Args:
         call: always computes the same of rows of the same shape.
+        device: where.
         generators: of its random numbers, beside torch's own.
     """
 
     def __init__(
-        self, call: Callable[[TensorDictBase], TensorDictBase], generators: Sequence[torch.Generator]
+        self,
+        call: Callable[[TensorDictBase], TensorDictBase],
+        *,
+        device: torch.device,
+        generators: Sequence[torch.Generator],
     ) -> None:
-        self._call, self._generators = call, generators
+        self._call, self._device, self._generators = call, device, generators
         self._graph: torch.cuda.CUDAGraph | None = None
         self._rows = self._out = TensorDict()  # what the graph reads and writes
-        self._is_warm = self._failed = False
+        self._was_called = False
 
     def __call__(self, rows: TensorDictBase) -> TensorDictBase:
-        if self._failed:
-            return self._call(rows)
-        if not self._is_warm:
-            self._is_warm = True
-            return self._beside(rows)
-        if self._graph is None:
-            try:
+        with torch.cuda.device(self._device):
+            if not self._was_called:
+                self._was_called = True
+                return self._call_on_another_stream(rows)
+            if self._graph is None:
                 self._graph = self._record(rows)
-            except RuntimeError as error:  # nothing was computed: kernels that are recorded do not run
-                self._failed = True
-                reason = next(iter(str(error).splitlines()), type(error).__name__)
-                warnings.warn(f"gradient steps are launched one by one: {reason}", stacklevel=4)
-                return self._call(rows)
-        else:
-            self._rows.update_(rows, non_blocking=True)
-        self._graph.replay()
-        return self._out.clone()
+            else:
+                self._rows.update_(rows, non_blocking=True)
+            self._graph.replay()
+            return self._out.clone()
 
-    def _beside(self, rows: TensorDictBase) -> TensorDictBase:
-        """Calls it on a stream of its own, as CUDA asks for before something is recorded."""
-        stream = torch.cuda.Stream()
+    def _call_on_another_stream(self, rows: TensorDictBase) -> TensorDictBase:
+        """As CUDA asks for before something is recorded."""
+        stream = torch.cuda.Stream(self._device)
         stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
+        with torch.cuda.stream(stream), _uncaptured():
             out = self._call(rows)
         torch.cuda.current_stream().wait_stream(stream)
         return out
@@ -159,20 +171,40 @@ class _Recorded:
         graph, self._rows = torch.cuda.CUDAGraph(), rows.clone()
         for generator in self._generators:
             graph.register_generator_state(generator)
-        with torch.cuda.graph(graph):
-            self._out = self._call(self._rows.copy())  # which entries are added to
+        try:
+            # A stream of this device: torch's default for graphs is one of the device that was first used.
+            with torch.cuda.graph(graph, stream=torch.cuda.Stream(self._device)):
+                self._out = self._call(self._rows.copy())  # which entries are added to
+        except RuntimeError as error:
+            first: BaseException = error
+            while first.__context__ is not None:  # the end of the recording fails, too
+                first = first.__context__
+            reason = next(iter(str(first).splitlines()), type(first).__name__)
+            raise RuntimeError(
+                f"gradient steps cannot be recorded as a CUDA graph: {reason}; use LossLearner, in recipes "
+                "compile=never"
+            ) from error
         return graph
 
 
-def why_not_recorded(
-    loss: LossModule, optimizer: torch.optim.Optimizer, target: TargetNetUpdater | None
-) -> str | None:
-    """Why gradient steps cannot be recorded as a CUDA graph, or None if they can."""
+@contextmanager
+def _uncaptured() -> Iterator[None]:
+    """Steps of a ``capturable`` optimizer without a graph, which torch warns of."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*capturable=True.*")
+        yield
+
+
+def why_not_recorded(loss: LossModule, target: TargetNetUpdater | None = None) -> str | None:
+    """Why gradient steps cannot be recorded as a CUDA graph, or None if they can.
+
+    Args:
+        loss: any of TorchRL's.
+        target: moves its target networks.
+    """
     devices = {parameter.device for parameter in loss.parameters()}
-    if any(device.type != "cuda" for device in devices):
+    if any(device.type != "cuda" for device in devices) or len(devices) != 1:
         return f"networks on {', '.join(sorted(str(device) for device in devices))}"
-    if not all(group.get("capturable", False) for group in optimizer.param_groups):
-        return f"an optimizer without capturable=True, {type(optimizer).__name__}"
     if isinstance(target, HardUpdate):
         return "targets that are copied in some steps only, by a HardUpdate"
     return None

@@ -65,9 +65,7 @@ def make_agent(
         exploration=exploration,
         policy=TensorDictSequential(player, *([] if guide is None else [guide]), exploration),
         loss=loss,
-        optimizer=torch.optim.Adam(
-            loss.parameters(), lr=options.learning_rate, fused=True, capturable=device.type == "cuda"
-        ),
+        optimizer=torch.optim.Adam(loss.parameters(), lr=options.learning_rate, fused=True),
         target=make_target_updater(loss, tau=options.tau, hard_interval=options.hard_update_interval),
         norm=norm,
         average=_average_of(player, recipe),

@@ -3,38 +3,64 @@
 from __future__ import annotations
 
 import logging
+import signal
 import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import ray
 from ray.exceptions import RayTaskError
 
 _PATIENCE = 5.0  # seconds until an address that does not answer is given up
-QUIET = {"log_to_driver": False, "logging_level": logging.ERROR}  # options of ``ray.init``
 
 
-def join(address: str) -> None:
+def join(address: str) -> bool:
     """Makes this process part of a cluster, unless it is already.
 
     Args:
         address: HOST:PORT, or ``auto`` for the one that this machine is a node of.
 
+    Returns:
+        Whether it was not before.
+
     Raises:
-        ConnectionError: there is none.
+        ConnectionError: there is none, or this process is part of another one.
     """
+    if ray.is_initialized():
+        own = ray.get_runtime_context().gcs_address
+        if address not in ("auto", own):
+            raise ConnectionError(f"this process is part of the Ray cluster at {own} already, not {address}")
+        return False
     try:
         if ":" in address:  # Ray itself would try for minutes
             host, port = address.rsplit(":", 1)
             socket.create_connection((host, int(port)), timeout=_PATIENCE).close()
-        if not ray.is_initialized():
-            ray.init(address=address, **QUIET)
+        with _signals_kept():
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, RuntimeError, ValueError) as error:
         raise ConnectionError(f"no Ray cluster at {address} lets us in: {one_line(error)}") from error
+    return True
+
+
+@contextmanager
+def _signals_kept() -> Iterator[None]:
+    """Ray handles SIGTERM in its own way, and does not save what there is."""
+    before = signal.getsignal(signal.SIGTERM)
+    yield
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
 
 
 def resource(name: str) -> float:
     """How much of a resource, such as ``CPU``, the nodes have together just now."""
     return float(ray.cluster_resources().get(name, 0))
+
+
+def gpus() -> list[float]:
+    """How many GPUs each node has."""
+    return [float(node["Resources"].get("GPU", 0)) for node in ray.nodes() if node["Alive"]]
 
 
 def one_line(error: Any) -> str:

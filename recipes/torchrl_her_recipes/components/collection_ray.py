@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import ray
 import torch
-from ray.exceptions import ObjectLostError, RayActorError
+from ray.exceptions import ObjectLostError, OutOfMemoryError, RayActorError, RayError
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
-from torchrl_her_recipes.components.cluster import join, resource
+from torchrl_her_recipes.components.cluster import join, one_line, resource
 from torchrl_her_recipes.components.collection_worker import Beginning, NodeCollector
 
 _SECONDS = 1.0  # between two looks at whether there still are nodes
+_DEATHS = 3  # of a process without a batch in between, until the run ends
 _ON_A_CORE = {"num_cpus": 1, "num_gpus": 0, "scheduling_strategy": "SPREAD"}
 
 
@@ -26,8 +26,10 @@ class NodeWorkers(RayCollector):
     """Processes on the nodes of a Ray cluster, each with a core, which are sent weights and send batches.
 
     Nothing is asked of the nodes but this package. Where one dies, a process elsewhere takes the place of
-    each that was lost, as soon as there is a core for it; it begins new episodes. So the episodes that were
-    open there are lost, and nothing else.
+    each that was lost, as soon as there is a core for it; it begins new episodes. Lost are the batch that was
+    being collected there, and the rest of the episodes that were open: what was sent of them is kept by the
+    writer, which stores it when it is told that episodes have ended (at each epoch of a
+    :class:`~torchrl_her.Trainer`).
 
     Args:
         address: of the cluster, HOST:PORT, or ``auto`` for the one that this machine is a node of.
@@ -41,8 +43,8 @@ class NodeWorkers(RayCollector):
 
     Raises:
         ConnectionError: there is no such cluster.
-        ValueError: it has fewer than N cores.
-        RuntimeError: a process failed for another reason than the death of its node.
+        ValueError: fewer than N of its cores are free.
+        RuntimeError: a process failed for another reason than its death, or died time after time.
     """
 
     def __init__(
@@ -56,13 +58,16 @@ class NodeWorkers(RayCollector):
         sync: bool,
     ) -> None:
         join(address)
-        cores = int(resource("CPU"))
-        if cores < processes:
-            raise ValueError(f"processes={processes} need a core each, but the cluster has {cores}")
+        free, cores = (int(own.get("CPU", 0)) for own in (ray.available_resources(), ray.cluster_resources()))
+        if free < processes:
+            raise ValueError(
+                f"processes={processes} need a core each, but {free} of the cluster's {cores} are free"
+            )
         self._orders: dict[int, ray.ObjectRef] = {}  # the batch that each process is collecting
         self._beginnings: list[Beginning] = []
         self._to_begin: set[int] = set()  # processes that are to begin new episodes with their next batch
         self._lives = [1] * processes
+        self._deaths = [0] * processes  # since a batch came
         self._make_env, self._options = make_env, {"auto_register_policy_transforms": False}
         try:
             super().__init__(
@@ -77,8 +82,8 @@ class NodeWorkers(RayCollector):
                 sync=sync,
                 weight_sync_schemes={},  # TorchRL's would wait for a node that has died
             )
-        except RayActorError as error:
-            raise _failure(error) from error
+        except RayError as error:
+            raise RuntimeError(f"a process that collects cannot start: {one_line(error)}") from error
 
     def begin(self, beginnings: Sequence[Beginning]) -> None:
         """Drops what they are collecting, and begins new episodes in all of them."""
@@ -124,18 +129,25 @@ class NodeWorkers(RayCollector):
         order = self._orders.pop(process)
         try:
             batch = ray.get(order)
-        except (RayActorError, ObjectLostError) as error:
-            if getattr(error, "actor_init_failed", False):
-                raise _failure(error) from error
+        except (RayActorError, ObjectLostError, OutOfMemoryError) as error:
+            self._deaths[process] += 1
+            if self._deaths[process] > _DEATHS:
+                raise RuntimeError(
+                    f"process {process} of those that collect died {_DEATHS + 1} times without sending a "
+                    f"batch: {one_line(error)}"
+                ) from error
             warnings.warn(
-                f"process {process} of those that collect died: its open episodes are lost, and a new "
-                "process takes its place",
+                f"process {process} of those that collect died, for the {self._lives[process]}. time in this "
+                "run: what it was collecting is lost, and a new process takes its place",
                 stacklevel=2,
             )
             self._replace(process)
             return None
+        except RayError as error:
+            raise RuntimeError(f"a process that collects failed: {one_line(error)}") from error
         if isinstance(batch, str):
             raise RuntimeError(f"a process that collects failed on its node: {batch}")
+        self._deaths[process] = 0
         return batch
 
     def _replace(self, process: int) -> None:
@@ -144,9 +156,3 @@ class NodeWorkers(RayCollector):
         self._beginnings[process] = self._beginnings[process].again(self._lives[process])
         self._lives[process] += 1
         self._to_begin.add(process)
-
-
-def _failure(error: Any) -> RuntimeError:
-    """Why a process could not start."""
-    reason = next((line for line in reversed(str(error).splitlines()) if line.strip()), type(error).__name__)
-    return RuntimeError(f"a process that collects cannot start: {reason.strip()}")

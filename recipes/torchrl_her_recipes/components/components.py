@@ -113,9 +113,7 @@ class Components:
         here = place_of(self.loss).type == "cpu"
         reason = None
         if choice != "never":
-            reason = (
-                self._why_not_fused() if here else why_not_recorded(self.loss, self.optimizer, self.target)
-            )
+            reason = self._why_not_fused() if here else why_not_recorded(self.loss, self.target)
             try:
                 if reason is None and here:
                     return FusedLearner(

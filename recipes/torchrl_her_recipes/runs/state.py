@@ -40,7 +40,7 @@ def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
         "buffer": buffer_state_dict(components.buffer, copy=False),
         "generators": [generator.get_state() for generator in components.generators],
         "torch_generator": torch.get_rng_state(),  # for losses that draw, as SAC's
-        "cuda_generators": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
+        "cuda_generator": None if (gpu := _gpu_of(components)) is None else torch.cuda.get_rng_state(gpu),
         "worlds": None if (worlds := _worlds(components)) is None else worlds.world_state_dict(),
         "progress": None if components.curriculum is None else components.curriculum.progress.state_dict(),
         "collector": collector_state_dict(components.collector),
@@ -77,11 +77,9 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
     for generator, own in zip(components.generators, state["generators"], strict=True):
         generator.set_state(own)
     torch.set_rng_state(state["torch_generator"])
-    if (
-        torch.cuda.is_initialized()
-        and len(own := state.get("cuda_generators", [])) == torch.cuda.device_count()
-    ):
-        torch.cuda.set_rng_state_all(own)
+    gpu, own = _gpu_of(components), state.get("cuda_generator")
+    if gpu is not None and own is not None:
+        torch.cuda.set_rng_state(own, gpu)
     if components.curriculum is not None:
         components.curriculum.progress.load_state_dict(state["progress"])
         for run in range(components.recipe.run.num_runs):
@@ -94,6 +92,12 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
         components.collector.reset()
         if isinstance(components.buffer.writer, HERWriter):
             components.buffer.writer.end_episodes()
+
+
+def _gpu_of(components: Components) -> torch.device | None:
+    """Where the networks are, if that is a GPU."""
+    device = place_of(components.loss)
+    return device if device.type == "cuda" and torch.cuda.is_initialized() else None
 
 
 def _worlds(components: Components) -> BatchedEnv | None:

@@ -19,7 +19,7 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from torchrl_her_recipes.components.cluster import join, one_line, resource
+from torchrl_her_recipes.components.cluster import gpus, join, one_line, resource
 from torchrl_her_recipes.studies.jobs import (
     Job,
     Outcome,
@@ -50,12 +50,12 @@ class RayWorkers:
     """
 
     def __init__(self, address: str = "auto", *, gpus_per_job: float = 0.0) -> None:
-        join(address)
-        if resource("GPU") < gpus_per_job:
-            raise ValueError(
-                f"gpus_per_job={gpus_per_job:g} cannot be: the cluster's nodes have {resource('GPU'):g} GPUs"
-            )
-        self._gpus = gpus_per_job
+        if gpus_per_job > 1 and gpus_per_job != int(gpus_per_job):
+            raise ValueError(f"gpus_per_job must be at most 1 or a whole number, got {gpus_per_job:g}")
+        self._joined, self._gpus = join(address), gpus_per_job
+        if gpus_per_job and self._places_on_gpus() == 0:
+            self._leave()
+            raise ValueError(f"no node of the cluster has as many GPUs as gpus_per_job={gpus_per_job:g}")
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
         board = ray.remote(num_cpus=0, scheduling_strategy=here)(Board)
         self._board = board.remote()
@@ -66,7 +66,17 @@ class RayWorkers:
     def at_once(self) -> int:
         """How many jobs the cluster has cores and GPUs for just now."""
         cores = int(resource("CPU"))
-        return min(cores, int(resource("GPU") / self._gpus)) if self._gpus else cores
+        return min(cores, self._places_on_gpus()) if self._gpus else cores
+
+    def _places_on_gpus(self) -> int:
+        """How many jobs have their share of a GPU at once."""
+        if self._gpus > 1:
+            return sum(int(own // self._gpus) for own in gpus())
+        return sum(int(own) * int(1 / self._gpus) for own in gpus())
+
+    def _leave(self) -> None:
+        if self._joined:
+            ray.shutdown()
 
     def run(self, job: Job) -> Outcome:
         """Has a job done where there is a core free, and fetches its files."""
@@ -106,7 +116,7 @@ class RayWorkers:
             for task in list(self._tasks.values()):
                 ray.cancel(task, force=True)
             time.sleep(0.1)  # until run() has heard of it
-        ray.shutdown()
+        self._leave()
 
 
 class Board:

@@ -78,7 +78,7 @@ def test_a_node_that_dies_costs_its_open_episodes_alone(
         return batch
 
     components.collector.next = next_batch  # type: ignore[method-assign]
-    with pytest.warns(UserWarning, match="process . of those that collect died: its open episodes are lost"):
+    with pytest.warns(UserWarning, match="process . of those that collect died, for the 1. time in this run"):
         found = _ran(components)
     for rows, waiting in zip(found["rows"], found["held"], strict=True):
         shares = each_once(audit_run(rows))
@@ -91,7 +91,7 @@ def test_a_node_that_dies_costs_its_open_episodes_alone(
 @pytest.mark.full
 @pytest.mark.usefixtures("nodes")
 def test_too_few_cores_or_an_environment_that_fails_are_one_line(cluster: Cluster) -> None:
-    with pytest.raises(ValueError, match="processes=4 need a core each, but the cluster has 2"):
+    with pytest.raises(ValueError, match="processes=4 need a core each, but 2 of the cluster's 2 are free"):
         build(tagged(ray=cluster.address, processes=4)).collector.next()
     broken = build(tagged(ray=cluster.address, epochs=4, **{"task.options.fails_at": 130}))
     with pytest.raises(RuntimeError, match=r"failed on its node: ValueError: this environment breaks now"):

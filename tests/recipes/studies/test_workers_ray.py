@@ -101,8 +101,10 @@ def test_each_job_gets_its_share_of_a_gpu(cluster: Cluster) -> None:
         workers = RayWorkers(cluster.address, gpus_per_job=0.25)
         assert workers.at_once == 4
         workers.close()
-        with pytest.raises(ValueError, match="gpus_per_job=2 cannot be: the cluster's nodes have 1 GPUs"):
+        with pytest.raises(ValueError, match="no node of the cluster has as many GPUs as gpus_per_job=2"):
             RayWorkers(cluster.address, gpus_per_job=2)
+        with pytest.raises(ValueError, match=r"gpus_per_job must be at most 1 or a whole number, got 1\.5"):
+            RayWorkers(cluster.address, gpus_per_job=1.5)
     finally:
         ray.shutdown()
         cluster.remove_node(node, allow_graceful=False)
