@@ -1,6 +1,7 @@
 """What a run costs, in time and memory, as more of them train as one program.
 
     python benchmarks/many_runs.py --out many_runs.md
+    python benchmarks/many_runs.py --runs 100 --full
 
 Each number of runs is a program of its own: the loop of ``preset=demo algo=cher``, one thread. Memory is the
 most that the program had, and what it will have when all buffers are full, of which rows are counted.
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import resource
 import subprocess
 import sys
@@ -23,8 +25,8 @@ RUNS = (1, 15, 30, 60, 100)
 WARM, TIMED = 6_400, 5_120  # frames of each run
 
 
-def measure(runs: int) -> dict[str, float]:
-    """Seconds, bytes and gradient steps of a number of runs, in this process."""
+def measure(runs: int, *, full: bool) -> dict[str, float]:
+    """Seconds, bytes and gradient steps of a number of runs, in this process; with full buffers if asked."""
     import torch  # noqa: PLC0415  # after the process was put on one core
 
     from torchrl_her_recipes import build, make_recipe  # noqa: PLC0415
@@ -35,6 +37,11 @@ def measure(runs: int) -> dict[str, float]:
     recipe = make_recipe(load_preset("demo"), algo="cher", num_runs=runs)
     components = build(recipe)
     trainer = components.trainer()
+    if full:
+        trainer.warmup_frames = math.inf  # type: ignore[assignment]  # nothing is learned meanwhile
+        while min(components.buffer.writer.sizes) < recipe.replay.buffer_size:
+            trainer.run(TIMED)
+        trainer.warmup_frames, trainer._credit = 0, 0.0
     trainer.run(WARM)
     updates, began = trainer.updates, time.perf_counter()
     trainer.run(TIMED)
@@ -68,16 +75,17 @@ def line(runs: int, found: dict[str, float], of_15: float) -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--runs", type=int, nargs="+", default=RUNS)
+    parser.add_argument("--full", action="store_true", help="fill all buffers first, which takes minutes")
     parser.add_argument("--only", type=int, help=argparse.SUPPRESS)  # in a program of its own
     parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
     options = parser.parse_args(arguments)
     if options.only is not None:
         with one_core():
-            print(json.dumps(measure(options.only)))
+            print(json.dumps(measure(options.only, full=options.full)))
         return
     found = {}
     for runs in options.runs:
-        command = [sys.executable, __file__, "--only", str(runs)]
+        command = [sys.executable, __file__, "--only", str(runs), *(["--full"] if options.full else [])]
         program = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
         found[runs] = json.loads(program.stdout.splitlines()[-1])
         print(f"{runs} runs: {found[runs]}", flush=True)
