@@ -68,10 +68,11 @@ def print_table(cells: Sequence[Combination]) -> None:
     print("| task | algorithm | runs | frames | success at the end | worst run | KL(q, q*) |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for cell in cells:
-        success, kl = at_the_end(cell.rows, "success"), at_the_end(cell.rows, "kl", evaluations=1)
+        success, counted = at_the_end(cell.rows, "success"), "kl" in cell.rows[0]  # are goals counted?
+        kl = spread(at_the_end(cell.rows, "kl", evaluations=1), ".2f") if counted else ""
         print(
             f"| `{cell.task}` | `{cell.algorithm}` | {cell.runs} | {cell.frames:,} "
-            f"| {spread(success, '.0%')} | {min(success):.0%} | {spread(kl, '.2f')} |"
+            f"| {spread(success, '.0%')} | {min(success):.0%} | {kl} |"
         )
 
 
