@@ -85,7 +85,7 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
 
     (folder / "her").unlink()
     # another process would take seconds to start
-    monkeypatch.setattr(torchrl_her_recipes, "make_workers", lambda jobs, ray: Here())
+    monkeypatch.setattr(torchrl_her_recipes, "make_workers", lambda **_options: Here())
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "1 batched runs to go, 3,200 environment steps in all" in said
