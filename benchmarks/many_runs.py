@@ -49,24 +49,23 @@ def measure(runs: int, *, full: bool) -> dict[str, float]:
     row = components.buffer.storage.packed[0].nbytes
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     stored = sum(components.buffer.writer.sizes)
-    full = most + row * (runs * recipe.replay.buffer_size - stored)
     return {
         "seconds": seconds,
         "most": most,
-        "full": full,
+        "full": most + row * (runs * recipe.replay.buffer_size - stored),
         "row": row,
         "updates": trainer.updates - updates,
         "share": stored / components.buffer.writer.totals.real,
     }
 
 
-def line(runs: int, found: dict[str, float], of_15: float) -> list[str]:
+def line(runs: int, found: dict[str, float], of_base: float) -> list[str]:
     each = found["seconds"] / runs
     return [
         f"{runs}",
         f"{runs * TIMED / found['seconds']:,.0f}",
         f"{1e3 * each / found['updates']:.2f}",
-        f"{each / of_15:.2f}",
+        f"{each / of_base:.2f}",
         f"{found['most'] / 1e9:.1f}",
         f"{found['full'] / 1e9:.1f}",
     ]

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 
-from torchrl_her_recipes import Recipe, make_recipe
+from torchrl_her_recipes import Components, Recipe, make_recipe
+from torchrl_her_recipes.runs.interrupt import Interrupted
 
 SMALL: dict[str, Any] = {
     "epochs": 2,
@@ -23,6 +25,18 @@ SMALL: dict[str, Any] = {
 def small(**options: Any) -> Recipe:
     """A recipe that runs in about a second."""
     return make_recipe(SMALL, **options)
+
+
+def stop_after(components: Components, batches: int) -> None:
+    """Lets a run be interrupted when it asks for one batch more than so many."""
+    collect, left = components.collector.next, iter(range(batches, -1, -1))
+
+    def next_batch() -> TensorDictBase:
+        if next(left) == 0:
+            raise Interrupted
+        return collect()
+
+    components.collector.next = next_batch  # type: ignore[method-assign]
 
 
 def overrides(**options: Any) -> list[str]:

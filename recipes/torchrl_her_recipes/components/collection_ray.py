@@ -68,7 +68,7 @@ class NodeWorkers(RayCollector):
         self._to_begin: set[int] = set()  # processes that are to begin new episodes with their next batch
         self._lives = [1] * processes
         self._deaths = [0] * processes  # since a batch came
-        self._make_env, self._options = make_env, {"auto_register_policy_transforms": False}
+        self._make_env = make_env
         try:
             super().__init__(
                 [make_env] * processes,
@@ -76,7 +76,7 @@ class NodeWorkers(RayCollector):
                 frames_per_batch=frames * (processes if sync else 1),
                 device=torch.device("cpu"),
                 collector_class=NodeCollector,
-                collector_kwargs=self._options,
+                collector_kwargs={"auto_register_policy_transforms": False},
                 exploration_type=ExplorationType.RANDOM,
                 remote_configs=_ON_A_CORE,
                 sync=sync,

@@ -108,33 +108,27 @@ class Components:
         Raises:
             ValueError: ``compile=always``, and they cannot be compiled.
         """
-        choice = self.recipe.learner.compile
+        choice, parts = self.recipe.learner.compile, (self.loss, self.optimizer, self.target)
         norm, runs = self.recipe.learner.max_grad_norm, self.recipe.run.num_runs
+        if choice == "never":
+            return LossLearner(*parts, max_grad_norm=norm, runs=runs)
         here = place_of(self.loss).type == "cpu"
-        reason = None
-        if choice != "never":
-            reason = self._why_not_fused() if here else why_not_recorded(self.loss, self.target)
+        reason = self._why_not_fused() if here else why_not_recorded(self.loss, self.target)
+        if reason is None and not here:
+            return GraphLearner(*parts, max_grad_norm=norm, runs=runs, compile=choice == "always")
+        if reason is None:
             try:
-                if reason is None and here:
-                    return FusedLearner(
-                        self.loss,
-                        self.optimizer,
-                        self.target,
-                        max_grad_norm=norm,
-                        products=cast(Products, self.recipe.learner.products),
-                    )
+                products = cast(Products, self.recipe.learner.products)
+                return FusedLearner(*parts, max_grad_norm=norm, products=products)
             except CannotCompile as error:
                 reason = str(error)
                 if choice == "auto":
                     warnings.warn(
                         f"gradient steps are several times slower than they could be: {error}", stacklevel=2
                     )
-        if choice == "always" and reason is not None:
+        if choice == "always":
             raise ValueError(f"compile=always cannot be: {reason}; choose auto")
-        parts = (self.loss, self.optimizer, self.target)
-        if choice == "never" or reason is not None:
-            return LossLearner(*parts, max_grad_norm=norm, runs=runs)
-        return GraphLearner(*parts, max_grad_norm=norm, runs=runs, compile=choice == "always")
+        return LossLearner(*parts, max_grad_norm=norm, runs=runs)
 
     def _why_not_fused(self) -> str | None:
         if not is_plain_adam(self.optimizer, self.loss):

@@ -21,9 +21,8 @@ from torch import multiprocessing
 
 from torchrl_her_recipes import Components, Recipe, RunResult, build, resume, run
 from torchrl_her_recipes.components.collection import ProcessCollector
-from torchrl_her_recipes.runs.interrupt import Interrupted
 
-from ..small import small
+from ..small import small, stop_after
 from .tagged_task import TASK, block_of
 
 SECONDS = 300  # until it is ended
@@ -111,14 +110,7 @@ def _stopped() -> dict[str, Any]:
     """Stopped in the middle of the second epoch."""
     with tempfile.TemporaryDirectory() as folder:
         components = build(tagged())
-        collect, left = components.collector.next, iter(range(13, -1, -1))
-
-        def next_batch() -> Any:
-            if next(left) == 0:
-                raise Interrupted
-            return collect()
-
-        components.collector.next = next_batch  # type: ignore[method-assign]
+        stop_after(components, 13)
         assert run(components, f"{folder}/run", progress=False).interrupted
         components = build(tagged())
         return shown(components, resume(f"{folder}/run", components=components, progress=False))

@@ -17,11 +17,10 @@ from torchrl_her import FusedLearner, LossLearner, load_checkpoint
 from torchrl_her.trainers import GraphLearner
 from torchrl_her_recipes import Components, build, cli, load_actor, resume, run
 from torchrl_her_recipes.components.devices import devices_of
-from torchrl_her_recipes.runs.interrupt import Interrupted
 
 from ...emulated import emulated_device
 from ...emulated_graphs import emulated_graphs
-from ..small import assert_same, overrides, small
+from ..small import assert_same, overrides, small, stop_after
 
 CURRICULUM = {
     "task": "hand_v1",
@@ -101,14 +100,7 @@ def test_a_run_goes_on_in_the_middle_of_an_epoch(name: str, tmp_path: Path) -> N
     recipe = small(**CURRICULUM, **SHORT, num_runs=2, **{"learner.device": name})
     whole = run(build(recipe), tmp_path / "whole", progress=False)
     components = build(recipe)
-    collect, left = components.collector.next, iter(range(5, -1, -1))
-
-    def next_batch() -> TensorDictBase:
-        if next(left) == 0:
-            raise Interrupted
-        return collect()
-
-    components.collector.next = next_batch  # type: ignore[method-assign]
+    stop_after(components, 5)
     assert run(components, tmp_path / "parts", progress=False).interrupted
     again = resume(tmp_path / "parts", progress=False)
     assert [row["success"] for row in again.rows] == [row["success"] for row in whole.rows]
