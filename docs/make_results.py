@@ -31,6 +31,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "bias": "bias",
     "curriculum": "curriculum",
     "climb": str(HERE / "studies" / "climb.yaml"),
+    "cher": str(HERE / "studies" / "cher.yaml"),
     "draws": str(HERE / "studies" / "draws.yaml"),
     "learners": str(HERE / "studies" / "learners.yaml"),
     "n_steps": "n_steps",
