@@ -1,6 +1,6 @@
 """TorchRL's losses of DDPG, TD3, SAC, TQC and DQN, with clamped targets and an action L2 penalty."""
 
-from torchrl_her.objectives.critics import critic_value
+from torchrl_her.objectives.critics import critic_value, critic_values
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss, make_ddpg_loss
 from torchrl_her.objectives.dqn import make_dqn_loss
 from torchrl_her.objectives.noise import RunNoise
@@ -18,6 +18,7 @@ __all__ = [
     "RunNoise",
     "clamped_td0",
     "critic_value",
+    "critic_values",
     "make_ddpg_loss",
     "make_dqn_loss",
     "make_sac_loss",

@@ -41,6 +41,25 @@ def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None
         >>> critic_value(loss, actor(start)).shape
         torch.Size([4, 1])
     """
+    every = critic_values(loss, transitions)
+    if every is None:
+        return None
+    mean = isinstance(loss, TQCLoss) or getattr(loss, "target_critics", 0) > 0
+    return (every.mean(-1) if mean else every.amin(-1)).unsqueeze(-1)
+
+
+@torch.no_grad()
+def critic_values(loss: LossModule, transitions: TensorDictBase) -> Tensor | None:
+    """The values of actions that each of the loss's critics gives; see :func:`critic_value`.
+
+    Args:
+        loss: of TorchRL.
+        transitions: [...], with all that the critics read.
+
+    Returns:
+        [..., E] of E critics, in TQC the mean of the quantiles of each; None if the loss has no critics of
+        actions that are known here.
+    """
     keys: Any = loss.tensor_keys
     has_actions = hasattr(keys, "state_action_value")
     if getattr(loss, "qvalue_network_params", None) is not None and has_actions:
@@ -59,10 +78,7 @@ def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None
                 values.append(network(transitions.select(*network.in_keys)).get(key))
     finally:
         network.train(training)
-    every = torch.stack(values)
-    if isinstance(loss, TQCLoss):
-        return every.mean((0, -1)).unsqueeze(-1)
-    return every.mean(0) if getattr(loss, "target_critics", 0) else every.amin(0)
+    return torch.cat([own.mean(-1, keepdim=True) for own in values], -1)
 
 
 def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:

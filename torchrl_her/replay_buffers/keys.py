@@ -21,6 +21,7 @@ class TransitionKeys:
         goals: the desired goal, in the root and under ``next``.
         reward, terminated, truncated, done: under ``next``.
         trajectory, env_ids: ids.
+        real_goal: the goal that the task itself asked for, where another one was proposed in its place.
     """
 
     achieved: NestedKey
@@ -32,6 +33,12 @@ class TransitionKeys:
     done: NestedKey
     trajectory: NestedKey
     env_ids: NestedKey
+    real_goal: NestedKey
+
+    def asked_for(self, rows: TensorDictBase) -> Tensor:
+        """The goals [..., g] that the task itself has asked for."""
+        real = rows.get(self.real_goal, None)
+        return entry_of(rows, self.goals[0]) if real is None else real
 
     def changes(
         self, goals: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor

@@ -64,6 +64,9 @@ class HindsightOptions:
         trajectory_key: ids that tell trajectories apart; the entry may be missing.
         env_ids_key: ids that tell environments apart, as :class:`~torchrl_her.EnvIds` gives them; the entry
             may be missing, and is not stored by the writer.
+        real_goal_key: the goal that the task itself asked for, where another one was proposed in its place
+            (:class:`~torchrl_her.BehaviorGoals`); the entry may be missing, and is left out like those of ``exclude``.
+            The source ``"actual"`` takes these.
         virtual_key: where a bool [..., 1] marks virtual transitions; None for no mark.
 
     Raises:
@@ -100,6 +103,7 @@ class HindsightOptions:
     done_key: NestedKey = "done"
     trajectory_key: NestedKey = ("collector", "traj_ids")
     env_ids_key: NestedKey = "env_ids"
+    real_goal_key: NestedKey = "real_goal"
     virtual_key: NestedKey | None = "virtual"
 
     def __post_init__(self) -> None:
@@ -185,6 +189,7 @@ class HindsightOptions:
             done=under_next(self.done_key),
             trajectory=unravel_key(self.trajectory_key),
             env_ids=unravel_key(self.env_ids_key),
+            real_goal=unravel_key(self.real_goal_key),
         )
 
 
@@ -261,7 +266,8 @@ class HindsightBase:
     @options.setter
     def options(self, options: HindsightOptions) -> None:
         self._options = options
-        self._keys, self._exclude = options.transition_keys(), in_root_and_next(options.exclude)
+        self._keys = options.transition_keys()
+        self._exclude = in_root_and_next([*options.exclude, options.real_goal_key])
 
     def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
         """The filter, [...]: False where a goal [..., g] was already achieved before the action."""

@@ -381,7 +381,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                 seams=((after, before), (next_wanted, wanted)),
             )
             rows = rows if dims == 1 else rows.flatten(0, dims - 1)
-            wanted = wanted.to(after.dtype)
+            wanted = self._keys.asked_for(rows).to(after.dtype)
             self._stored = stored = _Stored(storage, state, rows, before, after, wanted, episodes, {})
         return stored
 

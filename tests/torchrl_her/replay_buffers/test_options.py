@@ -39,6 +39,7 @@ OTHERS = {
     "done_key": "over",
     "trajectory_key": "path",
     "env_ids_key": "who",
+    "real_goal_key": ("goals", "real"),
     "virtual_key": None,
 }
 
@@ -99,9 +100,9 @@ def test_options_are_read_and_set_as_attributes(make: Callable[..., Any]) -> Non
         with pytest.raises(ValueError, match=message):
             setattr(part, name, value)
     assert (part.k, part.strategy) == (7, "final")
-    part.options = replace(part.options, reward_key="cost", exclude=("seen",))
+    part.options = replace(part.options, reward_key="cost", exclude=("seen",), real_goal_key="real")
     assert part._keys.reward == ("next", "cost")
-    assert part._exclude == ["seen", ("next", "seen")]
+    assert part._exclude == ["seen", ("next", "seen"), "real", ("next", "real")]
 
 
 @both

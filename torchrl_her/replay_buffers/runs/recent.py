@@ -68,14 +68,14 @@ class RecentGoals:
         """
         if len(episodes.lengths) == 0 or not sizes:
             return self
-        out, lengths = dict(self.goals), episodes.lengths
+        out, lengths, achieved = dict(self.goals), episodes.lengths, entry_of(rows, keys.next_achieved)
         for name, size in sizes.items():
             if name == "actual":  # one of each episode
-                number, key, row = torch.ones_like(lengths), keys.goals[0], episodes.rows[:, 0]
+                number, goals, row = torch.ones_like(lengths), keys.asked_for(rows), episodes.rows[:, 0]
             else:
-                number, key, row = lengths, keys.next_achieved, episodes.rows[episodes.inside]
+                number, goals, row = lengths, achieved, episodes.rows[episodes.inside]
             # Of the type of achieved goals, as all virtual goals are.
-            new = entry_of(rows, key).index_select(0, row).to(entry_of(rows, keys.next_achieved).dtype)
+            new = goals.index_select(0, row).to(achieved.dtype)
             counts = [len(new)]
             if run is not None:
                 counts = number.new_zeros(len(out[name])).index_add_(0, run, number).tolist()

@@ -1,0 +1,348 @@
+"""Behavior goals: which episodes ask for which goal, and what that does to their rewards and ends."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_her import GoalReward, GoalWeights, HERSampleUnit, HERWriter
+from torchrl_her.behavior import BehaviorGoals, GoalFactor, Offers
+from torchrl_her.trainers import collector_state_dict, load_collector_state_dict
+
+from .line import WANTED, Line, walk
+
+REWARD = GoalReward(0.5)
+
+
+class Told(GoalWeights):
+    """Prefers one goal, and remembers what it was told of."""
+
+    def __init__(self, best: float) -> None:
+        self.best, self.goals = best, []
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        return (goals[..., 0] == self.best).float()
+
+    def update(self, goals: Tensor) -> None:
+        self.goals += goals.flatten().tolist()
+
+
+class Farther(GoalFactor):
+    """Prefers goals that were achieved farther from where the episode begins."""
+
+    def __init__(self) -> None:
+        self.ends: list[tuple[list[int], list[int]]] = []
+
+    def __call__(self, offers: Offers) -> Tensor:
+        return (offers.reached - offers.start.unsqueeze(1)).squeeze(-1)  # observations are ten times goals
+
+    def record(self, ended: Tensor, achieved: Tensor) -> None:
+        self.ends.append((ended.tolist(), achieved.tolist()))
+
+
+def made(num_envs: int = 2, *, runs: int = 1, line: dict[str, float] | None = None, **options: object):
+    generators = [torch.Generator().manual_seed(seed) for seed in range(runs)]
+    behavior = BehaviorGoals(
+        REWARD, runs=runs, generators=generators, **{"real_share": 0.0, "memory": 100} | options
+    )
+    return TransformedEnv(Line(num_envs, **line or {}), behavior), behavior  # type: ignore[arg-type]
+
+
+def played(env: TransformedEnv, steps: int = 5) -> TensorDictBase:
+    return env.rollout(steps, walk, break_when_any_done=False)
+
+
+def wanted(rows: TensorDictBase) -> list[list[float]]:
+    return rows["next", "desired_goal"].squeeze(-1).tolist()
+
+
+def test_first_episodes_ask_for_the_tasks_goals() -> None:
+    env, _ = made()
+    rows = played(env)
+    assert wanted(rows) == [[WANTED] * 5] * 2
+    assert not rows["proposed"].any()
+
+
+def test_later_ones_ask_for_what_was_achieved() -> None:
+    env, _ = made(weights=Told(3.0))
+    played(env)
+    rows = played(env)
+    assert rows["desired_goal"][:, 0].tolist() == [[3.0], [3.0]]
+    # At 3 it is achieved: the episode ends there, and the next one asks for 3 again.
+    first = rows[0]
+    assert first["next", "achieved_goal"].flatten().tolist() == [1.0, 2.0, 3.0, 1.0, 2.0]
+    assert first["next", "reward"].flatten().tolist() == [-1.0, -1.0, 0.0, -1.0, -1.0]
+    assert first["next", "terminated"].flatten().tolist() == [False, False, True, False, False]
+    assert torch.equal(first["next", "done"], first["next", "terminated"])
+    assert first["next", "desired_goal"].flatten().tolist() == [3.0] * 5
+    assert first["next", "real_goal"].flatten().tolist() == [WANTED] * 5
+    assert rows["proposed"].all() and rows["next", "proposed"].all()
+
+
+def test_a_goal_stays_while_others_begin_anew() -> None:
+    class Cycle(GoalWeights):
+        """First 2, then 4."""
+
+        count = 0
+
+        def __call__(self, goals: Tensor) -> Tensor:
+            self.count += 1
+            return (goals[..., 0] == (4.0 if self.count > 1 else 2.0)).float()
+
+    env, _ = made(2, weights=[Cycle(), Cycle()], runs=2)
+    played(env)
+    first = env.reset()
+    env.base_env.place[1] = -10.0  # far back, so that only the first environment achieves its goal
+    rows = env.rollout(5, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    assert wanted(rows) == [[2.0, 2.0, 4.0, 4.0, 4.0], [2.0] * 5]
+
+
+def test_an_episode_that_misses_is_truncated_as_it_would_be() -> None:
+    env, _ = made(1, weights=Told(4.0), line={"steps": 3})
+    env.base_env.place += 1
+    for _ in range(2):  # 4 is never achieved in three steps from 0, so it is not known either
+        rows = played(env, 3)
+    assert rows["next", "truncated"].flatten().tolist() == [False, False, True]
+    assert not rows["proposed"].any()
+
+
+def test_the_tasks_goal_does_not_end_an_episode_with_another() -> None:
+    env, _ = made(1, weights=Told(2.0), goes_on=True, line={"steps": 20})
+    played(env, 11)  # the task's goal is achieved at 9, then two steps of the next episode
+    first = env.reset()
+    env.base_env.place += 7.0
+    rows = env.rollout(4, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    assert rows["next", "achieved_goal"].flatten().tolist() == [8.0, 9.0, 10.0, 11.0]
+    assert not rows["next", "done"].any()
+    assert rows["next", "reward"].flatten().tolist() == [-1.0] * 4
+
+
+def test_an_environment_that_cannot_go_on_truncates() -> None:
+    env, _ = made(1, weights=Told(2.0), line={"steps": 20})
+    played(env, 11)
+    first = env.reset()
+    env.base_env.place += 7.0
+    rows = env.rollout(2, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    assert rows["next", "terminated"].flatten().tolist() == [False, False]
+    assert rows["next", "truncated"].flatten().tolist() == [False, True]
+    assert rows["next", "done"].flatten().tolist() == [False, True]
+
+
+def test_a_fall_is_one_whatever_the_goal() -> None:
+    env, _ = made(1, weights=Told(2.0), goes_on=True, line={"edge": 3.5, "steps": 20})
+    played(env, 3)
+    first = env.reset()
+    env.base_env.place += 3.0
+    rows = env.rollout(1, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    assert rows["next", "terminated"].item()
+    assert rows["next", "reward"].item() == -1.0
+
+
+def test_a_share_of_the_episodes_keeps_the_tasks_goal() -> None:
+    env, _ = made(1_000, real_share=0.3, candidates=1, memory=5_000)
+    played(env, 1)
+    proposed = env.reset()["proposed"].float().mean().item()
+    assert proposed == pytest.approx(0.7, abs=0.05)
+
+
+def test_greedy_takes_the_greatest() -> None:
+    env, _ = made(4, factors=[Farther()], greedy=True, candidates=60)
+    played(env)
+    assert env.reset()["desired_goal"].flatten().tolist() == [5.0] * 4
+
+
+def test_others_are_drawn_in_proportion() -> None:
+    env, _ = made(2_000, factors=[Farther()], candidates=50, memory=20_000)
+    played(env)
+    goals = env.reset()["desired_goal"].flatten()
+    shares = goals.long().bincount(minlength=6) / len(goals)
+    torch.testing.assert_close(shares, torch.arange(6.0) / 15, atol=0.04, rtol=0.0)
+
+
+def test_weights_and_factors_multiply() -> None:
+    class Few(GoalWeights):
+        def __call__(self, goals: Tensor) -> Tensor:
+            return (goals[..., 0] < 3.5).float()
+
+    env, _ = made(4, weights=Few(), factors=[Farther()], greedy=True, candidates=60)
+    played(env)
+    assert env.reset()["desired_goal"].flatten().tolist() == [3.0] * 4
+
+
+def test_without_a_goal_that_may_be_proposed_the_tasks_own_stays() -> None:
+    env, _ = made(weights=Told(-1.0))
+    played(env)
+    begun = env.reset()
+    assert begun["desired_goal"].flatten().tolist() == [WANTED] * 2
+    assert not begun["proposed"].any()
+
+
+@pytest.mark.parametrize(("told", "goals"), [("achieved", [1.0, 1.0, 2.0, 2.0]), ("proposed", [2.0, 2.0])])
+def test_what_weights_are_told(told: str, goals: list[float]) -> None:
+    weights = Told(2.0)
+    env, _ = made(weights=weights, told=told, candidates=50)
+    played(env, 2)
+    env.reset()
+    assert weights.goals == goals
+
+
+def test_factors_are_told_how_episodes_ended() -> None:
+    factor = Farther()
+    env, behavior = made(4, factors=[factor], runs=2, greedy=True, candidates=60)
+    played(env)
+    assert factor.ends == []  # none was proposed
+    first = env.reset()
+    env.base_env.place[0] = 100.0  # never at 5 again
+    env.rollout(5, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    assert factor.ends == [([2, 2], [1, 2])]
+    assert behavior.success().tolist() == [0.5, 1.0]
+    assert behavior.success().isnan().all()
+
+
+def test_a_run_does_not_depend_on_others() -> None:
+    def goals(env: TransformedEnv) -> Tensor:
+        return torch.cat([played(env, 7)["desired_goal"] for _ in range(4)], 1)
+
+    both, _ = made(6, runs=2, real_share=0.5, candidates=3)
+    alone = BehaviorGoals(
+        REWARD, real_share=0.5, candidates=3, memory=100, generators=[torch.Generator().manual_seed(1)]
+    )
+    assert torch.equal(goals(both)[3:], goals(TransformedEnv(Line(3), alone)))
+
+
+def test_runs_that_take_no_part() -> None:
+    env, behavior = made(4, runs=2)
+    behavior.set_active(False, run=0)
+    played(env)
+    assert behavior.memory.sizes == [0, 10]
+    assert env.reset()["proposed"].flatten().tolist() == [False, False, True, True]
+
+
+def test_layers_that_take_no_part() -> None:
+    class Layers(Line):
+        """Two environments in two layers."""
+
+        def _shown(self) -> dict[str, Tensor]:
+            return super()._shown() | {"layer": torch.tensor([[0], [1]])}
+
+    line = Layers(2)
+    seen = line.observation_spec.clone()
+    seen["layer"] = seen["observation"].to(torch.int64)
+    line.observation_spec = seen
+    behavior = BehaviorGoals(REWARD, real_share=0.0, layer_key="layer", layer=1)
+    env = TransformedEnv(line, behavior)
+    played(env)
+    assert behavior.memory.sizes == [5]
+    assert env.reset()["proposed"].flatten().tolist() == [False, True]
+
+
+def test_specs_hold() -> None:
+    env, _ = made(2)
+    check_env_specs(env)
+    played(env)
+    check_env_specs(env)
+
+
+def test_it_is_right_under_a_collector() -> None:
+    env, _ = made(3, real_share=0.3, memory=1_000)
+    collector = Collector(env, walk, frames_per_batch=3 * 40, total_frames=-1, auto_register_policy_transforms=False)
+    batch = collector.next()
+    for goal, ids in zip(batch["desired_goal"], batch["collector", "traj_ids"], strict=True):
+        for episode in ids.unique():
+            assert len(goal[ids == episode].unique()) == 1
+    assert torch.equal(batch["next", "desired_goal"], batch["desired_goal"])
+    reward, _ = REWARD(batch["next", "achieved_goal"], batch["desired_goal"])
+    assert torch.equal(batch["next", "reward"], reward)
+    assert batch["proposed"].any() and not batch["proposed"].all()
+    collector.shutdown()
+
+
+def test_it_goes_on_from_a_collectors_state() -> None:
+    def collector() -> Collector:
+        env, _ = made(3, real_share=0.3, memory=50, weights=Told(3.0), factors=[Farther()])
+        return Collector(env, walk, frames_per_batch=3 * 8, total_frames=-1, auto_register_policy_transforms=False)
+
+    first, second = collector(), collector()
+    first.next()
+    second.next()
+    second.next()  # elsewhere
+    load_collector_state_dict(second, collector_state_dict(first))
+    own, line = first.env.base_env, second.env.base_env
+    line.place, line.time = own.place.clone(), own.time.clone()
+    for _ in range(3):
+        assert torch.equal(first.next()["desired_goal"], second.next()["desired_goal"])
+    first.shutdown()
+    second.shutdown()
+
+
+def test_other_parts_have_another_state() -> None:
+    _, behavior = made(weights=Told(3.0))
+    _, other = made()
+    with pytest.raises(ValueError, match="the state has 1 weights, not 0"):
+        other.load_state_dict(behavior.state_dict())
+
+
+@pytest.mark.parametrize("part", ["writer", "sample unit"])
+def test_actual_goals_are_those_of_the_task(part: str) -> None:
+    env, _ = made(weights=Told(3.0))
+    played(env)
+    rows = played(env)
+    assert rows["proposed"].all()
+    options: dict[str, object] = {"goal_sources": {"actual": 4}}
+    storage = LazyTensorStorage(100)
+    if part == "writer":
+        buffer = TensorDictReplayBuffer(storage=storage, writer=HERWriter(REWARD, **options), batch_size=60)
+        buffer.extend(rows)
+        sampled = buffer[:]
+    else:
+        unit = HERSampleUnit(REWARD, generator=torch.Generator(), **options)
+        buffer = TensorDictReplayBuffer(
+            storage=storage, batch_size=60, sample_unit=unit, transform=unit.relabel
+        )
+        buffer.extend(rows.reshape(-1))
+        sampled = buffer.sample()
+    assert "real_goal" not in sampled.keys() and "real_goal" not in sampled["next"].keys()
+    virtual = sampled["virtual"].squeeze(-1)
+    assert set(sampled["desired_goal"][virtual].flatten().tolist()) == {WANTED}
+    assert set(sampled["desired_goal"][~virtual].flatten().tolist()) == {3.0}
+
+
+def test_around_several_environments() -> None:
+    generator = torch.Generator().manual_seed(0)
+    behavior = BehaviorGoals(REWARD, real_share=0.0, weights=Told(3.0), generators=[generator])
+    env = TransformedEnv(SerialEnv(2, lambda: Line(1)), behavior)  # a batch of [2, 1]
+    played(env)
+    assert played(env)["next", "desired_goal"].flatten().tolist() == [3.0] * 10
+
+
+def test_bad_options() -> None:
+    with pytest.raises(ValueError, match=r"real_share must be in \[0, 1\], got 2"):
+        BehaviorGoals(REWARD, real_share=2)
+    with pytest.raises(ValueError, match="candidates must be at least 1, got 0"):
+        BehaviorGoals(REWARD, candidates=0)
+    with pytest.raises(ValueError, match="told must be one of achieved, proposed, got 'nothing'"):
+        BehaviorGoals(REWARD, told="nothing")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="2 runs need a list of 2 weights, one of each run, got 1"):
+        BehaviorGoals(REWARD, runs=2, weights=Told(1.0), generators=[torch.Generator()] * 2)
+
+
+def test_missing_entries() -> None:
+    with pytest.raises(KeyError, match="BehaviorGoals needs the entry 'desired_goal'"):
+        BehaviorGoals(REWARD)._reset(TensorDict(), TensorDict({"observation": torch.zeros(1, 1)}, [1]))
+
+
+def test_environments_that_cannot_be_shared_out() -> None:
+    env, _ = made(3, runs=2)
+    with pytest.raises(ValueError, match="3 environments cannot be shared out among 2 runs"):
+        env.reset()
+
+
+def test_it_is_not_for_buffers() -> None:
+    with pytest.raises(RuntimeError, match="sampled transitions have their goals already"):
+        BehaviorGoals(REWARD)(TensorDict({"observation": torch.zeros(1)}, []))

@@ -1,0 +1,258 @@
+"""What makes an achieved goal worth asking for: factors of how likely it is to be proposed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+Values = Callable[[Tensor, Tensor, Sequence[int]], Tensor]
+
+
+class Offers(NamedTuple):
+    """Goals of which one is proposed for each of m episodes that begin, run after run.
+
+    Attributes:
+        goals: [m, c, g], achieved goals.
+        reached: [m, c, o], what was observed when they were achieved.
+        start: [m, o], what is observed at the beginning of each episode.
+        target: [m, g], the goal that the task itself asks for.
+        counts: R numbers, how many of the m episodes are of each run.
+    """
+
+    goals: Tensor
+    reached: Tensor
+    start: Tensor
+    target: Tensor
+    counts: Sequence[int]
+
+    @property
+    def run(self) -> Tensor:
+        """[m] int64, the run of each episode."""
+        counts = torch.tensor(list(self.counts), device=self.goals.device)
+        return torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+
+
+class GoalFactor:
+    """One factor of how likely a goal is to be proposed. Subclass it for a measure of your own.
+
+    The base class finds all goals alike.
+
+    Example:
+        >>> class NotTooFar(GoalFactor):
+        ...     def __call__(self, offers):
+        ...         return (offers.goals - offers.target.unsqueeze(1)).norm(dim=-1) < 1.0
+    """
+
+    def __call__(self, offers: Offers) -> Tensor:
+        """[m, c] of at least 0, or of bool."""
+        return offers.goals.new_ones(offers.goals.shape[:-1])
+
+    def record(self, ended: Tensor, achieved: Tensor) -> None:
+        """Told how many episodes with proposed goals have ended, and in how many the goal was achieved.
+
+        Args:
+            ended: [R] int64, of each run.
+            achieved: [R] int64.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain data that :meth:`load_state_dict` takes."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` gave."""
+
+
+class Successes:
+    """The success of recent episodes of R runs: an average that forgets.
+
+    Args:
+        runs: R.
+
+    Keyword Args:
+        memory: episodes after which an episode counts 1 / e of what it counted first.
+
+    Attributes:
+        rate: [R] of float64; ``start`` before the first episode.
+
+    Example:
+        >>> successes = Successes(1, memory=2.0, start=0.0)
+        >>> successes.record(torch.tensor([2]), torch.tensor([1]))
+        >>> round(successes.rate.item(), 4)  # (1 - 1 / e) * 1 / 2
+        0.3161
+    """
+
+    def __init__(self, runs: int, *, memory: float = 100.0, start: float = 0.5) -> None:
+        if not memory > 0:
+            raise ValueError(f"memory must be positive, got {memory}")
+        self.memory = memory
+        self.rate = torch.full((runs,), start, dtype=torch.float64)
+
+    def record(self, ended: Tensor, achieved: Tensor) -> None:
+        """Counts [R] episodes that ended, and those of them in which the goal was achieved."""
+        kept = torch.exp(-ended.double() / self.memory)
+        self.rate = kept * self.rate.to(kept.device) + (1 - kept) * achieved / ended.clamp(min=1)
+
+
+class Achievable(GoalFactor):
+    """Leaves out goals that the critics do not yet believe in: those of a value below a cut-off.
+
+    The cut-off is each run's own and moves with the success of its proposed goals: down, by a step for as
+    many episodes as ``memory``, as long as more than ``high`` of them are achieved, and up, to its first
+    value at most, where fewer than ``low`` are. If all goals of an episode are below it, the one of the
+    highest value is left. After Pitis et al., Maximum Entropy Gain Exploration for Long Horizon Multi-goal
+    RL, 2020 (arXiv 2007.02832), section 3.3.
+
+    Args:
+        values: of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
+
+    Keyword Args:
+        runs: R.
+        cutoff: where it begins; its greatest value.
+        floor: its least value.
+        step: how far it moves in ``memory`` episodes.
+        low, high: between which success it stays where it is.
+        memory: episodes over which success is averaged.
+
+    Attributes:
+        cutoff: [R] of float64.
+
+    Raises:
+        ValueError: not 0 <= low <= high <= 1, or the floor lies above the cut-off.
+
+    Example:
+        >>> values = lambda observation, goals, counts: -goals.abs()  # the nearer to 0 the better
+        >>> goals = torch.tensor([[[1.0], [2.0], [9.0]], [[5.0], [4.0], [6.0]]])
+        >>> offers = Offers(goals, goals, torch.zeros(2, 1), torch.zeros(2, 1), [2])
+        >>> Achievable(values, cutoff=-3.0)(offers).tolist()
+        [[True, True, False], [False, True, False]]
+    """
+
+    def __init__(
+        self,
+        values: Values,
+        *,
+        runs: int = 1,
+        cutoff: float = -3.0,
+        floor: float = -math.inf,
+        step: float = 1.0,
+        low: float = 0.3,
+        high: float = 0.7,
+        memory: float = 100.0,
+    ) -> None:
+        if not 0 <= low <= high <= 1:
+            raise ValueError(f"low and high must be 0 <= low <= high <= 1, got low={low}, high={high}")
+        if not floor <= cutoff:
+            raise ValueError(f"floor must be at most the cut-off {cutoff}, got {floor}")
+        self.values, self.floor, self.first, self.step = values, floor, cutoff, step
+        self.low, self.high = low, high
+        self.successes = Successes(runs, memory=memory)
+        self.cutoff = torch.full((runs,), cutoff, dtype=torch.float64)
+
+    def __call__(self, offers: Offers) -> Tensor:
+        value = self.values(offers.start, offers.goals, offers.counts).mean(-1)
+        own = self.cutoff.to(value)[offers.run].unsqueeze(1)
+        believed = value >= own
+        return believed | (~believed.any(1, keepdim=True) & (value == value.amax(1, keepdim=True)))
+
+    def record(self, ended: Tensor, achieved: Tensor) -> None:
+        self.successes.record(ended, achieved)
+        rate, moved = self.successes.rate, self.step * ended.double() / self.successes.memory
+        direction = (rate < self.low).double() - (rate > self.high).double()
+        self.cutoff = (self.cutoff.to(moved.device) + direction * moved).clamp(self.floor, self.first)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"cutoff": self.cutoff, "rate": self.successes.rate}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.cutoff, self.successes.rate = state["cutoff"].clone(), state["rate"].clone()
+
+
+class Directed(GoalFactor):
+    """Prefers goals that can be achieved, that critics disagree about, and that lead to the task's goal.
+
+    The factor is exp(score / temperature), with the score of Diaz-Bone et al., DISCOVER: Automated Curricula
+    for Sparse-Reward RL, 2025 (arXiv 2505.19850):
+
+        score = alpha (V(s0, g) + beta S(s0, g)) + (1 - alpha) (V(s_g, g*) + beta S(s_g, g*))
+
+    V and S are the mean and the standard deviation of the critics' values, s0 is the beginning of the
+    episode, s_g what was observed when g was achieved, and g* the goal of the task. Each run's alpha rises,
+    so that achievable goals count more, as long as fewer than ``target`` of the proposed goals are achieved,
+    and falls otherwise.
+
+    With a single critic S is 0. Weights that prefer rare goals then take its place.
+
+    Args:
+        values: of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
+
+    Keyword Args:
+        runs: R.
+        beta: how much the critics' disagreement counts.
+        alpha: where it begins.
+        step: how far it moves in ``memory`` episodes whose success is off the target by 1.
+        target: the success that is aimed at.
+        temperature: in the unit of values; the lower, the more the best goal is preferred.
+        memory: episodes over which success is averaged.
+
+    Attributes:
+        alpha: [R] of float64.
+
+    Raises:
+        ValueError: alpha or target is outside of [0, 1], or the temperature is not positive.
+
+    Example:
+        >>> values = lambda observation, goals, counts: -(observation.view(1, -1, 1) - goals).abs()
+        >>> goals = torch.tensor([[[1.0], [3.0], [6.0]]])  # from 0, the task wants 4
+        >>> offers = Offers(goals, goals, torch.zeros(1, 1), torch.full((1, 1), 4.0), [1])
+        >>> Directed(values, alpha=0.0)(offers).log().tolist()  # towards the goal alone
+        [[-2.0, 0.0, -1.0]]
+    """
+
+    def __init__(
+        self,
+        values: Values,
+        *,
+        runs: int = 1,
+        beta: float = 1.0,
+        alpha: float = 0.5,
+        step: float = 1.0,
+        target: float = 0.5,
+        temperature: float = 1.0,
+        memory: float = 100.0,
+    ) -> None:
+        for name, number in (("alpha", alpha), ("target", target)):
+            if not 0 <= number <= 1:
+                raise ValueError(f"{name} must be in [0, 1], got {number}")
+        if not 0 < temperature < math.inf:
+            raise ValueError(f"temperature must be positive and finite, got {temperature}")
+        self.values, self.beta, self.step = values, beta, step
+        self.target, self.temperature = target, temperature
+        self.successes = Successes(runs, memory=memory, start=target)
+        self.alpha = torch.full((runs,), alpha, dtype=torch.float64)
+
+    def __call__(self, offers: Offers) -> Tensor:
+        near = self._bound(self.values(offers.start, offers.goals, offers.counts))
+        far = self._bound(self.values(offers.reached, offers.target.unsqueeze(1), offers.counts))
+        alpha = self.alpha.to(near)[offers.run].unsqueeze(1)
+        score = (alpha * near + (1 - alpha) * far) / self.temperature
+        return (score - score.amax(1, keepdim=True)).exp()
+
+    def record(self, ended: Tensor, achieved: Tensor) -> None:
+        self.successes.record(ended, achieved)
+        moved = self.step * ended.double() / self.successes.memory * (self.target - self.successes.rate)
+        self.alpha = (self.alpha.to(moved.device) + moved).clamp(0.0, 1.0)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"alpha": self.alpha, "rate": self.successes.rate}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.alpha, self.successes.rate = state["alpha"].clone(), state["rate"].clone()
+
+    def _bound(self, values: Tensor) -> Tensor:
+        """The optimistic value [m, c] of those of critics [m, c, E]."""
+        return values.mean(-1) + self.beta * values.std(-1, correction=0)

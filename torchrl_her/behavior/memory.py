@@ -1,0 +1,146 @@
+"""The goals that were achieved lately, as a memory from which goals of new episodes are taken."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_her.replay_buffers.runs.streams import Generators, uniform
+
+
+class AchievedGoals:
+    """The newest achieved goals of R runs, each with what was observed when it was achieved.
+
+    Each run has a ring of its own, which is on the device of the first goals that come.
+
+    Args:
+        capacity: goals that each run keeps.
+
+    Keyword Args:
+        runs: R.
+
+    Raises:
+        ValueError: ``capacity`` or ``runs`` is below 1; when adding, more goals come at once than fit.
+
+    Example:
+        >>> memory = AchievedGoals(3, runs=2)
+        >>> goals = torch.tensor([[1.0], [2.0], [3.0], [4.0]])  # two environments of each run
+        >>> memory.add(goals, goals * 10, which=torch.tensor([True, True, False, True]))
+        >>> memory.sizes
+        [2, 1]
+        >>> index = memory.draw([0, 1], 2, [None, torch.Generator().manual_seed(0)])
+        >>> memory.goals(index).tolist(), memory.observations(index).tolist()
+        ([[[4.0], [4.0]]], [[[40.0], [40.0]]])
+    """
+
+    def __init__(self, capacity: int = 50_000, *, runs: int = 1) -> None:
+        for name, number in (("capacity", capacity), ("runs", runs)):
+            if number < 1:
+                raise ValueError(f"{name} must be at least 1, got {number}")
+        self.capacity, self.runs = capacity, runs
+        self._written = torch.zeros(runs, dtype=torch.int64)
+        self._rows: tuple[Tensor, Tensor] | None = None  # goals and observations, [R * capacity, ...]
+
+    @property
+    def sizes(self) -> list[int]:
+        """How many goals each run has."""
+        return self._written.clamp(max=self.capacity).tolist()
+
+    def add(self, goals: Tensor, observations: Tensor, *, which: Tensor | None = None) -> None:
+        """Adds goals of all runs; the oldest ones make room for them.
+
+        Args:
+            goals: [N, g], R equal blocks in the order of the runs.
+            observations: [N, o].
+
+        Keyword Args:
+            which: [N] of bool, those that are added; None for all.
+        """
+        number = len(goals) // self.runs
+        if number * self.runs != len(goals):
+            raise ValueError(f"{len(goals)} goals cannot be shared out among {self.runs} runs")
+        if number > self.capacity:
+            raise ValueError(f"{number} goals of each run do not fit into a memory of {self.capacity}")
+        if self._rows is None:
+            self._rows = self._empty(goals), self._empty(observations)
+            self._written = self._written.to(goals.device)
+        run = torch.arange(self.runs, device=goals.device)
+        if which is None:
+            rank = torch.arange(number, device=goals.device).expand(self.runs, -1)
+            added = torch.full_like(self._written, number)
+        else:
+            blocks = which.view(self.runs, -1)
+            rank, added = blocks.cumsum(1) - 1, blocks.sum(1)
+        place = (self._written.unsqueeze(1) + rank) % self.capacity + run.unsqueeze(1) * self.capacity
+        self._written += added
+        flat = place.flatten()
+        for own, new in zip(self._rows, (goals, observations), strict=True):
+            own[flat if which is None else flat[which]] = (new if which is None else new[which]).to(own)
+
+    def draw(self, counts: Sequence[int], width: int, generators: Generators) -> Tensor:
+        """Draws goals, all alike, for episodes of several runs.
+
+        Args:
+            counts: R numbers of episodes; 0 where a run has no goals.
+            width: goals for each episode.
+            generators: R, one of each run; None for torch's own.
+
+        Returns:
+            [sum of counts, width] of int64, for :meth:`goals` and :meth:`observations`, run after run.
+        """
+        run = torch.arange(self.runs).repeat_interleave(torch.tensor(list(counts))).to(self._written.device)
+        size = self._written.clamp(max=self.capacity)[run].unsqueeze(1)
+        numbers = uniform(counts, width, generators, device=run.device)
+        return run.unsqueeze(1) * self.capacity + (numbers * size).long()
+
+    def goals(self, index: Tensor) -> Tensor:
+        """The goals [..., g] at some places [...]."""
+        return self._at(0, index)
+
+    def observations(self, index: Tensor) -> Tensor:
+        """What was observed [..., o] when they were achieved."""
+        return self._at(1, index)
+
+    def clear(self, run: int) -> None:
+        """Forgets the goals of a run."""
+        self._written[run] = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain data that :meth:`load_state_dict` takes."""
+        rows = []
+        for part in self._rows or ():
+            blocks = zip(part.split(self.capacity), self.sizes, strict=True)
+            rows.append([own[:size].clone() for own, size in blocks])
+        return {"written": self._written.clone(), "capacity": self.capacity, "rows": rows}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: it is of another number of runs, or of another capacity.
+        """
+        written, capacity = state["written"], state["capacity"]
+        if (len(written), capacity) != (self.runs, self.capacity):
+            raise ValueError(
+                f"the state must be that of {self.runs} runs with {self.capacity} goals each, got one of "
+                f"{len(written)} runs with {capacity}"
+            )
+        self._written, self._rows = written.clone(), None
+        if state["rows"]:
+            goals, observations = (self._empty(blocks[0]) for blocks in state["rows"])
+            for part, blocks in zip((goals, observations), state["rows"], strict=True):
+                for own, block in zip(part.split(capacity), blocks, strict=True):
+                    own[: len(block)] = block
+            self._rows = goals, observations
+
+    def _empty(self, like: Tensor) -> Tensor:
+        return like.new_zeros(self.runs * self.capacity, *like.shape[1:])
+
+    def _at(self, part: int, index: Tensor) -> Tensor:
+        if self._rows is None:
+            raise ValueError("no goals were added yet")
+        own = self._rows[part]
+        return own.index_select(0, index.flatten()).view(*index.shape, *own.shape[1:])

@@ -1,0 +1,339 @@
+"""Behavior goals: the goal that the next episode asks for is proposed from goals that were achieved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.data import Binary, Composite
+from torchrl.envs import Transform
+
+from torchrl_her.behavior.factors import GoalFactor, Offers
+from torchrl_her.behavior.memory import AchievedGoals
+from torchrl_her.goals.factors import draw
+from torchrl_her.goals.rewards import RewardFunction
+from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights
+from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
+
+Told = Literal["achieved", "proposed"]
+
+
+class BehaviorGoals(Transform):
+    """Asks for goals that were achieved before, in place of the task's own, in a share of the episodes.
+
+    At a reset, some goals that the run has achieved are drawn, and one of them is proposed, in proportion to
+
+        weight(g) * factor(g) * factor(g) * ...
+
+    where ``weight`` says how useful a goal is, as it does for virtual goals, and the factors how well it can
+    be achieved from here and how far it leads. Then the episode's reward, terminated and done are those of
+    the proposed goal. The other episodes are as the environment has them. Environments for evaluation do
+    without this transform.
+
+    | method | weights | told | factors | greedy |
+    | --- | --- | --- | --- | --- |
+    | uniform | none | | none | False |
+    | IBS | :class:`~torchrl_her.Instructiveness` | proposed | none | False |
+    | MEGA | ``RareGoals`` | achieved | :class:`~torchrl_her.behavior.Achievable` | True |
+    | DISCOVER | none, with several critics | | :class:`~torchrl_her.behavior.Directed` | True |
+
+    In a curriculum, put it behind :class:`~torchrl_her.StateToObs` and before :class:`~torchrl_her.ZeroPad`.
+    It acts in the last layer, which is the full task, if ``layer_key`` is given or :meth:`set_active` is
+    called.
+
+    The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
+    Put the transform around a ParallelEnv and not inside of its workers, which would each have a memory of
+    their own. All that it knows is a part of its ``state_dict()``, and so of the collector's.
+
+    Args:
+        reward_fn: maps (achieved, desired) goals to (reward, terminated), as the environment's own does.
+
+    Keyword Args:
+        weights: of goals; for several runs a list, one of each. None for all alike.
+        factors: others by which the weights are multiplied.
+        told: which goals the weights are told of by ``update``: those that are achieved, or those proposed.
+        greedy: whether the goal of the greatest product is proposed, and not one in proportion to it.
+        real_share: share of the episodes in which the task's own goal stays.
+        candidates: goals of which one is proposed.
+        memory: goals that each run remembers.
+        runs: R.
+        generators: sources of random numbers, one of each run; None for torch's own, with one run only.
+        achieved_reward: the reward of an achieved goal.
+        goes_on: whether the environment can be stepped further after it terminated an episode; if not, the
+            episode is truncated there.
+        observation_key, achieved_goal_key, desired_goal_key, reward_key, terminated_key, truncated_key,
+            done_key: read, and all but the first two written.
+        real_goal_key: where the task's own goal is written.
+        proposed_key: where it is written whether the goal is a proposed one, bool [..., 1].
+        layer_key: of the layer [..., 1] that an episode is played in, if it has one.
+        layer: the one in which goals are proposed.
+
+    Attributes:
+        memory: the achieved goals of each run, :class:`~torchrl_her.behavior.AchievedGoals`.
+        ended, achieved: [R] int64, episodes with proposed goals that have ended, and those in which the goal
+            was achieved, since :meth:`success` was called.
+
+    Raises:
+        ValueError: an option is out of its range; when used, the batch is not R equal blocks.
+        KeyError: when used, the environment lacks an entry.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torchrl_her import GoalReward
+        >>> from torchrl_her_envs import make_env
+        >>> env = make_env("hand_v0", num_envs=4, seed=0)
+        >>> env = TransformedEnv(env, BehaviorGoals(GoalReward(0.1), real_share=0.0, goes_on=True))
+        >>> _ = env.rollout(10)  # which is remembered
+        >>> begun = env.reset()
+        >>> begun["proposed"].flatten().tolist(), (begun["desired_goal"] == begun["real_goal"]).any().item()
+        ([True, True, True, True], False)
+    """
+
+    def __init__(
+        self,
+        reward_fn: RewardFunction,
+        *,
+        weights: GoalWeights | Sequence[GoalWeights] | None = None,
+        factors: Sequence[GoalFactor] = (),
+        told: Told = "achieved",
+        greedy: bool = False,
+        real_share: float = 0.5,
+        candidates: int = 100,
+        memory: int = 50_000,
+        runs: int = 1,
+        generators: Sequence[torch.Generator] | None = None,
+        achieved_reward: float = 0.0,
+        goes_on: bool = False,
+        observation_key: NestedKey = "observation",
+        achieved_goal_key: NestedKey = "achieved_goal",
+        desired_goal_key: NestedKey = "desired_goal",
+        reward_key: NestedKey = "reward",
+        terminated_key: NestedKey = "terminated",
+        truncated_key: NestedKey = "truncated",
+        done_key: NestedKey = "done",
+        real_goal_key: NestedKey = "real_goal",
+        proposed_key: NestedKey = "proposed",
+        layer_key: NestedKey | None = None,
+        layer: int = 0,
+    ) -> None:
+        if not 0.0 <= real_share <= 1.0:
+            raise ValueError(f"real_share must be in [0, 1], got {real_share}")
+        if candidates < 1:
+            raise ValueError(f"candidates must be at least 1, got {candidates}")
+        if told not in get_args(Told):
+            raise ValueError(f"told must be one of {', '.join(get_args(Told))}, got {told!r}")
+        own = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
+        if own and len(own) != runs:
+            raise ValueError(f"{runs} runs need a list of {runs} weights, one of each run, got {len(own)}")
+        out_keys = [desired_goal_key, real_goal_key, proposed_key]
+        super().__init__(in_keys=[observation_key, achieved_goal_key, desired_goal_key], out_keys=out_keys)
+        self.generators: Generators = check_generators(runs, generators) or [None]
+        self.reward_fn, self.weights, self.factors = reward_fn, own, list(factors)
+        self.told, self.greedy, self.real_share, self.candidates = told, greedy, real_share, candidates
+        self.runs, self.achieved_reward, self.goes_on = runs, achieved_reward, goes_on
+        self.memory = AchievedGoals(memory, runs=runs)
+        self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
+        self.truncated_key, self.done_key = unravel_key(truncated_key), unravel_key(done_key)
+        self.layer_key, self.layer = layer_key, layer
+        self.ended = torch.zeros(runs, dtype=torch.int64)
+        self.achieved = torch.zeros(runs, dtype=torch.int64)
+        self._active = [True] * runs
+
+    def set_active(self, active: bool, *, run: int = 0) -> None:
+        """Lets a run remember goals and propose them, or neither."""
+        self._active[run] = active
+
+    def success(self) -> Tensor:
+        """The success [R] of the proposed goals since the last call; NaN without any."""
+        rate = self.achieved.double() / self.ended.double()
+        self.achieved, self.ended = torch.zeros_like(self.achieved), torch.zeros_like(self.ended)
+        return rate
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """All that it knows, as tensors and plain data: a part of ``state_dict()``."""
+        return {
+            "memory": self.memory.state_dict(),
+            "weights": [own.state_dict() for own in self.weights],
+            "factors": [own.state_dict() for own in self.factors],
+            "generators": [None if own is None else own.get_state() for own in self.generators],
+            "ended": self.ended,
+            "achieved": self.achieved,
+            "active": list(self._active),
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Puts back what :meth:`get_extra_state` gave.
+
+        Raises:
+            ValueError: it is that of another number of runs, or of other weights and factors.
+        """
+        self.memory.load_state_dict(state["memory"])
+        parts: dict[str, Sequence[GoalWeights | GoalFactor]]
+        parts = {"weights": self.weights, "factors": self.factors}
+        for name, each in parts.items():
+            if len(each) != len(state[name]):
+                raise ValueError(f"the state has {len(state[name])} {name}, not {len(each)}")
+            for own, was in zip(each, state[name], strict=True):
+                own.load_state_dict(was)
+        for generator, own in zip(self.generators, state["generators"], strict=True):
+            if generator is not None and own is not None:
+                generator.set_state(own)
+        self.ended, self.achieved = state["ended"].clone(), state["achieved"].clone()
+        self._active = list(state["active"])
+
+    # TorchRL's hooks
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        goal_key, real_key, proposed_key = self.out_keys
+        real = self._get(tensordict_reset, goal_key)
+        if len(real) % self.runs:
+            raise ValueError(f"{len(real)} environments cannot be shared out among {self.runs} runs")
+        mask = tensordict.get("_reset", None)
+        begins = torch.ones_like(real[..., :1], dtype=torch.bool) if mask is None else mask
+        begins = begins.view(*real.shape[:-1], 1)
+        proposed, goals = self._propose(tensordict_reset, begins.flatten())
+        flags = proposed.view(begins.shape)
+        wanted = real if goals is None else real.index_put((flags.squeeze(-1),), goals.to(real))
+        if mask is not None and (before := tensordict.get(proposed_key, None)) is not None:  # others go on
+            wanted = torch.where(begins, wanted, tensordict.get(goal_key))
+            flags = torch.where(begins, flags, before)
+        for key, value in ((goal_key, wanted), (real_key, real), (proposed_key, flags)):
+            tensordict_reset.set(key, value)
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        goal_key, real_key, proposed_key = self.out_keys
+        proposed, real = self._get(tensordict, proposed_key), self._get(next_tensordict, goal_key)
+        achieved = self._get(next_tensordict, self.in_keys[1])
+        next_tensordict.set(real_key, real)
+        next_tensordict.set(proposed_key, proposed)
+        self._remember(tensordict, next_tensordict, achieved)
+        if not bool(proposed.any()):
+            return next_tensordict
+        wanted = torch.where(proposed, tensordict.get(goal_key), real)
+        reward, terminated = self.reward_fn(achieved, wanted)
+        before, ended = next_tensordict.get(self.reward_key), next_tensordict.get(self.terminated_key)
+        fell = ended & (before < self.achieved_reward)  # without its goal: so it does for any goal
+        terminated = torch.where(proposed, terminated | fell, ended)
+        truncated = next_tensordict.get(self.truncated_key)
+        if not self.goes_on:
+            truncated = truncated | (ended & ~terminated)
+        done = torch.where(proposed, terminated | truncated, next_tensordict.get(self.done_key))
+        reward = torch.where(proposed, reward.to(before), before)
+        keys = (goal_key, self.reward_key, self.terminated_key, self.truncated_key, self.done_key)
+        for key, value in zip(keys, (wanted, reward, terminated, truncated, done), strict=True):
+            next_tensordict.set(key, value)
+        self._count(proposed & done, reward >= self.achieved_reward)
+        return next_tensordict
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Raises a RuntimeError: goals are proposed where episodes begin, not in a replay buffer."""
+        raise RuntimeError("BehaviorGoals is for environments: sampled transitions have their goals already")
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        goal_key, real_key, proposed_key = self.out_keys
+        goal = observation_spec[goal_key]
+        observation_spec[real_key] = goal.clone()
+        shape = (*goal.shape[:-1], 1)
+        observation_spec[proposed_key] = Binary(shape=shape, dtype=torch.bool, device=goal.device)
+        return observation_spec
+
+    # The work
+
+    def _takes_part(self, tensordict: TensorDictBase, rows: int) -> Tensor | None:
+        """The environments [N] in which goals are remembered and proposed; None for all."""
+        part = None
+        if not all(self._active):
+            part = torch.tensor(self._active).repeat_interleave(rows // self.runs)
+        if self.layer_key is not None:
+            own = self._get(tensordict, self.layer_key).reshape(rows) == self.layer
+            part = own if part is None else part.to(own.device) & own
+        return part
+
+    def _remember(self, before: TensorDictBase, after: TensorDictBase, achieved: Tensor) -> None:
+        achieved = achieved.flatten(0, -2)
+        part = self._takes_part(before, len(achieved))
+        if part is not None and not bool(part.any()):
+            return
+        self.memory.add(achieved, self._get(after, self.in_keys[0]).flatten(0, -2), which=part)
+        if self.weights and self.told == "achieved":
+            goals = achieved if part is None else achieved[part]
+            self._weights_of_runs().update(goals, range(self.runs), self._counts(part, len(achieved)))
+
+    def _propose(self, tensordict: TensorDictBase, begins: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Which of the environments [N] get a proposed goal, and these goals [m, g]."""
+        part = self._takes_part(tensordict, len(begins))
+        chosen = begins if part is None else begins & part.to(begins.device)
+        known = torch.tensor([size > 0 for size in self.memory.sizes], device=begins.device)
+        chosen = chosen & known.repeat_interleave(len(begins) // self.runs)
+        if self.real_share > 0 and bool(chosen.any()):
+            numbers = uniform(self._counts(chosen, len(begins)), 1, self.generators, device=begins.device)
+            chosen = chosen.index_put((chosen.clone(),), numbers.squeeze(-1) >= self.real_share)
+        if not bool(chosen.any()):
+            return torch.zeros_like(begins), None
+        counts = self._counts(chosen, len(begins))
+        index = self.memory.draw(counts, self.candidates, self.generators)
+        offers = Offers(
+            goals=self.memory.goals(index),
+            reached=self.memory.observations(index),
+            start=self._get(tensordict, self.in_keys[0]).flatten(0, -2)[chosen],
+            target=self._get(tensordict, self.out_keys[0]).flatten(0, -2)[chosen],
+            counts=counts,
+        )
+        likelihood = self._likelihood(offers)
+        if self.greedy:
+            place, valid = likelihood.argmax(1, keepdim=True), likelihood.amax(1) > 0
+        else:
+            place, valid = draw(
+                likelihood,
+                1,
+                generator=lambda shape, dtype, device: uniform(
+                    counts, shape[-1], self.generators, dtype=dtype, device=device
+                ),
+            )
+        goals = offers.goals.take_along_dim(place.unsqueeze(-1), 1).squeeze(1)
+        if not bool(valid.all()):  # then the task's own goal stays
+            chosen, goals = chosen.index_put((chosen.clone(),), valid), goals[valid]
+            counts = self._counts(chosen, len(begins))
+        if self.weights and self.told == "proposed":
+            self._weights_of_runs().update(goals, range(self.runs), counts)
+        return chosen, goals
+
+    def _likelihood(self, offers: Offers) -> Tensor:
+        """How likely each goal is to be proposed, [m, c]."""
+        likelihood = offers.goals.new_ones(offers.goals.shape[:-1])
+        if self.weights and not self.weights[0].alike:
+            own = self._weights_of_runs()(offers.goals, range(self.runs), offers.counts)
+            likelihood = checked_weights(own)
+        for factor in self.factors:
+            likelihood = likelihood * factor(offers)
+        return likelihood
+
+    def _count(self, ended: Tensor, achieved: Tensor) -> None:
+        """Notes which episodes with proposed goals have ended, and how."""
+        if not bool(ended.any()):
+            return
+        counts = [own.reshape(self.runs, -1).sum(1) for own in (ended, ended & achieved)]
+        self.ended, self.achieved = (
+            total.to(own.device) + own for total, own in zip((self.ended, self.achieved), counts, strict=True)
+        )
+        for factor in self.factors:
+            factor.record(*counts)
+
+    def _weights_of_runs(self) -> WeightsOfRuns:
+        return type(self.weights[0]).of_runs(self.weights)
+
+    def _counts(self, which: Tensor | None, rows: int) -> list[int]:
+        """How many of the environments are of each run."""
+        if which is None:
+            return [rows // self.runs] * self.runs
+        return which.view(self.runs, -1).sum(1).tolist()
+
+    def _get(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        entry = tensordict.get(key, None)
+        if entry is None:
+            raise KeyError(f"BehaviorGoals needs the entry {key!r}, got {list(tensordict.keys())}")
+        return entry

@@ -1,0 +1,115 @@
+"""What a loss's own networks think of goals: how well each can be achieved from where an episode begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import LossModule
+
+from torchrl_her.objectives.critics import critic_values
+
+Prepare = Callable[[TensorDictBase], TensorDictBase]
+
+
+class GoalValues:
+    """Values of goals, [m, c, E] of E critics, for what is observed and goals that could be asked for.
+
+    The value is that of the greedy action. With rewards of -1 until the goal is achieved, a goal that takes d
+    steps has the value -(1 - gamma^d) / (1 - gamma).
+
+    Args:
+        loss: of TorchRL, whose critics are asked; see :func:`~torchrl_her.objectives.critic_values`.
+        actor: the greedy policy.
+
+    Keyword Args:
+        runs: R, whose networks are stacked.
+        before_actor: called with rows [R * n, c] before the actor, R equal blocks in the order of the runs;
+            for example :class:`~torchrl_her.ZeroPad`.
+        before_critic: called with them before the critics; for example
+            :class:`~torchrl_her.modules.RunningNorm`.
+        observation_key, desired_goal_key: of what the networks see.
+
+    Raises:
+        ValueError: the loss has no critics that are known.
+
+    Example:
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss
+        >>> actor, critic = make_actor((4, 2), 3), make_critic((4, 2), 3)
+        >>> loss = make_ddpg_loss(actor, critic, gamma=0.98)
+        >>> values = GoalValues(loss, actor)
+        >>> values(torch.zeros(5, 4), torch.zeros(5, 10, 2), [5]).shape
+        torch.Size([5, 10, 1])
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        actor: TensorDictModuleBase,
+        *,
+        runs: int = 1,
+        before_actor: Prepare | None = None,
+        before_critic: Prepare | None = None,
+        observation_key: NestedKey = "observation",
+        desired_goal_key: NestedKey = "desired_goal",
+    ) -> None:
+        self.loss, self.actor, self.runs = loss, actor, runs
+        self.before_actor, self.before_critic = before_actor, before_critic
+        self.observation_key, self.desired_goal_key = observation_key, desired_goal_key
+
+    @torch.no_grad()
+    def __call__(self, observation: Tensor, goals: Tensor, counts: Sequence[int]) -> Tensor:
+        """The values of goals.
+
+        Args:
+            observation: [m, o], or [m, c, o] with one for each goal; run after run.
+            goals: [m, c, g], or [m, 1, g] with one for all.
+            counts: R numbers, how many of the m are of each run.
+
+        Returns:
+            [m, c, E], on the goals' device.
+        """
+        if observation.ndim == 2:
+            observation = observation.unsqueeze(1)
+        width = max(observation.shape[1], goals.shape[1])
+        place = torch.device(next(self.loss.parameters()).device)
+        blocks = _blocks(counts, goals.device)
+        entries = {
+            key: entry.expand(-1, width, -1).index_select(0, blocks).flatten(0, 1).to(place)
+            for key, entry in ((self.observation_key, observation), (self.desired_goal_key, goals))
+        }
+        rows: TensorDictBase = TensorDict(entries, [len(blocks) * width], device=place)
+        rows = rows if self.before_actor is None else self.before_actor(rows)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            rows = self.actor(rows)
+        rows = rows if self.before_critic is None else self.before_critic(rows)
+        values = critic_values(self.loss, rows)
+        if values is None:
+            raise ValueError(f"{type(self.loss).__name__} has no critics whose values are known")
+        inside = _inside(counts, goals.device)
+        return values.to(goals.device).unflatten(0, (len(blocks), width))[inside]
+
+
+def _blocks(counts: Sequence[int], device: torch.device) -> Tensor:
+    """Positions of rows [R * n], as R equal blocks; shorter ones are padded with the first row of all.
+
+    Example:
+        >>> _blocks([1, 2], torch.device("cpu")).tolist()
+        [0, 0, 1, 2]
+    """
+    longest, begin, index = max(counts), 0, []
+    for count in counts:
+        index += [*range(begin, begin + count), *[0] * (longest - count)]
+        begin += count
+    return torch.tensor(index, device=device)
+
+
+def _inside(counts: Sequence[int], device: torch.device) -> Tensor:
+    """Which of the padded positions are rows: [R * n] of bool."""
+    step = torch.arange(max(counts), device=device)
+    return (step < torch.tensor(list(counts), device=device).unsqueeze(1)).flatten()
