@@ -197,9 +197,7 @@ class BehaviorGoals(Transform):
         proposed, goals = self._propose(tensordict_reset, begins.flatten())
         flags = proposed.view(begins.shape)
         wanted = real if goals is None else real.index_put((flags.squeeze(-1),), goals.to(real))
-        if mask is not None and (before := tensordict.get(proposed_key, None)) is not None:  # others go on
-            wanted = torch.where(begins, wanted, tensordict.get(goal_key))
-            flags = torch.where(begins, flags, before)
+        # TorchRL leaves the environments that were not reset as they were.
         for key, value in ((goal_key, wanted), (real_key, real), (proposed_key, flags)):
             tensordict_reset.set(key, value)
         return tensordict_reset

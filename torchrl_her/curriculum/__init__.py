@@ -3,6 +3,7 @@
 from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress, zero_unused_inputs
 from torchrl_her.curriculum.normalization import count_inputs, restart_inputs
+from torchrl_her.curriculum.orders import EpisodeLayers, TeacherStudent
 from torchrl_her.curriculum.switch import enter_layer, set_layer_goals
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
 
@@ -10,8 +11,10 @@ __all__ = [
     "Curriculum",
     "CurriculumLayer",
     "CurriculumProgress",
+    "EpisodeLayers",
     "GuidedExploration",
     "StateToObs",
+    "TeacherStudent",
     "ZeroPad",
     "count_inputs",
     "enter_layer",

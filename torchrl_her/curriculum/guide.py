@@ -24,6 +24,10 @@ class GuidedExploration(TensorDictModuleBase):
     achieved, and then the present policy. That is the self-guided exploration of Luo et al., Relay Hindsight
     Experience Replay, 2022 (arXiv 2208.00843), here with the layers one after another.
 
+    Where each episode has a layer of its own (``layer_key``), it is as in that paper: the policy itself
+    acts, as it would in the first layer, until that layer's goal is achieved, then as in the next one, up to
+    the episode's own layer.
+
     Put it behind the policy and before noise, and an InitTracker of TorchRL's into the environment. The
     environments of R runs are R equal blocks of the batch, in the order of the runs. Under
     ``set_exploration_type(ExplorationType.DETERMINISTIC)`` it does nothing.
@@ -33,15 +37,18 @@ class GuidedExploration(TensorDictModuleBase):
         curriculum: the layers.
 
     Keyword Args:
-        share: of the episodes that are begun so.
+        share: of the episodes that are begun so; of those above the first layer, if episodes have layers.
         runs: R; the weights of R runs are stacked, along the first dimension of each parameter.
         generators: sources of the random numbers, one for each run, or None for torch's own.
+        layer_key: of the layer [..., 1] that each episode is played in; None if runs have layers.
         state_key, input_key, action_key, init_key: of the state vector, which is read, of what the policy
             reads and writes, and of the flag at the beginning of an episode.
 
     Attributes:
-        layer: [R], which layer's policy begins a run's episodes; -1 as long as there is none.
-        guided: [B, 1], the environments in which it acts at the moment; None before the first step.
+        layer: [R], which layer's policy begins a run's episodes; -1 as long as there is none. It does not
+            matter if episodes have layers.
+        guided: [B, 1], the layer as in which it acts in each environment at the moment; -1 where it does not.
+            None before the first step.
 
     Raises:
         ValueError: the share is outside of [0, 1].
@@ -77,6 +84,7 @@ class GuidedExploration(TensorDictModuleBase):
         share: float = 0.5,
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
+        layer_key: NestedKey | None = None,
         state_key: NestedKey = "state",
         input_key: NestedKey = "input",
         action_key: NestedKey = "action",
@@ -86,7 +94,12 @@ class GuidedExploration(TensorDictModuleBase):
             raise ValueError(f"share must be in [0, 1], got {share}")
         super().__init__()
         self.in_keys, self.out_keys = [action_key, state_key, init_key], [action_key]
-        self.module, self.input_key = deepcopy(policy).requires_grad_(False), input_key
+        self.layer_key, self.input_key = layer_key, input_key
+        if layer_key is None:
+            self.module = deepcopy(policy).requires_grad_(False)
+        else:
+            self.in_keys.append(layer_key)
+            self._policy = (policy,)  # not a module of this one: its weights are those of the policy before
         self.curriculum, self.share = curriculum, share
         self.generators = [None] * runs if generators is None else list(generators)
         self.register_buffer("layer", torch.full((runs,), -1))
@@ -94,6 +107,11 @@ class GuidedExploration(TensorDictModuleBase):
         # For each layer: its inputs, its achieved and its desired goal, in the state with a zero appended.
         self._columns = torch.tensor([self._columns_of(layer) for layer in curriculum.layers])
         self._squares = torch.tensor([layer.threshold**2 for layer in curriculum.layers])
+
+    @property
+    def guide(self) -> TensorDictModuleBase:
+        """The policy that begins episodes."""
+        return self.module if self.layer_key is None else self._policy[0]
 
     @torch.no_grad()
     def follow(self, policy: TensorDictModuleBase, layer: int, *, run: int = 0) -> None:
@@ -120,40 +138,54 @@ class GuidedExploration(TensorDictModuleBase):
             KeyError: an entry is missing.
             ValueError: the batch cannot be cut into R equal blocks.
         """
-        layers = self.layer.tolist()
-        if exploration_type() not in (ExplorationType.RANDOM, None) or max(layers) < 0:
+        by_run = self.layer_key is None
+        if exploration_type() not in (ExplorationType.RANDOM, None) or (
+            by_run and max(self.layer.tolist()) < 0
+        ):
             return tensordict
-        action_key, state_key, init_key = self.in_keys
+        action_key, state_key, init_key = self.in_keys[:3]
         state, begun = tensordict.get(state_key), tensordict.get(init_key)
-        if len(state) % len(layers):
-            raise ValueError(f"{len(state)} rows cannot be shared out among {len(layers)} runs")
-        guided = self._begin(begun, layers)
-        if not bool(guided.any()):
+        runs = len(self.generators)
+        if len(state) % runs:
+            raise ValueError(f"{len(state)} rows cannot be shared out among {runs} runs")
+        top = None if by_run else tensordict.get(self.layer_key).view(begun.shape)
+        guided = self._begin(begun, top)
+        if not bool((guided >= 0).any()):
             return tensordict
-        seen, achieved, desired = self._look(state, layers)
-        squares = self._squares.to(state)[self.layer.clamp(min=0)]  # of each run
-        away = (achieved - desired).square().sum(-1).view(len(layers), -1) >= squares.unsqueeze(-1)
-        guided &= away.view(guided.shape)
-        guide = self.module(TensorDict({self.input_key: seen}, tensordict.batch_size)).get(action_key)
+        seen, achieved, desired = self._look(state, guided)
+        squares = self._squares.to(state)[guided.clamp(min=0)].view(achieved.shape[:-1])
+        there = ((achieved - desired).square().sum(-1) < squares).view(guided.shape)
+        after = torch.full_like(guided, -1) if top is None else torch.where(guided + 1 < top, guided + 1, -1)
+        guided.copy_(torch.where(there & (guided >= 0), after, guided))
+        if top is not None and bool((there & (guided >= 0)).any()):
+            seen, *_ = self._look(state, guided)  # some act as in the next layer from now on
+        rows = TensorDict({self.input_key: seen}, tensordict.batch_size)
         own = tensordict.get(action_key)
-        chosen = guided if own.ndim == guided.ndim else guided.squeeze(-1)
-        return tensordict.set(action_key, torch.where(chosen, guide, own))
+        acts = guided >= 0 if own.ndim == guided.ndim else (guided >= 0).squeeze(-1)
+        return tensordict.set(action_key, torch.where(acts, self.guide(rows).get(action_key), own))
 
-    def _begin(self, begun: Tensor, layers: list[int]) -> Tensor:
+    def _begin(self, begun: Tensor, top: Tensor | None) -> Tensor:
         """Draws which of the episodes that begin are guided; the others are as they were."""
-        if self.guided is None or self.guided.shape != begun.shape:
-            self.guided = torch.zeros_like(begun)
+        known = self.guided is not None and self.guided.dtype == torch.int64  # once these were flags
+        if self.guided is None or not known or self.guided.shape != begun.shape:
+            self.guided = torch.full(begun.shape, -1, device=begun.device)
         self.guided = self.guided.to(begun.device)  # it may have come with a checkpoint
-        blocks = zip(self.guided.chunk(len(layers)), begun.chunk(len(layers)), strict=True)
-        for (guided, new), layer, generator in zip(blocks, layers, self.generators, strict=True):
-            if layer >= 0 and bool(new.any()):  # the others draw nothing, as when they are alone
+        runs = len(self.generators)
+        tops = [None] * runs if top is None else list(top.chunk(runs))
+        blocks = zip(self.guided.chunk(runs), begun.chunk(runs), tops, strict=True)
+        for (guided, new, own), layer, generator in zip(
+            blocks, self.layer.tolist(), self.generators, strict=True
+        ):
+            first = layer if own is None else 0
+            if first >= 0 and bool(new.any()):  # the others draw nothing, as when they are alone
                 drawn = torch.rand(new.shape, generator=generator, device=new.device) < self.share
-                guided.copy_(torch.where(new, drawn, guided))
+                drawn = drawn if own is None else drawn & (own > 0)
+                guided.copy_(torch.where(new, torch.where(drawn, first, -1), guided))
         return self.guided
 
-    def _look(self, state: Tensor, layers: list[int]) -> tuple[Tensor, ...]:
-        """What the layers below show: the network's input, the achieved and the desired goal."""
-        index = self._columns.to(state.device)[[max(layer, 0) for layer in layers]]
+    def _look(self, state: Tensor, layer: Tensor) -> tuple[Tensor, ...]:
+        """What some layers show, one for each row: the network's input, the achieved and the desired goal."""
+        index = self._columns.to(state.device)[layer.flatten().clamp(min=0)]
         entries = take_columns(torch.nn.functional.pad(state, (0, 1)), index)
         goal = self.curriculum.goal_width
         return entries.split([self.curriculum.input_width, goal, goal], -1)

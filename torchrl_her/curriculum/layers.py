@@ -238,6 +238,9 @@ class CurriculumProgress:
         (1, 0)
     """
 
+    # Whether each episode has a layer of its own, and not each run.
+    by_episode = False
+
     def __init__(
         self,
         curriculum: Curriculum,

@@ -22,6 +22,7 @@ def count_inputs(
     observation_key: NestedKey = "observation",
     desired_goal_key: NestedKey = "desired_goal",
     input_key: NestedKey = "input",
+    layer_key: NestedKey = "layer",
 ) -> None:
     """Counts the networks' input of transitions that are written, as :class:`~torchrl_her.ZeroPad` makes it.
 
@@ -39,11 +40,19 @@ def count_inputs(
     Keyword Args:
         observation_key, desired_goal_key: read.
         input_key: of the input, in ``norm``.
+        layer_key: of the layer that each row carries, if episodes have layers of their own.
     """
+    layers = progress.curriculum.layers
     for run, own in zip(runs, rows.split(list(counts)), strict=True):
-        shown = len(progress.layer_of(run).observation)
-        seen = (own.get(observation_key)[..., :shown], own.get(desired_goal_key))
-        norm.count(input_key, torch.cat(seen, -1), run=run)
+        parts = [(progress.layer_of(run), own)]
+        if progress.by_episode:
+            which = own.get(layer_key).squeeze(-1)
+            parts = [(layer, own[which == place]) for place, layer in enumerate(layers)]
+        for layer, part in parts:
+            shown = len(layer.observation)
+            seen = (part.get(observation_key)[..., :shown], part.get(desired_goal_key))
+            if len(part) > 0:
+                norm.count(input_key, torch.cat(seen, -1), run=run)
 
 
 def restart_inputs(

@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from torchrl_her.curriculum.layers import Curriculum, CurriculumProgress
+from torchrl_her.curriculum.orders import EpisodeLayers
 from torchrl_her.replay_buffers.keys import device_of
 
 
@@ -47,6 +48,7 @@ class _LayerTransform(Transform):
         run: int | None,
         in_keys: list[NestedKey],
         out_keys: list[NestedKey],
+        layer_key: NestedKey,
     ) -> None:
         if progress.curriculum is not curriculum:
             raise ValueError("progress must be made of the same curriculum, got one of another")
@@ -54,6 +56,7 @@ class _LayerTransform(Transform):
             raise ValueError(f"run must be None or in [0, {progress.runs - 1}], got {run}")
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.curriculum, self.progress, self.run = curriculum, progress, run
+        self.layer_key = unravel_key(layer_key)
         self._tables: tuple[Any, Any] = (None, None)  # what the tables were made for, and the tables
         self._shown_in: tuple[int, ...] | None = None  # the layers that the last states were shown in
 
@@ -63,6 +66,12 @@ class _LayerTransform(Transform):
         if self.run is not None:
             return layers[self.run : self.run + 1]
         return layers[:1] if layers.count(layers[0]) == len(layers) else layers
+
+    def _rows_layers(self, tensordict: TensorDictBase) -> Tensor | None:
+        """The layer [...] that each row carries; None where it is the run that has one."""
+        if not self.progress.by_episode:
+            return None
+        return self._get(tensordict, self.layer_key, 1).squeeze(-1)
 
     def _check_blocks(self, shape: torch.Size) -> None:
         """Raises if a batch of ``shape`` [..., width] is not one equal block for each run."""
@@ -152,6 +161,8 @@ class StateToObs(_LayerTransform):
         state_key: the state vector, which is read.
         observation_key, achieved_goal_key, desired_goal_key, reward_key, terminated_key, done_key: what is
             written.
+        layer_key: where the layer of each row is written, [..., 1] of int64, if episodes have layers of their
+            own (:class:`~torchrl_her.curriculum.EpisodeLayers`).
         truncated_key: read; None if the environment below has no time limit (a StepCounter after this
             transform may add one).
         goes_on: whether the environment can be stepped further after it terminated an episode; if not,
@@ -194,12 +205,13 @@ class StateToObs(_LayerTransform):
         terminated_key: NestedKey = "terminated",
         truncated_key: NestedKey | None = "truncated",
         done_key: NestedKey = "done",
+        layer_key: NestedKey = "layer",
         goes_on: bool = True,
     ) -> None:
         if not goes_on and truncated_key is None:
             raise ValueError("goes_on=False needs a truncated_key, to say where the environment ended")
         shown = [observation_key, achieved_goal_key, desired_goal_key]
-        super().__init__(curriculum, progress, None, [state_key], shown)
+        super().__init__(curriculum, progress, None, [state_key], shown, layer_key)
         self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
         self.truncated_key = None if truncated_key is None else unravel_key(truncated_key)
         self.done_key, self.goes_on = unravel_key(done_key), goes_on
@@ -210,7 +222,14 @@ class StateToObs(_LayerTransform):
         self._observe(next_tensordict)
         return next_tensordict
 
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if self.progress.by_episode:
+            tensordict_reset.set(self.layer_key, self._draw(tensordict, tensordict_reset))
+        return super()._reset(tensordict, tensordict_reset)
+
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self.progress.by_episode:
+            next_tensordict.set(self.layer_key, self._get(tensordict, self.layer_key, 1))
         cut = self._show_again(tensordict)
         achieved_goal, desired_goal, squares = self._observe(next_tensordict)
         # Coordinate by coordinate, as in goals.achieved; here each block of rows has its own threshold.
@@ -233,6 +252,8 @@ class StateToObs(_LayerTransform):
         next_tensordict.set(self.reward_key, terminated.to(achieved_goal.dtype) - 1.0)
         next_tensordict.set(self.terminated_key, terminated)
         next_tensordict.set(self.done_key, done)
+        if isinstance(self.progress, EpisodeLayers):
+            self._record(self.progress, next_tensordict, terminated, done)
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -246,6 +267,14 @@ class StateToObs(_LayerTransform):
         for key, width in zip(self.out_keys, self._widths, strict=True):
             shape = (*seen.shape[:-1], width)
             observation_spec[key] = Unbounded(shape=shape, dtype=seen.dtype, device=seen.device)
+        if self.progress.by_episode:
+            observation_spec[self.layer_key] = Bounded(
+                low=0,
+                high=len(self.curriculum) - 1,
+                shape=(*seen.shape[:-1], 1),
+                dtype=torch.int64,
+                device=seen.device,
+            )
         return observation_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
@@ -263,26 +292,56 @@ class StateToObs(_LayerTransform):
                 raise KeyError(f"StateToObs needs the flag {key!r} of the environment, got {known}")
         return done_spec
 
+    def _draw(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
+        """The layers [..., 1] of rows whose episode begins; TorchRL leaves the others as they are."""
+        assert isinstance(self.progress, EpisodeLayers)
+        state, mask = tensordict_reset.get(self.in_keys[0]), tensordict.get("_reset", None)
+        self._check_blocks(state.shape)
+        shape = (*state.shape[:-1], 1)
+        begins = (
+            torch.ones(shape, dtype=torch.bool, device=state.device) if mask is None else mask.view(shape)
+        )
+        drawn = self.progress.draw(begins.reshape(self.progress.runs, -1).sum(1).tolist())
+        layers = torch.zeros(shape, dtype=torch.int64, device=state.device)
+        return layers.masked_scatter(begins, drawn.to(state.device))
+
+    def _record(self, progress: EpisodeLayers, rows: TensorDictBase, achieved: Tensor, done: Tensor) -> None:
+        """Tells how the episodes that ended here have ended."""
+        if not bool(done.any()):
+            return
+        layers = len(self.curriculum)
+        place = rows.get(self.layer_key).reshape(progress.runs, -1)
+        place = place + layers * torch.arange(progress.runs, device=place.device).unsqueeze(1)
+        counts = [
+            place[flags.reshape(place.shape)].bincount(minlength=layers * progress.runs).view(-1, layers)
+            for flags in (done, done & achieved)
+        ]
+        progress.record_episodes(*(own.cpu() for own in counts))
+
     def _observe(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         """Sets what the layers see; returns the goals and the squared thresholds [B, 1]."""
         state = self._get(tensordict, self.in_keys[0], self.curriculum.state_width)
-        index, squares = self._lookup(state)
+        index, squares = self._lookup(state, self._rows_layers(tensordict))
         with_zero = torch.nn.functional.pad(state, (0, 1))
         entries = take_columns(with_zero, index).split(self._widths, -1)
         for key, entry in zip(self.out_keys, entries, strict=True):
             tensordict.set(key, entry)
         return entries[1], entries[2], squares
 
-    def _lookup(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Columns [B, n] and squared thresholds [B, 1] of the present layers."""
-        made_for = (layers := self._layers(), state.device, state.dtype)
+    def _lookup(self, state: Tensor, rows: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Columns [B, n] and squared thresholds [B, 1] of the present layers, of blocks or of rows."""
+        layers = self._layers() if rows is None else tuple(range(len(self.curriculum)))
+        made_for = layers, state.device, state.dtype
         if self._tables[0] != made_for:
             index = self.curriculum.state_index[list(layers)].to(state.device)
             # Squared before they are rounded, as in goals.achieved: rewards agree to the last bit.
             squares = [[self.curriculum.layers[layer].threshold ** 2] for layer in layers]
             table = torch.tensor(squares, dtype=state.dtype, device=state.device)
             self._tables = made_for, (index, table)
-        return self._tables[1]
+        if rows is None:
+            return self._tables[1]
+        index, squares = self._tables[1]
+        return index[rows.flatten()], squares[rows.flatten()]
 
 
 class ZeroPad(_LayerTransform):
@@ -304,6 +363,8 @@ class ZeroPad(_LayerTransform):
             dimension is R equal blocks, in the order of the runs.
         observation_key, desired_goal_key: read.
         input_key: written.
+        layer_key: of the layer [..., 1] that each row carries, if episodes have layers of their own
+            (:class:`~torchrl_her.curriculum.EpisodeLayers`).
 
     Raises:
         ValueError: ``progress`` belongs to another curriculum, or there is no such run; when used, an entry
@@ -339,15 +400,21 @@ class ZeroPad(_LayerTransform):
         observation_key: NestedKey = "observation",
         desired_goal_key: NestedKey = "desired_goal",
         input_key: NestedKey = "input",
+        layer_key: NestedKey = "layer",
     ) -> None:
-        super().__init__(curriculum, progress, run, [observation_key, desired_goal_key], [input_key])
+        in_keys: list[NestedKey] = [observation_key, desired_goal_key]
+        if progress.by_episode:
+            in_keys.append(layer_key)
+        super().__init__(curriculum, progress, run, in_keys, [input_key], layer_key)
         self._sizes = [len(layer.observation) for layer in curriculum.layers]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        observation = self._get(next_tensordict, self.in_keys[0], self.curriculum.observation_width)
-        goal = self._get(next_tensordict, self.in_keys[1], self.curriculum.goal_width)
-        next_tensordict.set(self.out_keys[0], self._pad(observation, goal))
-        return next_tensordict
+        return self._set_input(next_tensordict, self._rows_layers(next_tensordict))
+
+    def _set_input(self, tensordict: TensorDictBase, layer: Tensor | None) -> TensorDictBase:
+        observation = self._get(tensordict, self.in_keys[0], self.curriculum.observation_width)
+        goal = self._get(tensordict, self.in_keys[1], self.curriculum.goal_width)
+        return tensordict.set(self.out_keys[0], self._pad(observation, goal, layer))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._show_again(tensordict)
@@ -356,21 +423,26 @@ class ZeroPad(_LayerTransform):
     @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Sets the input in the root and, where there is one, in ``next``."""
-        self._call(tensordict)
+        layer = self._rows_layers(tensordict)  # an episode stays in its layer, so next has the same
+        self._set_input(tensordict, layer)
         after = tensordict.get("next", None)
         if after is not None:
-            self._call(after)
+            self._set_input(after, layer)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         widths = (self.curriculum.observation_width, self.curriculum.goal_width)
-        for key, width in zip(self.in_keys, widths, strict=True):
+        for key, width in zip(self.in_keys, widths, strict=False):
             seen = self._seen(observation_spec, key, width)
         shape = (*seen.shape[:-1], self.curriculum.input_width)
         observation_spec[self.out_keys[0]] = Unbounded(shape=shape, dtype=seen.dtype, device=seen.device)
         return observation_spec
 
-    def _pad(self, observation: Tensor, goal: Tensor) -> Tensor:
+    def _pad(self, observation: Tensor, goal: Tensor, layer: Tensor | None) -> Tensor:
+        if layer is not None:
+            index = self.curriculum.input_index.to(observation.device)[layer]
+            zero = observation.new_zeros(*observation.shape[:-1], 1)
+            return torch.cat((observation, goal, zero), -1).gather(-1, index)
         self._check_blocks(observation.shape)
         layers = self._layers()
         if len(layers) == 1:

@@ -5,6 +5,7 @@ from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
 from torchrl_her.replay_buffers.episodes import Episodes, find_episodes
 from torchrl_her.replay_buffers.keys import TransitionKeys
+from torchrl_her.replay_buffers.layer_rules import LayerRule
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.runs import (
     PackedStorage,
@@ -27,6 +28,7 @@ __all__ = [
     "HERWriter",
     "HindsightBase",
     "HindsightOptions",
+    "LayerRule",
     "PackedStorage",
     "RunsPrioritizedSampler",
     "RunsSampler",

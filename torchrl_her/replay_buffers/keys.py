@@ -22,6 +22,7 @@ class TransitionKeys:
         reward, terminated, truncated, done: under ``next``.
         trajectory, env_ids: ids.
         real_goal: the goal that the task itself asked for, where another one was proposed in its place.
+        layer: the layer of a curriculum that an episode is played in.
     """
 
     achieved: NestedKey
@@ -34,6 +35,7 @@ class TransitionKeys:
     trajectory: NestedKey
     env_ids: NestedKey
     real_goal: NestedKey
+    layer: NestedKey
 
     def asked_for(self, rows: TensorDictBase) -> Tensor:
         """The goals [..., g] that the task itself has asked for."""

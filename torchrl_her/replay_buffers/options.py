@@ -65,8 +65,9 @@ class HindsightOptions:
         env_ids_key: ids that tell environments apart, as :class:`~torchrl_her.EnvIds` gives them; the entry
             may be missing, and is not stored by the writer.
         real_goal_key: the goal that the task itself asked for, where another one was proposed in its place
-            (:class:`~torchrl_her.BehaviorGoals`); the entry may be missing, and is left out like those of ``exclude``.
-            The source ``"actual"`` takes these.
+            (:class:`~torchrl_her.behavior.BehaviorGoals`); the entry may be missing, and is left out like
+            those of ``exclude``. The source ``"actual"`` takes these.
+        layer_key: of the layer [..., 1] that an episode was played in, for writers with ``layers``.
         virtual_key: where a bool [..., 1] marks virtual transitions; None for no mark.
 
     Raises:
@@ -104,6 +105,7 @@ class HindsightOptions:
     trajectory_key: NestedKey = ("collector", "traj_ids")
     env_ids_key: NestedKey = "env_ids"
     real_goal_key: NestedKey = "real_goal"
+    layer_key: NestedKey = "layer"
     virtual_key: NestedKey | None = "virtual"
 
     def __post_init__(self) -> None:
@@ -190,6 +192,7 @@ class HindsightOptions:
             trajectory=unravel_key(self.trajectory_key),
             env_ids=unravel_key(self.env_ids_key),
             real_goal=unravel_key(self.real_goal_key),
+            layer=unravel_key(self.layer_key),
         )
 
 

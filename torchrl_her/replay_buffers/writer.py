@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,10 @@ from torchrl.data.replay_buffers.writers import RoundRobinWriter
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 from torchrl_her.replay_buffers.draw import draw_for_runs
-from torchrl_her.replay_buffers.episodes import find_episodes, time_order
+from torchrl_her.replay_buffers.episodes import Episodes, find_episodes, time_order
 from torchrl_her.replay_buffers.keys import device_of, entry_of, in_root_and_next
 from torchrl_her.replay_buffers.lanes import broken, ends_of_held
+from torchrl_her.replay_buffers.layer_rules import LayerRule, check_layers, split_layers
 from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.runs.batches import Batch
@@ -85,6 +86,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             (``goal_weights``).
         runs: R.
         generators: R sources of random numbers; None for the buffer's, with one run only.
+        layers: for episodes that carry the layer of a curriculum in which they were played, one rule for each
+            layer; they take the place of ``reward_fn``. None if episodes have no layers.
         on_write: called with all that is written, real and virtual transitions, as ``(rows, runs, counts)``:
             rows run after run, which runs these are, and how many rows each has. It comes when they are
             stored, and may come several times for one batch. See :class:`~torchrl_her.modules.RunningNorm`.
@@ -152,10 +155,12 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         weights: GoalWeights | Sequence[GoalWeights] | None = None,
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
+        layers: Sequence[LayerRule] | None = None,
         on_write: OnWrite | None = None,
         **changes: Any,
     ) -> None:
         self.generators, self.on_write = check_generators(runs, generators), on_write
+        self.layers = check_layers(layers)
         own = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
         if own and len(own) != runs:
             raise ValueError(f"{runs} runs need a list of {runs} weights, one of each run, got {len(own)}")
@@ -165,7 +170,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._own_rewards: dict[int, RewardFunction] = {}  # of runs that differ from ``reward_fn``
         self._counts, self._rings = RunCounts(runs), Rings(runs)
         self._held = Batch.none(runs)  # transitions of open episodes
-        self._recent = RecentGoals.none(runs)
+        self._recent = self._no_goals(runs)
         self._episodes = 0  # copies of episodes ever written, if whole ones are
         self._process = os.getpid()
         # Whether the held ones came with a state, or are over, and nothing was written since.
@@ -266,9 +271,13 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         places = Places(run, len(batch), runs=self.runs, device=lanes.device)
         entries = min(_ROWS, self.capacity) // (self.k + 1), _ROWS // (self.k + 1)
         own = None if run is None else run[episodes.rows[:, :1]].flatten()
-        recent = self._recent.after(rows, episodes, own, self._keys, sizes=self.options.remembered)
-        for piece in split_runs(episodes, own, self._settings(), each=entries[0], together=entries[1]):
-            self._write(batch, piece, places, recent)
+        recent = list(self._recent)
+        for layer, part, run_of in self._by_layer(rows, episodes, own):
+            lately = recent[layer].after(rows, part, run_of, self._keys, sizes=self.options.remembered)
+            recent[layer] = lately
+            settings = self._settings()
+            for piece in split_runs(part, run_of, settings, each=entries[0], together=entries[1]):
+                self._write(batch, piece, places, lately, self._rule(layer, piece.runs[0]))
         # Last of all, so that a batch that cannot be written loses nothing that was held back before.
         self._held, self._recent = batch.take(left), recent
         self._loaded = self._all_over = False
@@ -294,7 +303,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         state["cursors"] = [self._cursor] if self.runs == 1 else list(self._rings.cursors)
         state["sizes"] = self.sizes
         state.update(self._held.state_dict())
-        state["recent"] = self._recent.state_dict()
+        state["recent"] = [own.state_dict() for own in self._recent]
         state["episodes"], state["all_over"] = self._episodes, self._all_over
         state.update(self._counts.state_dict())
         state["weights"] = [weights.state_dict() for weights in self.goal_weights]
@@ -313,7 +322,10 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._rings.cursors, self._rings.sizes = list(state_dict["cursors"]), list(state_dict["sizes"])
         self._held = Batch.from_state(state_dict, runs=self.runs)
         recent = state_dict.get("recent")  # states from before there were goals of other episodes have none
-        self._recent = RecentGoals.none(self.runs) if recent is None else RecentGoals.from_state(recent)
+        recent = [recent] if isinstance(recent, dict) else recent  # those from before there were layers
+        self._recent = (
+            self._no_goals(self.runs) if recent is None else [RecentGoals.from_state(own) for own in recent]
+        )
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
         self._counts.load_state_dict(state_dict)
@@ -342,7 +354,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         """
         self._rings.empty(run)
         self._counts.empty(run)
-        self._held, self._recent = self._held.without_run(run), self._recent.without_run(run)
+        self._held = self._held.without_run(run)
+        self._recent = [own.without_run(run) for own in self._recent]
         if self.goal_weights:
             self.goal_weights[run].clear()
 
@@ -356,18 +369,36 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     # The work
 
+    def _no_goals(self, runs: int) -> list[RecentGoals]:
+        """Nothing remembered, of each layer."""
+        return [RecentGoals.none(runs) for _ in self.layers or [None]]
+
+    def _by_layer(
+        self, rows: TensorDictBase, episodes: Episodes, run: Tensor | None
+    ) -> Iterable[tuple[int, Episodes, Tensor | None]]:
+        """The episodes of each layer; all of them where episodes have none."""
+        if not self.layers:
+            return [(0, episodes, run)]
+        return split_layers(rows, episodes, run, self._keys.layer, len(self.layers))
+
+    def _rule(self, layer: int, run: int) -> LayerRule:
+        """How episodes of a layer, or of a run without layers, are relabeled."""
+        return self.layers[layer] if self.layers else LayerRule(self.reward_of(run))
+
     def _settings(self) -> list[Hashable]:
         """For each run, what must be the same for runs that are written at once."""
         alike = [own.alike for own in self.goal_weights] or [True] * self.runs
         return [(id(self.reward_of(run)), alike[run]) for run in range(self.runs)]
 
-    def _write(self, batch: Batch, piece: Piece, places: Places, recent: RecentGoals) -> None:
+    def _write(
+        self, batch: Batch, piece: Piece, places: Places, recent: RecentGoals, rule: LayerRule
+    ) -> None:
         """Stores the real and virtual transitions of some episodes, and notes where the real ones went.
 
         If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out.
         """
         rows, runs, options, keys = batch.rows, piece.runs, self.options, self._keys
-        reward_fn, own, virtual = self.reward_of(runs[0]), self.goal_weights, None
+        reward_fn, own, virtual = rule.reward_fn, self.goal_weights if rule.weighted else [], None
         source, goals = draw_for_runs(
             rows,
             piece,
@@ -383,7 +414,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             virtual = virtual_share(
                 rows, batch.run, piece, source, goals, reward_fn, options, keys, first_id=first
             )
-            self._note(rows, virtual, runs)
+            self._note(rows, virtual, runs, rule)
         real = real_share(rows, piece, options, keys, first_id=self._new_ids(len(piece.episodes.lengths)))
         self._counts.add(runs, real=real.counts, **real_positives(*real, self.achieved_reward))
         exclude = [*self._exclude, *in_root_and_next([keys.env_ids])]
@@ -408,18 +439,18 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         own = self.goal_weights
         return own[0].of_runs(own) if isinstance(own[0], GoalWeights) else WeightsOfRuns(own)
 
-    def _note(self, rows: TensorDictBase, virtual: Share, runs: list[int]) -> None:
+    def _note(self, rows: TensorDictBase, virtual: Share, runs: list[int], rule: LayerRule) -> None:
         """Counts virtual transitions, and tells the weights which goals were written."""
         positives = virtual_positives(
             rows,
             *virtual,
-            self.reward_of(runs[0]),
+            rule.reward_fn,
             self._keys,
             achieved_reward=self.achieved_reward,
             filtered=self.filter_achieved,
         )
         self._counts.add(runs, virtual=virtual.counts, **positives)
-        if self.goal_weights:
+        if self.goal_weights and rule.weighted:
             goals = virtual.copies.changes[self._keys.goals[0]]
             self._weights_of_runs().update(goals, runs, virtual.counts)
 

@@ -12,7 +12,7 @@ WANTED = 9.0
 
 
 class Line(EnvBase):
-    """N walks from 0; an episode is truncated after ``steps`` steps, and terminates at 9 or beyond ``edge``."""
+    """N walks from 0; an episode is truncated after ``steps`` steps, and ends at 9 or beyond ``edge``."""
 
     def __init__(self, num_envs: int = 2, *, steps: int = 5, edge: float = 1e9) -> None:
         super().__init__(batch_size=[num_envs])

@@ -18,7 +18,9 @@ def nearness(observation: Tensor, goals: Tensor, counts: Sequence[int]) -> Tenso
     return torch.stack((near, near - 2.0), -1)
 
 
-def offers(*lines: list[float], start: float = 0.0, target: float = 10.0, counts: Sequence[int] = ()) -> Offers:
+def offers(
+    *lines: list[float], start: float = 0.0, target: float = 10.0, counts: Sequence[int] = ()
+) -> Offers:
     goals = torch.tensor(lines).unsqueeze(-1)
     begin = torch.full((len(lines), 1), start)
     return Offers(goals, goals, begin, torch.full_like(begin, target), counts or [len(lines)])
@@ -55,7 +57,9 @@ def test_the_cutoff_follows_success() -> None:
         achievable.record(ended, torch.tensor([10, 0, 0]))
     rate = 1 - 0.5 * torch.tensor(-2.0).exp().item()  # from 0.5, over two memories
     assert achievable.successes.rate.tolist() == pytest.approx([rate, 1 - rate, 0.5])
-    assert achievable.cutoff.tolist() == pytest.approx([-3.7, -3.0, -3.0])  # not below the floor, nor above -3
+    assert achievable.cutoff.tolist() == pytest.approx(
+        [-3.7, -3.0, -3.0]
+    )  # not below the floor, nor above -3
 
 
 def test_the_score_of_directed_goals() -> None:

@@ -82,7 +82,8 @@ def test_later_ones_ask_for_what_was_achieved() -> None:
     assert torch.equal(first["next", "done"], first["next", "terminated"])
     assert first["next", "desired_goal"].flatten().tolist() == [3.0] * 5
     assert first["next", "real_goal"].flatten().tolist() == [WANTED] * 5
-    assert rows["proposed"].all() and rows["next", "proposed"].all()
+    assert rows["proposed"].all()
+    assert rows["next", "proposed"].all()
 
 
 def test_a_goal_stays_while_others_begin_anew() -> None:
@@ -251,7 +252,9 @@ def test_specs_hold() -> None:
 
 def test_it_is_right_under_a_collector() -> None:
     env, _ = made(3, real_share=0.3, memory=1_000)
-    collector = Collector(env, walk, frames_per_batch=3 * 40, total_frames=-1, auto_register_policy_transforms=False)
+    collector = Collector(
+        env, walk, frames_per_batch=3 * 40, total_frames=-1, auto_register_policy_transforms=False
+    )
     batch = collector.next()
     for goal, ids in zip(batch["desired_goal"], batch["collector", "traj_ids"], strict=True):
         for episode in ids.unique():
@@ -259,14 +262,17 @@ def test_it_is_right_under_a_collector() -> None:
     assert torch.equal(batch["next", "desired_goal"], batch["desired_goal"])
     reward, _ = REWARD(batch["next", "achieved_goal"], batch["desired_goal"])
     assert torch.equal(batch["next", "reward"], reward)
-    assert batch["proposed"].any() and not batch["proposed"].all()
+    assert batch["proposed"].any()
+    assert not batch["proposed"].all()
     collector.shutdown()
 
 
 def test_it_goes_on_from_a_collectors_state() -> None:
     def collector() -> Collector:
         env, _ = made(3, real_share=0.3, memory=50, weights=Told(3.0), factors=[Farther()])
-        return Collector(env, walk, frames_per_batch=3 * 8, total_frames=-1, auto_register_policy_transforms=False)
+        return Collector(
+            env, walk, frames_per_batch=3 * 8, total_frames=-1, auto_register_policy_transforms=False
+        )
 
     first, second = collector(), collector()
     first.next()
@@ -307,7 +313,8 @@ def test_actual_goals_are_those_of_the_task(part: str) -> None:
         )
         buffer.extend(rows.reshape(-1))
         sampled = buffer.sample()
-    assert "real_goal" not in sampled.keys() and "real_goal" not in sampled["next"].keys()
+    assert "real_goal" not in sampled.keys()
+    assert "real_goal" not in sampled["next"].keys()
     virtual = sampled["virtual"].squeeze(-1)
     assert set(sampled["desired_goal"][virtual].flatten().tolist()) == {WANTED}
     assert set(sampled["desired_goal"][~virtual].flatten().tolist()) == {3.0}

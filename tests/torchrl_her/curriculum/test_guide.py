@@ -137,6 +137,53 @@ def test_a_run_without_a_layer_below_draws_nothing() -> None:
     assert not torch.equal(generators[1].get_state(), before[1])
 
 
+# Where episodes have layers of their own, the policy itself acts, as in one layer after the other.
+HOLD = CurriculumLayer(name="hold", observation=[0, 1], achieved_goal=[0], desired_goal=[2], threshold=0.5)
+THREE = Curriculum([REACH, MOVE, HOLD], 3)
+
+
+def in_layers(
+    guide: GuidedExploration, layers: list[int], state: list[list[float]], **options: object
+) -> list[float]:
+    seen = rows(state, **options)  # type: ignore[arg-type]
+    seen["layer"] = torch.tensor(layers).unsqueeze(-1)
+    return guide(seen)["action"].flatten().tolist()
+
+
+def test_episodes_above_the_first_layer_are_begun_as_in_it() -> None:
+    own = policy(2.0)
+    guide = GuidedExploration(own, CURRICULUM, share=1.0, layer_key="layer")
+    assert in_layers(guide, [1, 0], [[3.0, 5.0, 7.0]] * 2) == [2.0 * 53.0, -1.0]
+    own.module.weight.data.fill_(3.0)  # it has learned meanwhile
+    assert in_layers(guide, [1, 0], [[3.0, 5.0, 7.0]] * 2, begun=False) == [3.0 * 53.0, -1.0]
+    assert in_layers(guide, [1, 0], [[5.0, 5.0, 7.0]] * 2, begun=False) == [-1.0, -1.0]  # reached
+    assert in_layers(guide, [1, 0], [[3.0, 5.0, 7.0]] * 2, begun=False) == [-1.0, -1.0]
+    assert list(guide.parameters()) == []
+
+
+def test_layer_after_layer_up_to_the_episodes_own() -> None:
+    guide = GuidedExploration(policy(1.0), THREE, share=1.0, layer_key="layer")
+    assert in_layers(guide, [2, 1], [[3.0, 5.0, 7.0]] * 2) == [53.0, 53.0]  # sees [own place, block, 0]
+    # Both have reached the block: one goes on as in the second layer, which sees the wanted place, too.
+    assert in_layers(guide, [2, 1], [[5.0, 5.0, 7.0]] * 2, begun=False) == [5.0 + 50.0 + 700.0, -1.0]
+    assert in_layers(guide, [2, 1], [[5.0, 7.0, 7.0]] * 2, begun=False) == [-1.0, -1.0]
+    assert guide.guided is not None
+    assert guide.guided.flatten().tolist() == [-1, -1]
+
+
+def test_a_share_of_the_episodes_above_is_begun() -> None:
+    guide = GuidedExploration(
+        policy(1.0),
+        CURRICULUM,
+        share=0.3,
+        layer_key="layer",
+        generators=[torch.Generator().manual_seed(0)],
+    )
+    begun = in_layers(guide, [1] * 1000 + [0] * 10, [[3.0, 5.0, 7.0]] * 1010)
+    assert begun[:1000].count(53.0) == pytest.approx(300, abs=50)
+    assert begun[1000:] == [-1.0] * 10
+
+
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_impossible_shares_are_refused(share: float) -> None:
     with pytest.raises(ValueError, match=r"share must be in \[0, 1\], got"):

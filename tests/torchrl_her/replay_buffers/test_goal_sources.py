@@ -445,7 +445,7 @@ def test_a_batch_that_cannot_be_written_is_not_remembered_twice() -> None:
         buffer.extend(tagged([[3]]))
     buffer.writer.weights.bad = False
     buffer.extend(tagged([[3]]))
-    (goals,) = buffer.writer.state_dict()["recent"]["actual"]
+    (goals,) = buffer.writer.state_dict()["recent"][0]["actual"]
     assert goals[:, 0].tolist() == [wanted_by(0, 0)]
 
 

@@ -40,6 +40,7 @@ OTHERS = {
     "trajectory_key": "path",
     "env_ids_key": "who",
     "real_goal_key": ("goals", "real"),
+    "layer_key": "stage",
     "virtual_key": None,
 }
 

@@ -1,0 +1,315 @@
+"""Layers of episodes: which layer each is played in, how its rows carry it, and what is made of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_her import Curriculum, GoalReward, GoalWeights, HERWriter, StateToObs, ZeroPad
+from torchrl_her.curriculum import EpisodeLayers, TeacherStudent, count_inputs
+from torchrl_her.modules import RunningNorm
+from torchrl_her.replay_buffers import LayerRule, RunsSampler
+
+from ..her_data import make_batch, tag
+from .test_transforms import TinyEnv, make_three
+
+THREE = make_three()
+
+
+class Fixed(EpisodeLayers):
+    """Says which layers come next, and what it was told."""
+
+    def __init__(self, *layers: int, runs: int = 1) -> None:
+        super().__init__(THREE, runs=runs, generators=[torch.Generator() for _ in range(runs)])
+        self.next, self.told = list(layers), []
+
+    def draw(self, counts: object) -> Tensor:
+        some, self.next = self.next[: sum(counts)], self.next[sum(counts) :]  # type: ignore[call-overload]
+        return torch.tensor(some, dtype=torch.int64)
+
+    def record_episodes(self, ended: Tensor, achieved: Tensor) -> None:
+        self.told.append((ended.tolist(), achieved.tolist()))
+
+
+def shown(progress: EpisodeLayers, num_envs: int, **options: int) -> TransformedEnv:
+    transforms = StateToObs(THREE, progress), ZeroPad(THREE, progress)
+    return TransformedEnv(TinyEnv((num_envs,), **options), Compose(*transforms))
+
+
+def act(env: TransformedEnv, rows: TensorDictBase, *actions: float) -> TensorDictBase:
+    rows = rows.set("action", torch.tensor(actions).unsqueeze(-1))
+    return env.step_and_maybe_reset(rows)
+
+
+# Drawing
+
+
+def test_all_layers_are_drawn_alike() -> None:
+    layers = EpisodeLayers(THREE, generators=[torch.Generator().manual_seed(0)])
+    counts = layers.draw([3_000]).bincount()
+    torch.testing.assert_close(counts / 3_000, torch.full((3,), 1 / 3), atol=0.03, rtol=0.0)
+
+
+def test_a_run_draws_as_it_would_alone() -> None:
+    both = EpisodeLayers(THREE, runs=2, generators=[torch.Generator().manual_seed(seed) for seed in (0, 1)])
+    alone = EpisodeLayers(THREE, generators=[torch.Generator().manual_seed(1)])
+    assert torch.equal(both.draw([5, 20])[5:], alone.draw([20]))
+    assert torch.equal(both.draw([0, 7]), alone.draw([7]))
+
+
+def test_runs_stay_in_the_last_layer() -> None:
+    layers = EpisodeLayers(THREE)
+    assert layers.layers == (2,)
+    layers.record(torch.ones(1, 30))
+    assert layers.layers == (2,)
+    with pytest.raises(ValueError, match="run 0 cannot be moved to layer 1"):
+        layers.set_layer(0, 1)
+
+
+def test_progress_is_preferred_whether_up_or_down() -> None:
+    teacher = TeacherStudent(THREE, uniform_share=0.3, memory=100.0)
+    assert teacher.shares[0].tolist() == pytest.approx([1 / 3] * 3)  # nothing is known
+    ended = torch.tensor([[100, 100, 100]])
+    teacher.record_episodes(ended, torch.tensor([[100, 50, 0]]))
+    # short - long: (1 - e^-2) - (1 - e^-1) = 0.2325, half of it for the second layer
+    assert (teacher.short - teacher.long)[0].tolist() == pytest.approx([0.2325, 0.1163, 0.0], abs=1e-4)
+    assert teacher.shares[0].tolist() == pytest.approx([0.1 + 0.7 * 2 / 3, 0.1 + 0.7 / 3, 0.1])
+    for _ in range(40):
+        teacher.record_episodes(ended, torch.tensor([[100, 50, 0]]))  # nothing changes any more
+    forgets = torch.tensor([[0, 0, 0]])
+    teacher.record_episodes(forgets, forgets)
+    teacher.record_episodes(ended, torch.tensor([[0, 50, 0]]))  # the first layer is forgotten
+    assert teacher.shares[0].tolist() == pytest.approx([0.8, 0.1, 0.1], abs=1e-6)
+
+
+def test_runs_have_progress_of_their_own() -> None:
+    generators = [torch.Generator() for _ in range(2)]
+    teacher = TeacherStudent(THREE, runs=2, generators=generators, uniform_share=0.3)
+    teacher.record_episodes(torch.tensor([[9, 9, 9], [0, 0, 9]]), torch.tensor([[9, 0, 0], [0, 0, 5]]))
+    assert teacher.shares.argmax(1).tolist() == [0, 2]
+    assert teacher.shares[1].tolist() == pytest.approx([0.1, 0.1, 0.8])
+
+
+def test_a_teacher_goes_on_from_its_state() -> None:
+    first, second = (TeacherStudent(THREE, generators=[torch.Generator()]) for _ in range(2))
+    first.record_episodes(torch.tensor([[9, 9, 9]]), torch.tensor([[9, 3, 0]]))
+    first.draw([3])
+    second.load_state_dict(first.state_dict())
+    assert torch.equal(first.shares, second.shares)
+    assert torch.equal(first.draw([50]), second.draw([50]))
+
+
+def test_bad_options() -> None:
+    with pytest.raises(ValueError, match=r"uniform_share must be in \(0, 1\], got 0"):
+        TeacherStudent(THREE, uniform_share=0)
+    with pytest.raises(ValueError, match="memory must be positive, got -1"):
+        TeacherStudent(THREE, memory=-1)
+    with pytest.raises(ValueError, match="2 runs need 2 generators"):
+        EpisodeLayers(THREE, runs=2)
+
+
+# What an environment shows. World n starts at 1000 n + (10, 20, 30, 40); a goes to b, b to c, c to d.
+
+
+def test_each_environment_is_shown_in_its_layer() -> None:
+    env = shown(Fixed(2, 0, 1), 3)
+    rows = env.reset()
+    assert rows["layer"].flatten().tolist() == [2, 0, 1]
+    assert rows["observation"].tolist() == [
+        [10.0, 20.0, 30.0],
+        [1010.0, 0.0, 0.0],
+        [2010.0, 2020.0, 0.0],
+    ]
+    assert rows["achieved_goal"].flatten().tolist() == [30.0, 1010.0, 2020.0]
+    assert rows["desired_goal"].flatten().tolist() == [40.0, 1020.0, 2030.0]
+    assert rows["input"].tolist() == [
+        [10.0, 20.0, 30.0, 40.0],
+        [1010.0, 1020.0, 0.0, 0.0],
+        [2010.0, 2020.0, 2030.0, 0.0],
+    ]
+
+
+def test_an_episode_stays_in_its_layer() -> None:
+    progress = Fixed(0, 1, 1)
+    env = shown(progress, 2)
+    step, after = act(env, env.reset(), 10.0, 0.0)  # the first layer's goal: a at b
+    assert step["next", "reward"].flatten().tolist() == [0.0, -1.0]
+    assert step["next", "layer"].flatten().tolist() == [0, 1]
+    assert after["layer"].flatten().tolist() == [1, 1]  # a new episode, and the same one
+    assert after["desired_goal"].flatten().tolist() == [30.0, 1030.0]
+    step, _ = act(env, after, 0.0, 0.0)
+    assert step["next", "layer"].flatten().tolist() == [1, 1]
+    assert progress.next == []
+
+
+def test_it_is_told_how_the_episodes_of_each_layer_end() -> None:
+    progress = Fixed(0, 0, 1, 2, 0, 0, 0, 0, runs=2)
+    env = shown(progress, 4, horizon=1)  # the last layer's goal is near enough from the beginning
+    act(env, env.reset(), 10.0, 0.0, 0.0, 0.0)
+    assert progress.told == [([[2, 0, 0], [0, 1, 1]], [[1, 0, 0], [0, 0, 1]])]
+
+
+def test_specs_hold() -> None:
+    check_env_specs(shown(EpisodeLayers(THREE), 2))  # type: ignore[arg-type]
+
+
+def test_thresholds_are_those_of_the_rows_layers() -> None:
+    layers = [
+        replace(own, threshold=threshold)
+        for own, threshold in zip(THREE.layers, (8.0, 12.0, 8.0), strict=True)
+    ]
+    curriculum = Curriculum(layers, 4)
+    progress = Fixed(0, 1, 2)
+    progress.curriculum = curriculum
+    env = TransformedEnv(TinyEnv((3,)), StateToObs(curriculum, progress))
+    step = env.step(env.reset().set("action", torch.zeros(3, 1)))  # each goal is at a distance of 10
+    assert step["next", "reward"].flatten().tolist() == [-1.0, 0.0, -1.0]
+    assert step["next", "terminated"].flatten().tolist() == [False, True, False]
+
+
+# What is written and sampled
+
+
+class OnlyLast(GoalWeights):
+    """Prefers the largest goals, and remembers which it was told of."""
+
+    def __init__(self) -> None:
+        self.told: list[float] = []
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        return (goals[..., 0] % 100 >= 2.5).float()
+
+    def update(self, goals: Tensor) -> None:
+        self.told += goals[:, 0].tolist()
+
+
+def episodes(layer: list[int], length: int = 3) -> TensorDict:
+    """One episode of each of some environments, in a layer each."""
+    rows = make_batch([[length]] * len(layer))
+    layers = torch.tensor(layer).view(-1, 1, 1).expand(-1, length, 1).clone()
+    rows["layer"], rows["next", "layer"] = layers, layers.clone()
+    return rows
+
+
+def strict(achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
+    """A goal is never achieved."""
+    return -torch.ones_like(achieved[..., :1]), torch.zeros_like(achieved[..., :1], dtype=torch.bool)
+
+
+def test_each_layer_has_its_reward() -> None:
+    writer = HERWriter(strict, k=1, strategy="final", layers=[LayerRule(strict), LayerRule(GoalReward(0.5))])
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), writer=writer, batch_size=4)
+    index = buffer.extend(episodes([1, 0, 1]))
+    stored = buffer[:]
+    virtual = stored[stored["virtual"].squeeze(-1)]
+    achieved = virtual["next", "reward"].squeeze(-1) == 0.0
+    assert virtual["layer"][achieved].flatten().tolist() == [1, 1]  # the last steps of two episodes
+    assert virtual["next", "terminated"].sum() == 2
+    # Each transition is where the writer says.
+    assert torch.equal(stored["achieved_goal"][index], episodes([1, 0, 1])["achieved_goal"])
+
+
+def test_weights_apply_in_some_layers() -> None:
+    weights = OnlyLast()
+    rules = [LayerRule(GoalReward(0.5), weighted=False), LayerRule(GoalReward(0.5))]
+    writer = HERWriter(strict, k=20, layers=rules, weights=weights)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), writer=writer, batch_size=4)
+    buffer.extend(episodes([0, 1]))
+    stored = buffer[:]
+    virtual = stored[stored["virtual"].squeeze(-1)]
+    goals = [
+        set(virtual["desired_goal"][virtual["layer"].squeeze(-1) == own][:, 0].tolist()) for own in (0, 1)
+    ]
+    assert goals == [{1.0, 2.0, 3.0}, {tag(1, 0, 3)}]
+    assert set(weights.told) == {tag(1, 0, 3)}
+
+
+def test_goals_of_other_episodes_are_of_the_same_layer() -> None:
+    rules = [LayerRule(GoalReward(0.5))] * 2
+    writer = HERWriter(strict, goal_sources={"achieved": 30}, layers=rules)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), writer=writer, batch_size=4)
+    buffer.extend(episodes([0, 1, 0]))
+    stored = buffer[:]
+    virtual = stored[stored["virtual"].squeeze(-1)]
+    for layer, envs in ((0, {0.0, 2.0}), (1, {1.0})):
+        own = virtual["desired_goal"][virtual["layer"].squeeze(-1) == layer][:, 0]
+        assert set(own.div(1000).floor().tolist()) == envs
+    state = writer.state_dict()
+    other = HERWriter(strict, goal_sources={"achieved": 30}, layers=rules)
+    TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), writer=other, batch_size=4)
+    other.load_state_dict(state)
+    assert [own["achieved"][0].shape for own in other.state_dict()["recent"]] == [(6, 2), (3, 2)]
+
+
+def test_runs_with_layers_write_what_they_would_alone() -> None:
+    def stored(layers: list[int], seeds: list[int]) -> TensorDictBase:
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        rules = [LayerRule(GoalReward(0.5)), LayerRule(GoalReward(1.5))]
+        writer = HERWriter(strict, k=2, layers=rules, runs=len(seeds), generators=generators)
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(100 * len(seeds)),
+            writer=writer,
+            sampler=RunsSampler(100, runs=len(seeds), generators=generators),
+            batch_size=4,
+        )
+        rows = episodes(layers)
+        rows["achieved_goal"] %= 1000.0
+        rows["next", "achieved_goal"] %= 1000.0
+        buffer.extend(rows)
+        return buffer.storage[:]
+
+    both, alone = stored([0, 1, 1, 0], [0, 1]), stored([1, 0], [1])
+    for key in ("desired_goal", "layer", ("next", "reward")):
+        assert torch.equal(both[key][100:118], alone[key][:18])
+
+
+def test_rows_without_a_layer_are_refused() -> None:
+    writer = HERWriter(strict, layers=[LayerRule(strict)])
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), writer=writer, batch_size=4)
+    with pytest.raises(KeyError, match="episodes of several layers need the entry 'layer'"):
+        buffer.extend(make_batch([[3]]))
+    with pytest.raises(ValueError, match=r"'layer' must be in \[0, 0\], got 1"):
+        buffer.extend(episodes([1]))
+    with pytest.raises(TypeError, match="layers must be a list of LayerRule"):
+        HERWriter(strict, layers=[strict])  # type: ignore[list-item]
+
+
+def test_sampled_rows_are_padded_by_their_layer() -> None:
+    rows = TensorDict(
+        {
+            "observation": torch.tensor([[1.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 0.0]]),
+            "desired_goal": torch.tensor([[9.0], [8.0], [7.0]]),
+            "layer": torch.tensor([[0], [2], [1]]),
+            "next": {
+                "observation": torch.tensor([[4.0, 0.0, 0.0], [4.0, 5.0, 6.0], [4.0, 5.0, 0.0]]),
+                "desired_goal": torch.tensor([[9.0], [8.0], [7.0]]),
+            },
+        },
+        [3],
+    )
+    padded = ZeroPad(THREE, EpisodeLayers(THREE))(rows)
+    assert padded["input"].tolist() == [[1, 9, 0, 0], [1, 2, 3, 8], [1, 2, 7, 0]]
+    assert padded["next", "input"].tolist() == [[4, 9, 0, 0], [4, 5, 6, 8], [4, 5, 7, 0]]
+    assert ZeroPad(THREE, EpisodeLayers(THREE)).in_keys == ["observation", "desired_goal", "layer"]
+
+
+def test_inputs_are_counted_layer_by_layer() -> None:
+    norm = RunningNorm({"input": 4})
+    rows = TensorDict(
+        {
+            "observation": torch.tensor([[1.0, 0.0, 0.0], [3.0, 2.0, 3.0]]),
+            "desired_goal": torch.tensor([[9.0], [8.0]]),
+            "layer": torch.tensor([[0], [2]]),
+        },
+        [2],
+    )
+    count_inputs(norm, EpisodeLayers(THREE), rows, [0], [2])
+    moments = norm.moments_of("input")
+    assert moments.n.tolist() == [2.0, 2.0, 1.0, 1.0]  # what a layer does not use does not count

@@ -1,0 +1,175 @@
+"""Curricula whose layers are trained at the same time: each episode is played in a layer of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_her.curriculum.layers import Curriculum, CurriculumProgress
+from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
+
+
+class EpisodeLayers(CurriculumProgress):
+    """Draws the layer of each episode when it begins, all layers alike: all of them are trained at once.
+
+    Runs are always in the last layer, which is the full task; it is their episodes that are in layers.
+    :class:`~torchrl_her.StateToObs` draws them, and writes each row's layer, so that one buffer holds rows
+    of all layers and :class:`~torchrl_her.ZeroPad` pads each by its own. After Luo et al., Relay Hindsight
+    Experience Replay, 2022 (arXiv 2208.00843).
+
+    Args:
+        curriculum: the layers.
+
+    Keyword Args:
+        runs: R.
+        generators: sources of random numbers, one of each run; None for torch's own, with one run only.
+
+    Raises:
+        ValueError: ``runs`` is below 1, or several runs have no generators.
+
+    Example:
+        >>> from torchrl_her import CurriculumLayer
+        >>> near, far = (
+        ...     CurriculumLayer(
+        ...         name=name, observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
+        ...     )
+        ...     for name in ("near", "far")
+        ... )
+        >>> layers = EpisodeLayers(Curriculum([near, far], 2))
+        >>> layers.shares.tolist()
+        [[0.5, 0.5]]
+        >>> set(layers.draw([100]).tolist())
+        {0, 1}
+    """
+
+    by_episode = True
+
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        *,
+        runs: int = 1,
+        generators: Sequence[torch.Generator] | None = None,
+    ) -> None:
+        super().__init__(curriculum, runs=runs)
+        self.layers = (len(curriculum) - 1,) * runs
+        self.generators: Generators = check_generators(runs, generators) or [None]
+
+    @property
+    def shares(self) -> Tensor:
+        """How likely each layer is for the next episode of each run, [R, L] of float64."""
+        return torch.full((self.runs, len(self.curriculum)), 1 / len(self.curriculum), dtype=torch.float64)
+
+    def draw(self, counts: Sequence[int]) -> Tensor:
+        """Draws the layers of episodes that begin.
+
+        Args:
+            counts: R numbers of episodes.
+
+        Returns:
+            [sum of counts] of int64, run after run.
+        """
+        numbers = uniform(counts, 1, self.generators, dtype=torch.float64)
+        below = self.shares.cumsum(1).repeat_interleave(torch.tensor(list(counts)), 0)
+        return (numbers >= below[:, :-1]).sum(1)
+
+    def record_episodes(self, ended: Tensor, achieved: Tensor) -> None:
+        """Told how many episodes of each run and layer have ended, and in how many the goal was achieved.
+
+        Args:
+            ended: [R, L] int64.
+            achieved: [R, L] int64.
+        """
+
+    def set_layer(self, run: int, layer: int) -> None:
+        """Raises a ValueError: episodes have layers here, not runs."""
+        raise ValueError(f"run {run} cannot be moved to layer {layer}: each episode has a layer of its own")
+
+    def state_dict(self) -> dict[str, Any]:
+        states = [None if own is None else own.get_state() for own in self.generators]
+        return {**super().state_dict(), "generators": states}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        for generator, own in zip(self.generators, state["generators"], strict=True):
+            if generator is not None and own is not None:
+                generator.set_state(own)
+
+
+class TeacherStudent(EpisodeLayers):
+    """Prefers layers whose success changes: in proportion to its absolute progress, up or down.
+
+    Each layer's success is averaged over its recent episodes, and over the half as many newest ones; the
+    distance between the two is its progress. A share of the episodes is drawn from all layers alike, so that
+    a layer that stood still is noticed when it moves. After Matiisen et al., Teacher-Student Curriculum
+    Learning, 2017 (arXiv 1707.00183), here with averages that forget in place of windows.
+
+    Args:
+        curriculum: the layers.
+
+    Keyword Args:
+        runs: R.
+        generators: sources of random numbers, one of each run; None for torch's own, with one run only.
+        memory: episodes of a layer after which an episode counts 1 / e of what it counted first.
+        uniform_share: share of the episodes that are drawn from all layers alike.
+
+    Attributes:
+        long, short: [R, L] of float64, success over recent episodes, and over the newest.
+
+    Raises:
+        ValueError: an option is out of its range.
+
+    Example:
+        >>> from torchrl_her import CurriculumLayer
+        >>> near, far = (
+        ...     CurriculumLayer(
+        ...         name=name, observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
+        ...     )
+        ...     for name in ("near", "far")
+        ... )
+        >>> teacher = TeacherStudent(Curriculum([near, far], 2), uniform_share=0.2)
+        >>> teacher.record_episodes(torch.tensor([[50, 50]]), torch.tensor([[40, 0]]))
+        >>> teacher.shares.tolist()  # only the first layer has made progress
+        [[0.9, 0.1]]
+    """
+
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        *,
+        runs: int = 1,
+        generators: Sequence[torch.Generator] | None = None,
+        memory: float = 200.0,
+        uniform_share: float = 0.2,
+    ) -> None:
+        if not memory > 0:
+            raise ValueError(f"memory must be positive, got {memory}")
+        if not 0 < uniform_share <= 1:
+            raise ValueError(f"uniform_share must be in (0, 1], got {uniform_share}")
+        super().__init__(curriculum, runs=runs, generators=generators)
+        self.memory, self.uniform_share = memory, uniform_share
+        self.long = torch.zeros(runs, len(curriculum), dtype=torch.float64)
+        self.short = torch.zeros_like(self.long)
+
+    @property
+    def shares(self) -> Tensor:
+        alike, progress = super().shares, (self.short - self.long).abs()
+        total = progress.sum(1, keepdim=True)
+        preferred = torch.where(total > 0, progress / total, alike)
+        return self.uniform_share * alike + (1 - self.uniform_share) * preferred
+
+    def record_episodes(self, ended: Tensor, achieved: Tensor) -> None:
+        rate = (achieved / ended.clamp(min=1)).to(self.long)
+        for average, memory in ((self.long, self.memory), (self.short, self.memory / 2)):
+            kept = torch.exp(-ended.to(self.long) / memory)
+            average.mul_(kept).add_((1 - kept) * rate)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "long": self.long.clone(), "short": self.short.clone()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.long, self.short = state["long"].clone(), state["short"].clone()

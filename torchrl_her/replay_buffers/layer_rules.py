@@ -1,0 +1,68 @@
+"""How episodes are relabeled that carry the layer of a curriculum which they were played in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from torchrl_her.goals.rewards import RewardFunction
+from torchrl_her.replay_buffers.episodes import Episodes
+
+
+class LayerRule(NamedTuple):
+    """How :class:`~torchrl_her.HERWriter` relabels the episodes of one layer.
+
+    Attributes:
+        reward_fn: maps (achieved, desired) goals to (reward, terminated).
+        weighted: whether the weights of goals apply, and are told of the goals that were written.
+    """
+
+    reward_fn: RewardFunction
+    weighted: bool = True
+
+
+def split_layers(
+    rows: TensorDictBase, episodes: Episodes, run: Tensor | None, key: NestedKey, layers: int
+) -> Iterator[tuple[int, Episodes, Tensor | None]]:
+    """The episodes of each layer, in the order in which they came.
+
+    Args:
+        rows: [n], transitions.
+        episodes: positions among them.
+        run: [E] int64, the run of each episode; None if there is only one.
+        key: of the layer [n, 1].
+        layers: how many there are.
+
+    Raises:
+        KeyError: rows do not carry their layer.
+        ValueError: there is no such layer.
+    """
+    if len(episodes.lengths) == 0:
+        return
+    layer = rows.get(key, None)
+    if layer is None:
+        raise KeyError(f"episodes of several layers need the entry {key!r}, got {list(rows.keys())}")
+    own = layer.reshape(-1)[episodes.rows[:, 0]]
+    least, most = int(own.min()), int(own.max())
+    if least < 0 or most >= layers:
+        raise ValueError(f"{key!r} must be in [0, {layers - 1}], got {least if least < 0 else most}")
+    for number in range(layers):
+        which = own == number
+        if bool(which.any()):
+            part = Episodes(episodes.rows[which], episodes.lengths[which])
+            yield number, part, None if run is None else run[which]
+
+
+def check_layers(layers: Sequence[LayerRule] | None) -> list[LayerRule]:
+    """The rules of layers as a list; empty without layers.
+
+    Raises:
+        TypeError: one of them is no rule.
+    """
+    for rule in layers or ():
+        if not isinstance(rule, LayerRule):
+            raise TypeError(f"layers must be a list of LayerRule, got {rule!r} in it")
+    return list(layers or ())
