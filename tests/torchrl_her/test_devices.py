@@ -23,6 +23,7 @@ from torchrl_her import (
     DecayingEpsilonGreedy,
     GoalGrid,
     GoalReward,
+    GoalWeights,
     GuidedExploration,
     HERSampleUnit,
     HERWriter,
@@ -45,6 +46,13 @@ from torchrl_her import (
     sampled_target,
     save_checkpoint,
     success,
+)
+from torchrl_her.goals import (
+    KernelInstructiveness,
+    NetworkNovelty,
+    RareGoals,
+    log_kernel_density,
+    log_neighbor_density,
 )
 from torchrl_her.goals.grid import kl_divergence
 from torchrl_her.modules import NormalizeBatch, NormalizedPolicy, PolicyAverage, RunningNorm
@@ -77,6 +85,16 @@ def instructive() -> Instructiveness:
     return Instructiveness(grid, lambda sigma: box_target(grid, (0.0, -1.0), (3000.0, 1.0), sigma), sigma=9.0)
 
 
+WEIGHTS: dict[str, Callable[[], GoalWeights]] = {
+    "IBS": instructive,
+    "kernel IBS": lambda: KernelInstructiveness(
+        torch.tensor([[0.0, 0.0], [9.0, 0.0]]), sigma=9.0, samples=20
+    ),
+    "rare": lambda: RareGoals(memory=40, samples=20),
+    "rare by neighbors": lambda: RareGoals(estimator="neighbors", k=2, memory=40, samples=20),
+    "novel": lambda: NetworkNovelty(hidden=8, features=4),
+}
+
 WAYS: dict[str, dict[str, Any]] = {
     "HER": {"k": 3},
     "filter": {"k": 3, "filter_achieved": True},
@@ -87,18 +105,18 @@ WAYS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("rows_at", ["cpu", "device"])
 @pytest.mark.parametrize("storage_at", ["cpu", "device"])
-@pytest.mark.parametrize("way", [*WAYS, "whole episodes", "IBS"])
+@pytest.mark.parametrize("way", [*WAYS, "whole episodes", *WEIGHTS])
 def test_the_writer_works_where_the_rows_are(
     way: str, rows_at: str, storage_at: str, device: torch.device, make_generator: Generators
 ) -> None:
     rows = collected().to(device if rows_at == "device" else CPU)
     place = device if storage_at == "device" else CPU
-    options = {**WAYS, "whole episodes": {"k": 3, "per": "episode"}, "IBS": {"k": 3}}[way]
+    options = {**WAYS, "whole episodes": {"k": 3, "per": "episode"}}.get(way, {"k": 3})
     generator = make_generator(0) if rows_at == "device" else torch.Generator()
     writer = HERWriter(
         GoalReward(0.1),
         generators=[generator],
-        weights=instructive() if way == "IBS" else None,
+        weights=WEIGHTS[way]() if way in WEIGHTS else None,
         **options,
     )
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(300, device=place), writer=writer, batch_size=8)
@@ -110,7 +128,7 @@ def test_the_writer_works_where_the_rows_are(
     assert int(virtual.sum()) == writer.totals.virtual > 0
 
 
-@pytest.mark.parametrize("way", [*WAYS, "IBS"])
+@pytest.mark.parametrize("way", [*WAYS, *WEIGHTS])
 @pytest.mark.parametrize("storage_at", ["cpu", "device"])
 def test_the_sample_unit_works_where_the_storage_is(
     way: str, storage_at: str, device: torch.device, make_generator: Generators
@@ -119,7 +137,7 @@ def test_the_sample_unit_works_where_the_storage_is(
     unit = HERSampleUnit(
         GoalReward(0.1),
         generator=make_generator(0) if storage_at == "device" else torch.Generator(),
-        weights=instructive() if way == "IBS" else None,
+        weights=WEIGHTS[way]() if way in WEIGHTS else None,
         **WAYS.get(way, {"k": 3}),
     )
     buffer = TensorDictReplayBuffer(
@@ -192,18 +210,38 @@ def test_targets_of_goals(device: torch.device) -> None:
     assert float(kl_divergence(q, target.to(device))) > 0
 
 
-def test_weights_follow_the_goals(device: torch.device) -> None:
-    weights, goals = instructive(), torch.rand(30, 2) * torch.tensor([3000.0, 1.0])
-    elsewhere = instructive()
+def test_densities_of_goals(device: torch.device) -> None:
+    points, samples = torch.rand(5, 3, 4), torch.rand(20, 4)
+    here, there = (points, samples), (points.to(device), samples.to(device))
+    for found, expected in (
+        (log_kernel_density(*there, torch.full((4,), 0.2)), log_kernel_density(*here, 0.2)),
+        (log_neighbor_density(*there, 3), log_neighbor_density(*here, 3)),
+    ):
+        check(found, device)
+        torch.testing.assert_close(found.cpu(), expected)
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_weights_follow_the_goals(name: str, device: torch.device) -> None:
+    weights, goals = WEIGHTS[name](), torch.rand(30, 2) * torch.tensor([3000.0, 1.0])
+    elsewhere = WEIGHTS[name]()
     for _ in range(2):
         weights.update(goals.to(device))
         elsewhere.update(goals)
     weight = weights(goals.to(device))
     check(weight, device)
-    torch.testing.assert_close(weight.cpu(), elsewhere(goals))
-    again = instructive()
+    close = {"atol": 1e-4, "rtol": 1e-3}
+    torch.testing.assert_close(weight.cpu(), elsewhere(goals), **close)
+    if isinstance(weights, KernelInstructiveness):
+        assert weights.divergence > 0
+    again = WEIGHTS[name]()
     again.load_state_dict(weights.state_dict())
     torch.testing.assert_close(again(goals.to(device)), weight)
+    for own in (weights, again, elsewhere):  # they go on at another place, too
+        own.update(goals)
+        check(own(goals), CPU)
+    torch.testing.assert_close(weights(goals), elsewhere(goals), **close)
+    torch.testing.assert_close(again(goals), elsewhere(goals), **close)
 
 
 REACH = CurriculumLayer(name="reach", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.5)

@@ -7,7 +7,7 @@ from functools import cache
 from torchrl.data import ReplayBuffer, Writer
 
 from torchrl_her.curriculum.layers import CurriculumLayer
-from torchrl_her.goals.ibs import Instructiveness
+from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.rewards import GoalReward
 from torchrl_her.modules.exploration import DecayingEpsilon
 from torchrl_her.replay_buffers.runs.buffer import empty_run, runs_of
@@ -34,7 +34,7 @@ def set_layer_goals(writer: Writer, layer: CurriculumLayer, *, run: int = 0) -> 
         raise TypeError(f"a curriculum needs a buffer with a HERWriter, got a {type(writer).__name__}")
     writer.set_reward(_reward(layer.threshold), run=run)
     weights = writer.goal_weights[run] if writer.goal_weights else None
-    if isinstance(weights, Instructiveness):
+    if isinstance(weights, InstructiveWeights):
         weights.alike = not layer.instructive
 
 
@@ -64,7 +64,7 @@ def enter_layer(
     empty_run(buffer, place)
     writer = buffer.writer
     set_layer_goals(writer, layer, run=place)
-    if writer.goal_weights and isinstance(weights := writer.goal_weights[place], Instructiveness):
+    if writer.goal_weights and isinstance(weights := writer.goal_weights[place], InstructiveWeights):
         weights.restart()
     if exploration is not None:
         exploration.restart(epsilon, run=run)

@@ -1,9 +1,14 @@
 """Goals: rewards, which goals to relabel with, and how useful each of them is."""
 
+from torchrl_her.goals.density import log_kernel_density, log_neighbor_density
 from torchrl_her.goals.factors import candidates, combine, draw, draw_alike, draw_weighted
 from torchrl_her.goals.grid import GoalGrid, box_target, kl_divergence, sampled_target
 from torchrl_her.goals.ibs import GoalHistogram, Instructiveness
+from torchrl_her.goals.instructive import InstructiveWeights
+from torchrl_her.goals.kernel_ibs import KernelInstructiveness
+from torchrl_her.goals.rare import RareGoals
 from torchrl_her.goals.rewards import EnvReward, GoalReward, RewardFunction, achieved, distance
+from torchrl_her.goals.rnd import NetworkNovelty
 from torchrl_her.goals.strategies import (
     STRATEGIES,
     Strategy,
@@ -22,7 +27,11 @@ __all__ = [
     "GoalHistogram",
     "GoalReward",
     "GoalWeights",
+    "InstructiveWeights",
     "Instructiveness",
+    "KernelInstructiveness",
+    "NetworkNovelty",
+    "RareGoals",
     "RewardFunction",
     "Strategy",
     "StrategyFunction",
@@ -38,6 +47,8 @@ __all__ = [
     "draw_weighted",
     "get_strategy",
     "kl_divergence",
+    "log_kernel_density",
+    "log_neighbor_density",
     "register_strategy",
     "sampled_target",
     "strategy_name",

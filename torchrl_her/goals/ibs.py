@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrl_her.goals.grid import GoalGrid, kl_divergence
+from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 
 
@@ -68,11 +69,11 @@ class GoalHistogram(GoalWeights):
         self.counts = state["counts"].to(self.counts.device, copy=True)
 
 
-class Instructiveness(GoalHistogram):
+class Instructiveness(InstructiveWeights, GoalHistogram):
     """The weights of IBS: max(q* - q, floor) in a goal's cell. Equations 4.5 and 4.9.
 
-    The kernel's sigma starts larger and shrinks at each :meth:`step` down to its final value. Emptying the
-    buffer (``clear``) forgets q but not sigma; :meth:`restart` sets sigma back to its first value.
+    The schedule of the kernel's sigma is that of :class:`~torchrl_her.goals.InstructiveWeights`. For goals
+    of more dimensions than a grid can hold there is :class:`~torchrl_her.goals.KernelInstructiveness`.
 
     Args:
         grid: cells over the range of achieved goals.
@@ -103,7 +104,6 @@ class Instructiveness(GoalHistogram):
         tensor([0.0015, 0.2500])
     """
 
-    alike = False
     q_star: Tensor
 
     def __init__(
@@ -118,19 +118,12 @@ class Instructiveness(GoalHistogram):
         floor_is_relative: bool = True,
         subtract: bool = True,
     ) -> None:
-        if not 0 < sigma < math.inf:
-            raise ValueError(f"sigma must be positive and finite, got {sigma}")
-        if not 1 <= start_factor < math.inf:
-            raise ValueError(f"start_factor must be at least 1 and finite, got {start_factor}")
-        if not 0 < decay <= 1:
-            raise ValueError(f"decay must be above 0 and at most 1, got {decay}")
-        if not 0 <= floor < math.inf:
-            raise ValueError(f"floor must be at least 0 and finite, got {floor}")
-        super().__init__(grid)
-        self.target, self.final_sigma, self.start_factor, self.decay = target, sigma, start_factor, decay
-        self.floor, self.floor_is_relative, self.subtract = floor, floor_is_relative, subtract
+        GoalHistogram.__init__(self, grid)
+        self.target, self.floor_is_relative = target, floor_is_relative
+        InstructiveWeights.__init__(
+            self, sigma=sigma, start_factor=start_factor, decay=decay, floor=floor, subtract=subtract
+        )
         self.final_q_star = self._target(sigma)
-        self.restart()
 
     @property
     def divergence(self) -> float:
@@ -146,26 +139,12 @@ class Instructiveness(GoalHistogram):
         floor = self.floor * q_star.max() if self.floor_is_relative else self.floor
         return (q_star - self.q).clamp_min(floor)
 
-    def step(self) -> None:
-        """Shrinks sigma; to be called at the end of each epoch."""
-        self._set_sigma(max(self.final_sigma, self.sigma * math.sqrt(self.decay)))
-
-    def restart(self) -> None:
-        """Sets sigma back to its first value."""
-        self._set_sigma(self.final_sigma * self.start_factor)
-
     def __call__(self, goals: Tensor) -> Tensor:
         return _look_up(self.table, self.grid.cell(goals), goals)
 
-    def state_dict(self) -> dict[str, Any]:
-        return {**super().state_dict(), "sigma": self.sigma}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        super().load_state_dict(state)
-        self._set_sigma(state["sigma"])
-
     def _set_sigma(self, sigma: float) -> None:
-        self.sigma, self.q_star = sigma, self._target(sigma)
+        super()._set_sigma(sigma)
+        self.q_star = self._target(sigma)
 
     def _target(self, sigma: float) -> Tensor:
         q_star = self.target(sigma)

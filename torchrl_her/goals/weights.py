@@ -101,3 +101,35 @@ def checked_weights(weight: Tensor) -> Tensor:
         if not bool((least >= 0) & (most < torch.inf)):  # NaN fails both
             raise ValueError(f"weights of goals must be finite and at least 0, got {least} to {most}")
     return weight
+
+
+def normalized_weights(logs: Tensor, goals: Tensor) -> Tensor:
+    """Weights from their logarithms, the largest of them 1, and none so small that it would be rounded to 0.
+
+    Args:
+        logs: [...], of the weights; NaN for a goal that must not be drawn.
+        goals: [..., g], which are weighed.
+
+    Returns:
+        [...], 0 where ``logs`` are NaN; of the goals' type, unless that is whole numbers.
+
+    Example:
+        >>> normalized_weights(torch.tensor([800.0, 801.0, -1e6, torch.nan]), torch.zeros(4, 2)).tolist()
+        [0.3678794503211975, 1.0, 1.1754943508222875e-38, 0.0]
+    """
+    dtype = goals.dtype if goals.is_floating_point() else torch.get_default_dtype()
+    refused = logs.isnan()
+    logs = logs.masked_fill(refused, -torch.inf)
+    weight = (logs - logs.amax()).exp().to(dtype).clamp_min(torch.finfo(dtype).tiny)
+    return weight.masked_fill_(refused, 0.0)
+
+
+def spread_evenly(count: int, most: int, device: torch.device | None = None) -> Tensor:
+    """Indices of ``count`` things: of all, or of ``most`` of them that are spread evenly.
+
+    Example:
+        >>> spread_evenly(3, 5).tolist(), spread_evenly(10, 4).tolist()
+        ([0, 1, 2], [0, 2, 5, 7])
+    """
+    n = min(count, most)
+    return torch.arange(n, device=device) * count // max(n, 1)

@@ -22,7 +22,7 @@ from torchrl_her.replay_buffers.writer import HERWriter, OnWrite
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
-from torchrl_her_recipes.components.goal_space import GoalSpace, make_goal_weights
+from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_goal_weights
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.learners import priority_power
 from torchrl_her_recipes.config.recipe import Recipe
@@ -37,7 +37,7 @@ def make_buffer(
     generators: Sequence[torch.Generator],
     *,
     rewards: tuple[float, float] = (-1.0, 0.0),
-    space: GoalSpace | None = None,
+    space: GoalSpace | KernelSpace | None = None,
     state: CurriculumState | None = None,
     norm: RunningNorm | None = None,
     devices: Devices = ON_THE_CPU,
@@ -57,7 +57,7 @@ def make_buffer(
         devices: where the buffer is, and the learner that samples from it.
     """
     algorithm, task, runs = get_algorithm(recipe.hindsight.algo), goal_env(env), len(generators)
-    own = [make_goal_weights(recipe, task, space) for _ in range(runs if algorithm.hindsight else 0)]
+    own = [make_goal_weights(each, task, space) for each in recipe.of_runs() if algorithm.hindsight]
     buffer = TensorDictReplayBuffer(
         storage=PackedStorage(runs * recipe.replay.buffer_size, device=devices.replay),
         writer=HERWriter(

@@ -17,7 +17,6 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
 from torchrl_her.curriculum.guide import GuidedExploration
-from torchrl_her.goals.ibs import Instructiveness
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import Exploration
 from torchrl_her.modules.normalization import RunningNorm
@@ -30,7 +29,7 @@ from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import CPU, place_of
-from torchrl_her_recipes.components.goal_space import histograms
+from torchrl_her_recipes.components.goal_space import scheduled
 from torchrl_her_recipes.config.recipe import Recipe
 
 
@@ -58,7 +57,7 @@ class Components:
         target: moves the target networks.
         curriculum: the curriculum and the layer of each run, or None.
         goal_target: q* [cells] of the task's goals, to which the divergence of virtual goals is
-            measured; None if they are not counted.
+            measured; None if they are not counted in cells.
         generators: sources of the random numbers of each run (exploration, relabeling, sampling).
         rewards: of a missed goal and of an achieved one.
         norm: statistics of observations and goals by which actor and sampled transitions are normalized, or
@@ -147,7 +146,7 @@ class Components:
             collector=self.collector,
             buffer=self.buffer,
             learner=self.learner(),
-            schedules=[self.exploration, *self._goal_weights()],
+            schedules=[self.exploration, *scheduled(self.buffer)],
             runs=recipe.run.num_runs,
             epoch_frames=recipe.collection.epoch_frames,
             frames_per_update=recipe.collection.frames_per_update,
@@ -156,7 +155,3 @@ class Components:
             batches_per_sample=min(replay.batches_per_sample, replay.buffer_size // replay.batch_size),
             average=self.average,
         )
-
-    def _goal_weights(self) -> list[Instructiveness]:
-        """The weights of goals that change from epoch to epoch."""
-        return [own for own in histograms(self.buffer) if isinstance(own, Instructiveness)]

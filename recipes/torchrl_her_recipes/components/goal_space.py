@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,9 +15,11 @@ from torchrl.envs import EnvBase
 
 from torchrl_her.goals.grid import GoalGrid, box_target, sampled_target
 from torchrl_her.goals.ibs import GoalHistogram, Instructiveness
+from torchrl_her.goals.instructive import InstructiveWeights
+from torchrl_her.goals.kernel_ibs import KernelInstructiveness
 from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.replay_buffers.writer import HERWriter
-from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_envs.common.goal_env import Box, goal_env
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
@@ -25,7 +28,7 @@ from torchrl_her_recipes.config.values import load_name
 _SAMPLES = 10_000  # goals, if they do not fill a box
 _RESETS = 1_000  # episodes whose goals are collected, if the environment has no distribution of goals
 _SEED = 1 << 40  # of these episodes, far from the seeds of training and evaluation
-_MOST_DIMENSIONS = 3
+MOST_DIMENSIONS = 3  # that a grid is kept over
 
 
 @dataclass(frozen=True)
@@ -48,14 +51,33 @@ class GoalSpace:
         return self.target_at(self.sigma)
 
 
-def goal_space(recipe: Recipe, env: EnvBase) -> GoalSpace | None:
+@dataclass(frozen=True)
+class KernelSpace:
+    """Goals of the task itself, where no grid is kept over them.
+
+    Attributes:
+        goals: [n, g].
+        sigma: the final one, in the unit of the goals.
+    """
+
+    goals: Tensor
+    sigma: float
+
+    @property
+    def target(self) -> None:
+        """There are no cells that reported divergences could be to."""
+        return None
+
+
+def goal_space(recipe: Recipe, env: EnvBase) -> GoalSpace | KernelSpace | None:
     """The space of a task's goals: the range that the task states, or else a box around goals of it.
 
-    None if the task states no range and the algorithm does not need one.
+    For kernel densities it is goals of the task. None if the task states no range and the algorithm does
+    not need one.
 
     Raises:
         ValueError: the algorithm prefers instructive goals, but the goals of the task lie around its
-            start states or have too many coordinates for a grid.
+            start states, or a grid is asked for and they have too many coordinates for one.
     """
     task, instructive = goal_env(env), get_algorithm(recipe.hindsight.algo).instructive
     if instructive and task.starts_near_goals:
@@ -65,9 +87,36 @@ def goal_space(recipe: Recipe, env: EnvBase) -> GoalSpace | None:
             "throwing task"
         )
     box = task.goal_box()
+    if instructive and _without_grid(recipe, task):
+        return _kernel(recipe, task, box)
     if box is not None:
         return _given(recipe, task, *box)
     return _sampled(recipe, task) if instructive else None
+
+
+def goal_width(env: Any) -> int:
+    """How many numbers a goal of a task has."""
+    return int(env.observation_spec["desired_goal"].shape[-1])
+
+
+def _without_grid(recipe: Recipe, env: Any) -> bool:
+    """Whether q* and q are kernel densities."""
+    choice, width = recipe.ibs.estimator, goal_width(env)
+    if choice == "grid" and width > MOST_DIMENSIONS:
+        raise ValueError(
+            f"estimator=grid cannot be on {recipe.task.name}: its goals have {width} numbers, and a grid is "
+            f"kept over {MOST_DIMENSIONS} at most; choose kernel"
+        )
+    return choice == "kernel" or (choice == "auto" and width > MOST_DIMENSIONS)
+
+
+def _kernel(recipe: Recipe, env: Any, box: Box | None) -> KernelSpace:
+    """Goals of the task. Its own share for sigma grows with the root of their width, as distances do."""
+    goals = _desired_goals(recipe, env).double()
+    low, high = (goals.amin(0), goals.amax(0)) if box is None else map(goals.new_tensor, box)
+    width = float((high - low).max()) or 1.0
+    wider = math.sqrt(max(1.0, goals.shape[-1] / MOST_DIMENSIONS)) if recipe.ibs.sigma is None else 1.0
+    return KernelSpace(goals, _share(recipe, env) * width * wider)
 
 
 def _given(recipe: Recipe, env: Any, low: Sequence[float], high: Sequence[float]) -> GoalSpace:
@@ -86,17 +135,11 @@ def _given(recipe: Recipe, env: Any, low: Sequence[float], high: Sequence[float]
 def _sampled(recipe: Recipe, env: Any) -> GoalSpace:
     """A box around goals of the task, half as wide again on each side."""
     goals = _desired_goals(recipe, env).double()
-    dimensions = goals.shape[-1]
-    if dimensions > _MOST_DIMENSIONS:
-        raise ValueError(
-            f"{recipe.hindsight.algo} must not be used on {recipe.task.name}: its goals have {dimensions} "
-            f"numbers, and a grid is kept over {_MOST_DIMENSIONS} at most"
-        )
     low, high = goals.amin(0), goals.amax(0)
     width = float((high - low).max()) or 1.0
     margin = torch.where(high > low, (high - low) / 2, width / 2)
     # This box is a guess, so goals outside of it count at its edge without a warning.
-    grid = GoalGrid(low - margin, high + margin, [recipe.ibs.cells] * dimensions, warn=False)
+    grid = GoalGrid(low - margin, high + margin, [recipe.ibs.cells] * goals.shape[-1], warn=False)
     return GoalSpace(grid, partial(sampled_target, grid, goals), _share(recipe, env) * width)
 
 
@@ -117,11 +160,11 @@ def _share(recipe: Recipe, env: Any) -> float:
     return env.goal_sigma if recipe.ibs.sigma is None else recipe.ibs.sigma
 
 
-def make_goal_weights(recipe: Recipe, env: Any, space: GoalSpace | None) -> GoalWeights | None:
+def make_goal_weights(recipe: Recipe, env: Any, space: GoalSpace | KernelSpace | None) -> GoalWeights | None:
     """The weights of one run's virtual goals; without IBS they are equal and goals are only counted.
 
     Args:
-        recipe: of the run.
+        recipe: of the run alone.
         env: of its task.
         space: of its goals; None where they are not counted.
     """
@@ -130,20 +173,29 @@ def make_goal_weights(recipe: Recipe, env: Any, space: GoalSpace | None) -> Goal
         return load_name(algorithm.weights)(recipe, env)
     if space is None:
         return None
+    options: dict[str, Any] = {
+        "sigma": space.sigma,
+        "start_factor": recipe.ibs.start_factor,
+        "decay": recipe.ibs.decay,
+        "floor": recipe.ibs.floor,
+        "subtract": algorithm.instructive == "simultaneous",
+    }
+    if isinstance(space, KernelSpace):
+        return KernelInstructiveness(space.goals, **options)
     if algorithm.instructive is None:
         return GoalHistogram(space.grid)
-    return Instructiveness(
-        space.grid,
-        space.target_at,
-        sigma=space.sigma,
-        start_factor=recipe.ibs.start_factor,
-        decay=recipe.ibs.decay,
-        floor=recipe.ibs.floor,
-        subtract=algorithm.instructive == "simultaneous",
-    )
+    return Instructiveness(space.grid, space.target_at, **options)
 
 
 def histograms(buffer: TensorDictReplayBuffer) -> list[GoalHistogram]:
     """The histograms of virtual goals of the runs; empty if they are not counted."""
-    weights = buffer.writer.goal_weights if isinstance(buffer.writer, HERWriter) else []
-    return [own for own in weights if isinstance(own, GoalHistogram)]
+    return [own for own in _goal_weights(buffer) if isinstance(own, GoalHistogram)]
+
+
+def scheduled(buffer: TensorDictReplayBuffer) -> list[InstructiveWeights]:
+    """The weights of goals of the runs that change from epoch to epoch."""
+    return [own for own in _goal_weights(buffer) if isinstance(own, InstructiveWeights)]
+
+
+def _goal_weights(buffer: TensorDictReplayBuffer) -> list[GoalWeights]:
+    return buffer.writer.goal_weights if isinstance(buffer.writer, HERWriter) else []

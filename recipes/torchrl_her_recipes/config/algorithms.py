@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from torchrl_her_recipes.config.options import what_there_is
 
@@ -28,8 +28,11 @@ class Algorithm:
             q* - q, so that a goal counts less the more often it was written; "sequential" by q* alone;
             None for equal weights.
         curriculum: whether runs learn the layers of a curriculum one after the other (CHER).
-        weights: a function that makes other weights, as ``module:function``. It gets the recipe and the
-            environment and returns new :class:`~torchrl_her.GoalWeights`; it is called once for each run.
+        weights: a function that makes other weights, as ``module:function``. It is called once for each run,
+            gets the recipe of that run alone (``recipe.run.seed`` is its seed) and the environment, and
+            returns new :class:`~torchrl_her.GoalWeights`.
+        reads: the options of the groups ``ibs`` and ``novelty`` that this function reads, as in
+            ``"novelty.memory"``; the others are refused. None if it may read all of them.
         summary: one line for people.
     """
 
@@ -39,8 +42,19 @@ class Algorithm:
     instructive: Instructive | None = None
     curriculum: bool = False
     weights: str = ""
+    reads: tuple[str, ...] | None = None
     summary: str = ""
 
+
+# Weights by novelty.
+_RARE: dict[str, Any] = {
+    "weights": "torchrl_her_recipes.components.novelty:rare_goals",
+    "reads": ("novelty.sharpness", "novelty.memory"),
+}
+_RND: dict[str, Any] = {
+    "weights": "torchrl_her_recipes.components.novelty:network_novelty",
+    "reads": ("novelty.sharpness",),
+}
 
 ALGORITHMS: dict[str, Algorithm] = {
     algorithm.name: algorithm
@@ -69,6 +83,18 @@ ALGORITHMS: dict[str, Algorithm] = {
             summary="HER with weights q* alone; prioritized replay does the rest",
         ),
         Algorithm(
+            name="filtered_her_rare",
+            filter_achieved=True,
+            summary="Filtered-HER that prefers goals with few others around them",
+            **_RARE,
+        ),
+        Algorithm(
+            name="filtered_her_rnd",
+            filter_achieved=True,
+            summary="Filtered-HER that prefers goals new to a network (RND)",
+            **_RND,
+        ),
+        Algorithm(
             name="cher", curriculum=True, filter_achieved=True, summary="Filtered-HER with a curriculum: CHER"
         ),
         Algorithm(
@@ -77,6 +103,20 @@ ALGORITHMS: dict[str, Algorithm] = {
             filter_achieved=True,
             instructive="simultaneous",
             summary="CHER that prefers instructive goals in the layers that say so",
+        ),
+        Algorithm(
+            name="cher_rare",
+            curriculum=True,
+            filter_achieved=True,
+            summary="CHER that prefers goals with few others around them",
+            **_RARE,
+        ),
+        Algorithm(
+            name="cher_rnd",
+            curriculum=True,
+            filter_achieved=True,
+            summary="CHER that prefers goals new to a network (RND)",
+            **_RND,
         ),
         Algorithm(name="unfiltered_cher", curriculum=True, summary="CHER without the filter"),
         Algorithm(

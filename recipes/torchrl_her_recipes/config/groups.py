@@ -161,7 +161,26 @@ class IBSConfig(Group):
     start_factor: float = option(3.0, "sigma begins at this multiple of its final value", at_least=1)
     decay: float = option(0.9, "the kernel's covariance is multiplied by this each epoch", above=0, at_most=1)
     floor: float = option(0.002, "lowest weight of a goal, as a share of the largest q*", at_least=0)
+    estimator: str = option(
+        "auto",
+        "what q* and q are: grid (histograms, for goals of up to three numbers), kernel (densities, for any "
+        "goals), or auto (kernel for more than three numbers)",
+        choices=("auto", "grid", "kernel"),
+    )
     cells: int = option(20, "cells along each dimension of the grid that goals are counted in", at_least=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoveltyConfig(Group):
+    """Goals weighted by how rare or new they are."""
+
+    sharpness: float | None = option(
+        None,
+        "exponent of the weights; the default is 1, and 3 / g for rare goals of g numbers, if g is above 3",
+        above=0,
+        below=math.inf,
+    )
+    memory: int = option(10_000, "virtual goals among which others are rare, the newest ones", at_least=1)
 
 
 @dataclass(frozen=True, kw_only=True)

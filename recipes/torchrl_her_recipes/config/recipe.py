@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
@@ -14,6 +14,7 @@ from torchrl_her_recipes.config.groups import (
     Group,
     HindsightConfig,
     IBSConfig,
+    NoveltyConfig,
     ReplayConfig,
     RunConfig,
     TaskConfig,
@@ -49,6 +50,7 @@ class Recipe:
     collection: CollectionConfig = field(default_factory=CollectionConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     ibs: IBSConfig = field(default_factory=IBSConfig)
+    novelty: NoveltyConfig = field(default_factory=NoveltyConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     run: RunConfig = field(default_factory=RunConfig)
@@ -75,6 +77,15 @@ class Recipe:
     def seeds(self) -> list[int]:
         """The seed of each run."""
         return [self.run.seed + run for run in range(self.run.num_runs)]
+
+    def of_runs(self) -> list[Recipe]:
+        """For each run the recipe of that run alone, with its seed.
+
+        Example:
+            >>> [own.seeds for own in Recipe(run=RunConfig(seed=3, num_runs=2)).of_runs()]
+            [[3], [4]]
+        """
+        return [replace(self, run=replace(self.run, seed=seed, num_runs=1)) for seed in self.seeds]
 
     def replace(self, **values: Any) -> Recipe:
         """The same recipe with some other values, by their short names; see :func:`make_recipe`.

@@ -8,6 +8,8 @@ from typing import Any
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.algorithms import get_algorithm
 
+WEIGHTS = ("ibs", "novelty")  # the groups of options of weights of goals
+
 
 def without_effect(groups: Any) -> dict[tuple[str, str], str]:
     """The options that have no effect, as (group, name), and with what they have none.
@@ -31,16 +33,28 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
     if not algorithm.hindsight:
         for name in ("k", "strategy", "goal_sources"):
             idle["hindsight", name] = with_algo
-        all_of("ibs", with_algo)
+        for group in WEIGHTS:
+            all_of(group, with_algo)
     elif not groups.hindsight.sources:
         idle["hindsight", "strategy"] = "with k=0"
-        all_of("ibs", "with k=0")
+        for group in WEIGHTS:
+            all_of(group, "with k=0")
     elif algorithm.weights:
-        pass  # the function that makes them may read any option of IBS
-    elif algorithm.instructive is None:
-        all_of("ibs", with_algo, but=("cells",))  # the goals of HER are counted in cells, too
-    elif algorithm.instructive == "sequential":
-        idle["ibs", "floor"] = with_algo
+        if (reads := algorithm.reads) is not None:
+            for group in WEIGHTS:
+                all_of(
+                    group,
+                    with_algo,
+                    but=tuple(own.partition(".")[2] for own in reads if own.startswith(f"{group}.")),
+                )
+    else:
+        all_of("novelty", with_algo)
+        if algorithm.instructive is None:
+            all_of("ibs", with_algo, but=("cells",))  # the goals of HER are counted in cells, too
+        elif groups.ibs.estimator == "kernel":
+            idle["ibs", "cells"] = "with estimator=kernel"
+        if algorithm.instructive == "sequential":
+            idle["ibs", "floor"] = with_algo
     if algorithm.hindsight and groups.hindsight.goal_sources is not None:
         idle["hindsight", "k"] = idle["hindsight", "strategy"] = "with goal_sources"
     if not algorithm.curriculum:

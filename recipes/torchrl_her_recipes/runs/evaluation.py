@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_her.goals.ibs import GoalHistogram
+from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.objectives.critics import critic_value
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.metrics import discounted_return, final_distance, q_bias, success
@@ -57,8 +58,13 @@ def written(components: Components, run: int) -> dict[str, float]:
         return {}
     counts = {f"rows_{name}": value for name, value in asdict(writer.totals_of(run)).items()}
     weights = writer.goal_weights[run] if writer.goal_weights else None
+    divergence = None
     if isinstance(weights, GoalHistogram) and components.goal_target is not None:
+        divergence = weights.divergence_to(components.goal_target)
+    elif isinstance(weights, InstructiveWeights):
+        divergence = weights.divergence
+    if divergence is not None:
         # q* is that of the full task
         full = components.curriculum is None or components.curriculum.at_the_top(run)
-        counts["kl"] = weights.divergence_to(components.goal_target) if full else math.nan
+        counts["kl"] = divergence if full else math.nan
     return counts

@@ -91,8 +91,8 @@ def test_every_algorithm_runs_with_every_sampler(algo: str, sampler: str) -> Non
     assert type(components.buffer.sampler) is kind
     assert len(result.rows) == 2
     assert (result.rows[-1]["rows_virtual"] > 0) == (algo != "no_hindsight")
-    filtered = {"filtered_her", "filtered_her_ibs", "cher", "cher_ibs"}
-    assert components.buffer.writer.filter_achieved == (algo in filtered)
+    filtered = algo.startswith(("filtered_her", "cher"))
+    assert components.buffer.writer.filter_achieved == filtered
 
 
 @pytest.mark.parametrize("algo", ["filtered_her_ibs", "cher"])

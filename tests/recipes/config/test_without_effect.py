@@ -17,6 +17,16 @@ IDLE = [
     ({"algo": "her"}, {"sigma": 0.3}),
     ({"algo": "her"}, {"floor": 0.3}),
     ({"algo": "her_ibs_sequential"}, {"floor": 0.3}),
+    ({"algo": "her"}, {"estimator": "kernel"}),
+    ({"algo": "her_ibs", "estimator": "kernel"}, {"cells": 8}),
+    ({"algo": "her"}, {"sharpness": 2.0}),
+    ({"algo": "her_ibs"}, {"memory": 50}),
+    ({"algo": "no_hindsight"}, {"memory": 50}),
+    ({"algo": "filtered_her_rnd"}, {"memory": 50}),
+    ({"algo": "cher_rnd"}, {"estimator": "kernel"}),
+    ({"algo": "filtered_her_rare"}, {"sigma": 0.3}),
+    ({"algo": "cher_rare"}, {"cells": 8}),
+    ({"algo": "filtered_her_rare", "k": 0}, {"sharpness": 2.0}),
     ({"algo": "her"}, {"window": 5}),
     ({"algo": "cher", "learner": "sac"}, {"layer_epsilon": 0.5}),
     ({"sampler": "uniform"}, {"priority_alpha": 0.5}),
@@ -54,6 +64,9 @@ def test_what_has_no_effect_is_dropped_from_a_preset(options: dict[str, Any], id
     [
         {"algo": "her", "cells": 8},  # goals are counted
         {"algo": "her_ibs_sequential", "sigma": 0.3},
+        {"algo": "her_ibs", "estimator": "kernel", "floor": 0.1},
+        {"algo": "filtered_her_rare", "sharpness": 2.0, "memory": 50},
+        {"algo": "cher_rnd", "sharpness": 2.0},
         {"algo": "cher", "layer_epsilon": 0.5},
         {"algo": "cher", "epsilon_start": 0.0, "epsilon_end": 0.0, "action_noise": 0.1},
         {"task": "hand_v0", "threshold": 0.5, "dtype": "float64"},
@@ -85,9 +98,15 @@ def test_goal_sources_take_the_place_of_k_and_strategy_and_the_other_way_round()
     assert make_recipe(algo="her_ibs", goal_sources=mixed, sigma=0.3).ibs.sigma == 0.3
 
 
-def test_weights_of_ones_own_may_read_every_option_of_ibs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_of_ones_own_may_read_every_option_of_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(ALGORITHMS, "own", Algorithm(name="own", weights="nowhere:make"))
+    recipe = make_recipe(algo="own", sigma=0.3, memory=50)
+    assert (recipe.ibs.sigma, recipe.novelty.memory) == (0.3, 50)
+    own = Algorithm(name="own", weights="nowhere:make", reads=("ibs.sigma",))
+    monkeypatch.setitem(ALGORITHMS, "own", own)
     assert make_recipe(algo="own", sigma=0.3).ibs.sigma == 0.3
+    with pytest.raises(ValueError, match="memory=50 has no effect with algo=own"):
+        make_recipe(algo="own", memory=50)
 
 
 def test_options_of_another_task_do_not_come_along() -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrl_her import GoalWeights
-from torchrl_her.goals.weights import checked_weights
+from torchrl_her.goals.weights import checked_weights, normalized_weights
 
 
 def test_the_base_class_weighs_all_alike_and_remembers_nothing() -> None:
@@ -31,3 +31,13 @@ def test_weights_become_floating_numbers() -> None:
 def test_weights_that_are_negative_or_not_finite_are_refused(bad: float) -> None:
     with pytest.raises(ValueError, match="weights of goals must be finite and at least 0, got"):
         checked_weights(torch.tensor([1.0, bad, 2.0]))
+
+
+def test_weights_from_logarithms_by_hand() -> None:
+    logs = torch.tensor([[-1000.0, -1000.0 + float(torch.log(torch.tensor(4.0)))], [-1e5, float("nan")]])
+    found = normalized_weights(logs.double(), torch.zeros(2, 2, 3))
+    assert found.dtype == torch.float32
+    tiny = torch.finfo(torch.float32).tiny
+    torch.testing.assert_close(found, torch.tensor([[0.25, 1.0], [tiny, 0.0]]))
+    assert normalized_weights(logs, torch.zeros(2, 2, 3, dtype=torch.int64)).dtype == torch.float32
+    assert normalized_weights(torch.full((2,), float("nan")), torch.zeros(2, 1)).tolist() == [0.0, 0.0]

@@ -15,7 +15,7 @@ from torchrl.data import LazyTensorStorage, ListStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 
 from torchrl_her import GoalGrid, GoalReward, GoalWeights, HERWriter, Instructiveness
-from torchrl_her.goals import GoalHistogram
+from torchrl_her.goals import GoalHistogram, KernelInstructiveness, NetworkNovelty, RareGoals
 from torchrl_her.replay_buffers.runs import (
     PackedStorage,
     RunsPrioritizedSampler,
@@ -56,7 +56,13 @@ def q_star(sigma: float) -> torch.Tensor:
 def make_weights(kind: str, run: int) -> GoalWeights | None:
     if kind == "ibs":
         return Instructiveness(GRID, q_star, sigma=0.1 + run)
-    return {"counted": GoalHistogram(GRID), "own": PreferLate(run + 1.0)}.get(kind)
+    if kind == "kernel ibs":
+        real = torch.stack([torch.linspace(0.0, 6_000.0, 7), torch.zeros(7)], 1)
+        return KernelInstructiveness(real, sigma=300.0 + 100.0 * run, samples=50)
+    if kind == "novel":
+        return NetworkNovelty(seed=run, hidden=8, features=4)
+    rare = RareGoals(estimator="neighbors", k=3, sharpness=1.0 + run, memory=60, samples=20)
+    return {"counted": GoalHistogram(GRID), "own": PreferLate(run + 1.0), "rare": rare}.get(kind)
 
 
 def make_buffer(
@@ -96,6 +102,18 @@ def same(one: TensorDict, other: TensorDict) -> bool:
     return set(one.keys(True, True)) == keys and all(torch.equal(one[key], other[key]) for key in keys)
 
 
+def assert_same_state(one: Any, other: Any) -> None:
+    """Nested plain data and tensors, up to rounding."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_same_state(one[key], other[key])
+    elif isinstance(one, torch.Tensor):
+        torch.testing.assert_close(one, other)
+    else:
+        assert one == other
+
+
 def check_alone(together: TensorDictReplayBuffer, alone: list[TensorDictReplayBuffer]) -> None:
     """Everything that is known of each run is what its own buffer knows."""
     writer = together.writer
@@ -111,6 +129,8 @@ def check_alone(together: TensorDictReplayBuffer, alone: list[TensorDictReplayBu
                 assert torch.equal(weights.counts, single.counts)
             elif isinstance(weights, PreferLate):
                 assert weights.seen == single.seen
+            else:
+                assert_same_state(weights.state_dict(), single.state_dict())
     assert writer.held_back == sum(own.writer.held_back for own in alone)
 
 
@@ -154,6 +174,9 @@ CASES: list[dict[str, Any]] = [
         "recent_achieved": 20,
     },
     {"goal_sources": {"achieved": 3}, "weights": "own", "n_steps": 3, "gamma": 0.9},
+    {"filter_achieved": True, "weights": "rare"},
+    {"filter_achieved": True, "weights": "novel"},
+    {"filter_achieved": True, "weights": "kernel ibs"},
 ]
 
 
@@ -243,7 +266,7 @@ def test_episodes_are_ended_for_all_runs() -> None:
     assert together.writer.totals.real == RUNS * ENVS * STEPS
 
 
-@pytest.mark.parametrize("weights", ["ibs", "own"])
+@pytest.mark.parametrize("weights", ["ibs", "own", "rare", "novel", "kernel ibs"])
 def test_emptying_a_run_empties_it_alone(weights: str) -> None:
     """Rows, priorities, q, counts and open episodes; the others go on as if nothing were the matter."""
     options: dict[str, Any] = {"filter_achieved": True, "weights": weights, "capacity": 50}

@@ -1,0 +1,149 @@
+"""Algorithms that prefer rare or new goals, and IBS without a grid: each trains, resumes and stands alone."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+
+from torchrl_her import Instructiveness, load_checkpoint
+from torchrl_her.goals import KernelInstructiveness, NetworkNovelty, RareGoals
+from torchrl_her.replay_buffers.runs import rows_of_run
+from torchrl_her_envs import make_env
+from torchrl_her_recipes import build, resume, run
+from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.components.goal_space import KernelSpace, goal_space
+
+from ..runs.killed import no_pictures
+from ..small import assert_same, small, stop_after
+
+CASES: dict[str, dict[str, Any]] = {
+    "rare": {"algo": "filtered_her_rare"},
+    "rnd": {"algo": "filtered_her_rnd"},
+    "layers, rare": {"algo": "cher_rare", "task": "hand_v1", "success_threshold": 0.01, "window": 4},
+    "layers, rnd": {"algo": "cher_rnd", "task": "hand_v1", "success_threshold": 0.01, "window": 4},
+    "kernel": {"algo": "filtered_her_ibs", "estimator": "kernel"},
+    "many numbers, rare": {"algo": "filtered_her_rare", "task": "bit_flip"},
+    "many numbers, IBS": {"algo": "her_ibs", "task": "bit_flip"},
+}
+KINDS = {
+    "rare": RareGoals,
+    "rnd": NetworkNovelty,
+    "kernel": KernelInstructiveness,
+    "IBS": KernelInstructiveness,
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_runs_side_by_side_are_the_runs_that_they_would_be_alone(case: str) -> None:
+    options = {**CASES[case], "epoch_frames": 800, "frames_per_update": 50.0}
+    together = build(small(num_runs=2, seed=5, **options))
+    run(together, progress=False)
+    alone = build(small(seed=6, **options))
+    run(alone, progress=False)
+    weights = together.buffer.writer.goal_weights
+    assert [type(own) for own in weights] == [KINDS[case.split()[-1]]] * 2
+    rows, own = rows_of_run(together.buffer, 1), rows_of_run(alone.buffer)
+    assert bool(own["virtual"].any())
+    torch.testing.assert_close(rows["desired_goal"], own["desired_goal"], rtol=1e-4, atol=1e-5)
+    goals = own["desired_goal"][::7]
+    torch.testing.assert_close(weights[1](goals), alone.buffer.writer.weights(goals), rtol=1e-2, atol=1e-4)
+    assert not torch.allclose(weights[0](goals), weights[1](goals))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(case: str, tmp_path: Path) -> None:
+    recipe = small(**{**CASES[case], "epoch_frames": 480, "frames_per_update": 60.0, "num_runs": 2})
+    with no_pictures():
+        run(build(recipe), tmp_path / "whole", progress=False)
+        stopped = build(recipe)
+        stop_after(stopped, 8)
+        run(stopped, tmp_path / "stopped", progress=False)
+        resume(tmp_path / "stopped", progress=False)
+    first, second = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("whole", "stopped"))
+    assert_same(first, second)
+    tables = [pd.read_csv(tmp_path / name / "metrics.csv") for name in ("whole", "stopped")]
+    pd.testing.assert_frame_equal(*(table.drop(columns="seconds") for table in tables), check_exact=True)
+
+
+def test_only_runs_with_ibs_tell_a_divergence(tmp_path: Path) -> None:
+    for algo, told in (("filtered_her_rare", False), ("filtered_her_ibs", True)):
+        estimator = {"estimator": "kernel"} if told else {}
+        with no_pictures():
+            rows = run(build(small(algo=algo, **estimator)), tmp_path / algo, progress=False).rows
+        assert all(("kl" in row) == told for row in rows)
+        assert not told or all(0.0 < row["kl"] < 100.0 for row in rows)
+        assert not (tmp_path / algo / "goal_map.npz").exists()
+
+
+def test_the_options_arrive() -> None:
+    rare = build(small(algo="filtered_her_rare", sharpness=0.5, memory=77)).buffer.writer.weights
+    assert (rare.estimator, rare.sharpness, rare.memory) == ("kernel", 0.5, 77)
+    assert (
+        build(small(algo="filtered_her_rare", task="bit_flip")).buffer.writer.weights.estimator == "neighbors"
+    )
+    new = build(small(algo="filtered_her_rnd", sharpness=0.5, num_runs=2, seed=3)).buffer.writer.goal_weights
+    assert [(own.seed, own.sharpness) for own in new] == [(3, 0.5), (4, 0.5)]
+    ibs = build(small(algo="her_ibs_sequential", estimator="kernel", sigma=0.1, start_factor=2.0, decay=0.5))
+    weights = ibs.buffer.writer.weights
+    assert (weights.subtract, weights.start_factor, weights.decay) == (False, 2.0, 0.5)
+    assert weights.final_sigma == pytest.approx(0.1 * 2.0)  # the screen is 2 wide
+    assert ibs.trainer().schedules[1:] == [weights]
+
+
+def test_the_kernel_s_sigma_is_the_grid_s_and_grows_with_the_root_of_the_numbers() -> None:
+    space = goal_space(small(algo="her_ibs", estimator="kernel"), make_env("hand_v0"))
+    assert isinstance(space, KernelSpace)
+    grid = goal_space(small(algo="her_ibs"), make_env("hand_v0"))
+    assert grid is not None
+    assert space.sigma == pytest.approx(grid.sigma) == pytest.approx(0.4)
+    assert space.goals.shape[1] == 2
+    env = make_env("bit_flip", bits=12)
+    recipe = small(**{"algo": "her_ibs", "task": "bit_flip", "task.options.bits": 12})
+    many = goal_space(recipe, env)
+    assert isinstance(many, KernelSpace)
+    assert many.sigma == pytest.approx(0.2 * math.sqrt(12 / 3))
+    given = goal_space(recipe.replace(sigma=0.3), env)
+    assert given is not None
+    assert given.sigma == pytest.approx(0.3)
+
+
+def test_a_grid_over_many_numbers_is_refused_by_name() -> None:
+    with pytest.raises(
+        ValueError, match="estimator=grid cannot be on bit_flip: its goals have 15 numbers, and"
+    ):
+        build(small(task="bit_flip", algo="her_ibs", estimator="grid"))
+    weights = build(small(task="treasure_hunt", algo="her_ibs")).buffer.writer.weights
+    assert isinstance(weights, Instructiveness)  # one number
+
+
+def test_they_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == 0
+    listed = capsys.readouterr().out
+    for name in ("filtered_her_rare", "filtered_her_rnd", "cher_rare", "cher_rnd"):
+        assert f"  {name} " in listed
+
+
+def test_a_fetch_task_trains_with_a_curriculum_and_ibs_by_kernels() -> None:
+    pytest.importorskip("gymnasium_robotics")
+    recipe = small(
+        algo="cher_ibs",
+        task="gym:FetchPickAndPlace-v4",
+        estimator="kernel",
+        num_envs=4,
+        epochs=1,
+        epoch_frames=400,
+        episodes=4,
+        goal_sources={"future": 3, "actual": 1},
+    )
+    components = build(recipe)
+    weights = components.buffer.writer.weights
+    assert isinstance(weights, KernelInstructiveness)
+    assert weights.alike  # the first layer reaches for the object
+    rows = run(components, progress=False).rows
+    assert rows[-1]["rows_virtual"] == weights.written > 0
+    assert math.isnan(rows[-1]["kl"])  # until the last layer

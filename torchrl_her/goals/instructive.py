@@ -1,0 +1,80 @@
+"""What all weights of IBS have in common: the schedule of the kernel's sigma, and their options."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from torchrl_her.goals.weights import GoalWeights
+
+
+class InstructiveWeights(GoalWeights):
+    """The instructiveness of goals, max(q* - q, floor), with a kernel whose sigma shrinks. A base class.
+
+    Sigma starts larger and shrinks at each :meth:`step` down to its final value. Emptying the buffer
+    (``clear``) forgets q but not sigma; :meth:`restart` sets sigma back to its first value, as at the change
+    of a curriculum's layer. In layers that are not instructive ``alike`` is True, so that no weights are
+    asked for.
+
+    Keyword Args:
+        sigma: the final standard deviation of the kernel.
+        start_factor: the first sigma divided by the final one; at least 1.
+        decay: what a step multiplies the covariance by, in (0, 1]; 1 never shrinks it.
+        floor: the least weight of a goal.
+        subtract: False for the weights q* alone, without q and floor (the sequential architecture).
+
+    Attributes:
+        sigma: its present value.
+        final_sigma: its value at the end of the schedule.
+
+    Raises:
+        ValueError: an option is out of its range.
+
+    Example:
+        >>> weights = InstructiveWeights(sigma=0.2, start_factor=3.0, decay=0.9, floor=0.0, subtract=True)
+        >>> weights.step()
+        >>> round(weights.sigma**2, 3)  # 0.6 squared, times 0.9
+        0.324
+    """
+
+    alike = False
+    sigma: float
+
+    def __init__(
+        self, *, sigma: float, start_factor: float, decay: float, floor: float, subtract: bool
+    ) -> None:
+        if not 0 < sigma < math.inf:
+            raise ValueError(f"sigma must be positive and finite, got {sigma}")
+        if not 1 <= start_factor < math.inf:
+            raise ValueError(f"start_factor must be at least 1 and finite, got {start_factor}")
+        if not 0 < decay <= 1:
+            raise ValueError(f"decay must be above 0 and at most 1, got {decay}")
+        if not 0 <= floor < math.inf:
+            raise ValueError(f"floor must be at least 0 and finite, got {floor}")
+        self.final_sigma, self.start_factor, self.decay = sigma, start_factor, decay
+        self.floor, self.subtract = floor, subtract
+        self.restart()
+
+    @property
+    def divergence(self) -> float:
+        """KL(q || q*) in nats at the final and not the present sigma; NaN before the first write."""
+        raise NotImplementedError
+
+    def step(self) -> None:
+        """Shrinks sigma; to be called at the end of each epoch."""
+        self._set_sigma(max(self.final_sigma, self.sigma * math.sqrt(self.decay)))
+
+    def restart(self) -> None:
+        """Sets sigma back to its first value."""
+        self._set_sigma(self.final_sigma * self.start_factor)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "sigma": self.sigma}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self._set_sigma(state["sigma"])
+
+    def _set_sigma(self, sigma: float) -> None:
+        """Called whenever sigma changes."""
+        self.sigma = sigma

@@ -1,0 +1,185 @@
+"""IBS without a grid: q* and q are kernel densities, for goals of more dimensions than a grid can hold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_her.goals.density import log_kernel_density
+from torchrl_her.goals.grid import Numbers
+from torchrl_her.goals.instructive import InstructiveWeights
+from torchrl_her.goals.weights import spread_evenly
+
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+
+
+class KernelInstructiveness(InstructiveWeights):
+    """The weights of IBS, max(q* - q, floor), by kernel densities in place of a grid. Equations 4.5 and 4.9.
+
+    q* is the kernel density of the real goals, q that of the virtual goals that were written since the
+    buffer was last emptied, with the same kernel. Weights are given in units of the largest q* of a real
+    goal. What they are for, and the schedule of sigma, are as for :class:`~torchrl_her.Instructiveness`; but
+    both densities are smooth here, so that q counts around a goal and not in its cell.
+
+    Goals that are not finite have weight 0.
+
+    Args:
+        goals: [n, g], goals as the task asks for them. If there are more than ``samples``, some of them,
+            spread evenly, are used.
+
+    Keyword Args:
+        sigma: the final standard deviation of the kernel, in the unit of the goals divided by ``scale``.
+        start_factor: the first sigma divided by the final one; at least 1.
+        decay: what a step multiplies the covariance by, in (0, 1]; 1 never shrinks it.
+        floor: the least weight of a goal, as a share of the largest q* of a real goal.
+        subtract: False for the weights q* alone, without q and floor (the sequential architecture).
+        scale: what goals are divided by first, a number or g of them, where their numbers have different
+            units.
+        samples: how many real goals, and how many virtual ones, the densities are computed from at most. The
+            virtual ones are a part that is spread evenly over all that were written.
+        log_target: maps goals [m, g] and a sigma to the logarithm of the density q* [m], in place of the
+            kernel density of ``goals``.
+
+    Attributes:
+        sigma: its present value.
+        final_sigma: its value at the end of the schedule.
+        written: how many virtual goals there were since the buffer was last emptied.
+
+    Raises:
+        ValueError: an option is out of its range, goals are not finite, or of another width than the real
+        ones.
+
+    Example:
+        >>> real = torch.tensor([[1.0] * 15, [2.0] * 15])
+        >>> weights = KernelInstructiveness(real, sigma=1.0)
+        >>> weights(torch.cat([real, real + 3.0]))
+        tensor([1.0000, 1.0000, 0.0253, 0.0020])
+        >>> weights.update(real[:1])
+        >>> weights(real).round(decimals=3)  # the first one has had more than its share
+        tensor([0.0020, 0.3940])
+    """
+
+    _real: Tensor
+    _scale: Tensor
+    _virtual: Tensor
+    _keys: Tensor
+    _peak: Tensor | None  # the logarithm of the largest q* of a real goal, computed when it is needed
+
+    def __init__(
+        self,
+        goals: Tensor,
+        *,
+        sigma: float,
+        start_factor: float = 3.0,
+        decay: float = 0.9,
+        floor: float = 0.002,
+        subtract: bool = True,
+        scale: Numbers = 1.0,
+        samples: int = 1_000,
+        log_target: Callable[[Tensor, float], Tensor] | None = None,
+    ) -> None:
+        if goals.ndim != 2 or len(goals) == 0 or not goals.isfinite().all():
+            raise ValueError(f"goals must be finite, [n, g] with n > 0, got a shape of {list(goals.shape)}")
+        if samples < 1:
+            raise ValueError(f"samples must be at least 1, got {samples}")
+        g = goals.shape[1]
+        factor = torch.as_tensor(scale, dtype=torch.float64).reshape(-1)
+        if len(factor) not in (1, g) or not bool(((factor > 0) & factor.isfinite()).all()):
+            raise ValueError(f"scale must be positive and finite, one number or {g}, got {scale}")
+        self.samples, self.log_target = samples, log_target
+        self._scale = factor.to(goals.device).expand(g)
+        self._real = goals.detach()[spread_evenly(len(goals), samples, goals.device)].double()
+        self.clear()
+        super().__init__(sigma=sigma, start_factor=start_factor, decay=decay, floor=floor, subtract=subtract)
+
+    @property
+    def divergence(self) -> float:
+        """KL(q || q*) in nats of the two kernel densities at the final sigma, a mean over goals from q.
+
+        It is 0 if virtual goals lie as the real ones do; NaN before the first write.
+        """
+        if len(self._virtual) == 0:
+            return math.nan
+        generator = torch.Generator().manual_seed(0)  # the same goals at each call, up to where q is
+        noise = torch.randn(self._virtual.shape, dtype=torch.float64, generator=generator)
+        self._move(self._virtual.device)
+        goals = self._virtual + self.final_sigma * self._scale * noise.to(self._virtual.device)
+        logs = self._log_kernel(goals, self._virtual, self.final_sigma)
+        return max(0.0, float((logs - self._log_q_star(goals, self.final_sigma)).mean()))
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        if goals.numel() == 0:
+            return super().__call__(goals)
+        self._check(goals)
+        self._move(goals.device)
+        if self._peak is None:
+            self._peak = self._log_q_star(self._real, self.sigma).max()
+        weight = (self._log_q_star(goals, self.sigma) - self._peak).exp()
+        if self.subtract and len(self._virtual) > 0:
+            weight -= (self._log_kernel(goals, self._virtual, self.sigma) - self._peak).exp()
+        dtype = goals.dtype if goals.is_floating_point() else torch.get_default_dtype()
+        # Far from all real goals q* alone would be rounded to 0, and a transition there would get no goals.
+        least = max(self.floor if self.subtract else 0.0, torch.finfo(dtype).tiny)
+        return weight.clamp_min(least).nan_to_num(0.0).to(dtype)
+
+    def update(self, goals: Tensor) -> None:
+        """Counts goals in q.
+
+        Each goal has a key, the fraction of its number times the golden ratio, and those with the least keys
+        stay. Such keys are spread evenly over any stretch of numbers, so what stays is, too, and at each
+        moment.
+        """
+        if self.alike and goals.shape[-1] != self._real.shape[1]:
+            return  # goals of a curriculum's layer, which are not weighed
+        self._check(goals)
+        goals = goals.detach().reshape(-1, goals.shape[-1])
+        goals = goals[goals.isfinite().all(-1)]
+        number = torch.arange(self.written, self.written + len(goals), device=goals.device)
+        self.written += len(goals)
+        self._move(goals.device)
+        keys = torch.cat([self._keys, (number.double() * _GOLDEN).frac()])
+        keys, order = keys.sort(stable=True)
+        order = order[: self.samples]
+        self._virtual, self._keys = torch.cat([self._virtual, goals.double()])[order], keys[: self.samples]
+
+    def clear(self) -> None:
+        self.written = 0
+        self._virtual, self._keys = self._real[:0], self._real.new_empty(0)
+
+    def state_dict(self) -> dict[str, Any]:
+        own = {"written": self.written, "virtual": self._virtual.clone(), "keys": self._keys.clone()}
+        return {**super().state_dict(), **own}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self._check(state["virtual"])
+        self.written = state["written"]
+        self._virtual, self._keys = (state[name].clone() for name in ("virtual", "keys"))
+
+    def _set_sigma(self, sigma: float) -> None:
+        super()._set_sigma(sigma)
+        self._peak = None
+
+    def _log_q_star(self, goals: Tensor, sigma: float) -> Tensor:
+        if self.log_target is not None:
+            flat = goals.reshape(-1, goals.shape[-1])
+            return self.log_target(flat, sigma).double().view(goals.shape[:-1])
+        return self._log_kernel(goals, self._real, sigma)
+
+    def _log_kernel(self, goals: Tensor, samples: Tensor, sigma: float) -> Tensor:
+        return log_kernel_density(goals, samples, sigma * self._scale)
+
+    def _check(self, goals: Tensor) -> None:
+        if goals.shape[-1] != self._real.shape[1]:
+            raise ValueError(f"real goals have {self._real.shape[1]} numbers, got goals of {goals.shape[-1]}")
+
+    def _move(self, device: torch.device) -> None:
+        """Everything to where goals are."""
+        if self._real.device != device or self._virtual.device != device:
+            self._real, self._scale = self._real.to(device), self._scale.to(device)
+            self._virtual, self._keys = self._virtual.to(device), self._keys.to(device)
+            self._peak = None

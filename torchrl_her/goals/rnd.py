@@ -1,0 +1,203 @@
+"""Weights that prefer goals which a network has not learned yet: random network distillation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import deepcopy
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.nn.utils import skip_init
+from torchrl.envs.transforms.rnd import RunningMeanStd
+from torchrl.objectives import RNDLoss
+
+from torchrl_her.goals.weights import GoalWeights, normalized_weights, spread_evenly
+
+_GOAL = "goal"
+_LEAST_ERROR = 1e-30
+_FARTHEST = 1e15  # beyond this, sums of squares of float32 would overflow
+_RANGE = 2.0  # standard deviations within which most goals are
+
+
+class NetworkNovelty(GoalWeights):
+    """A goal's weight is the error with which a network predicts what a random network makes of it.
+
+    The predictor is trained on the goals that are written, so its error is small where there were many like
+    them and large where there were few. Burda et al., Exploration by random network distillation, 2018, with
+    goals in place of observations; networks and loss are TorchRL's :class:`~torchrl.objectives.RNDLoss`.
+    Goals are normalized by the running mean and standard deviation of those that were written, and clipped
+    at 5.
+
+    Before the first goals all weights are 1, and goals that are not finite have weight 0. Networks are made
+    from ``seed`` alone; neither here nor later are random numbers of torch's own generator used. Emptying
+    the buffer (``clear``) starts again with the networks of the beginning.
+
+    Keyword Args:
+        seed: of both networks.
+        sharpness: weights are ``error ** sharpness``, of the squared error.
+        hidden: width of the hidden layers, of which the target has one and the predictor two.
+        features: how many numbers the networks give.
+        lr: learning rate of the predictor (Adam).
+        steps: gradient steps for the goals of one ``update``, at most.
+        batch_size: goals of a gradient step, at most. Of more goals than all steps take, some are left out
+            evenly.
+
+    Raises:
+        ValueError: an option is out of its range, or goals have another width than those before.
+
+    Example:
+        >>> weights = NetworkNovelty(seed=0)
+        >>> often = torch.rand(256, 2, generator=torch.Generator().manual_seed(0))
+        >>> for _ in range(50):
+        ...     weights.update(often)
+        >>> near, far = weights(torch.tensor([[0.5, 0.5], [3.0, 3.0]])).tolist()
+        >>> near < 0.05, far
+        (True, 1.0)
+    """
+
+    def __init__(
+        self,
+        *,
+        seed: int = 0,
+        sharpness: float = 1.0,
+        hidden: int = 64,
+        features: int = 32,
+        lr: float = 1e-3,
+        steps: int = 4,
+        batch_size: int = 256,
+    ) -> None:
+        for name, value in (("sharpness", sharpness), ("lr", lr)):
+            if not 0 < value < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {value}")
+        for name, count in (
+            ("hidden", hidden),
+            ("features", features),
+            ("steps", steps),
+            ("batch_size", batch_size),
+        ):
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}")
+        self.seed, self.sharpness, self.hidden, self.features = seed, sharpness, hidden, features
+        self.lr, self.steps, self.batch_size = lr, steps, batch_size
+        self._learned: _Learned | None = None
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        if self._learned is None or goals.numel() == 0:
+            return super().__call__(goals)
+        error = self.error(goals).double().clamp_min(_LEAST_ERROR)  # NaN stays NaN
+        return normalized_weights(error.log() * self.sharpness, goals)
+
+    @torch.no_grad()
+    def error(self, goals: Tensor) -> Tensor:
+        """The squared prediction errors [...] of goals [..., g]; NaN for goals that are not finite.
+
+        Raises:
+            RuntimeError: there were no goals to learn from yet.
+        """
+        learned = self._at(goals)
+        if learned is None:
+            raise RuntimeError("there is no prediction before the first goals: call update() first")
+        error = _errors(learned.loss, _bounded(goals.nan_to_num(0.0, 0.0, 0.0)))
+        return error.masked_fill(~goals.isfinite().all(-1), math.nan)
+
+    def update(self, goals: Tensor) -> None:
+        """Learns goals."""
+        goals = goals.detach().reshape(-1, goals.shape[-1])
+        goals = _bounded(goals[goals.isfinite().all(-1)])
+        if len(goals) == 0:
+            return
+        if self._learned is None:
+            self._learned = self._begin(goals.shape[1], goals.device)
+        learned = self._at(goals)
+        assert learned is not None
+        learned.loss.obs_rms.update(goals)
+        chosen = goals[spread_evenly(len(goals), self.steps * self.batch_size, goals.device)]
+        batches = -(-len(chosen) // self.batch_size)
+        with torch.enable_grad():
+            for batch in range(batches):
+                _errors(learned.loss, chosen[batch::batches]).mean().backward()
+                learned.optimizer.step()
+                learned.optimizer.zero_grad()
+
+    def clear(self) -> None:
+        self._learned = None
+
+    def state_dict(self) -> dict[str, Any]:
+        if self._learned is None:
+            return {"networks": None, "optimizer": None}
+        networks = {name: value.clone() for name, value in self._learned.loss.state_dict().items()}
+        return {"networks": networks, "optimizer": deepcopy(self._learned.optimizer.state_dict())}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._learned = None
+        if (networks := state["networks"]) is not None:
+            mean = networks["obs_rms.mean"]
+            self._learned = self._begin(len(mean), mean.device)
+            self._learned.loss.load_state_dict(networks)
+            self._learned.optimizer.load_state_dict(deepcopy(state["optimizer"]))
+
+    def _begin(self, width: int, device: torch.device) -> _Learned:
+        """New networks, always the same ones for a seed and width."""
+        generator = torch.Generator().manual_seed(self.seed)
+        target = _network([width, self.hidden, self.features], generator)
+        predictor = _network([width, self.hidden, self.hidden, self.features], generator)
+        loss = RNDLoss(
+            predictor, target, obs_rms=RunningMeanStd((width,)), reduction="none", update_fraction=1.0
+        )
+        loss.set_keys(observation=_GOAL)
+        return self._with_optimizer(loss.to(device))
+
+    def _with_optimizer(self, loss: RNDLoss) -> _Learned:
+        return _Learned(loss, torch.optim.Adam(loss.predictor_network.parameters(), lr=self.lr))
+
+    def _at(self, goals: Tensor) -> _Learned | None:
+        """The networks, moved to where goals are."""
+        learned = self._learned
+        if learned is None:
+            return None
+        mean = learned.loss.obs_rms.mean
+        if len(mean) != goals.shape[-1]:
+            raise ValueError(f"goals of {len(mean)} numbers were learned, got goals of {goals.shape[-1]}")
+        if mean.device != goals.device:
+            self._learned = self._with_optimizer(learned.loss.to(goals.device))
+            self._learned.optimizer.load_state_dict(learned.optimizer.state_dict())
+        return self._learned
+
+
+class _Learned(NamedTuple):
+    """Both networks with the goals' moments, and what trains the predictor."""
+
+    loss: RNDLoss
+    optimizer: torch.optim.Optimizer
+
+
+def _bounded(goals: Tensor) -> Tensor:
+    """Finite goals as the networks take them."""
+    return goals.float().clamp(-_FARTHEST, _FARTHEST)
+
+
+def _errors(loss: RNDLoss, goals: Tensor) -> Tensor:
+    """The squared errors [...] of finite goals [..., g]."""
+    flat = goals.reshape(-1, goals.shape[-1])
+    return loss(TensorDict({_GOAL: flat}, [len(flat)]))["loss_predictor"].view(goals.shape[:-1])
+
+
+def _network(widths: Sequence[int], generator: torch.Generator) -> nn.Sequential:
+    """Linear layers with rectifiers between them, whose weights come from a generator.
+
+    Biases of the first layer are spread over the range of normalized goals. Without them outputs would grow
+    in proportion along each ray from the mean, and the predictor would know them from the goals near the
+    mean.
+    """
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        linear = skip_init(nn.Linear, inputs, outputs)
+        bound = 0.0 if layers else _RANGE
+        nn.init.normal_(linear.weight, std=math.sqrt(2.0 / inputs), generator=generator)
+        nn.init.uniform_(linear.bias, -bound, bound, generator=generator)
+        layers += [linear, nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
