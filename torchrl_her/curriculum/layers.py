@@ -277,6 +277,10 @@ class CurriculumProgress:
         """Copies of the R windows: samples of the present layer, the latest at the end."""
         return [list(own) for own in self._successes]
 
+    def mean_layer(self, run: int) -> float:
+        """The layer that a run's episodes are played in, on average."""
+        return float(self.layers[self._check_run(run)])
+
     def layer_of(self, run: int) -> CurriculumLayer:
         """The present layer of a run."""
         return self.curriculum.layers[self.layers[self._check_run(run)]]

@@ -63,6 +63,9 @@ class EpisodeLayers(CurriculumProgress):
         """How likely each layer is for the next episode of each run, [R, L] of float64."""
         return torch.full((self.runs, len(self.curriculum)), 1 / len(self.curriculum), dtype=torch.float64)
 
+    def mean_layer(self, run: int) -> float:
+        return float(self.shares[self._check_run(run)] @ torch.arange(len(self.curriculum)).double())
+
     def draw(self, counts: Sequence[int]) -> Tensor:
         """Draws the layers of episodes that begin.
 

@@ -371,7 +371,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     def _no_goals(self, runs: int) -> list[RecentGoals]:
         """Nothing remembered, of each layer."""
-        return [RecentGoals.none(runs) for _ in self.layers or [None]]
+        return [RecentGoals.none(runs) for _ in range(max(1, len(self.layers)))]
 
     def _by_layer(
         self, rows: TensorDictBase, episodes: Episodes, run: Tensor | None

@@ -133,6 +133,7 @@ def _guide_of(
         policy,
         curriculum,
         share=recipe.curriculum.guided_share,
+        layer_key=None if recipe.curriculum.order == "threshold" else "layer",
         runs=recipe.run.num_runs,
         generators=generators,
     )

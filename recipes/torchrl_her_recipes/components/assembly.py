@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
+from torchrl_her.behavior import BehaviorGoals
 from torchrl_her_envs.common.goal_env import goal_env, reward_bounds
 from torchrl_her_recipes.components.agents import make_agent
+from torchrl_her_recipes.components.behavior import make_behavior, make_factors
 from torchrl_her_recipes.components.buffers import make_buffer
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import (
+    CurriculumState,
     in_layers,
     is_guided,
     make_curriculum,
@@ -46,15 +49,16 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
     curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
     state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
-    env = (
-        task if state is None else in_layers(task, state.progress, begins=is_guided(recipe, state.curriculum))
-    )
+    rewards = played_rewards(recipe, task)
+    behavior = make_behavior(recipe, task, rewards=rewards, space=space, state=state)
+    env = _shown(recipe, task, state, behavior)
     devices = devices_of(recipe)
     generators = make_generators(recipe.seeds, devices.replay)
     own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
-    rewards = played_rewards(recipe, task)
     bounds = reward_bounds(goal_env(task)) if curriculum is None else rewards
     agent = make_agent(recipe, env, own, rewards=bounds, curriculum=curriculum, device=devices.learner)
+    if behavior is not None:
+        behavior.factors += make_factors(recipe, agent, state)
     collector = (
         ProcessCollector(
             recipe,
@@ -84,8 +88,19 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
         generators=generators if own is generators else [*generators, *own],
         rewards=rewards,
         curriculum=state,
+        behavior=behavior,
         **vars(agent),
     )
+
+
+def _shown(
+    recipe: Recipe, task: EnvBase, state: CurriculumState | None, behavior: BehaviorGoals | None
+) -> EnvBase:
+    """The task's environments as the runs see them in training."""
+    if state is not None:
+        begins = is_guided(recipe, state.curriculum)
+        return in_layers(task, state.progress, begins=begins, behavior=behavior)
+    return task if behavior is None else TransformedEnv(task, behavior)
 
 
 def make_collector(

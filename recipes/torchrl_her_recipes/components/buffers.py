@@ -14,9 +14,10 @@ from torchrl.envs import DeviceCastTransform, EnvBase
 from torchrl_her.curriculum.normalization import count_inputs
 from torchrl_her.curriculum.switch import set_layer_goals
 from torchrl_her.curriculum.transforms import ZeroPad
-from torchrl_her.goals.rewards import EnvReward
+from torchrl_her.goals.rewards import EnvReward, GoalReward
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch
+from torchrl_her.replay_buffers.layer_rules import LayerRule
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler
 from torchrl_her.replay_buffers.writer import HERWriter, OnWrite
 from torchrl_her_envs.common.goal_env import goal_env
@@ -28,7 +29,7 @@ from torchrl_her_recipes.config.learners import priority_power
 from torchrl_her_recipes.config.recipe import Recipe
 
 # Entries of a collected batch that no loss reads: not stored.
-_NOT_STORED = ("state", "achieved_goal", "input", "is_init", "collector")
+_NOT_STORED = ("state", "achieved_goal", "input", "is_init", "collector", "proposed")
 
 
 def make_buffer(
@@ -71,6 +72,7 @@ def make_buffer(
             exclude=_NOT_STORED,
             runs=runs,
             generators=generators,
+            layers=_rules(state),
             on_write=None if norm is None else _counted_by(norm, state),
         ),
         sampler=_make_sampler(recipe, generators, devices.replay),
@@ -79,12 +81,20 @@ def make_buffer(
     if devices.learner != devices.replay:
         buffer.append_transform(DeviceCastTransform(devices.learner, orig_device=devices.replay))
     if state is not None:
-        for run in range(runs):
-            set_layer_goals(buffer.writer, state.progress.layer_of(run), run=run)
+        if not state.progress.by_episode:
+            for run in range(runs):
+                set_layer_goals(buffer.writer, state.progress.layer_of(run), run=run)
         buffer.append_transform(ZeroPad(state.curriculum, state.progress))
     if norm is not None:
         buffer.append_transform(NormalizeBatch(norm))
     return buffer
+
+
+def _rules(state: CurriculumState | None) -> list[LayerRule] | None:
+    """How the episodes of each layer are relabeled, where they have layers of their own."""
+    if state is None or not state.progress.by_episode:
+        return None
+    return [LayerRule(GoalReward(layer.threshold), layer.instructive) for layer in state.curriculum.layers]
 
 
 def _goals(recipe: Recipe) -> dict[str, Any]:

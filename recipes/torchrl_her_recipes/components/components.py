@@ -16,7 +16,9 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
+from torchrl_her.behavior import BehaviorGoals
 from torchrl_her.curriculum.guide import GuidedExploration
+from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import Exploration
 from torchrl_her.modules.normalization import RunningNorm
@@ -29,7 +31,7 @@ from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import CPU, place_of
-from torchrl_her_recipes.components.goal_space import scheduled
+from torchrl_her_recipes.components.goal_space import goal_weights, scheduled
 from torchrl_her_recipes.config.recipe import Recipe
 
 
@@ -64,6 +66,8 @@ class Components:
             None.
         average: follows the actor, and is what is evaluated, filmed and kept in its place; or None.
         guide: begins episodes as the layer below has learned it, see ``guided_share``; or None.
+        behavior: proposes the goals of episodes, or None. It is one of the environment's transforms, and its
+            state a part of the collector's.
     """
 
     recipe: Recipe
@@ -85,6 +89,7 @@ class Components:
     norm: RunningNorm | None = None
     average: PolicyAverage | None = None
     guide: GuidedExploration | None = None
+    behavior: BehaviorGoals | None = None
 
     @property
     def greedy(self) -> TensorDictModuleBase:
@@ -146,7 +151,7 @@ class Components:
             collector=self.collector,
             buffer=self.buffer,
             learner=self.learner(),
-            schedules=[self.exploration, *scheduled(self.buffer)],
+            schedules=[self.exploration, *scheduled([*goal_weights(self.buffer), *self._proposals()])],
             runs=recipe.run.num_runs,
             epoch_frames=recipe.collection.epoch_frames,
             frames_per_update=recipe.collection.frames_per_update,
@@ -155,3 +160,7 @@ class Components:
             batches_per_sample=min(replay.batches_per_sample, replay.buffer_size // replay.batch_size),
             average=self.average,
         )
+
+    def _proposals(self) -> list[GoalWeights]:
+        """The weights of proposed goals."""
+        return [] if self.behavior is None else self.behavior.weights

@@ -8,13 +8,17 @@ from typing import Any
 
 from torchrl.envs import CatTensors, Compose, EnvBase, InitTracker, Transform, TransformedEnv
 
+from torchrl_her.behavior import BehaviorGoals
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
+from torchrl_her.curriculum.orders import EpisodeLayers, TeacherStudent
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
+from torchrl_her_recipes.components.devices import CPU, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
+_SEED = 1 << 34  # so that drawn layers do not repeat the numbers of exploration
 _STATE = ["observation", "desired_goal"]  # what the state is made of, in this order
 
 
@@ -24,11 +28,11 @@ class CurriculumState:
 
     Attributes:
         progress: the layer of each run.
-        layer_env: for evaluation at the layers' goals.
+        layer_env: for evaluation at the layers' goals; None where episodes have layers, and not runs.
     """
 
     progress: CurriculumProgress
-    layer_env: EnvBase
+    layer_env: EnvBase | None
 
     @property
     def curriculum(self) -> Curriculum:
@@ -94,15 +98,36 @@ def make_curriculum_state(recipe: Recipe, curriculum: Curriculum, seeds: Sequenc
         curriculum: its curriculum.
         seeds: of the evaluation of each run.
     """
-    options = recipe.curriculum
-    progress = CurriculumProgress(
-        curriculum,
-        runs=recipe.run.num_runs,
-        window=options.window,
-        success_threshold=options.success_threshold,
+    progress = _make_progress(recipe, curriculum)
+    layer_env = None
+    if not progress.by_episode:
+        layer_env = in_layers(make_task_envs(recipe, evaluation_envs(recipe), seeds), progress)
+    return CurriculumState(progress, layer_env)
+
+
+def _make_progress(recipe: Recipe, curriculum: Curriculum) -> CurriculumProgress:
+    """What decides in which layer episodes are played.
+
+    Raises:
+        ValueError: processes collect, and would each have to know how the episodes of the others ended.
+    """
+    options, runs = recipe.curriculum, recipe.run.num_runs
+    if options.order == "threshold":
+        return CurriculumProgress(
+            curriculum,
+            runs=runs,
+            window=options.window,
+            success_threshold=options.success_threshold,
+        )
+    if recipe.collection.processes > 0:
+        raise ValueError(
+            f"order={options.order} draws layers where the environments are: it needs processes=0, "
+            f"got processes={recipe.collection.processes}"
+        )
+    kind = TeacherStudent if options.order == "teacher_student" else EpisodeLayers
+    return kind(
+        curriculum, runs=runs, generators=make_generators([seed + _SEED for seed in recipe.seeds], CPU)
     )
-    layer_env = make_task_envs(recipe, evaluation_envs(recipe), seeds)
-    return CurriculumState(progress, in_layers(layer_env, progress))
 
 
 def make_played_env(
@@ -119,7 +144,13 @@ def is_guided(recipe: Recipe, curriculum: Curriculum) -> bool:
     return recipe.curriculum.guided_share > 0 and len(curriculum) > 1
 
 
-def in_layers(env: EnvBase, progress: CurriculumProgress, *, begins: bool = False) -> TransformedEnv:
+def in_layers(
+    env: EnvBase,
+    progress: CurriculumProgress,
+    *,
+    begins: bool = False,
+    behavior: BehaviorGoals | None = None,
+) -> TransformedEnv:
     """An environment as the layers of its runs see it, with the networks' input.
 
     Args:
@@ -128,10 +159,12 @@ def in_layers(env: EnvBase, progress: CurriculumProgress, *, begins: bool = Fals
 
     Keyword Args:
         begins: whether steps say if they are the first of an episode, as ``is_init``.
+        behavior: proposes goals, if there is one.
     """
     curriculum = progress.curriculum
     shown = StateToObs(curriculum, progress, goes_on=goal_env(env).goes_on)
-    transforms: list[Transform] = [shown, ZeroPad(curriculum, progress)]
+    proposes = [] if behavior is None else [behavior]
+    transforms: list[Transform] = [shown, *proposes, ZeroPad(curriculum, progress)]
     if "state" not in env.observation_spec:
         transforms.insert(0, CatTensors(_STATE, "state", del_keys=False, sort=False))
     if begins:

@@ -79,12 +79,14 @@ def goal_space(recipe: Recipe, env: EnvBase) -> GoalSpace | KernelSpace | None:
         ValueError: the algorithm prefers instructive goals, but the goals of the task lie around its
             start states, or a grid is asked for and they have too many coordinates for one.
     """
-    task, instructive = goal_env(env), get_algorithm(recipe.hindsight.algo).instructive
+    task, algorithm = goal_env(env), recipe.hindsight.algo
+    proposed = recipe.behavior.name == "ibs"
+    instructive = proposed or get_algorithm(algorithm).instructive
     if instructive and task.starts_near_goals:
         raise ValueError(
-            f"{recipe.hindsight.algo} must not be used on {recipe.task.name}: its goals lie around its start "
-            "states, so the goals that it would prefer are achieved without doing anything; choose a "
-            "throwing task"
+            f"{'behavior=ibs' if proposed else algorithm} must not be used on {recipe.task.name}: its goals "
+            "lie around its start states, so the goals that it would prefer are achieved without doing "
+            "anything; choose a throwing task"
         )
     box = task.goal_box()
     if instructive and _without_grid(recipe, task):
@@ -173,29 +175,45 @@ def make_goal_weights(recipe: Recipe, env: Any, space: GoalSpace | KernelSpace |
         return load_name(algorithm.weights)(recipe, env)
     if space is None:
         return None
+    if algorithm.instructive is None:
+        return GoalHistogram(space.grid) if isinstance(space, GoalSpace) else None
+    return make_instructive(recipe, space, subtract=algorithm.instructive == "simultaneous")
+
+
+def make_instructive(
+    recipe: Recipe, space: GoalSpace | KernelSpace, *, subtract: bool = True
+) -> InstructiveWeights:
+    """The weights of IBS over the goals of a task.
+
+    Args:
+        recipe: of the run.
+        space: of the goals.
+
+    Keyword Args:
+        subtract: whether they are q* - q, or q* alone.
+    """
     options: dict[str, Any] = {
         "sigma": space.sigma,
         "start_factor": recipe.ibs.start_factor,
         "decay": recipe.ibs.decay,
         "floor": recipe.ibs.floor,
-        "subtract": algorithm.instructive == "simultaneous",
+        "subtract": subtract,
     }
     if isinstance(space, KernelSpace):
         return KernelInstructiveness(space.goals, **options)
-    if algorithm.instructive is None:
-        return GoalHistogram(space.grid)
     return Instructiveness(space.grid, space.target_at, **options)
 
 
 def histograms(buffer: TensorDictReplayBuffer) -> list[GoalHistogram]:
     """The histograms of virtual goals of the runs; empty if they are not counted."""
-    return [own for own in _goal_weights(buffer) if isinstance(own, GoalHistogram)]
+    return [own for own in goal_weights(buffer) if isinstance(own, GoalHistogram)]
 
 
-def scheduled(buffer: TensorDictReplayBuffer) -> list[InstructiveWeights]:
-    """The weights of goals of the runs that change from epoch to epoch."""
-    return [own for own in _goal_weights(buffer) if isinstance(own, InstructiveWeights)]
+def scheduled(weights: Sequence[GoalWeights]) -> list[InstructiveWeights]:
+    """Those of some weights that change from epoch to epoch."""
+    return [own for own in weights if isinstance(own, InstructiveWeights)]
 
 
-def _goal_weights(buffer: TensorDictReplayBuffer) -> list[GoalWeights]:
+def goal_weights(buffer: TensorDictReplayBuffer) -> list[GoalWeights]:
+    """The weights of the virtual goals of the runs; empty if there are none."""
     return buffer.writer.goal_weights if isinstance(buffer.writer, HERWriter) else []

@@ -193,6 +193,12 @@ class CurriculumConfig(Group):
         shown_as="curriculum",
     )
     layers: Any = option(None, "the layers themselves, as a list of their options")
+    order: str = option(
+        "threshold",
+        "threshold: one layer after the other; all_at_once: each episode is played in any of them; "
+        "teacher_student: rather in those whose success changes",
+        choices=("threshold", "all_at_once", "teacher_student"),
+    )
     window: int = option(20, "a layer ends by the mean success of this many greedy episodes", at_least=1)
     success_threshold: float = option(0.9, "mean success at which a layer ends", above=0, at_most=1)
     layer_epsilon: float = option(1.0, "epsilon of exploration when a layer begins", at_least=0, at_most=1)
@@ -224,6 +230,34 @@ def _read_layers(path: Path) -> Any:
     if not path.is_file():
         raise ValueError(f"curriculum must be 'task' or a YAML file with a list of layers, got {str(path)!r}")
     return read_yaml(path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BehaviorConfig(Group):
+    """Which goals the episodes of training ask for (behavior goals)."""
+
+    name: str = option(
+        "real",
+        "real: those of the task. In some episodes goals that were achieved before: uniform_achieved, any of "
+        "them; ibs, instructive ones; mega, rare ones; discover, achievable ones towards the task's goal",
+        choices=("real", "uniform_achieved", "ibs", "mega", "discover"),
+        shown_as="behavior",
+    )
+    real_share: float = option(
+        0.5, "share of the episodes that ask for the task's own goals nevertheless", at_least=0, at_most=1
+    )
+    candidates: int = option(100, "achieved goals of which one is proposed", at_least=1)
+    memory: int = option(50_000, "newest achieved goals that are remembered", at_least=1)
+    cutoff: float = option(-3.0, "mega proposes no goal of a lower value, at first")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not math.isfinite(self.cutoff):
+            raise ValueError(f"behavior.cutoff must be finite, got {self.cutoff}")
+
+    def prefers_rare(self, learner: Any) -> bool:
+        """Whether rare goals are proposed. Several critics show by their disagreement what is new instead."""
+        return self.name == "mega" or (self.name == "discover" and getattr(learner, "critics", 1) == 1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.groups import (
+    BehaviorConfig,
     CollectionConfig,
     CurriculumConfig,
     EvaluationConfig,
@@ -52,6 +53,7 @@ class Recipe:
     ibs: IBSConfig = field(default_factory=IBSConfig)
     novelty: NoveltyConfig = field(default_factory=NoveltyConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    behavior: BehaviorConfig = field(default_factory=BehaviorConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     run: RunConfig = field(default_factory=RunConfig)
 

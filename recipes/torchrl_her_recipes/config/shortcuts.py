@@ -7,6 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 from torchrl_her_recipes.config.groups import (
+    BehaviorConfig,
     CollectionConfig,
     CurriculumConfig,
     EvaluationConfig,
@@ -32,6 +33,7 @@ GROUPS: dict[str, type[Group]] = {
     "ibs": IBSConfig,
     "novelty": NoveltyConfig,
     "curriculum": CurriculumConfig,
+    "behavior": BehaviorConfig,
     "evaluation": EvaluationConfig,
     "run": RunConfig,
 }

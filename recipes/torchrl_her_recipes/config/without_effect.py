@@ -61,6 +61,18 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         all_of("curriculum", with_algo)
     elif not groups.learner.has_epsilon:
         idle["curriculum", "layer_epsilon"] = f"with learner={groups.learner.name}"
+    elif groups.curriculum.order != "threshold":
+        for name in ("window", "success_threshold", "layer_epsilon"):
+            idle["curriculum", name] = f"with order={groups.curriculum.order}"
+    behavior = groups.behavior.name
+    if behavior == "real":
+        all_of("behavior", "with behavior=real", but=("name",))
+    elif behavior != "mega":
+        idle["behavior", "cutoff"] = f"with behavior={behavior}"
+    read = {"ibs": "ibs"}.get(behavior, "novelty" if groups.behavior.prefers_rare(groups.learner) else "")
+    for group, name in list(idle):
+        if group == read and not (name == "cells" and groups.ibs.estimator == "kernel"):
+            del idle[group, name]
     if groups.collection.processes == 0:
         idle["collection", "sync"] = "with processes=0"
     if groups.replay.sampler != "prioritized":

@@ -40,7 +40,7 @@ def layer_success(
     runs, last = components.recipe.run.num_runs, len(state.curriculum) - 1
     full = success(rollout).float().view(runs, -1)
     below = state.progress.layer < last
-    if not bool(below.any()):
+    if state.layer_env is None or not bool(below.any()):
         return full
     own = success(play_greedily(components, state.layer_env, epoch)).float().view(runs, -1)
     return torch.where(below.unsqueeze(1), own, full)
@@ -65,6 +65,8 @@ def move_on(components: Components, state: CurriculumState, samples: Tensor, fra
             epsilon=components.recipe.curriculum.layer_epsilon,
             run=run,
         )
+        if components.behavior is not None:
+            components.behavior.set_active(state.at_the_top(run), run=run)
         if components.norm is not None:
             restart_inputs(components.norm, old, new, run=run)
     return lines

@@ -48,6 +48,8 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     means = {name: value.view(recipe.run.num_runs, -1).mean(1) for name, value in measured.items()}
     if components.curriculum is None:
         means |= measure_values(components.actor, goal_env(components.eval_env), recipe.run.num_runs)
+    if components.behavior is not None:
+        means["proposed_success"] = components.behavior.success()
     return means | {"epsilon": components.exploration.epsilon}
 
 

@@ -224,7 +224,8 @@ def _epoch(
         times = {"updates": trainer.updates, "seconds": seconds}
         values = {name: float(value[run]) for name, value in measured.items()}
         if components.curriculum is not None:
-            values["layer"] = components.curriculum.progress.layers[run]
+            progress = components.curriculum.progress
+            values["mean_layer" if progress.by_episode else "layer"] = progress.mean_layer(run)
         rows.append({**counters, **times, **values, **written(components, run)})
     if components.curriculum is not None and samples is not None:
         for line in move_on(components, components.curriculum, samples, trainer.frames):

@@ -82,8 +82,9 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
         torch.cuda.set_rng_state(own, gpu)
     if components.curriculum is not None:
         components.curriculum.progress.load_state_dict(state["progress"])
-        for run in range(components.recipe.run.num_runs):
-            set_layer_goals(components.buffer.writer, components.curriculum.progress.layer_of(run), run=run)
+        progress = components.curriculum.progress
+        for run in range(0 if progress.by_episode else components.recipe.run.num_runs):
+            set_layer_goals(components.buffer.writer, progress.layer_of(run), run=run)
     load_collector_state_dict(components.collector, state["collector"])
     trainer.load_state_dict(state["trainer"])
     if (worlds := _worlds(components)) is not None:

@@ -1,0 +1,102 @@
+"""The behavior goals that a recipe asks for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchrl.envs import EnvBase
+
+from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor, GoalValues
+from torchrl_her.curriculum.transforms import ZeroPad
+from torchrl_her.goals.rewards import EnvReward, GoalReward
+from torchrl_her.goals.weights import GoalWeights
+from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
+from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top
+from torchrl_her_recipes.components.devices import CPU, make_generators
+from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_instructive
+from torchrl_her_recipes.components.learner import Agent
+from torchrl_her_recipes.components.novelty import rare_goals
+from torchrl_her_recipes.config.recipe import Recipe
+
+_SEED = 1 << 33  # so that proposals do not repeat the numbers of exploration
+_GREEDY = ("mega", "discover")
+
+
+def make_behavior(
+    recipe: Recipe,
+    env: EnvBase,
+    *,
+    rewards: tuple[float, float] = (-1.0, 0.0),
+    space: GoalSpace | KernelSpace | None = None,
+    state: CurriculumState | None = None,
+) -> BehaviorGoals | None:
+    """The transform that proposes goals, still without the factors that need networks; None without any.
+
+    Args:
+        recipe: of the runs.
+        env: of their task.
+
+    Keyword Args:
+        rewards: of a missed and of an achieved goal.
+        space: of the goals.
+        state: the curriculum, if there is one: goals are proposed in its last layer.
+
+    Raises:
+        ValueError: processes collect, each of which would remember its own goals alone.
+    """
+    options, task = recipe.behavior, goal_env(env)
+    if options.name == "real":
+        return None
+    if recipe.collection.processes > 0:
+        raise ValueError(
+            f"behavior={options.name} proposes goals that this process has collected: it needs processes=0, "
+            f"got processes={recipe.collection.processes}"
+        )
+    own = [_weights_of(recipe, task, space) for _ in recipe.seeds]
+    top: dict[str, Any] = {}
+    if state is not None and state.progress.by_episode:
+        top = {"layer_key": "layer", "layer": len(state.curriculum) - 1}
+    behavior = BehaviorGoals(
+        EnvReward(task.compute_reward, task.compute_terminated)
+        if state is None
+        else GoalReward(state.curriculum.layers[-1].threshold),
+        weights=[weights for weights in own if weights is not None] or None,
+        told="proposed" if options.name == "ibs" else "achieved",
+        greedy=options.name in _GREEDY,
+        real_share=options.real_share,
+        candidates=options.candidates,
+        memory=options.memory,
+        runs=recipe.run.num_runs,
+        generators=make_generators([seed + _SEED for seed in recipe.seeds], CPU),
+        achieved_reward=rewards[1],
+        goes_on=task.goes_on,
+        **top,
+    )
+    if state is not None:
+        for run in range(recipe.run.num_runs):
+            behavior.set_active(state.at_the_top(run), run=run)
+    return behavior
+
+
+def make_factors(recipe: Recipe, agent: Agent, state: CurriculumState | None) -> list[GoalFactor]:
+    """The factors of proposed goals that ask the agent's networks."""
+    name, runs = recipe.behavior.name, recipe.run.num_runs
+    if name not in _GREEDY:
+        return []
+    values = GoalValues(
+        agent.loss,
+        agent.actor,
+        runs=runs,
+        before_actor=None if state is None else ZeroPad(state.curriculum, at_the_top(state.curriculum, runs)),
+        before_critic=agent.norm,
+    )
+    if name == "mega":
+        return [Achievable(values, runs=runs, cutoff=recipe.behavior.cutoff)]
+    return [Directed(values, runs=runs)]
+
+
+def _weights_of(recipe: Recipe, env: GoalEnv, space: GoalSpace | KernelSpace | None) -> GoalWeights | None:
+    """The weights of one run's proposals; None for all alike."""
+    if recipe.behavior.name == "ibs" and space is not None:
+        return make_instructive(recipe, space)
+    return rare_goals(recipe, env) if recipe.behavior.prefers_rare(recipe.learner) else None

@@ -1,0 +1,204 @@
+"""Runs whose episodes ask for goals that were achieved before, and runs whose episodes have layers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+
+from torchrl_her import load_checkpoint
+from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor
+from torchrl_her.curriculum import EpisodeLayers, TeacherStudent
+from torchrl_her.replay_buffers import rows_of_run
+from torchrl_her_recipes import Components, Recipe, build, make_recipe, resume, run
+from torchrl_her_recipes.runs.curriculum import move_on
+
+from ..small import assert_same, small, stop_after
+
+PLAIN: dict[str, Any] = {"task": "hand_v0", "algo": "her", "behavior.memory": 5_000}
+LAYERS: dict[str, Any] = {"task": "hand_v1", "algo": "cher_ibs", "normalize": True, "guided_share": 0.5}
+WAYS: dict[str, dict[str, Any]] = {
+    "uniform_achieved": {**PLAIN, "behavior": "uniform_achieved"},
+    "ibs": {**PLAIN, "behavior": "ibs"},
+    "mega": {**PLAIN, "behavior": "mega", "normalize": True},
+    "discover": {**PLAIN, "behavior": "discover", "learner": "td3"},
+    "all at once": {**LAYERS, "order": "all_at_once"},
+    "teacher": {**LAYERS, "order": "teacher_student", "behavior": "mega", "behavior.memory": 5_000},
+}
+
+
+def recipe(way: str, **options: Any) -> Recipe:
+    return small(**{**WAYS[way], "epoch_frames": 960, **options})
+
+
+def trained(own: Recipe) -> Components:
+    components = build(own)
+    run(components, progress=False)
+    return components
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(way: str, tmp_path: Path) -> None:
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    run(build(recipe(way)), whole, progress=False)
+    components = build(recipe(way))
+    stop_after(components, 18)  # in the second epoch
+    assert run(components, stopped, progress=False).interrupted
+    assert not resume(stopped, progress=False).interrupted
+    assert_same(load_checkpoint(whole / "checkpoint.pt"), load_checkpoint(stopped / "checkpoint.pt"))
+    tables = [pd.read_csv(folder / "metrics.csv").drop(columns="seconds") for folder in (whole, stopped)]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+
+
+@pytest.mark.parametrize("way", ["ibs", "mega", "teacher"])
+def test_runs_side_by_side_are_those_that_they_would_be_alone(way: str) -> None:
+    options: dict[str, Any] = {"dtype": "float64", "epochs": 1, "frames_per_update": 40.0}
+    both, alone = (trained(recipe(way, **options, **own)) for own in ({"num_runs": 2}, {"seed": 1}))
+    rows, single = rows_of_run(both.buffer, 1), rows_of_run(alone.buffer)
+    assert len(rows) == len(single)
+    for key in ("desired_goal", "action", ("next", "reward")):
+        torch.testing.assert_close(rows[key], single[key], rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("way", ["uniform_achieved", "ibs", "mega", "discover"])
+def test_goals_are_proposed_and_counted(way: str) -> None:
+    components = trained(recipe(way, num_runs=2))
+    behavior = components.behavior
+    assert behavior is not None
+    assert min(behavior.memory.sizes) > 0
+    table = run(build(recipe(way)), progress=False).rows
+    assert 0.0 <= table[-1]["proposed_success"] <= 1.0
+    stored = rows_of_run(components.buffer, 0)
+    assert not {"proposed", "real_goal", "achieved_goal"} & set(stored.keys())
+
+
+@pytest.mark.parametrize(
+    ("way", "factors"),
+    [("uniform_achieved", []), ("ibs", []), ("mega", [Achievable]), ("discover", [Directed])],
+)
+def test_each_way_has_its_factors(way: str, factors: list[type[GoalFactor]]) -> None:
+    behavior = build(recipe(way)).behavior
+    assert behavior is not None
+    assert [type(own) for own in behavior.factors] == factors
+    assert behavior.greedy == bool(factors)
+    assert [type(own).__name__ for own in behavior.weights] == {
+        "uniform_achieved": [],
+        "ibs": ["Instructiveness"],
+        "mega": ["RareGoals"],
+        "discover": [],  # TD3 has two critics
+    }[way]
+
+
+def test_a_single_critic_leaves_it_to_rare_goals_what_is_new() -> None:
+    behavior = build(recipe("discover", learner="ddpg")).behavior
+    assert behavior is not None
+    assert [type(own).__name__ for own in behavior.weights] == ["RareGoals"]
+
+
+def test_evaluation_asks_for_the_tasks_goals() -> None:
+    components = build(recipe("mega"))
+    assert not isinstance(getattr(components.eval_env, "transform", None), BehaviorGoals)
+    layered = build(recipe("teacher"))
+    assert not any(isinstance(own, BehaviorGoals) for own in layered.eval_env.transform)
+    assert any(isinstance(own, BehaviorGoals) for own in layered.env.transform)
+
+
+def test_in_a_curriculum_goals_are_proposed_in_the_last_layer() -> None:
+    components = build(small(task="hand_v1", algo="cher", behavior="uniform_achieved", num_runs=2))
+    assert components.behavior is not None
+    assert components.curriculum is not None
+    samples = torch.zeros(2, components.recipe.curriculum.window)
+    samples[1] = 1.0
+    move_on(components, components.curriculum, samples, 0)
+    components.collector.next()
+    assert components.behavior.memory.sizes[0] == 0
+    assert components.behavior.memory.sizes[1] > 0
+
+
+def test_ibs_proposals_shrink_their_sigma_with_the_epochs() -> None:
+    components = build(recipe("ibs"))
+    assert components.behavior is not None
+    (weights,) = components.behavior.weights
+    before = weights.sigma  # type: ignore[attr-defined]
+    components.trainer().epoch()
+    assert weights.sigma < before  # type: ignore[attr-defined]
+
+
+# Episodes with layers of their own
+
+
+def test_one_buffer_holds_rows_of_all_layers() -> None:
+    components = trained(recipe("all at once"))
+    assert components.curriculum is not None
+    assert isinstance(components.curriculum.progress, EpisodeLayers)
+    rows = rows_of_run(components.buffer, 0)
+    counts = rows["layer"].flatten().bincount(minlength=2)
+    assert counts.min() > 0
+    first = rows["layer"].squeeze(-1) == 0
+    # The first layer sees the hand alone: its goal is not observed, nor is the ball's speed.
+    assert (rows["observation"][first][:, 5:] == 0).all()
+    assert (rows["observation"][~first][:, 5:7] != 0).any()
+
+
+def test_a_teacher_knows_both_layers() -> None:
+    components = trained(recipe("teacher"))
+    assert components.curriculum is not None
+    teacher = components.curriculum.progress
+    assert isinstance(teacher, TeacherStudent)
+    assert (teacher.long >= 0).all()
+    rows = run(build(recipe("teacher")), progress=False).rows
+    assert 0.0 < rows[-1]["mean_layer"] < 1.0
+    assert "layer" not in rows[-1]
+
+
+def test_the_policy_itself_begins_episodes() -> None:
+    components = build(recipe("all at once", guided_share=1.0))
+    assert components.guide is not None
+    assert components.guide.guide is components.actor
+    batch = components.collector.next()
+    assert components.guide.guided is not None
+    top = batch["next", "layer"][:, -1] == 1
+    assert ((components.guide.guided == 0) <= top).all()
+
+
+# What cannot be
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"behavior.cutoff": -5.0}, "cutoff=-5.0 has no effect with behavior=real"),
+        ({"behavior": "ibs", "behavior.cutoff": -5.0}, "cutoff=-5.0 has no effect with behavior=ibs"),
+        ({"behavior": "goid"}, "behavior must be one of real, uniform_achieved, ibs, mega, discover"),
+        ({"behavior": "mega", "behavior.real_share": 2.0}, "real_share must be at least 0 and at most 1"),
+        ({"behavior": "mega", "behavior.cutoff": float("nan")}, "behavior.cutoff must be finite, got nan"),
+        ({"order": "all_at_once"}, "order=all_at_once has no effect with algo=her"),
+        (
+            {"algo": "cher", "order": "all_at_once", "window": 5},
+            "window=5 has no effect with order=all_at_once",
+        ),
+        ({"algo": "her", "sigma": 0.3}, "sigma=0.3 has no effect"),
+    ],
+)
+def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_recipe({"algo": "her"}, **options)
+
+
+def test_options_of_ibs_have_an_effect_on_proposals() -> None:
+    own = make_recipe(algo="her", behavior="ibs", **{"ibs.sigma": 0.3, "ibs.floor": 0.01})
+    assert (own.ibs.sigma, own.ibs.floor) == (0.3, 0.01)
+
+
+@pytest.mark.parametrize("options", [{"behavior": "mega"}, {"algo": "cher", "order": "all_at_once"}])
+def test_processes_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="it needs processes=0, got processes=2"):
+        build(small(**{"algo": "her", "task": "hand_v1", **options, "processes": 2}))
+
+
+def test_instructive_goals_around_the_start_are_refused() -> None:
+    with pytest.raises(ValueError, match="behavior=ibs must not be used on hand_reach"):
+        build(small(task="hand_reach", algo="her", behavior="ibs"))
