@@ -13,7 +13,7 @@ import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 PACKAGES = ("torchrl_her", "torchrl_her_envs", "torchrl_her_recipes")
-LIBRARY = ("goals", "replay_buffers", "modules", "objectives", "curriculum", "trainers", "native")
+LIBRARY = ("goals", "replay_buffers", "modules", "objectives", "curriculum", "behavior", "trainers", "native")
 PAGES = sorted(path.name for path in DOCS.glob("*.md"))
 
 
