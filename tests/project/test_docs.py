@@ -38,6 +38,7 @@ def conf() -> ModuleType:
         ("devices.md", 1),
         ("index.md", 1),
         ("normalization.md", 2),
+        ("novelty.md", 4),
         ("replay_buffers.md", 4),
         ("weights.md", 3),
     ],
