@@ -23,6 +23,12 @@ class GoalHistogram(GoalWeights):
     Args:
         grid: cells to count in.
 
+    Keyword Args:
+        recent: how many of the newest goals count; None for all of them.
+
+    Raises:
+        ValueError: ``recent`` is below 1.
+
     Attributes:
         counts: [cells] of int64, on the device of the goals that were counted last.
 
@@ -35,9 +41,12 @@ class GoalHistogram(GoalWeights):
 
     alike = True
 
-    def __init__(self, grid: GoalGrid) -> None:
-        self.grid = grid
+    def __init__(self, grid: GoalGrid, *, recent: int | None = None) -> None:
+        if recent is not None and recent < 1:
+            raise ValueError(f"recent must be at least 1, or None, got {recent}")
+        self.grid, self.recent = grid, recent
         self.counts = torch.zeros(grid.num_cells, dtype=torch.int64)
+        self._newest = torch.zeros(0, dtype=torch.int32)  # cells of the goals that count, if not all do
 
     @property
     def q(self) -> Tensor:
@@ -50,23 +59,35 @@ class GoalHistogram(GoalWeights):
         return float(kl_divergence(q, q_star.to(q))) if q.any() else math.nan
 
     def update(self, goals: Tensor) -> None:
-        cells = self.grid.cell(goals).flatten()
-        self.counts = self.counts.to(cells.device) + cells.bincount(minlength=self.grid.num_cells)
+        self.count(self.grid.cell(goals).flatten())
+
+    def count(self, cells: Tensor) -> None:
+        """Counts goals by their cells [n], int64."""
+        self._add(cells.bincount(minlength=self.grid.num_cells), cells)
+
+    def _add(self, counts: Tensor, cells: Tensor) -> None:
+        self.counts = self.counts.to(counts.device) + counts
+        if self.recent is not None:
+            newest = torch.cat((self._newest.to(cells.device), cells.int()))
+            old = newest[: max(0, len(newest) - self.recent)]
+            self.counts -= old.bincount(minlength=self.grid.num_cells)
+            self._newest = newest[len(old) :].clone()
 
     def clear(self) -> None:
-        self.counts = torch.zeros_like(self.counts)
+        self.counts, self._newest = torch.zeros_like(self.counts), self._newest[:0]
 
     @classmethod
     def of_runs(cls, own: Sequence[GoalWeights]) -> WeightsOfRuns:
         return HistogramsOfRuns(own) if HistogramsOfRuns.fits(own) else WeightsOfRuns(own)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"counts": self.counts.clone()}
+        return {"counts": self.counts.clone(), "newest": self._newest.clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         if state["counts"].shape != self.counts.shape:
             raise ValueError(f"the grid has {self.grid.num_cells} cells, the state {len(state['counts'])}")
         self.counts = state["counts"].to(self.counts.device, copy=True)
+        self._newest = state.get("newest", self._newest).to(self.counts.device, copy=True)
 
 
 class Instructiveness(InstructiveWeights, GoalHistogram):
@@ -86,6 +107,7 @@ class Instructiveness(InstructiveWeights, GoalHistogram):
         floor: the least weight of a goal. At 0, a goal is no longer drawn once q reaches q* in its cell.
         floor_is_relative: whether ``floor`` is multiplied by the largest q*; the thesis's floor is absolute.
         subtract: False for the weights q* alone, without q and floor (the sequential architecture).
+        recent: how many of the newest virtual goals q counts; None for all since the buffer was emptied.
 
     Attributes:
         sigma, q_star: their present values.
@@ -117,8 +139,9 @@ class Instructiveness(InstructiveWeights, GoalHistogram):
         floor: float = 0.002,
         floor_is_relative: bool = True,
         subtract: bool = True,
+        recent: int | None = None,
     ) -> None:
-        GoalHistogram.__init__(self, grid)
+        GoalHistogram.__init__(self, grid, recent=recent)
         self.target, self.floor_is_relative = target, floor_is_relative
         InstructiveWeights.__init__(
             self, sigma=sigma, start_factor=start_factor, decay=decay, floor=floor, subtract=subtract
@@ -189,10 +212,11 @@ class HistogramsOfRuns(WeightsOfRuns):
         return _look_up(torch.cat(tables), self._cells(goals, counts), goals)
 
     def update(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> None:
-        size = self.own[0].grid.num_cells
-        added = self._cells(goals, counts).bincount(minlength=len(runs) * size).view(len(runs), size)
-        for run, own in zip(runs, added, strict=True):
-            self.own[run].counts = self.own[run].counts.to(own.device) + own
+        size, cells = self.own[0].grid.num_cells, self._cells(goals, counts)
+        added = cells.bincount(minlength=len(runs) * size).view(len(runs), size)
+        parts = zip(runs, added, cells.split(list(counts)), strict=True)
+        for place, (run, own, part) in enumerate(parts):
+            self.own[run]._add(own, part - place * size)
 
     def _cells(self, goals: Tensor, counts: Sequence[int]) -> Tensor:
         """The cell [n, ...] of each goal in the joined tables of some runs."""

@@ -65,7 +65,7 @@ def make_behavior(
         greedy=options.name in _GREEDY,
         real_share=options.real_share,
         candidates=options.candidates,
-        memory=options.memory,
+        memory=options.goal_memory,
         runs=recipe.run.num_runs,
         generators=make_generators([seed + _SEED for seed in recipe.seeds], CPU),
         achieved_reward=rewards[1],

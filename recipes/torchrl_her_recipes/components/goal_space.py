@@ -176,7 +176,7 @@ def make_goal_weights(recipe: Recipe, env: Any, space: GoalSpace | KernelSpace |
     if space is None:
         return None
     if algorithm.instructive is None:
-        return GoalHistogram(space.grid) if isinstance(space, GoalSpace) else None
+        return GoalHistogram(space.grid, recent=recipe.ibs.recent) if isinstance(space, GoalSpace) else None
     return make_instructive(recipe, space, subtract=algorithm.instructive == "simultaneous")
 
 
@@ -201,7 +201,7 @@ def make_instructive(
     }
     if isinstance(space, KernelSpace):
         return KernelInstructiveness(space.goals, **options)
-    return Instructiveness(space.grid, space.target_at, **options)
+    return Instructiveness(space.grid, space.target_at, recent=recipe.ibs.recent, **options)
 
 
 def histograms(buffer: TensorDictReplayBuffer) -> list[GoalHistogram]:

@@ -168,6 +168,11 @@ class IBSConfig(Group):
         choices=("auto", "grid", "kernel"),
     )
     cells: int = option(20, "cells along each dimension of the grid that goals are counted in", at_least=1)
+    recent: int | None = option(
+        None,
+        "how many of the newest virtual goals q counts; all since the buffer was emptied, if not given",
+        at_least=1,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,7 +252,7 @@ class BehaviorConfig(Group):
         0.5, "share of the episodes that ask for the task's own goals nevertheless", at_least=0, at_most=1
     )
     candidates: int = option(100, "achieved goals of which one is proposed", at_least=1)
-    memory: int = option(50_000, "newest achieved goals that are remembered", at_least=1)
+    goal_memory: int = option(50_000, "newest achieved goals that are remembered", at_least=1)
     cutoff: float = option(-3.0, "mega proposes no goal of a lower value, at first")
 
     def __post_init__(self) -> None:

@@ -50,9 +50,9 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
     else:
         all_of("novelty", with_algo)
         if algorithm.instructive is None:
-            all_of("ibs", with_algo, but=("cells",))  # the goals of HER are counted in cells, too
+            all_of("ibs", with_algo, but=("cells", "recent"))  # the goals of HER are counted, too
         elif groups.ibs.estimator == "kernel":
-            idle["ibs", "cells"] = "with estimator=kernel"
+            idle["ibs", "cells"] = idle["ibs", "recent"] = "with estimator=kernel"
         if algorithm.instructive == "sequential":
             idle["ibs", "floor"] = with_algo
     if algorithm.hindsight and groups.hindsight.goal_sources is not None:
@@ -71,7 +71,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         idle["behavior", "cutoff"] = f"with behavior={behavior}"
     read = {"ibs": "ibs"}.get(behavior, "novelty" if groups.behavior.prefers_rare(groups.learner) else "")
     for group, name in list(idle):
-        if group == read and not (name == "cells" and groups.ibs.estimator == "kernel"):
+        if group == read and not (name in ("cells", "recent") and groups.ibs.estimator == "kernel"):
             del idle[group, name]
     if groups.collection.processes == 0:
         idle["collection", "sync"] = "with processes=0"

@@ -102,7 +102,7 @@ def test_goals_of_other_episodes_are_written(algo: str) -> None:
     writer = components.buffer.writer
     assert writer.options.sources == sources
     assert run(components, progress=False).rows[-1]["rows_virtual"] > 0
-    assert all(goals is not None for own in writer.state_dict()["recent"].values() for goals in own)
+    assert all(goals is not None for own in writer.state_dict()["recent"][0].values() for goals in own)
 
 
 @pytest.mark.parametrize("strategy", ["future", "final", "episode"])

@@ -18,7 +18,7 @@ from torchrl_her_recipes.runs.curriculum import move_on
 
 from ..small import assert_same, small, stop_after
 
-PLAIN: dict[str, Any] = {"task": "hand_v0", "algo": "her", "behavior.memory": 5_000}
+PLAIN: dict[str, Any] = {"task": "hand_v0", "algo": "her", "behavior.goal_memory": 5_000}
 LAYERS: dict[str, Any] = {"task": "hand_v1", "algo": "cher_ibs", "normalize": True, "guided_share": 0.5}
 WAYS: dict[str, dict[str, Any]] = {
     "uniform_achieved": {**PLAIN, "behavior": "uniform_achieved"},
@@ -26,7 +26,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "mega": {**PLAIN, "behavior": "mega", "normalize": True},
     "discover": {**PLAIN, "behavior": "discover", "learner": "td3"},
     "all at once": {**LAYERS, "order": "all_at_once"},
-    "teacher": {**LAYERS, "order": "teacher_student", "behavior": "mega", "behavior.memory": 5_000},
+    "teacher": {**LAYERS, "order": "teacher_student", "behavior": "mega", "behavior.goal_memory": 5_000},
 }
 
 

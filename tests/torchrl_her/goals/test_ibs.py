@@ -407,3 +407,32 @@ def test_runs_over_different_grids_are_asked_one_by_one() -> None:
     assert type(together) is WeightsOfRuns
     together.update(torch.tensor([[0.1], [0.9], [0.9]]), [0, 1], [1, 2])
     assert [weights.counts.tolist() for weights in own] == [[1, 0], [0, 0, 0, 2]]
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_only_the_newest_goals_count(together: bool) -> None:
+    grid = GoalGrid(0.0, 3.0, [3])
+    first, second = GoalHistogram(grid, recent=4), GoalHistogram(grid, recent=4)
+    for goals in ([0.5, 0.5, 1.5], [2.5, 2.5, 2.5], [1.5] * 9):
+        both = torch.tensor(goals).unsqueeze(-1)
+        if together:
+            first.of_runs([first, second]).update(torch.cat((both, both[:1])), [0, 1], [len(goals), 1])
+        else:
+            first.update(both)
+        if goals[0] == 2.5:
+            assert first.counts.tolist() == [0, 1, 3]
+    assert first.counts.tolist() == [0, 4, 0]
+    assert second.counts.tolist() == ([1, 1, 1] if together else [0, 0, 0])
+    other = GoalHistogram(grid, recent=4)
+    other.load_state_dict(first.state_dict())
+    for own in (first, other):
+        own.update(torch.tensor([[0.5], [2.5]]))
+        assert own.counts.tolist() == [1, 2, 1]
+    first.clear()
+    first.update(torch.tensor([[0.5]]))
+    assert first.counts.tolist() == [1, 0, 0]
+
+
+def test_recent_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="recent must be at least 1, or None, got 0"):
+        GoalHistogram(GoalGrid(0.0, 3.0, [3]), recent=0)
