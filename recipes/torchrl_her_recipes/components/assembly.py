@@ -9,7 +9,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_her.behavior import BehaviorGoals
 from torchrl_her_envs.common.goal_env import goal_env, reward_bounds
 from torchrl_her_recipes.components.agents import make_agent
-from torchrl_her_recipes.components.behavior import make_behavior, make_factors
+from torchrl_her_recipes.components.behavior import make_asking, make_behavior, make_factors
 from torchrl_her_recipes.components.buffers import make_buffer
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.components import Components
@@ -89,8 +89,15 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
         rewards=rewards,
         curriculum=state,
         behavior=behavior,
+        virtual_env=_virtual_env(recipe, task, rewards) if recipe.evaluation.virtual_goals else None,
         **vars(agent),
     )
+
+
+def _virtual_env(recipe: Recipe, task: EnvBase, rewards: tuple[float, float]) -> EnvBase:
+    """Environments for episodes that ask for virtual goals."""
+    asking = make_asking(recipe, task, rewards=rewards)
+    return make_played_env(recipe, evaluation_envs(recipe), eval_seeds(recipe, 0), behavior=asking)
 
 
 def _shown(

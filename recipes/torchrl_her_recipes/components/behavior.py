@@ -7,12 +7,14 @@ from typing import Any
 from torchrl.envs import EnvBase
 
 from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor, GoalValues
+from torchrl_her.curriculum.layers import Curriculum
 from torchrl_her.curriculum.transforms import ZeroPad
-from torchrl_her.goals.rewards import EnvReward, GoalReward
+from torchrl_her.goals.rewards import EnvReward, GoalReward, RewardFunction
 from torchrl_her.goals.weights import GoalWeights
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
-from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top
+from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top, make_curriculum
 from torchrl_her_recipes.components.devices import CPU, make_generators
+from torchrl_her_recipes.components.envs import evaluation_envs
 from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_instructive
 from torchrl_her_recipes.components.learner import Agent
 from torchrl_her_recipes.components.novelty import rare_goals
@@ -57,9 +59,7 @@ def make_behavior(
     if state is not None and state.progress.by_episode:
         top = {"layer_key": "layer", "layer": len(state.curriculum) - 1}
     behavior = BehaviorGoals(
-        EnvReward(task.compute_reward, task.compute_terminated)
-        if state is None
-        else GoalReward(state.curriculum.layers[-1].threshold),
+        _reward_of(task, None if state is None else state.curriculum),
         weights=[weights for weights in own if weights is not None] or None,
         told="proposed" if options.name == "ibs" else "achieved",
         greedy=options.name in _GREEDY,
@@ -76,6 +76,36 @@ def make_behavior(
         for run in range(recipe.run.num_runs):
             behavior.set_active(state.at_the_top(run), run=run)
     return behavior
+
+
+def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = (-1.0, 0.0)) -> BehaviorGoals:
+    """The transform that lets episodes ask for any goals that are put into its memory, for evaluation.
+
+    Args:
+        recipe: of the runs.
+        env: of their task.
+
+    Keyword Args:
+        rewards: of a missed and of an achieved goal.
+    """
+    task = goal_env(env)
+    return BehaviorGoals(
+        _reward_of(task, make_curriculum(recipe, env)),
+        real_share=0.0,
+        candidates=1,
+        memory=evaluation_envs(recipe),
+        runs=recipe.run.num_runs,
+        generators=make_generators([seed + _SEED for seed in recipe.seeds], CPU),
+        achieved_reward=rewards[1],
+        goes_on=task.goes_on,
+    )
+
+
+def _reward_of(env: GoalEnv, curriculum: Curriculum | None) -> RewardFunction:
+    """The reward of the full task."""
+    if curriculum is None:
+        return EnvReward(env.compute_reward, env.compute_terminated)
+    return GoalReward(curriculum.layers[-1].threshold)
 
 
 def make_factors(recipe: Recipe, agent: Agent, state: CurriculumState | None) -> list[GoalFactor]:

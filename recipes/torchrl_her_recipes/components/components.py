@@ -66,6 +66,7 @@ class Components:
             None.
         average: follows the actor, and is what is evaluated, filmed and kept in its place; or None.
         guide: begins episodes as the layer below has learned it, see ``guided_share``; or None.
+        virtual_env: environments for evaluation at virtual goals, or None.
         behavior: proposes the goals of episodes, or None. It is one of the environment's transforms, and its
             state a part of the collector's.
     """
@@ -90,6 +91,7 @@ class Components:
     average: PolicyAverage | None = None
     guide: GuidedExploration | None = None
     behavior: BehaviorGoals | None = None
+    virtual_env: EnvBase | None = None
 
     @property
     def greedy(self) -> TensorDictModuleBase:

@@ -131,12 +131,19 @@ def _make_progress(recipe: Recipe, curriculum: Curriculum) -> CurriculumProgress
 
 
 def make_played_env(
-    recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictures: bool = False
+    recipe: Recipe,
+    num_envs: int,
+    seeds: Sequence[int],
+    *,
+    pictures: bool = False,
+    behavior: BehaviorGoals | None = None,
 ) -> EnvBase:
     """Environments as a trained policy sees them: at the top of the curriculum, if there is one."""
     env = make_task_envs(recipe, num_envs, seeds, pictures=pictures)
     curriculum = make_curriculum(recipe, env)
-    return env if curriculum is None else in_layers(env, at_the_top(curriculum, len(seeds)))
+    if curriculum is not None:
+        return in_layers(env, at_the_top(curriculum, len(seeds)), behavior=behavior)
+    return env if behavior is None else TransformedEnv(env, behavior)
 
 
 def is_guided(recipe: Recipe, curriculum: Curriculum) -> bool:

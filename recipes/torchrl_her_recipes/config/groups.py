@@ -270,6 +270,10 @@ class EvaluationConfig(Group):
     """How runs are evaluated at the end of each epoch."""
 
     episodes: int = option(100, "greedy episodes of each evaluation", at_least=1)
+    virtual_goals: bool = option(
+        False,
+        "whether as many other episodes ask for virtual goals, and log virtual_success and virtual_q_bias",
+    )
 
 
 _SEEDS = 1 << 31  # so that those of evaluations, which are made of it, have room

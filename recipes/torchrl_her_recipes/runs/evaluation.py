@@ -29,6 +29,18 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     :func:`~torchrl_her.objectives.critic_value`), and ``q_bias`` is that minus the return of the policy that
     played: the average of the actor, if there is one. Both are missing if the loss has no such critics.
     """
+    means = measure_rollout(components, rollout)
+    if components.curriculum is None:
+        env, runs = goal_env(components.eval_env), components.recipe.run.num_runs
+        means |= measure_values(components.actor, env, runs)
+    if components.behavior is not None:
+        means["proposed_success"] = components.behavior.success()
+    return means | {"epsilon": components.exploration.epsilon}
+
+
+@torch.no_grad()
+def measure_rollout(components: Components, rollout: TensorDictBase) -> dict[str, Tensor]:
+    """What greedy episodes of each run show of the policy and the critics, [R] each."""
     recipe = components.recipe
     missed, achieved = components.rewards
     returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=missed)
@@ -45,12 +57,7 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     if value is not None:
         value = value.to(returns.device)
         measured |= {"q": value.squeeze(-1), "q_bias": q_bias(value, returns)}
-    means = {name: value.view(recipe.run.num_runs, -1).mean(1) for name, value in measured.items()}
-    if components.curriculum is None:
-        means |= measure_values(components.actor, goal_env(components.eval_env), recipe.run.num_runs)
-    if components.behavior is not None:
-        means["proposed_success"] = components.behavior.success()
-    return means | {"epsilon": components.exploration.epsilon}
+    return {name: value.view(recipe.run.num_runs, -1).mean(1) for name, value in measured.items()}
 
 
 def written(components: Components, run: int) -> dict[str, float]:

@@ -29,6 +29,7 @@ from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.plots import plot_curves, plot_goals
 from torchrl_her_recipes.runs.saturation import saturation_notices
 from torchrl_her_recipes.runs.state import load_run_state, run_state
+from torchrl_her_recipes.runs.virtual_goals import at_virtual_goals
 
 
 @dataclass(frozen=True)
@@ -209,7 +210,7 @@ def _epoch(
     began = time.perf_counter()
     measured = trainer.epoch(on_batch)
     rollout = play_greedily(components, components.eval_env, trainer.epochs)
-    measured |= measure(components, rollout)
+    measured |= measure(components, rollout) | at_virtual_goals(components, trainer.epochs)
     samples = (
         None
         if components.curriculum is None

@@ -7,10 +7,12 @@ from typing import Any
 import pytest
 import torch
 
+from torchrl_her.replay_buffers import rows_of_run
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import Components, build
 from torchrl_her_recipes.runs.curriculum import play_greedily
 from torchrl_her_recipes.runs.evaluation import measure
+from torchrl_her_recipes.runs.virtual_goals import ask_for_virtual_goals, at_virtual_goals
 
 from ..small import small
 
@@ -87,3 +89,36 @@ def test_few_worlds_play_as_many_episodes_as_asked(algo: str) -> None:
     assert torch.equal(other["desired_goal"], played["desired_goal"][25:])  # as if it were alone
     assert torch.equal(other["observation"], played["observation"][25:])
     assert measure(components, played)["success"].shape == (2,)
+
+
+def test_episodes_may_ask_for_virtual_goals() -> None:
+    components = build(small(task="hand_v1", algo="her", num_runs=2, virtual_goals=True))
+    assert components.virtual_env is not None
+    before = at_virtual_goals(components, 0)
+    assert all(value.isnan().all() for value in before.values())
+    assert list(before) == ["virtual_success", "virtual_q", "virtual_q_bias"]
+    components.trainer().epoch()
+    rows = at_virtual_goals(components, 1)
+    assert all(value.isfinite().all() for value in rows.values())
+    again = at_virtual_goals(components, 1)
+    assert all(torch.equal(value, again[name]) for name, value in rows.items())
+    assert ask_for_virtual_goals(components, components.virtual_env, 1)
+    wanted = components.virtual_env.reset()["desired_goal"].view(2, -1, 2)
+    for run, goals in enumerate(wanted):
+        own = rows_of_run(components.buffer, run)
+        known = own["desired_goal"][own["virtual"].squeeze(-1)]
+        assert all((known == goal).all(-1).any() for goal in goals)
+
+
+def test_virtual_goals_of_lower_layers_are_not_those_of_the_task() -> None:
+    components = build(small(task="hand_v1", algo="cher", num_runs=2, virtual_goals=True))
+    assert components.curriculum is not None
+    components.trainer().epoch()
+    components.curriculum.progress.set_layer(1, 1)
+    assert at_virtual_goals(components, 1)["virtual_success"].isnan().tolist() == [True, False]
+
+
+def test_without_it_there_is_no_environment_for_virtual_goals() -> None:
+    components = build(small(task="hand_v1", algo="her"))
+    assert components.virtual_env is None
+    assert at_virtual_goals(components, 0) == {}
