@@ -30,9 +30,9 @@ class Demonstrations:
     """Whole episodes, one after the other, and what is known of them.
 
     Args:
-        rows: [n], all transitions: ``observation``, ``achieved_goal``, ``desired_goal``, ``action``, and under
-            ``next`` the first three with ``reward``, ``terminated``, ``truncated`` and ``done``. The last
-            transition of each episode is done, and no other one. Other entries are left out.
+        rows: [n], all transitions: ``observation``, ``achieved_goal``, ``desired_goal``, ``action``, and
+            under ``next`` the first three with ``reward``, ``terminated``, ``truncated`` and ``done``. The
+            last transition of each episode is done, and no other one. Other entries are left out.
         lengths: [E] int64, transitions of each episode.
 
     Keyword Args:
@@ -119,15 +119,19 @@ class Demonstrations:
         offset = torch.arange(int(lengths.sum())) - (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
         return self.take(begins.repeat_interleave(lengths) + offset, lengths)
 
-    def take(self, rows: Tensor, lengths: Tensor) -> Demonstrations:
+    def take(self, index: Tensor, lengths: Tensor, *, rows: TensorDictBase | None = None) -> Demonstrations:
         """Some of the transitions, which are episodes of these lengths.
 
         Args:
-            rows: [m] int64.
+            index: [m] int64, which transitions.
             lengths: [e] int64, which sum to m.
+
+        Keyword Args:
+            rows: [n], of which they are taken; those that there are if None.
         """
-        states = None if self.states is None else {name: own[rows] for name, own in self.states.items()}
-        return replace(self, rows=self.rows[rows], lengths=lengths, states=states)
+        states = None if self.states is None else {name: own[index] for name, own in self.states.items()}
+        taken = (self.rows if rows is None else rows)[index]
+        return replace(self, rows=taken, lengths=lengths, states=states)
 
     def first(self, count: int) -> Demonstrations:
         """The first episodes.
@@ -167,7 +171,9 @@ class Demonstrations:
         """
         rows = cut_episodes(rollout.select(*_ENTRIES, strict=False)).reshape(-1).clone()
         if ("next", "done") not in rows.keys(True, True):
-            raise ValueError(f"demonstrations need the entry ('next', 'done'), got {list(rollout.keys(True))}")
+            raise ValueError(
+                f"demonstrations need the entry ('next', 'done'), got {list(rollout.keys(True))}"
+            )
         ends = rows["next", "done"].flatten().nonzero().flatten()
         lengths = torch.diff(ends, prepend=ends.new_tensor([-1]))
         flat = None if states is None else {name: own.flatten(0, 1) for name, own in states.items()}
@@ -182,7 +188,9 @@ class Demonstrations:
         """The episodes of several, in order; what is known of them is that of the first."""
         states = None
         if parts[0].states is not None:
-            states = {name: torch.cat([(own.states or {})[name] for own in parts]) for name in parts[0].states}
+            states = {
+                name: torch.cat([(own.states or {})[name] for own in parts]) for name in parts[0].states
+            }
         rows: TensorDictBase = torch.cat([own.rows for own in parts])
         return replace(parts[0], rows=rows, lengths=torch.cat([own.lengths for own in parts]), states=states)
 
