@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
@@ -18,6 +20,12 @@ from torchrl_her_recipes.components.curricula import (
     make_curriculum_state,
     make_played_env,
     played_rewards,
+)
+from torchrl_her_recipes.components.demonstrations import (
+    load_demonstrations,
+    rows_needed,
+    with_outcomes,
+    with_starts,
 )
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
@@ -46,9 +54,11 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
     curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
     state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
-    env = (
-        task if state is None else in_layers(task, state.progress, begins=is_guided(recipe, state.curriculum))
-    )
+    shown = load_demonstrations(recipe, task, state)
+    env = with_starts(task, shown)
+    if state is not None:
+        env = in_layers(env, state.progress, begins=is_guided(recipe, state.curriculum))
+        env = with_outcomes(env, shown)
     devices = devices_of(recipe)
     generators = make_generators(recipe.seeds, devices.replay)
     own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
@@ -65,25 +75,27 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
         if processes
         else make_collector(recipe, env, agent.policy, devices)
     )
+    replay: dict[str, Any] = {
+        "rewards": rewards,
+        "space": space,
+        "state": state,
+        "norm": agent.norm,
+        "devices": devices,
+    }
+    if shown is not None and recipe.demonstrations.in_batches:
+        capacity = rows_needed(recipe, shown)
+        shown.fill(make_buffer(recipe, task, generators, capacity=capacity, **replay), recipe.run.num_runs)
     return Components(
         recipe=recipe,
         env=env,
         eval_env=make_played_env(recipe, evaluation_envs(recipe), eval_seeds(recipe, 0)),
         collector=collector,
-        buffer=make_buffer(
-            recipe,
-            task,
-            generators,
-            rewards=rewards,
-            space=space,
-            state=state,
-            norm=agent.norm,
-            devices=devices,
-        ),
+        buffer=make_buffer(recipe, task, generators, **replay),
         goal_target=None if space is None else space.target,
         generators=generators if own is generators else [*generators, *own],
         rewards=rewards,
         curriculum=state,
+        demonstrations=shown,
         **vars(agent),
     )
 

@@ -29,6 +29,7 @@ from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.curricula import CurriculumState
+from torchrl_her_recipes.components.demonstrations import RunDemonstrations
 from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.goal_space import histograms
 from torchrl_her_recipes.config.recipe import Recipe
@@ -65,6 +66,7 @@ class Components:
             None.
         average: follows the actor, and is what is evaluated, filmed and kept in its place; or None.
         guide: begins episodes as the layer below has learned it, see ``guided_share``; or None.
+        demonstrations: episodes that somebody else played, in batches and as starts; or None.
     """
 
     recipe: Recipe
@@ -86,6 +88,7 @@ class Components:
     norm: RunningNorm | None = None
     average: PolicyAverage | None = None
     guide: GuidedExploration | None = None
+    demonstrations: RunDemonstrations | None = None
 
     @property
     def greedy(self) -> TensorDictModuleBase:
@@ -142,10 +145,10 @@ class Components:
 
     def trainer(self) -> Trainer:
         """The training loop over these components."""
-        recipe, replay = self.recipe, self.recipe.replay
+        recipe, replay, shown = self.recipe, self.recipe.replay, self.demonstrations
         return Trainer(
             collector=self.collector,
-            buffer=self.buffer,
+            buffer=self.buffer if shown is None else shown.mixed_with(self.buffer, recipe),
             learner=self.learner(),
             schedules=[self.exploration, *self._goal_weights()],
             runs=recipe.run.num_runs,

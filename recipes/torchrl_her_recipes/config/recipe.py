@@ -10,6 +10,7 @@ from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.groups import (
     CollectionConfig,
     CurriculumConfig,
+    DemonstrationsConfig,
     EvaluationConfig,
     Group,
     HindsightConfig,
@@ -21,7 +22,7 @@ from torchrl_her_recipes.config.groups import (
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.learners import AUTO, DDPGConfig, LearnerConfig, options_of
 from torchrl_her_recipes.config.options import default_of, what_there_is
-from torchrl_her_recipes.config.shortcuts import GROUPS, Nested, over, place
+from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, Nested, over, place
 from torchrl_her_recipes.config.without_effect import without_effect
 
 # Compiling takes 15 s the first time and saves half a millisecond a step: from this many steps on it pays.
@@ -50,6 +51,7 @@ class Recipe:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     ibs: IBSConfig = field(default_factory=IBSConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    demonstrations: DemonstrationsConfig = field(default_factory=DemonstrationsConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     run: RunConfig = field(default_factory=RunConfig)
 
@@ -64,7 +66,8 @@ class Recipe:
         for (group, name), why in without_effect(self).items():
             value = getattr(getattr(self, group), name)
             if value != _default(getattr(self, group), name):
-                raise ValueError(f"{name}={value} has no effect {why}: leave it out")
+                shown = f"{group}.{name}" if group in LONG_ONLY else name
+                raise ValueError(f"{shown}={value} has no effect {why}: leave it out")
 
     @property
     def total_frames(self) -> int:
@@ -227,6 +230,7 @@ class _Groups:
     learner: LearnerConfig
     collection: CollectionConfig
     replay: ReplayConfig
+    demonstrations: DemonstrationsConfig
 
 
 def _groups(values: Nested) -> Any:

@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_her import __version__
 from torchrl_her.demonstrations.dataset import Demonstrations, check_free
-from torchrl_her.trainers.trainer import evaluate
-from torchrl_her_envs.common.batched_env import BatchedEnv
+from torchrl_her.demonstrations.play import demonstrate
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_envs.registry import GYM
 from torchrl_her_envs.throwing.experts.controller import make_controller
@@ -117,7 +115,7 @@ def _play(
     reward, parts = reward_range(goal_env(env))[1], []
     kept = played = achieved = 0
     while kept < episodes and played < _MOST * episodes:
-        own = play_whole_episodes(env, player, achieved_reward=reward)
+        own = demonstrate(env, player, max_steps=goal_env(env).max_steps, achieved_reward=reward)
         own = own.select(range(min(len(own), (episodes if keep_all else _MOST * episodes) - played)))
         good = own.achieved.nonzero().flatten()
         if not keep_all and len(good) >= episodes - kept:  # episodes behind the last one were in vain
@@ -134,28 +132,3 @@ def _play(
         )
     made_by = {**facts, "played": played, "achieved": achieved}
     return Recorded(replace(Demonstrations.join(parts), task=name, made_by=made_by), played, achieved)
-
-
-def play_whole_episodes(env: EnvBase, player: Policy, *, achieved_reward: float = 0.0) -> Demonstrations:
-    """The next episode of each environment, with its physical states if the environment has some.
-
-    Args:
-        env: batched, [N].
-        player: chooses actions.
-
-    Keyword Args:
-        achieved_reward: the reward of an achieved goal.
-    """
-    task, states = goal_env(env), []
-
-    def act(tensordict: TensorDictBase) -> TensorDictBase:
-        if isinstance(task, BatchedEnv):
-            states.append(task.world_state_dict())
-        return player(tensordict)
-
-    rollout = evaluate(env, act, max_steps=task.max_steps)
-    stacked = None
-    if states:
-        names = [name for name in states[0] if name not in ("key", "step", "episode")]
-        stacked = {name: torch.stack([own[name] for own in states], 1) for name in names}
-    return Demonstrations.from_rollout(rollout, first=True, states=stacked, achieved_reward=achieved_reward)

@@ -146,7 +146,7 @@ def test_a_negative_weight_is_refused() -> None:
 
 
 def make_loss(name: str, runs: int, cloning: Cloning | None, *, seed: int = 0) -> LossModule:
-    """A loss of one run, or of several, whose weights are those of single runs with seeds one after another."""
+    """A loss of some runs, each with the weights that it has alone."""
     shape: Any = ((4, 2), SPEC) if name in ("sac", "tqc") else ((4, 2), 3)
     make: Any = make_stochastic_actor if name in ("sac", "tqc") else make_actor
     outputs = {"outputs": 5} if name == "tqc" else {}
