@@ -6,7 +6,7 @@ from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_her_envs.common.goal_env import goal_env, reward_bounds
 from torchrl_her_recipes.components.agents import make_agent
@@ -21,12 +21,7 @@ from torchrl_her_recipes.components.curricula import (
     make_played_env,
     played_rewards,
 )
-from torchrl_her_recipes.components.demonstrations import (
-    load_demonstrations,
-    rows_needed,
-    with_outcomes,
-    with_starts,
-)
+from torchrl_her_recipes.components.demonstrations import load_demonstrations, rows_needed
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.components.goal_space import goal_space
@@ -55,10 +50,12 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
     state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
     shown = load_demonstrations(recipe, task, state)
-    env = with_starts(task, shown)
+    starts = None if shown is None else shown.starts
     if state is not None:
-        env = in_layers(env, state.progress, begins=is_guided(recipe, state.curriculum))
-        env = with_outcomes(env, shown)
+        begins = is_guided(recipe, state.curriculum)
+        env: EnvBase = in_layers(task, state.progress, begins=begins, starts=starts)
+    else:
+        env = task if starts is None else TransformedEnv(task, starts)
     devices = devices_of(recipe)
     generators = make_generators(recipe.seeds, devices.replay)
     own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)

@@ -10,6 +10,7 @@ from torchrl.envs import CatTensors, Compose, EnvBase, InitTracker, Transform, T
 
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
+from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.config.algorithms import get_algorithm
@@ -119,7 +120,13 @@ def is_guided(recipe: Recipe, curriculum: Curriculum) -> bool:
     return recipe.curriculum.guided_share > 0 and len(curriculum) > 1
 
 
-def in_layers(env: EnvBase, progress: CurriculumProgress, *, begins: bool = False) -> TransformedEnv:
+def in_layers(
+    env: EnvBase,
+    progress: CurriculumProgress,
+    *,
+    begins: bool = False,
+    starts: DemonstrationStarts | None = None,
+) -> TransformedEnv:
     """An environment as the layers of its runs see it, with the networks' input.
 
     Args:
@@ -128,6 +135,7 @@ def in_layers(env: EnvBase, progress: CurriculumProgress, *, begins: bool = Fals
 
     Keyword Args:
         begins: whether steps say if they are the first of an episode, as ``is_init``.
+        starts: starts episodes at demonstrations; None if there are no such episodes.
     """
     curriculum = progress.curriculum
     shown = StateToObs(curriculum, progress, goes_on=goal_env(env).goes_on)
@@ -136,6 +144,8 @@ def in_layers(env: EnvBase, progress: CurriculumProgress, *, begins: bool = Fals
         transforms.insert(0, CatTensors(_STATE, "state", del_keys=False, sort=False))
     if begins:
         transforms.append(InitTracker())
+    if starts is not None:
+        transforms = [starts, *transforms, starts.outcomes()]
     return TransformedEnv(env, Compose(*transforms))
 
 

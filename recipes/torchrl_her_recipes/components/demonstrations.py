@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from torchrl_her.curriculum.switch import enter_layer, set_layer_goals
 from torchrl_her.demonstrations.dataset import Demonstrations
@@ -156,19 +156,6 @@ def _make_starts(recipe: Recipe, own: RunDemonstrations) -> DemonstrationStarts:
         threshold=options.starts_threshold,
         samples=options.starts_samples,
     )
-
-
-def with_starts(env: EnvBase, own: RunDemonstrations | None) -> EnvBase:
-    """A task's environments, with episodes that start at demonstrations if there are some."""
-    return env if own is None or own.starts is None else TransformedEnv(env, own.starts)
-
-
-def with_outcomes(env: EnvBase, own: RunDemonstrations | None) -> EnvBase:
-    """The same in layers of a curriculum, whose goals end episodes."""
-    if own is not None and own.starts is not None:
-        assert isinstance(env, TransformedEnv)
-        env.append_transform(own.starts.outcomes())
-    return env
 
 
 def rows_needed(recipe: Recipe, own: RunDemonstrations) -> int:

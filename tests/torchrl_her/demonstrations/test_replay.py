@@ -53,7 +53,7 @@ def collected(runs: int) -> TensorDict:
 def mixed(
     seeds: range = range(1), *, sampler: str = "prioritized", batch: TensorDict | None = None
 ) -> MixedReplay:
-    """A quarter of each batch is demonstrations; each run has its seed, and its share of a collected batch."""
+    """A quarter of each batch is demonstrations; each run has its own seed."""
     own = make_buffer(seeds, 100, sampler=sampler)
     shown = make_buffer(range(20 + seeds.start, 20 + seeds.stop), 60, sampler=sampler)
     for run in range(len(seeds)):

@@ -223,9 +223,7 @@ def test_only_demonstrations_that_succeed_are_starts() -> None:
 
 def test_an_environment_that_cannot_start_anywhere_is_refused_by_name() -> None:
     env = make_env("gym:torchrl_her/HandThrow-v1")
-    with pytest.raises(
-        ValueError, match="HandThrow-v1 cannot be started at states of demonstrations: it has"
-    ):
+    with pytest.raises(ValueError, match="HandThrow-v1 cannot be started at states of demonstrations"):
         TransformedEnv(env, DemonstrationStarts(SHOWN)).reset()
 
 
