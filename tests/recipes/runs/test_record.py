@@ -44,13 +44,10 @@ def test_a_state_is_what_its_row_shows(tmp_path: Path) -> None:
 
 
 def test_seeds_repeat_and_differ(tmp_path: Path) -> None:
-    recorded = [
-        record_demonstrations(
-            "hand_v0", tmp_path / f"{place}.pt", episodes=3, seed=seed
-        ).demonstrations.digest
-        for place, seed in enumerate((1, 1, 2))
-    ]
-    first, again, other = [own.demonstrations.digest for own in recorded]
+    paths = [tmp_path / f"{place}.pt" for place in range(3)]
+    for path, seed in zip(paths, (1, 1, 2), strict=True):
+        record_demonstrations("hand_v0", path, episodes=3, seed=seed)
+    first, again, other = [Demonstrations.load(path).digest for path in paths]
     assert first == again != other
 
 
