@@ -228,3 +228,22 @@ def test_environments_that_cannot_be_started_anywhere_are_refused_by_name(tmp_pa
         ValueError, match=r"demonstrations.starts_share=0.5 cannot be on gym:torchrl_her/HandThrow-v1"
     ):
         build(small(**options))
+
+
+# Learning
+
+
+def test_a_few_demonstrations_teach_what_no_reward_has_taught_yet(tmp_path: Path) -> None:
+    """320 gradient steps without hindsight, in three runs: the goal is hardly ever achieved by chance."""
+    path = tmp_path / "hand_reach.pt"
+    record_demonstrations("hand_reach", path, episodes=20)
+    short: dict[str, Any] = {"task": "hand_reach", "algo": "no_hindsight", "num_runs": 3, "epochs": 1}
+    short |= {"frames_per_update": 5.0, "batch_size": 64, "hidden": 32, "depth": 2, "episodes": 50}
+    shown = asked(str(path), episodes=20, share=0.5, q_filter=False) | short
+    successes = []
+    for options in (short, shown):
+        result = run(build(small(**options, average_decay=0.0, compile="never")), progress=False)
+        successes.append(sum(result.successes) / 3)
+    without, with_demonstrations = successes
+    assert without < 0.25
+    assert with_demonstrations > 0.4
