@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 
-from torchrl_her.demonstrations import Demonstrations, MixedReplay
+from torchrl_her.demonstrations import Demonstrations, MixedReplay, demonstrate
 from torchrl_her.objectives import CloningDDPGLoss, CloningSACLoss, CloningTD3Loss, PenalizedDDPGLoss
 from torchrl_her.replay_buffers.runs import rows_of_run, sizes_of
 from torchrl_her.trainers import FusedLearner, LossLearner
+from torchrl_her_envs import make_env
 from torchrl_her_recipes import Components, build, record_demonstrations, run
 
 from ..small import small
@@ -185,6 +187,37 @@ def test_each_run_follows_the_single_run_with_its_seed(options: dict[str, Any], 
             for each, place in ((together.demonstrations, number), (alone.demonstrations, 0))
         )
         torch.testing.assert_close(rows["desired_goal"], single["desired_goal"])
+
+
+# Other tasks and other ways to collect
+
+
+def test_discrete_actions_are_learned_from_without_cloning(tmp_path: Path) -> None:
+    """DQN has rows and starts; the toy tasks can be started anywhere, too."""
+    env = make_env("chain", num_envs=4, length=6)
+    forward = TensorDictModule(
+        lambda place: torch.ones(len(place), dtype=torch.int64), ["observation"], ["action"]
+    )
+    demonstrate(env, forward, max_steps=6, task="chain").save(tmp_path / "chain.pt")
+    options = asked(str(tmp_path / "chain.pt"), starts_share=1.0) | {"task": "chain"}
+    components = build(small(**options, **{"task.options.length": 6}))
+    shown = components.demonstrations
+    assert shown is not None
+    components.trainer().run(800)
+    assert shown.recorded.achieved.all()
+    assert shown.starts is not None
+    assert shown.starts.walk.back == [6]  # all the way
+
+
+@pytest.mark.long
+def test_rows_are_learned_from_while_other_processes_collect(file: str) -> None:
+    components = build(small(**asked(file), processes=2))
+    trainer = components.trainer()
+    try:
+        trainer.run(800)
+    finally:
+        components.close()
+    assert trainer.updates > 0
 
 
 # What is refused
