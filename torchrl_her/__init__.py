@@ -1,7 +1,7 @@
 """Hindsight experience replay as parts of a TorchRL replay buffer.
 
 The names that most scripts need are here; all others are in the sub-packages ``goals``, ``modules``,
-``objectives``, ``replay_buffers``, ``trainers`` and ``curriculum``.
+``objectives``, ``replay_buffers``, ``trainers``, ``curriculum`` and ``demonstrations``.
 """
 
 from importlib.metadata import version

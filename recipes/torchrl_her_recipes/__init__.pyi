@@ -25,6 +25,8 @@ from .runs.policies import TrainedPolicy as TrainedPolicy
 from .runs.policies import export_policy as export_policy
 from .runs.policies import load_policy as load_policy
 from .runs.policies import load_trained as load_trained
+from .runs.record import Recorded as Recorded
+from .runs.record import record_demonstrations as record_demonstrations
 from .runs.run import RunResult as RunResult
 from .runs.run import resume as resume
 from .runs.run import run as run

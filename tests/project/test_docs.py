@@ -13,7 +13,17 @@ import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 PACKAGES = ("torchrl_her", "torchrl_her_envs", "torchrl_her_recipes")
-LIBRARY = ("goals", "replay_buffers", "modules", "objectives", "curriculum", "behavior", "trainers", "native")
+LIBRARY = (
+    "goals",
+    "replay_buffers",
+    "modules",
+    "objectives",
+    "curriculum",
+    "behavior",
+    "trainers",
+    "native",
+    "demonstrations",
+)
 PAGES = sorted(path.name for path in DOCS.glob("*.md"))
 
 
@@ -35,6 +45,7 @@ def conf() -> ModuleType:
 @pytest.mark.parametrize(
     ("page", "number"),
     [
+        ("demonstrations.md", 4),
         ("devices.md", 1),
         ("index.md", 1),
         ("normalization.md", 2),

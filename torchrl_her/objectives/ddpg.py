@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss
 
+from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
 from torchrl_her.objectives.targets import clamped_td0
 
 
@@ -35,6 +36,20 @@ class PenalizedDDPGLoss(DDPGLoss):
         with action_penalty_of(self.actor_network, self.action_penalty) as penalties:
             loss, metadata = super().loss_actor(tensordict)
         return loss + (penalties[0] if loss.ndim else penalties[0].mean()), metadata
+
+
+class CloningDDPGLoss(ClonesDemonstrations, PenalizedDDPGLoss):
+    """The loss with behavior cloning.
+
+    Args:
+        *args: of :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        **kwargs: of the same.
+        cloning: its weight and filter.
+    """
+
+    def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        loss, metadata = super().loss_actor(tensordict)
+        return self.with_cloning(loss, tensordict), metadata
 
 
 @contextmanager
@@ -74,6 +89,7 @@ def make_ddpg_loss(
     reward_range: tuple[float, float] = (-1.0, 0.0),
     action_penalty: float = 0.0,
     reduction: Literal["mean", "none"] = "mean",
+    cloning: Cloning | None = None,
 ) -> DDPGLoss:
     """TorchRL's DDPG loss with clamped targets, and target networks for actor and critic.
 
@@ -85,6 +101,7 @@ def make_ddpg_loss(
         action_penalty: weight of the action L2 penalty, see
             :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
+        cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 
     Raises:
         ValueError: ``gamma`` is outside of [0, 1).
@@ -95,8 +112,15 @@ def make_ddpg_loss(
         >>> round(loss.value_estimator.low), round(loss.value_estimator.high)
         (-50, 0)
     """
-    loss = PenalizedDDPGLoss(
-        actor, critic, delay_actor=True, delay_value=True, action_penalty=action_penalty, reduction=reduction
+    kind, own = cloning_or(PenalizedDDPGLoss, CloningDDPGLoss, cloning)
+    loss = kind(
+        actor,
+        critic,
+        delay_actor=True,
+        delay_value=True,
+        action_penalty=action_penalty,
+        reduction=reduction,
+        **own,
     )
     estimator = clamped_td0(gamma, reward_range, loss.actor_critic)
     loss.set_keys(state_action_value=critic.out_keys[0])

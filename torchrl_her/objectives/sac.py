@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SACLoss
 
+from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
 from torchrl_her.objectives.critics import as_critics, checked_subset, least_of_some
 from torchrl_her.objectives.noise import RunNoise
 from torchrl_her.objectives.targets import clamped_td0
@@ -111,6 +112,20 @@ class PenalizedSACLoss(SACLoss):
         return -self._by_run(self.log_alpha, log_prob) * (log_prob + self.target_entropy)
 
 
+class CloningSACLoss(ClonesDemonstrations, PenalizedSACLoss):
+    """The loss with behavior cloning.
+
+    Args:
+        *args: of :class:`~torchrl_her.objectives.PenalizedSACLoss`.
+        **kwargs: of the same.
+        cloning: its weight and filter.
+    """
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        loss, metadata = super().actor_loss(tensordict)
+        return self.with_cloning(loss, tensordict), metadata
+
+
 def make_sac_loss(
     actor: ProbabilisticActor,
     critic: TensorDictModule | Sequence[TensorDictModule],
@@ -125,6 +140,7 @@ def make_sac_loss(
     runs: int = 1,
     generators: Sequence[torch.Generator] | None = None,
     reduction: Literal["mean", "none"] = "mean",
+    cloning: Cloning | None = None,
 ) -> SACLoss:
     """TorchRL's SAC loss with several critics and a learned temperature.
 
@@ -153,6 +169,7 @@ def make_sac_loss(
         runs: R, how many runs the networks are stacked for; each has a temperature of its own.
         generators: of the random numbers of each run; None for torch's own.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
+        cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 
     Raises:
         ValueError: ``gamma`` is outside of [0, 1), ``temperature`` is not positive, ``critics`` is below 1 or
@@ -167,7 +184,8 @@ def make_sac_loss(
         2
     """
     own = as_critics(critic, critics)
-    loss = PenalizedSACLoss(
+    kind, options = cloning_or(PenalizedSACLoss, CloningSACLoss, cloning)
+    loss = kind(
         actor,
         own,
         action_spec=action_spec,
@@ -180,6 +198,7 @@ def make_sac_loss(
         noise=RunNoise(generators),
         reduction=reduction,
         scalar_output_mode="exclude" if reduction == "none" else None,
+        **options,
     )
     loss.set_keys(state_action_value=(own[0] if isinstance(own, list) else own).out_keys[0])
     set_soft_targets(loss, gamma, reward_range)

@@ -13,6 +13,7 @@ from torchrl.data import Bounded
 from torchrl.objectives import TD3Loss
 from torchrl.objectives.utils import distance_loss
 
+from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
 from torchrl_her.objectives.critics import as_critics, checked_subset, least_of_some
 from torchrl_her.objectives.noise import RunNoise
 from torchrl_her.objectives.targets import clamped_td0
@@ -104,6 +105,20 @@ class PenalizedTD3Loss(TD3Loss):
         return valued.get(self.tensor_keys.state_action_value).squeeze(-1)
 
 
+class CloningTD3Loss(ClonesDemonstrations, PenalizedTD3Loss):
+    """The loss with behavior cloning.
+
+    Args:
+        *args: of :class:`~torchrl_her.objectives.PenalizedTD3Loss`.
+        **kwargs: of the same.
+        cloning: its weight and filter.
+    """
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        loss, metadata = super().actor_loss(tensordict)
+        return self.with_cloning(loss, tensordict), metadata
+
+
 def make_td3_loss(
     actor: TensorDictModule,
     critic: TensorDictModule | Sequence[TensorDictModule],
@@ -116,6 +131,7 @@ def make_td3_loss(
     action_penalty: float = 0.0,
     generators: Sequence[torch.Generator] | None = None,
     reduction: Literal["mean", "none"] = "mean",
+    cloning: Cloning | None = None,
 ) -> TD3Loss:
     """TorchRL's TD3 loss: several critics, and targets smoothed by noise and clamped.
 
@@ -136,6 +152,7 @@ def make_td3_loss(
             :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
         generators: of the random numbers of each run; None for torch's own.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
+        cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 
     Raises:
         ValueError: ``gamma`` is outside of [0, 1), ``critics`` is below 1 or not their number, or
@@ -150,7 +167,8 @@ def make_td3_loss(
         2
     """
     own = as_critics(critic, critics)
-    loss = PenalizedTD3Loss(
+    kind, options = cloning_or(PenalizedTD3Loss, CloningTD3Loss, cloning)
+    loss = kind(
         actor,
         own,
         action_spec=action_spec,
@@ -160,6 +178,7 @@ def make_td3_loss(
         target_critics=target_critics,
         noise=RunNoise(generators),
         reduction=reduction,
+        **options,
     )
     key = (own[0] if isinstance(own, list) else own).out_keys[0]
     estimator = clamped_td0(gamma, reward_range)

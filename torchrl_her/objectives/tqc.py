@@ -13,6 +13,7 @@ from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import TQCLoss
 
+from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
 from torchrl_her.objectives.critics import as_critics
 from torchrl_her.objectives.noise import RunNoise
 from torchrl_her.objectives.sac import PenalizedSACLoss, positive_temperature, set_soft_targets
@@ -65,6 +66,20 @@ class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
         return self.value_estimator.value_estimate(rows, next_value=value)
 
 
+class CloningTQCLoss(ClonesDemonstrations, PenalizedTQCLoss):
+    """The loss with behavior cloning.
+
+    Args:
+        *args: of :class:`~torchrl_her.objectives.PenalizedTQCLoss`.
+        **kwargs: of the same.
+        cloning: its weight and filter.
+    """
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        loss, metadata = super().actor_loss(tensordict)
+        return self.with_cloning(loss, tensordict), metadata
+
+
 def make_tqc_loss(
     actor: ProbabilisticActor,
     critic: TensorDictModule | Sequence[TensorDictModule],
@@ -79,6 +94,7 @@ def make_tqc_loss(
     runs: int = 1,
     generators: Sequence[torch.Generator] | None = None,
     reduction: Literal["mean", "none"] = "mean",
+    cloning: Cloning | None = None,
 ) -> TQCLoss:
     """TorchRL's TQC loss: critics that give quantiles, of which targets leave out the greatest ones.
 
@@ -101,6 +117,7 @@ def make_tqc_loss(
         runs: R, how many runs the networks are stacked for; each has a temperature of its own.
         generators: of the random numbers of each run; None for torch's own.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
+        cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 
     Raises:
         ValueError: ``gamma`` is outside of [0, 1), ``temperature`` is not positive, ``critics`` is below 1 or
@@ -129,7 +146,8 @@ def make_tqc_loss(
             f"quantile{'s' * (quantiles != 1)}, got {dropped_quantiles}{hint}"
         )
     options: dict[str, Any] = {"scalar_output_mode": "exclude" if reduction == "none" else None}
-    loss = PenalizedTQCLoss(
+    kind, cloned = cloning_or(PenalizedTQCLoss, CloningTQCLoss, cloning)
+    loss = kind(
         actor,
         own,
         action_spec=action_spec,
@@ -141,6 +159,7 @@ def make_tqc_loss(
         noise=RunNoise(generators),
         reduction=reduction,
         **options,
+        **cloned,
     )
     loss.set_keys(state_action_value=first.out_keys[0])
     set_soft_targets(loss, gamma, reward_range)

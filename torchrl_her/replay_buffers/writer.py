@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import replace
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     One writer may serve R independent runs: ``HERWriter(..., runs=R, generators=...)``. It takes batches
     [R * N, T], R equal blocks in the order of the runs, and the storage is R equal blocks of rows, each of
     them a ring of its own. What is written for a run does not depend on the other runs.
+
+    Episodes that nobody collected, such as demonstrations, are written with :meth:`extend_run`.
 
     The writer works in any TorchRL replay buffer with a one-dimensional storage, under any sampler that does
     not consume its transitions (those of slices need ``per="episode"``); the capacity counts real and virtual
@@ -250,34 +253,12 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             KeyError: an entry is missing.
             RuntimeError: the buffer was made by another process.
         """
-        if os.getpid() != self._process:
-            raise RuntimeError(f"HERWriter writes only in the process that made its buffer: {SHARED}")
-        refuse_beside_writer("HERWriter", self._storage, data, self.options, runs=self.runs)
+        self._check(data)
         if data.batch_size.numel() == 0:
             return torch.empty(data.shape, dtype=torch.int64, device=device_of(data))
         held = self._held
         batch = Batch.of(data, self._keys, runs=self.runs).after(held)
-        rows, run, lanes = batch.rows, batch.run, batch.lanes()
-        order = time_order(lanes)
-        ends = entry_of(rows, self._keys.done).reshape(-1)
-        if self._all_over:
-            ends = ends | ends_of_held(lanes, order, len(held))
-        ends = ends | broken(
-            rows, lanes, order, ends, self._keys, kind=batch.kind, held=len(held), resumed=self._loaded
-        )
-        episodes, left = find_episodes(lanes, ends, order)
-        if self.runs == 1:  # then TorchRL's own cursor counts
-            self._rings.cursors[0] = self._cursor
-        places = Places(run, len(batch), runs=self.runs, device=lanes.device)
-        entries = min(_ROWS, self.capacity) // (self.k + 1), _ROWS // (self.k + 1)
-        own = None if run is None else run[episodes.rows[:, :1]].flatten()
-        recent = list(self._recent)
-        for layer, part, run_of in self._by_layer(rows, episodes, own):
-            lately = recent[layer].after(rows, part, run_of, self._keys, sizes=self.options.remembered)
-            recent[layer] = lately
-            settings = self._settings()
-            for piece in split_runs(part, run_of, settings, each=entries[0], together=entries[1]):
-                self._write(batch, piece, places, lately, self._rule(layer, piece.runs[0]))
+        index, left, recent = self._write_episodes(batch, len(held))
         # Last of all, so that a batch that cannot be written loses nothing that was held back before.
         self._held, self._recent = batch.take(left), recent
         self._loaded = self._all_over = False
@@ -288,7 +269,36 @@ class HERWriter(HindsightBase, RoundRobinWriter):
                 "come as [N, T]?",
                 stacklevel=2,
             )
-        return places.rows(self._rings.cursors, self.capacity)[len(held) :].reshape(data.shape)
+        return index.reshape(data.shape)
+
+    def extend_run(self, data: TensorDictBase, run: int = 0) -> Tensor:
+        """Writes whole episodes of one of several runs, which its environments did not collect.
+
+        Open episodes that are held back wait as before, in all runs.
+
+        Args:
+            data: [n], one episode after the other, as if of one environment; the last transition is done.
+            run: which one, from 0.
+
+        Returns:
+            The index of each transition in the storage, [n]; -1 as in :meth:`extend`.
+
+        Raises:
+            ValueError: there is no such run, the last episode is open, or as in :meth:`extend`.
+            RuntimeError: the buffer was made by another process.
+        """
+        if not 0 <= run < self.runs:
+            raise ValueError(f"run must be in [0, {self.runs - 1}], got {run}")
+        if data.ndim != 1 or len(data) == 0 or not bool(entry_of(data, self._keys.done)[-1]):
+            raise ValueError(
+                f"extend_run takes whole episodes [n], got {list(data.shape)}, the last one open or none"
+            )
+        self._check(data if self.runs == 1 else data.unsqueeze(0).expand(self.runs, len(data)))
+        batch = Batch.of(data, self._keys, runs=1)
+        if self.runs > 1:
+            batch = replace(batch, run=torch.full_like(batch.ids, run))
+        index, _, self._recent = self._write_episodes(batch, 0)
+        return index
 
     def end_episodes(self) -> None:
         """Tells that all environments were reset, so that episodes which are held back do not go on.
@@ -368,6 +378,46 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         super().__setstate__({**state, "_process": os.getpid()})
 
     # The work
+
+    def _check(self, data: TensorDictBase) -> None:
+        """Raises an error if this writer cannot write a batch."""
+        if os.getpid() != self._process:
+            raise RuntimeError(f"HERWriter writes only in the process that made its buffer: {SHARED}")
+        refuse_beside_writer("HERWriter", self._storage, data, self.options, runs=self.runs)
+
+    def _write_episodes(self, batch: Batch, held: int) -> tuple[Tensor, Tensor, list[RecentGoals]]:
+        """Writes all episodes that end in a batch.
+
+        Args:
+            batch: [held + n]; the first ones were held back.
+            held: how many.
+
+        Returns:
+            ``(index, left, recent)``: where the n new rows are in the storage, the positions in the batch of
+            rows of open episodes, and the goals to be remembered.
+        """
+        rows, run, lanes = batch.rows, batch.run, batch.lanes()
+        order = time_order(lanes)
+        ends = entry_of(rows, self._keys.done).reshape(-1)
+        if self._all_over and held:
+            ends = ends | ends_of_held(lanes, order, held)
+        ends = ends | broken(
+            rows, lanes, order, ends, self._keys, kind=batch.kind, held=held, resumed=self._loaded
+        )
+        episodes, left = find_episodes(lanes, ends, order)
+        if self.runs == 1:  # then TorchRL's own cursor counts
+            self._rings.cursors[0] = self._cursor
+        places = Places(run, len(batch), runs=self.runs, device=lanes.device)
+        entries = min(_ROWS, self.capacity) // (self.k + 1), _ROWS // (self.k + 1)
+        own = None if run is None else run[episodes.rows[:, :1]].flatten()
+        recent = list(self._recent)
+        for layer, part, run_of in self._by_layer(rows, episodes, own):
+            lately = recent[layer].after(rows, part, run_of, self._keys, sizes=self.options.remembered)
+            recent[layer] = lately
+            settings = self._settings()
+            for piece in split_runs(part, run_of, settings, each=entries[0], together=entries[1]):
+                self._write(batch, piece, places, lately, self._rule(layer, piece.runs[0]))
+        return places.rows(self._rings.cursors, self.capacity)[held:], left, recent
 
     def _no_goals(self, runs: int) -> list[RecentGoals]:
         """Nothing remembered, of each layer."""

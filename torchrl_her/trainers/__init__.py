@@ -17,7 +17,7 @@ from torchrl_her.trainers.graphs import GraphLearner, why_not_recorded
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.metrics import discounted_return, final_distance, first_episode, q_bias, success
 from torchrl_her.trainers.runs import clip_by_run, keep_runs
-from torchrl_her.trainers.trainer import CollectsAhead, Schedule, Trainer, evaluate
+from torchrl_her.trainers.trainer import CollectsAhead, Replay, Schedule, Trainer, evaluate
 
 __all__ = [
     "CheckpointError",
@@ -26,6 +26,7 @@ __all__ = [
     "GraphLearner",
     "Learner",
     "LossLearner",
+    "Replay",
     "Schedule",
     "Trainer",
     "buffer_state_dict",

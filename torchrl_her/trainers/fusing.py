@@ -18,6 +18,7 @@ from torchrl_her.modules.networks import ActorNet, CriticNet
 from torchrl_her.modules.q_actor import QNet
 from torchrl_her.modules.stochastic_actor import StochasticActorNet
 from torchrl_her.native.job import STOCHASTIC, Algorithm
+from torchrl_her.objectives.cloning import ClonesDemonstrations
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss
 from torchrl_her.objectives.sac import PenalizedSACLoss
 from torchrl_her.objectives.targets import ClampedTD0
@@ -125,6 +126,8 @@ def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | Non
         >>> why_not_fused(loss, SoftUpdate(loss, tau=0.01))
         "reduction='sum'"
     """
+    if isinstance(loss, ClonesDemonstrations):
+        return "behavior cloning of demonstrations, which the C++ steps do not have"
     if type(loss) not in FUSED:
         return f"a {type(loss).__name__}, which is not a loss that this library makes"
     if type(target) not in (SoftUpdate, HardUpdate) or target is None or target.loss_module is not loss:

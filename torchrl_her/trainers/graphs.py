@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
+from torchrl_her.objectives.cloning import ClonesDemonstrations
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY
 from torchrl_her.trainers.learner import WEIGHT, LossLearner, check_rows
 
@@ -202,6 +203,8 @@ def why_not_recorded(loss: LossModule, target: TargetNetUpdater | None = None) -
         loss: any of TorchRL's.
         target: moves its target networks.
     """
+    if isinstance(loss, ClonesDemonstrations):
+        return "behavior cloning of demonstrations, whose places in a batch are read from the GPU"
     devices = {parameter.device for parameter in loss.parameters()}
     if any(device.type != "cuda" for device in devices) or len(devices) != 1:
         return f"networks on {', '.join(sorted(str(device) for device in devices))}"

@@ -31,6 +31,36 @@ class Schedule(Protocol):
         ...
 
 
+class Replay(Protocol):
+    """What the training loop needs of a replay buffer: TorchRL's own, or one that mixes several."""
+
+    @property
+    def writer(self) -> Any:
+        """Where what is collected goes, for one run or several."""
+        ...
+
+    @property
+    def priority_key(self) -> str:
+        """Under which new priorities are found."""
+        ...
+
+    def __len__(self) -> int:
+        """Rows that a single run can learn from."""
+        ...
+
+    def extend(self, data: TensorDictBase) -> Tensor:
+        """Writes a collected batch."""
+        ...
+
+    def sample(self, batch_size: int) -> TensorDictBase:
+        """Rows of whole batches, R equal blocks; with an entry ``index``."""
+        ...
+
+    def update_tensordict_priority(self, rows: TensorDictBase) -> None:
+        """Takes new priorities of sampled rows."""
+        ...
+
+
 @runtime_checkable
 class CollectsAhead(Protocol):
     """A collector that can collect while somebody learns."""
@@ -68,7 +98,8 @@ class Trainer:
         collector: yields batches [R * E, T] that the exploring policy played. One that
             :class:`CollectsAhead` collects the next batch while this loop learns from the last one.
         buffer: for one run any replay buffer, usually with a :class:`~torchrl_her.HERWriter`; for several one
-            whose writer (``HERWriter(..., runs=R)``) and sampler are for R runs.
+            whose writer (``HERWriter(..., runs=R)``) and sampler are for R runs. With demonstrations a
+            :class:`~torchrl_her.demonstrations.MixedReplay`.
         learner: learns from what is sampled.
         schedules: take a step after each epoch, for example exploration and weights of goals.
 
@@ -101,7 +132,7 @@ class Trainer:
         self,
         *,
         collector: BaseCollector,
-        buffer: TensorDictReplayBuffer,
+        buffer: TensorDictReplayBuffer | Replay,
         learner: Learner,
         schedules: Sequence[Schedule] = (),
         runs: int = 1,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -18,6 +18,7 @@ from torchrl_her_envs.common.goal_env import TaskTraits
 from torchrl_her_envs.common.seeding import block_keys
 
 _ENDS = ("done", "terminated", "truncated")
+_COUNTERS = ("step", "episode")  # of the state: what is counted and not physical
 
 
 class BatchedEnv(TaskTraits, EnvBase):
@@ -113,6 +114,56 @@ class BatchedEnv(TaskTraits, EnvBase):
         entries = {field.name: state[field.name].clone() for field in fields(self.worlds)}
         self.worlds = type(self.worlds)(**entries)
         self._keys = state["key"].numpy().copy().view(np.uint64)
+
+    def start_at(self, states: Mapping[str, Tensor], which: Tensor) -> dict[str, Tensor]:
+        """Lets the episodes of some environments begin at given states, with their goals.
+
+        The episodes have all of their steps before them. Seeds, the count of episodes and all other
+        environments stay as they are, so what is drawn later is the same as without this call.
+
+        Args:
+            states: M rows of each entry of ``worlds``, as :meth:`world_state_dict` gives them; ``step``,
+                ``episode`` and ``key`` are not read.
+            which: [M] of int64, the environments, each of them once.
+
+        Returns:
+            What all N environments show now: ``state``, ``observation`` and goals.
+
+        Raises:
+            ValueError: an entry is missing or has another shape, or an environment is named twice or is not
+                there; nothing has changed then.
+
+        Example:
+            >>> import torch
+            >>> from torchrl_her_envs import make_env
+            >>> env = make_env("hand_v1", num_envs=2, seed=0)
+            >>> _ = env.reset()
+            >>> first = {name: entry[:1] for name, entry in env.world_state_dict().items()}
+            >>> shown = env.start_at(first, torch.tensor([1]))
+            >>> bool((shown["state"][0] == shown["state"][1]).all())
+            True
+        """
+        entries = [field.name for field in fields(self.worlds) if field.name not in _COUNTERS]
+        self._check_starts(states, which, entries)
+        for name in entries:
+            getattr(self.worlds, name)[which] = states[name]  # in place: others may share the memory
+        self.worlds.step[which] = 0
+        return self._show()
+
+    def _check_starts(self, states: Mapping[str, Tensor], which: Tensor, entries: Sequence[str]) -> None:
+        """Raises a ValueError for states or environments that :meth:`start_at` cannot take."""
+        chosen = which.tolist()
+        if len(set(chosen)) < len(chosen) or not all(0 <= own < self.batch_size[0] for own in chosen):
+            raise ValueError(
+                f"which must be different environments from 0 to {self.batch_size[0] - 1}, got {chosen}"
+            )
+        for name in entries:
+            if name not in states:
+                raise ValueError(f"the states of {self.task_name} lack {name!r}, got {', '.join(states)}")
+            wanted = (len(chosen), *getattr(self.worlds, name).shape[1:])
+            if states[name].shape != wanted:
+                got = list(states[name].shape)
+                raise ValueError(f"{name!r} of the states must be of shape {list(wanted)}, got {got}")
 
     def _check_state(self, state: dict[str, Tensor]) -> None:
         """Raises a ValueError for a state whose entries are of other shapes than these environments'."""

@@ -13,6 +13,7 @@ import click
 from torchrl_her_recipes.cli.listing import listing
 from torchrl_her_recipes.cli.play import export, play
 from torchrl_her_recipes.cli.plot import plot
+from torchrl_her_recipes.cli.record import record
 from torchrl_her_recipes.cli.say import (
     BAD_INPUT,
     BAD_INPUT_ERRORS,
@@ -75,7 +76,7 @@ def group(context: click.Context) -> None:
         context.exit(BAD_INPUT)
 
 
-for _command in (train, play, export, plot, study, report, listing):
+for _command in (train, record, play, export, plot, study, report, listing):
     group.add_command(_command)
 
 

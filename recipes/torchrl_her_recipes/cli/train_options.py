@@ -19,7 +19,7 @@ from torchrl_her_recipes.config.learners import LEARNERS, options_of
 from torchrl_her_recipes.config.options import default_of
 from torchrl_her_recipes.config.recipe import Recipe, check_extending, make_recipe
 from torchrl_her_recipes.config.shipped import load_preset, preset_names
-from torchrl_her_recipes.config.shortcuts import GROUPS, option_names
+from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, option_names
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def _of_other_learners() -> Iterator[tuple[str, str]]:
 
 def _written(group: str, name: str, default: Any) -> str:
     """How an option is given on the command line, with its default."""
-    key = group if name == "name" else name
+    key = group if name == "name" else f"{group}.{name}" if group in LONG_ONLY else name
     shown = str(default).lower() if isinstance(default, bool) else default
     return key if default is None else f"{key}={shown}"
 
@@ -145,7 +145,8 @@ def complete(_context: click.Context, _parameter: click.Parameter, incomplete: s
     name, equals, begun = incomplete.partition("=")
     if equals:
         return [CompletionItem(f"{name}={own}") for own in _values().get(name, []) if own.startswith(begun)]
-    known = [own for names in options.values() for own in names if own != "name"]
+    short = {group: names for group, names in options.items() if group not in LONG_ONLY}
+    known = [own for names in short.values() for own in names if own != "name"]
     names = ["task", "algo", "learner", "curriculum", *ARGUMENTS, *known]
     if "." in name:
         names = [f"{group}.{own}" for group, own_names in options.items() for own in own_names]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_her.behavior import BehaviorGoals
+from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import goal_env, reward_bounds
 from torchrl_her_recipes.components.agents import make_agent
 from torchrl_her_recipes.components.behavior import make_asking, make_behavior, make_factors
@@ -22,6 +25,7 @@ from torchrl_her_recipes.components.curricula import (
     make_played_env,
     played_rewards,
 )
+from torchrl_her_recipes.components.demonstrations import load_demonstrations, rows_needed
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.components.goal_space import goal_space
@@ -51,7 +55,8 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
     rewards = played_rewards(recipe, task)
     behavior = make_behavior(recipe, task, rewards=rewards, space=space, state=state)
-    env = _shown(recipe, task, state, behavior)
+    shown = load_demonstrations(recipe, task, state)
+    env = _shown(recipe, task, state, behavior, None if shown is None else shown.starts)
     devices = devices_of(recipe)
     generators = make_generators(recipe.seeds, devices.replay)
     own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
@@ -69,27 +74,29 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
         if processes
         else make_collector(recipe, env, agent.policy, devices)
     )
+    replay: dict[str, Any] = {
+        "rewards": rewards,
+        "space": space,
+        "state": state,
+        "norm": agent.norm,
+        "devices": devices,
+    }
+    if shown is not None and recipe.demonstrations.in_batches:
+        capacity = rows_needed(recipe, shown)
+        shown.fill(make_buffer(recipe, task, generators, capacity=capacity, **replay), recipe.run.num_runs)
     return Components(
         recipe=recipe,
         env=env,
         eval_env=make_played_env(recipe, evaluation_envs(recipe), eval_seeds(recipe, 0)),
         collector=collector,
-        buffer=make_buffer(
-            recipe,
-            task,
-            generators,
-            rewards=rewards,
-            space=space,
-            state=state,
-            norm=agent.norm,
-            devices=devices,
-        ),
+        buffer=make_buffer(recipe, task, generators, **replay),
         goal_target=None if space is None else space.target,
         generators=generators if own is generators else [*generators, *own],
         rewards=rewards,
         curriculum=state,
         behavior=behavior,
         virtual_env=_virtual_env(recipe, task, rewards) if recipe.evaluation.virtual_goals else None,
+        demonstrations=shown,
         **vars(agent),
     )
 
@@ -101,13 +108,18 @@ def _virtual_env(recipe: Recipe, task: EnvBase, rewards: tuple[float, float]) ->
 
 
 def _shown(
-    recipe: Recipe, task: EnvBase, state: CurriculumState | None, behavior: BehaviorGoals | None
+    recipe: Recipe,
+    task: EnvBase,
+    state: CurriculumState | None,
+    behavior: BehaviorGoals | None,
+    starts: DemonstrationStarts | None,
 ) -> EnvBase:
     """The task's environments as the runs see them in training."""
     if state is not None:
         begins = is_guided(recipe, state.curriculum)
-        return in_layers(task, state.progress, begins=begins, behavior=behavior)
-    return task if behavior is None else TransformedEnv(task, behavior)
+        return in_layers(task, state.progress, begins=begins, behavior=behavior, starts=starts)
+    own = behavior if starts is None else starts  # a recipe has one of them at most
+    return task if own is None else TransformedEnv(task, own)
 
 
 def make_collector(

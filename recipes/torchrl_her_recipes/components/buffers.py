@@ -42,6 +42,7 @@ def make_buffer(
     state: CurriculumState | None = None,
     norm: RunningNorm | None = None,
     devices: Devices = ON_THE_CPU,
+    capacity: int | None = None,
 ) -> TensorDictReplayBuffer:
     """The replay buffer of all runs, with the hindsight writer and the sampler.
 
@@ -56,11 +57,13 @@ def make_buffer(
         state: the curriculum, if there is one.
         norm: counts what is written and normalizes what is sampled; None for raw transitions.
         devices: where the buffer is, and the learner that samples from it.
+        capacity: in transitions of each run; the recipe's if None.
     """
+    size = recipe.replay.buffer_size if capacity is None else capacity
     algorithm, task, runs = get_algorithm(recipe.hindsight.algo), goal_env(env), len(generators)
     own = [make_goal_weights(each, task, space) for each in recipe.of_runs() if algorithm.hindsight]
     buffer = TensorDictReplayBuffer(
-        storage=PackedStorage(runs * recipe.replay.buffer_size, device=devices.replay),
+        storage=PackedStorage(runs * size, device=devices.replay),
         writer=HERWriter(
             EnvReward(task.compute_reward, task.compute_terminated),
             **_goals(recipe),
@@ -75,7 +78,7 @@ def make_buffer(
             layers=_rules(state),
             on_write=None if norm is None else _counted_by(norm, state),
         ),
-        sampler=_make_sampler(recipe, generators, devices.replay),
+        sampler=_make_sampler(recipe, generators, size, devices.replay),
         priority_key="td_error",
     )
     if devices.learner != devices.replay:
@@ -112,13 +115,15 @@ def _counted_by(norm: RunningNorm, state: CurriculumState | None) -> OnWrite:
     return norm.update if state is None else partial(count_inputs, norm, state.progress)
 
 
-def _make_sampler(recipe: Recipe, generators: Sequence[torch.Generator], device: torch.device) -> Sampler:
+def _make_sampler(
+    recipe: Recipe, generators: Sequence[torch.Generator], capacity: int, device: torch.device
+) -> Sampler:
     options = recipe.replay
     if options.sampler == "uniform":
-        return RunsSampler(options.buffer_size, runs=len(generators), generators=generators, device=device)
+        return RunsSampler(capacity, runs=len(generators), generators=generators, device=device)
     # Alpha is Schaul's, for absolute TD errors; most of TorchRL's losses give their squares.
     return RunsPrioritizedSampler(
-        options.buffer_size,
+        capacity,
         alpha=options.priority_alpha / priority_power(recipe.learner.name),
         beta=options.priority_beta,
         runs=len(generators),

@@ -30,6 +30,7 @@ from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.curricula import CurriculumState
+from torchrl_her_recipes.components.demonstrations import RunDemonstrations
 from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.goal_space import goal_weights, scheduled
 from torchrl_her_recipes.config.recipe import Recipe
@@ -69,6 +70,7 @@ class Components:
         virtual_env: environments for evaluation at virtual goals, or None.
         behavior: proposes the goals of episodes, or None. It is one of the environment's transforms, and its
             state a part of the collector's.
+        demonstrations: episodes that somebody else played, in batches and as starts; or None.
     """
 
     recipe: Recipe
@@ -92,6 +94,7 @@ class Components:
     guide: GuidedExploration | None = None
     behavior: BehaviorGoals | None = None
     virtual_env: EnvBase | None = None
+    demonstrations: RunDemonstrations | None = None
 
     @property
     def greedy(self) -> TensorDictModuleBase:
@@ -148,10 +151,10 @@ class Components:
 
     def trainer(self) -> Trainer:
         """The training loop over these components."""
-        recipe, replay = self.recipe, self.recipe.replay
+        recipe, replay, shown = self.recipe, self.recipe.replay, self.demonstrations
         return Trainer(
             collector=self.collector,
-            buffer=self.buffer,
+            buffer=self.buffer if shown is None else shown.mixed_with(self.buffer, recipe),
             learner=self.learner(),
             schedules=[self.exploration, *scheduled([*goal_weights(self.buffer), *self._proposals()])],
             runs=recipe.run.num_runs,

@@ -12,6 +12,7 @@ from torchrl_her.behavior import BehaviorGoals
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
 from torchrl_her.curriculum.orders import EpisodeLayers, TeacherStudent
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
+from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
 from torchrl_her_recipes.components.devices import CPU, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
@@ -157,6 +158,7 @@ def in_layers(
     *,
     begins: bool = False,
     behavior: BehaviorGoals | None = None,
+    starts: DemonstrationStarts | None = None,
 ) -> TransformedEnv:
     """An environment as the layers of its runs see it, with the networks' input.
 
@@ -167,6 +169,7 @@ def in_layers(
     Keyword Args:
         begins: whether steps say if they are the first of an episode, as ``is_init``.
         behavior: proposes goals, if there is one.
+        starts: starts episodes at demonstrations; None if there are no such episodes.
     """
     curriculum = progress.curriculum
     shown = StateToObs(curriculum, progress, goes_on=goal_env(env).goes_on)
@@ -176,6 +179,8 @@ def in_layers(
         transforms.insert(0, CatTensors(_STATE, "state", del_keys=False, sort=False))
     if begins:
         transforms.append(InitTracker())
+    if starts is not None:
+        transforms = [starts, *transforms, starts.outcomes()]
     return TransformedEnv(env, Compose(*transforms))
 
 

@@ -17,6 +17,7 @@ from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import DecayingEpsilon, Exploration
 from torchrl_her.modules.normalization import RunningNorm
+from torchrl_her.objectives.cloning import Cloning
 from torchrl_her_recipes.config.recipe import Recipe
 
 Networks = tuple[TensorDictModule, list[TensorDictModule]]
@@ -101,6 +102,14 @@ class LearnerBuilder(ABC):
             rewards: the least and the greatest that there can be; infinite if the task's is dense.
             generators: of each run's random numbers.
         """
+
+    @property
+    def cloning(self) -> Cloning | None:
+        """How the loss clones demonstrations; None if it does not."""
+        own = self.recipe.demonstrations
+        if not own.in_batches or own.bc_weight == 0:
+            return None
+        return Cloning(weight=own.bc_weight, q_filter=own.q_filter)
 
     def exploration(self, generators: Sequence[torch.Generator]) -> Exploration:
         """Turns greedy into exploring actions; here for continuous ones.

@@ -266,6 +266,75 @@ class BehaviorConfig(Group):
 
 
 @dataclass(frozen=True, kw_only=True)
+class DemonstrationsConfig(Group):
+    """Episodes that somebody else played, as `torchrl-her record` writes them."""
+
+    episodes: int = option(
+        0,
+        "how many of the file's episodes are used, the first ones; 0: none",
+        at_least=0,
+        shown_as="demonstrations.episodes",
+    )
+    file: str | None = option(None, "the file", shown_as="demonstrations.file")
+    share: float = option(
+        0.125,
+        "share of each batch that are demonstrations; 0: none, for starts alone",
+        at_least=0,
+        below=1,
+        shown_as="demonstrations.share",
+    )
+    bc_weight: float = option(
+        1.0,
+        "weight of behavior cloning on them, in the actor's loss",
+        at_least=0,
+        shown_as="demonstrations.bc_weight",
+    )
+    q_filter: bool = option(
+        True,
+        "whether only actions are cloned that the critic prefers to the policy's",
+        shown_as="demonstrations.q_filter",
+    )
+    starts_share: float = option(
+        0.0,
+        "share of the episodes that start at states of demonstrations, at first near their ends",
+        at_least=0,
+        at_most=1,
+        shown_as="demonstrations.starts_share",
+    )
+    starts_width: int = option(4, "steps of a demonstration among which such starts are drawn", at_least=1)
+    starts_stride: int = option(
+        2, "steps by which they walk back from the end when these episodes succeed", at_least=1
+    )
+    starts_threshold: float = option(
+        0.5, "mean success of these episodes at which starts walk back", above=0, at_most=1
+    )
+    starts_samples: int = option(50, "episodes of which it is the mean", at_least=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.episodes and self.file is None:
+            raise ValueError(
+                f"demonstrations.episodes={self.episodes} needs a file: demonstrations.file=FILE, as "
+                "`torchrl-her record` writes it"
+            )
+        if self.episodes and self.share == self.starts_share == 0:
+            raise ValueError(
+                f"demonstrations.episodes={self.episodes} has no effect with demonstrations.share=0 and "
+                "demonstrations.starts_share=0"
+            )
+
+    @property
+    def in_batches(self) -> bool:
+        """Whether batches have demonstrations."""
+        return self.episodes > 0 and self.share > 0
+
+    @property
+    def as_starts(self) -> bool:
+        """Whether episodes start at states of demonstrations."""
+        return self.episodes > 0 and self.starts_share > 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class EvaluationConfig(Group):
     """How runs are evaluated at the end of each epoch."""
 

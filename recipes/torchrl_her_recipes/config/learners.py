@@ -24,9 +24,11 @@ class LearnerConfig(Group):
 
     Attributes:
         has_epsilon: whether a share epsilon of the actions explores.
+        clones: whether its loss can clone the behavior of demonstrations.
     """
 
     has_epsilon: ClassVar[bool] = False
+    clones: ClassVar[bool] = False
 
     @property
     def hidden_weights(self) -> int:
@@ -136,6 +138,8 @@ class NoiseConfig(EpsilonConfig):
 class DDPGConfig(NoiseConfig):
     """DDPG."""
 
+    clones: ClassVar[bool] = True
+
     action_penalty: float = option(
         0.3, "action L2 penalty, which keeps actions off the ends of tanh", at_least=0
     )
@@ -156,6 +160,8 @@ class TD3Config(DDPGConfig):
 @dataclass(frozen=True, kw_only=True)
 class EntropyConfig(LearnerConfig):
     """A learner whose policy is stochastic and explores by itself."""
+
+    clones: ClassVar[bool] = True
 
     temperature: float = option(0.1, "the temperature that learning begins with", above=0)
     action_penalty: float = option(

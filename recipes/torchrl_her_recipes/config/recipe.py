@@ -11,6 +11,7 @@ from torchrl_her_recipes.config.groups import (
     BehaviorConfig,
     CollectionConfig,
     CurriculumConfig,
+    DemonstrationsConfig,
     EvaluationConfig,
     Group,
     HindsightConfig,
@@ -23,7 +24,7 @@ from torchrl_her_recipes.config.groups import (
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.learners import AUTO, DDPGConfig, LearnerConfig, options_of
 from torchrl_her_recipes.config.options import default_of, what_there_is
-from torchrl_her_recipes.config.shortcuts import GROUPS, Nested, over, place
+from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, Nested, over, place
 from torchrl_her_recipes.config.without_effect import without_effect
 
 # Compiling takes 15 s the first time and saves half a millisecond a step: from this many steps on it pays.
@@ -54,6 +55,7 @@ class Recipe:
     novelty: NoveltyConfig = field(default_factory=NoveltyConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     behavior: BehaviorConfig = field(default_factory=BehaviorConfig)
+    demonstrations: DemonstrationsConfig = field(default_factory=DemonstrationsConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     run: RunConfig = field(default_factory=RunConfig)
 
@@ -68,7 +70,8 @@ class Recipe:
         for (group, name), why in without_effect(self).items():
             value = getattr(getattr(self, group), name)
             if value != _default(getattr(self, group), name):
-                raise ValueError(f"{name}={value} has no effect {why}: leave it out")
+                shown = f"{group}.{name}" if group in LONG_ONLY else name
+                raise ValueError(f"{shown}={value} has no effect {why}: leave it out")
 
     @property
     def total_frames(self) -> int:
@@ -240,6 +243,7 @@ class _Groups:
     learner: LearnerConfig
     collection: CollectionConfig
     replay: ReplayConfig
+    demonstrations: DemonstrationsConfig
 
 
 def _groups(values: Nested) -> Any:

@@ -10,6 +10,7 @@ from torchrl_her_recipes.config.groups import (
     BehaviorConfig,
     CollectionConfig,
     CurriculumConfig,
+    DemonstrationsConfig,
     EvaluationConfig,
     Group,
     HindsightConfig,
@@ -34,9 +35,13 @@ GROUPS: dict[str, type[Group]] = {
     "novelty": NoveltyConfig,
     "curriculum": CurriculumConfig,
     "behavior": BehaviorConfig,
+    "demonstrations": DemonstrationsConfig,
     "evaluation": EvaluationConfig,
     "run": RunConfig,
 }
+
+
+LONG_ONLY = ("demonstrations",)  # its options are always named with it: of what would ``file`` be?
 
 
 class Entries(dict[str, Any]):
@@ -55,7 +60,8 @@ def locate(name: str) -> tuple[str, str]:
     """The group and the name of an option.
 
     Args:
-        name: short (``seed``), with its group (``run.seed``), or a group that has a name (``task``).
+        name: short (``seed``), with its group (``run.seed``), or a group that has a name (``task``). Those of
+            some groups (``demonstrations.file``) are never short.
 
     Raises:
         ValueError: it does not exist, or is not unique; the message names the nearest one.
@@ -82,7 +88,7 @@ def locate(name: str) -> tuple[str, str]:
         return name, "name"
     if name in names:
         raise ValueError(f"{name} is a group of options: write {name}.{names[name][0]}=..., for instance")
-    found = [group for group, known in names.items() if name in known]
+    found = [group for group, known in names.items() if name in known and group not in LONG_ONLY]
     if len(found) == 1:
         return found[0], name
     if found:
@@ -90,7 +96,10 @@ def locate(name: str) -> tuple[str, str]:
             f"several groups have an option {name!r}: write {' or '.join(f'{g}.{name}' for g in found)}"
         )
     named = [each for each, known in names.items() if "name" in known]
-    every = [own for known in names.values() for own in known if own != "name"] + named
+    if long := [f"{group}.{name}" for group in LONG_ONLY if name in names[group]]:
+        raise ValueError(f"no option {name!r}; did you mean {long[0]}?")
+    short = [known for group, known in names.items() if group not in LONG_ONLY]
+    every = [own for known in short for own in known if own != "name"] + named
     raise ValueError(f"no option {name!r}{nearest(name, every)}; `torchrl-her train -h` lists them")
 
 

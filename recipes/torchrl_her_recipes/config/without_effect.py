@@ -73,6 +73,25 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
     for group, name in list(idle):
         if group == read and not (name in ("cells", "recent") and groups.ibs.estimator == "kernel"):
             del idle[group, name]
+    shown = groups.demonstrations
+    if shown.episodes == 0:
+        all_of("demonstrations", "with demonstrations.episodes=0", but=("episodes",))
+    else:
+        if shown.share == 0:
+            for name in ("bc_weight", "q_filter"):
+                idle["demonstrations", name] = "with demonstrations.share=0"
+        elif not groups.learner.clones:
+            for name in ("bc_weight", "q_filter"):
+                idle["demonstrations", name] = f"with learner={groups.learner.name}"
+        elif shown.bc_weight == 0:
+            idle["demonstrations", "q_filter"] = "with demonstrations.bc_weight=0"
+        if shown.starts_share == 0:
+            for own in fields(shown):
+                if own.name.startswith("starts_"):
+                    idle["demonstrations", own.name] = "with demonstrations.starts_share=0"
+        elif groups.collection.processes > 0:
+            processes = groups.collection.processes
+            idle["demonstrations", "starts_share"] = f"with processes={processes}"
     if groups.collection.processes == 0:
         idle["collection", "sync"] = "with processes=0"
     if groups.replay.sampler != "prioritized":

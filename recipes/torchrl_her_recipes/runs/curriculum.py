@@ -69,4 +69,6 @@ def move_on(components: Components, state: CurriculumState, samples: Tensor, fra
             components.behavior.set_active(state.at_the_top(run), run=run)
         if components.norm is not None:
             restart_inputs(components.norm, old, new, run=run)
+        if components.demonstrations is not None:
+            components.demonstrations.enter_layer(run)
     return lines

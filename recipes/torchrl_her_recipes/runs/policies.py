@@ -75,6 +75,22 @@ def load_trained(name: str | Path, *, allow_import: bool = False) -> TrainedPoli
     return policy
 
 
+def check_plays(policy: TrainedPolicy, env: EnvBase, task: str) -> None:
+    """Refuses a policy for environments that show or want something else than those of its own task.
+
+    Args:
+        policy: the policy.
+        env: the environments.
+        task: what theirs is called.
+
+    Raises:
+        ValueError: they do.
+    """
+    own = make_task_envs(policy.recipe.replace(task=policy.task), 1, [0])
+    if not env.action_spec.dtype.is_floating_point or _widths(own) != _widths(env):
+        raise ValueError(f"a policy of {policy.task} cannot play {task}: it has other widths")
+
+
 def load_policy(name: str | Path) -> TensorDictModuleBase:
     """The greedy policy of a task, trained: reads ``observation`` and ``desired_goal``, writes ``action``.
 

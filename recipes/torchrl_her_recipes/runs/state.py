@@ -38,6 +38,9 @@ def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
         "guide": None if components.guide is None else components.guide.state_dict(),
         "guided": None if components.guide is None else components.guide.guided,
         "buffer": buffer_state_dict(components.buffer, copy=False),
+        "demonstrations": None
+        if components.demonstrations is None
+        else components.demonstrations.state_dict(),
         "generators": [generator.get_state() for generator in components.generators],
         "torch_generator": torch.get_rng_state(),  # for losses that draw, as SAC's
         "cuda_generator": None if (gpu := _gpu_of(components)) is None else torch.cuda.get_rng_state(gpu),
@@ -85,6 +88,8 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
         progress = components.curriculum.progress
         for run in range(0 if progress.by_episode else components.recipe.run.num_runs):
             set_layer_goals(components.buffer.writer, progress.layer_of(run), run=run)
+    if components.demonstrations is not None:
+        components.demonstrations.load_state_dict(state["demonstrations"])
     load_collector_state_dict(components.collector, state["collector"])
     trainer.load_state_dict(state["trainer"])
     if (worlds := _worlds(components)) is not None:
@@ -124,9 +129,10 @@ def _made_of(components: Components) -> dict[str, str]:
         name: type(getattr(components, name)).__name__
         for name in ("actor", "critic", "loss", "optimizer", "target")
     }
-    guide = components.guide
+    guide, shown = components.guide, components.demonstrations
     return names | {
         "guide": type(guide).__name__,
+        "demonstrations": "none" if shown is None else f"{len(shown.recorded)}, {shown.recorded.digest}",
         "device": str(place_of(components.loss)),
         "writer": " ".join(map(str, [type(writer).__name__, *hindsight])),
         "sampler": type(components.buffer.sampler).__name__,

@@ -201,3 +201,47 @@ def test_what_is_shown_must_have_a_row_for_each_environment() -> None:
 
     with pytest.raises(RuntimeError, match="batch"):
         Odd(3).reset()
+
+
+def test_episodes_start_at_given_states_and_the_others_go_on() -> None:
+    env, untouched = Counting(3), Counting(3)
+    for each in (env, untouched):
+        each.reset()
+        each.worlds.goal[:] = 3
+        act(each, 1, 1, 1)
+    shown = env.start_at({"value": torch.tensor([2, 0]), "goal": torch.tensor([3, 1])}, torch.tensor([2, 0]))
+    assert shown["state"].tolist() == [[0.0, 1.0], [1.0, 3.0], [2.0, 3.0]]
+    assert env.worlds.step.tolist() == [0, 1, 0]
+    assert env.worlds.episode.tolist() == [1, 1, 1]
+    assert act(env, 1, 1, 1)["terminated"].flatten().tolist() == [True, False, True]
+    assert torch.equal(env.reset()["state"], untouched.reset()["state"])  # the same draws follow
+
+
+@pytest.mark.parametrize(
+    ("states", "which", "message"),
+    [
+        ({"value": torch.zeros(1)}, [0], "the states of Counting lack 'goal', got value"),
+        (
+            {"value": torch.zeros(2), "goal": torch.zeros(1)},
+            [0],
+            r"'value' of the states must be of shape \[1\], got \[2\]",
+        ),
+        (
+            {"value": torch.zeros(2), "goal": torch.zeros(2)},
+            [1, 1],
+            r"different environments from 0 to 1, got \[1, 1\]",
+        ),
+        (
+            {"value": torch.zeros(1), "goal": torch.zeros(1)},
+            [2],
+            r"different environments from 0 to 1, got \[2\]",
+        ),
+    ],
+)
+def test_states_that_cannot_be_started_at(states: dict[str, Tensor], which: list[int], message: str) -> None:
+    env = Counting(2)
+    env.reset()
+    before = env.world_state_dict()
+    with pytest.raises(ValueError, match=message):
+        env.start_at(states, torch.tensor(which))
+    assert all(torch.equal(own, env.world_state_dict()[name]) for name, own in before.items())

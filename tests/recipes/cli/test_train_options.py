@@ -12,7 +12,7 @@ import yaml
 from torchrl_her_recipes import Recipe, cli, make_recipe
 from torchrl_her_recipes.cli.train import train
 from torchrl_her_recipes.cli.train_options import complete, requests
-from torchrl_her_recipes.config.shortcuts import option_names
+from torchrl_her_recipes.config.shortcuts import LONG_ONLY, option_names
 
 
 def completed(text: str) -> list[str]:
@@ -26,12 +26,16 @@ def test_completion_of_names_and_values() -> None:
     assert completed("sampler=") == ["sampler=prioritized", "sampler=uniform"]
     assert completed("strategy=f") == ["strategy=future", "strategy=final"]
     assert completed("seed=") == []
+    assert completed("demonstrations.f") == ["demonstrations.file="]
+    assert completed("starts") == []
 
 
 def test_help_explains_every_option_of_the_default_learner(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train", "-h"]) == 0
     words = {word.partition("=")[0] for word in capsys.readouterr().out.split()}
-    assert {name for names in option_names().values() for name in names} - {"name"} <= words
+    for group, names in option_names().items():
+        shown = [f"{group}.{name}" for name in names] if group in LONG_ONLY else names
+        assert set(shown) - {"name"} <= words
 
 
 def test_show_prints_documents_that_are_recipes(capsys: pytest.CaptureFixture[str]) -> None:

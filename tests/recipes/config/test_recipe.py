@@ -46,6 +46,15 @@ from ..small import small
             "num_envs=64 cannot be shared out among processes=3: it must be a multiple of it",
         ),
         ({"epoch_frames": 100}, "epoch_frames=100 must be at least num_envs times steps_per_batch, 640"),
+        (
+            {"demonstrations.episodes": 3},
+            "demonstrations.episodes=3 needs a file: demonstrations.file=FILE, as `torchrl-her record`",
+        ),
+        (
+            {"demonstrations.episodes": 3, "demonstrations.file": "demos.pt", "demonstrations.share": 0},
+            "demonstrations.episodes=3 has no effect with demonstrations.share=0 and ",
+        ),
+        ({"demonstrations.share": 1.0}, "demonstrations.share must be at least 0 and below 1, got 1.0"),
         ({"seed": 2**40}, "seed must be below 2147483648, got 1099511627776"),
         ({"k": -1}, "k must be at least 0, got -1"),
         ({"seed": -1}, "seed must be at least 0, got -1"),

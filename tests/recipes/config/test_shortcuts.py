@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from torchrl_her_recipes import make_recipe
-from torchrl_her_recipes.config.shortcuts import locate, merge, option_names, place
+from torchrl_her_recipes.config.shortcuts import LONG_ONLY, locate, merge, option_names, place
 
 
 def test_every_option_is_found_by_its_long_name() -> None:
@@ -15,7 +15,8 @@ def test_every_option_is_found_by_its_long_name() -> None:
 
 
 def test_short_names_are_unique_except_for_the_names_of_groups() -> None:
-    every = [name for names in option_names().values() for name in names if name != "name"]
+    short = {group: names for group, names in option_names().items() if group not in LONG_ONLY}
+    every = [name for names in short.values() for name in names if name != "name"]
     unique = [name for name in every if name != "device"]  # which has to be said: of what?
     assert sorted(unique) == sorted(set(every) - {"device"})
     assert [locate(name)[1] for name in unique] == unique
@@ -30,6 +31,8 @@ def test_short_names_are_unique_except_for_the_names_of_groups() -> None:
         ("runs.seed", "no group 'runs'; did you mean run. The groups are task"),
         ("seed.x", "seed is an option of the group run: 'seed.x' has one name too many"),
         ("run", "run is a group of options: write run.seed="),
+        ("demonstrations", "demonstrations is a group of options: write demonstrations.episodes="),
+        ("file", "no option 'file'; did you mean demonstrations.file?"),
         (
             "task_options.continuing_task",
             "are written task.options.NAME=VALUE: task.options.continuing_task, not task_options.continuing",
@@ -52,6 +55,13 @@ def test_one_entry_of_a_mapping_leaves_the_others() -> None:
     assert make_recipe(base, **{"task.options": {"bits": 4}}).task.options == {"bits": 4}
     both = place({"task.options": {"bits": 4}, "task.options.max_steps": 3})
     assert both == {"task": {"options": {"bits": 4, "max_steps": 3}}}
+
+
+def test_options_of_some_groups_are_never_short() -> None:
+    assert locate("episodes") == ("evaluation", "episodes")
+    recipe = make_recipe(**{"episodes": 7, "demonstrations.episodes": 3, "demonstrations.file": "demos.pt"})
+    assert (recipe.evaluation.episodes, recipe.demonstrations.episodes) == (7, 3)
+    assert make_recipe(demonstrations={"episodes": 3, "file": "demos.pt"}).demonstrations.file == "demos.pt"
 
 
 def test_later_values_replace_earlier_ones() -> None:

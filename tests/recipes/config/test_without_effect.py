@@ -8,7 +8,9 @@ import pytest
 
 from torchrl_her_recipes import ALGORITHMS, Algorithm, Recipe, make_recipe
 
-IDLE = [
+SHOWN = {"demonstrations.file": "demos.pt", "demonstrations.episodes": 10}
+STARTS = {"demonstrations.starts_share": 0.5}
+IDLE: list[tuple[dict[str, Any], dict[str, Any]]] = [
     ({"algo": "no_hindsight"}, {"k": 8}),
     ({"algo": "no_hindsight"}, {"goal_sources": {"actual": 2}}),
     ({"algo": "no_hindsight"}, {"cells": 8}),
@@ -41,6 +43,13 @@ IDLE = [
     ({"dtype": "float64"}, {"products": "bfloat16"}),
     ({"norm": "batch"}, {"products": "bfloat16"}),
     ({"hidden": 31}, {"products": "bfloat16"}),
+    ({}, {"demonstrations.file": "demos.pt"}),
+    ({}, {"demonstrations.share": 0.3}),
+    ({**SHOWN, "demonstrations.share": 0.0, **STARTS}, {"demonstrations.bc_weight": 0.3}),
+    ({**SHOWN, "demonstrations.bc_weight": 0.0}, {"demonstrations.q_filter": False}),
+    (SHOWN, {"demonstrations.starts_width": 9}),
+    ({**SHOWN, "processes": 2}, {"demonstrations.starts_share": 0.5}),
+    ({**SHOWN, "task": "bit_flip", "learner": "dqn"}, {"demonstrations.q_filter": False}),
     ({"task": "bit_flip"}, {"threshold": 0.5}),
     ({"task": "chain"}, {"dtype": "float64"}),
     ({"task": "gym:FetchReach-v4"}, {"dtype": "float64"}),
@@ -70,6 +79,9 @@ def test_what_has_no_effect_is_dropped_from_a_preset(options: dict[str, Any], id
         {"algo": "cher", "layer_epsilon": 0.5},
         {"algo": "cher", "epsilon_start": 0.0, "epsilon_end": 0.0, "action_noise": 0.1},
         {"task": "hand_v0", "threshold": 0.5, "dtype": "float64"},
+        {**SHOWN, **STARTS, "demonstrations.starts_width": 9, "demonstrations.share": 0.0},
+        {**SHOWN, "processes": 2, "demonstrations.q_filter": False},
+        {**SHOWN, "task": "bit_flip", "learner": "dqn", "demonstrations.share": 0.5},
     ],
 )
 def test_what_has_an_effect_is_kept(options: dict[str, Any]) -> None:

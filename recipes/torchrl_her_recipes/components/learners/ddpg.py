@@ -61,4 +61,5 @@ class DDPGBuilder(LearnerBuilder):
             reward_range=rewards,
             action_penalty=self.options.action_penalty,
             reduction="none",
+            cloning=self.cloning,
         )

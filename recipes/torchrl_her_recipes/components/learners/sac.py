@@ -49,6 +49,7 @@ class SACBuilder(DDPGBuilder):
             "runs": self.recipe.run.num_runs,
             "generators": generators,
             "reduction": "none",
+            "cloning": self.cloning,
         }
 
     def bounds(self, rewards: tuple[float, float]) -> tuple[float, float] | None:

@@ -33,4 +33,5 @@ class TD3Builder(DDPGBuilder):
             action_penalty=self.options.action_penalty,
             generators=generators,
             reduction="none",
+            cloning=self.cloning,
         )

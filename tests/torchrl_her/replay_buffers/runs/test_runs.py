@@ -377,3 +377,51 @@ def test_what_cannot_be_is_refused() -> None:
         beside(ListStorage(30), sampler)
     with pytest.raises(ValueError, match="of as many runs, got a RandomSampler of 1"):
         beside(LazyTensorStorage(30), RandomSampler())
+
+
+# Episodes of one run that nobody collected
+
+
+@pytest.mark.parametrize("weights", ["none", "ibs"])
+def test_whole_episodes_of_one_run_are_written_as_if_it_were_alone(weights: str) -> None:
+    together = make_buffer(range(RUNS), weights=weights, filter_achieved=True)
+    alone = [make_buffer(range(run, run + 1), weights=weights, filter_achieved=True) for run in range(RUNS)]
+    collected = next(batches([[4], [4]] * RUNS, 1))
+    shown = make_batch([[3, 2, 5]], steps=10)[0].exclude("collector")
+    together.extend(collected)
+    index = together.writer.extend_run(shown, run=1)
+    for run, own in enumerate(alone):
+        own.extend(block(collected, run))
+    own_index = alone[1].writer.extend_run(shown)
+    check_alone(together, alone)
+    assert (index - own_index).unique().tolist() == [1_000]  # the block of run 1
+    assert torch.equal(together.storage[index]["observation"], shown["observation"])
+    together.sample(RUNS * 4)  # the sampler knows of them
+
+
+def test_open_episodes_wait_while_others_are_written() -> None:
+    first, second = batches([[6], [6]] * RUNS, 2)
+    whole, plain = make_buffer(range(RUNS)), make_buffer(range(RUNS))
+    for buffer in (whole, plain):
+        buffer.extend(first)
+    whole.writer.extend_run(make_batch([[3]])[0].exclude("collector"), run=2)
+    assert whole.writer.held_back == plain.writer.held_back == RUNS * ENVS * STEPS
+    for buffer in (whole, plain):
+        buffer.extend(second)
+    assert whole.writer.counts_of(2).real == plain.writer.counts_of(2).real + 3
+    assert same(rows_of_run(whole, 0), rows_of_run(plain, 0))
+
+
+@pytest.mark.parametrize(
+    ("steps", "run", "message"),
+    [
+        (3, 3, r"run must be in \[0, 2\], got 3"),
+        (2, 0, r"extend_run takes whole episodes \[n\], got \[2\], the last one open"),
+        (0, 0, r"extend_run takes whole episodes \[n\], got \[0\]"),
+    ],
+)
+def test_what_is_no_whole_episode_of_a_run_is_refused(steps: int, run: int, message: str) -> None:
+    buffer = make_buffer(range(RUNS))
+    with pytest.raises(ValueError, match=message):
+        buffer.writer.extend_run(make_batch([[3]])[0, :steps], run=run)
+    assert len(buffer) == 0

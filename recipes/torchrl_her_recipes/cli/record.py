@@ -1,0 +1,46 @@
+"""``torchrl-her record``: demonstrations of a task, as a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
+from torchrl_her_recipes.cli.permission import allow_import
+from torchrl_her_recipes.cli.say import file_name
+
+
+@click.command(short_help="demonstrations of a task, for demonstrations.file=FILE")
+@click.argument("task", metavar="TASK")
+@click.option(
+    "--episodes", type=click.IntRange(1), default=100, show_default=True, help="how many are written"
+)
+@click.option("--out", type=click.Path(path_type=Path), help="the .pt file (default: TASK_demos.pt)")
+@click.option(
+    "--policy",
+    metavar="expert|FILE.pt|NAME",
+    help="who plays: the scripted controller (default), an exported policy, or one that comes with the "
+    "package",
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of starts and goals")
+@click.option("--all", "keep_all", is_flag=True, help="write episodes that fail, too")
+@click.option("--force", is_flag=True, help="replace the file if it exists")
+@allow_import
+def record(
+    task: str, episodes: int, out: Path | None, policy: str | None, seed: int, keep_all: bool, force: bool
+) -> int:
+    """Play episodes of TASK and write those that achieve their goal.
+
+    Training learns from them with demonstrations.file=FILE demonstrations.episodes=10.
+    """
+    file = out or Path(f"{file_name(task)}_demos.pt")
+    recorded = recipes.record_demonstrations(
+        task, file, episodes=episodes, policy=policy, seed=seed, keep_all=keep_all, force=force
+    )
+    own = recorded.demonstrations
+    click.echo(
+        f"{recorded.achieved} of {recorded.played} episodes achieved their goal; {len(own)} of them with "
+        f"{len(own.rows):,} transitions are in {file}"
+    )
+    return 0

@@ -1,0 +1,175 @@
+"""The demonstrations of a recipe: rows in a buffer of their own, and starts of episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+
+from torchrl_her.curriculum.switch import enter_layer, set_layer_goals
+from torchrl_her.demonstrations.dataset import Demonstrations
+from torchrl_her.demonstrations.replay import MixedReplay, write_demonstrations
+from torchrl_her.demonstrations.shown import in_layer, with_reward
+from torchrl_her.demonstrations.starts import DemonstrationStarts
+from torchrl_her.goals.rewards import EnvReward
+from torchrl_her.trainers.checkpoint import buffer_state_dict, load_buffer_state_dict
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_recipes.components.curricula import CurriculumState
+from torchrl_her_recipes.components.devices import CPU, make_generators
+from torchrl_her_recipes.config.algorithms import get_algorithm
+from torchrl_her_recipes.config.recipe import Recipe
+
+_SEEDS = 1 << 40  # of the starts: random numbers of their own, far from those of everything else
+
+
+@dataclass
+class RunDemonstrations:
+    """The demonstrations of some runs side by side.
+
+    Attributes:
+        recorded: those of the file that are used, as the full task.
+        env: of the task; its reward is that of runs without a curriculum.
+        state: the curriculum, if there is one.
+        buffer: their rows, relabeled like all rows; None if batches have none.
+        starts: starts episodes at their states; None if there are no such episodes.
+    """
+
+    recorded: Demonstrations
+    env: EnvBase
+    state: CurriculumState | None = None
+    buffer: TensorDictReplayBuffer | None = None
+    starts: DemonstrationStarts | None = None
+
+    def shown(self, run: int) -> Demonstrations:
+        """As a run sees them at the moment."""
+        if self.state is not None:
+            return in_layer(self.recorded, self.state.curriculum, self.state.progress.layers[run])
+        task = goal_env(self.env)
+        return with_reward(self.recorded, EnvReward(task.compute_reward, task.compute_terminated))
+
+    def fill(self, buffer: TensorDictReplayBuffer, runs: int) -> None:
+        """Writes the rows of all runs into an empty buffer."""
+        self.buffer = buffer
+        for run in range(runs):
+            write_demonstrations(buffer, self.shown(run), run=run)
+
+    def enter_layer(self, run: int) -> None:
+        """Shows a run its demonstrations in the layer that it has entered."""
+        assert self.state is not None
+        if self.buffer is not None:
+            enter_layer(self.buffer, self.state.progress.layer_of(run), run=run)
+            write_demonstrations(self.buffer, self.shown(run), run=run)
+        if self.starts is not None:
+            self.starts.show(self.shown(run), run=run)
+
+    def mixed_with(self, buffer: TensorDictReplayBuffer, recipe: Recipe) -> Any:
+        """A buffer that gives their rows besides a run's own."""
+        if self.buffer is None:
+            return buffer
+        share = recipe.demonstrations.share
+        return MixedReplay(buffer, self.buffer, share=share, batch_size=recipe.replay.batch_size)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain data; that of the starts is a part of the collector's."""
+        return {
+            "buffer": None if self.buffer is None else buffer_state_dict(self.buffer, copy=False),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` gave; the progress of the curriculum was put back before."""
+        runs = 1 if self.state is None else self.state.progress.runs
+        if self.buffer is not None:
+            self.buffer.empty()
+            load_buffer_state_dict(self.buffer, state["buffer"])
+        for run in range(runs if self.state is not None else 0):
+            assert self.state is not None
+            if self.buffer is not None:
+                set_layer_goals(self.buffer.writer, self.state.progress.layer_of(run), run=run)
+            if self.starts is not None:
+                self.starts.show(self.shown(run), run=run)
+
+
+def load_demonstrations(
+    recipe: Recipe, env: EnvBase, state: CurriculumState | None
+) -> RunDemonstrations | None:
+    """The demonstrations that a recipe asks for, without a buffer yet; None if it asks for none.
+
+    Args:
+        recipe: of the runs.
+        env: of their task.
+        state: the curriculum, if there is one.
+
+    Raises:
+        ValueError: another option cannot be beside them, the file cannot be read, is of another task, holds
+            too few episodes, or has nothing that episodes could start at.
+    """
+    options = recipe.demonstrations
+    if options.episodes == 0:
+        return None
+    if state is not None and state.progress.by_episode:
+        raise ValueError(
+            f"demonstrations are shown in a run's layer, and with order={recipe.curriculum.order} "
+            "it has none: choose order=threshold"
+        )
+    try:
+        every = Demonstrations.load(str(options.file))
+    except OSError as error:
+        raise ValueError(
+            f"demonstrations.file={options.file} cannot be read ({str(error.strerror).lower()}): "
+            f"`torchrl-her record {recipe.task.name} --out {options.file}` writes it"
+        ) from error
+    _check(every, recipe, env)
+    recorded = every.first(options.episodes).to(getattr(torch, recipe.run.dtype))
+    own = RunDemonstrations(recorded, env, state)
+    if options.as_starts:
+        if recipe.behavior.name != "real":
+            raise ValueError(
+                f"demonstrations.starts_share={options.starts_share} and behavior={recipe.behavior.name} "
+                "both choose the goals of episodes: leave one of them out"
+            )
+        if not callable(getattr(goal_env(env), "start_at", None)):
+            raise ValueError(
+                f"demonstrations.starts_share={options.starts_share} cannot be on {recipe.task.name}, whose "
+                "environments cannot be started at given states: leave it out"
+            )
+        own.starts = _make_starts(recipe, own)
+    return own
+
+
+def _check(every: Demonstrations, recipe: Recipe, env: EnvBase) -> None:
+    """Refuses demonstrations of something else."""
+    options, task = recipe.demonstrations, recipe.task.name
+    if every.task != task:
+        raise ValueError(f"{options.file} holds demonstrations of {every.task}, not of {task}")
+    base: Any = goal_env(env)
+    for key in ("observation", "achieved_goal", "desired_goal"):
+        width, own = base.observation_spec[key].shape[-1], every.rows[key].shape[-1]
+        if width != own:
+            raise ValueError(
+                f"{options.file} holds demonstrations of {task} with other options: {key!r} of width {own}, "
+                f"not {width}"
+            )
+
+
+def _make_starts(recipe: Recipe, own: RunDemonstrations) -> DemonstrationStarts:
+    options, runs = recipe.demonstrations, recipe.run.num_runs
+    return DemonstrationStarts(
+        [own.shown(run) for run in range(runs)],
+        share=options.starts_share,
+        runs=runs,
+        generators=make_generators([_SEEDS + seed for seed in recipe.seeds], CPU),
+        width=options.starts_width,
+        stride=options.starts_stride,
+        threshold=options.starts_threshold,
+        samples=options.starts_samples,
+    )
+
+
+def rows_needed(recipe: Recipe, own: RunDemonstrations) -> int:
+    """How many rows of a run the demonstrations have at most, virtual ones among them."""
+    hindsight = get_algorithm(recipe.hindsight.algo).hindsight
+    copies = sum(recipe.hindsight.sources.values()) if hindsight else 0
+    return len(own.recorded.rows) * (1 + copies)

@@ -1,0 +1,134 @@
+"""Recording demonstrations: episodes of a scripted controller or of a trained policy, as a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+from torchrl_her import __version__
+from torchrl_her.demonstrations.dataset import Demonstrations, check_free
+from torchrl_her.demonstrations.play import demonstrate
+from torchrl_her_envs.common.goal_env import goal_env, reward_range
+from torchrl_her_envs.registry import GYM
+from torchrl_her_envs.throwing.experts.controller import make_controller
+from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.config.recipe import Recipe, make_recipe
+from torchrl_her_recipes.runs.policies import check_plays, load_trained
+
+EXPERT = "expert"
+_AT_ONCE, _OF_GYM_AT_ONCE = 100, 10  # environments
+_MOST = 10  # episodes that are played for each one that is asked for, at most
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What was recorded.
+
+    Attributes:
+        demonstrations: what the file holds.
+        played: how many episodes were played for it.
+        achieved: in how many of these the goal was achieved.
+    """
+
+    demonstrations: Demonstrations
+    played: int
+    achieved: int
+
+
+def record_demonstrations(
+    task: str,
+    out: str | Path,
+    *,
+    episodes: int = 100,
+    policy: str | Path | None = None,
+    seed: int = 0,
+    keep_all: bool = False,
+    force: bool = False,
+    allow_import: bool = False,
+) -> Recorded:
+    """Plays episodes of a task and writes those that achieve their goal into a file.
+
+    The file also holds the physical states of this library's own environments, so that episodes can start
+    there. :meth:`~torchrl_her.demonstrations.Demonstrations.load` reads it.
+
+    Args:
+        task: its name.
+        out: the file.
+
+    Keyword Args:
+        episodes: how many are written. At most ten times as many are played.
+        policy: ``"expert"``, which is the task's scripted controller; the name of a trained policy that comes
+            with the package; or the file of an exported one. None: the scripted controller.
+        seed: of starts and goals.
+        keep_all: whether episodes that fail are written, too; then no more than ``episodes`` are played.
+        force: whether a file that is there is replaced.
+        allow_import: whether the module that the task of the policy's file may name may be imported.
+
+    Raises:
+        ValueError: there is no such task or policy, the policy is for another kind of task, the file exists,
+            or the policy hardly ever achieves a goal.
+        OSError: the file cannot be written.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    check_free(out, force=force)
+    recipe = make_recipe(task=task, seed=seed)
+    most = _OF_GYM_AT_ONCE if task.startswith(GYM) else _AT_ONCE
+    with closing(make_task_envs(recipe, min(episodes, most), [seed])) as env:
+        player, who = _find_policy(recipe, env, policy, allow_import=allow_import)
+        facts = {"policy": who, "seed": seed, "torchrl_her": __version__}
+        recorded = _play(env, player, task, episodes, keep_all=keep_all, facts=facts)
+    recorded.demonstrations.save(out, force=force)
+    return recorded
+
+
+def _find_policy(
+    recipe: Recipe, env: EnvBase, policy: str | Path | None, *, allow_import: bool
+) -> tuple[Policy, str]:
+    """A policy that plays in some environments, and its name."""
+    task = recipe.task.name
+    if policy is None or str(policy) == EXPERT:
+        try:
+            return make_controller(env), "the scripted controller"
+        except TypeError:
+            raise ValueError(
+                f"{task} has no scripted controller: give --policy (policy=...), a file that `torchrl-her "
+                "export` wrote or the name of a trained policy"
+            ) from None
+    trained = load_trained(policy, allow_import=allow_import)
+    check_plays(trained, env, task)
+    return trained.actor, f"{policy}, a policy of {trained.task}"
+
+
+def _play(
+    env: EnvBase, player: Policy, name: str, episodes: int, *, keep_all: bool, facts: dict[str, Any]
+) -> Recorded:
+    """Plays one episode after the other in each environment, until there are enough."""
+    reward, parts = reward_range(goal_env(env))[1], []
+    kept = played = achieved = 0
+    while kept < episodes and played < _MOST * episodes:
+        own = demonstrate(env, player, max_steps=goal_env(env).max_steps, achieved_reward=reward)
+        own = own.select(range(min(len(own), (episodes if keep_all else _MOST * episodes) - played)))
+        good = own.achieved.nonzero().flatten()
+        if not keep_all and len(good) >= episodes - kept:  # episodes behind the last one were in vain
+            good = good[: episodes - kept]
+            own = own.select(range(int(good[-1]) + 1))
+        played, achieved = played + len(own), achieved + len(good)
+        kept += len(own) if keep_all else len(good)
+        if keep_all or len(good):
+            parts.append(own if keep_all else own.select(good))
+    if kept < episodes:
+        raise ValueError(
+            f"only {achieved} of {played} episodes of {name} by {facts['policy']} achieved their goal: "
+            "choose another policy, fewer --episodes, or --all, which keeps those that fail"
+        )
+    made_by = {**facts, "played": played, "achieved": achieved}
+    return Recorded(replace(Demonstrations.join(parts), task=name, made_by=made_by), played, achieved)

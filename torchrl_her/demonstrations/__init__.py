@@ -1,0 +1,21 @@
+"""Learning from demonstrations: their file, their rows beside a run's own, and starts of episodes at them."""
+
+from torchrl_her.demonstrations.dataset import Demonstrations
+from torchrl_her.demonstrations.play import demonstrate
+from torchrl_her.demonstrations.replay import MixedReplay, demonstration_rows, write_demonstrations
+from torchrl_her.demonstrations.shown import in_layer, with_reward
+from torchrl_her.demonstrations.starts import DemonstrationStarts
+from torchrl_her.demonstrations.walk import WalkBack, step_back
+
+__all__ = [
+    "DemonstrationStarts",
+    "Demonstrations",
+    "MixedReplay",
+    "WalkBack",
+    "demonstrate",
+    "demonstration_rows",
+    "in_layer",
+    "step_back",
+    "with_reward",
+    "write_demonstrations",
+]

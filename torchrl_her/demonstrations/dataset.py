@@ -1,0 +1,262 @@
+"""Demonstrations: whole episodes that somebody else played, and the file that they are kept in."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_her.trainers.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from torchrl_her.trainers.cut import cut_episodes
+
+_SEEN = ("observation", "achieved_goal", "desired_goal")
+_ENDS = ("terminated", "truncated", "done")
+_ENTRIES: list[NestedKey] = [
+    *_SEEN,
+    "action",
+    *(("next", name) for name in (*_SEEN, "reward", *_ENDS)),
+]
+_KIND = "demonstrations 1"
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Whole episodes, one after the other, and what is known of them.
+
+    Args:
+        rows: [n], all transitions: ``observation``, ``achieved_goal``, ``desired_goal``, ``action``, and
+            under ``next`` the first three with ``reward``, ``terminated``, ``truncated`` and ``done``. The
+            last transition of each episode is done, and no other one. Other entries are left out.
+        lengths: [E] int64, transitions of each episode.
+
+    Keyword Args:
+        states: the physical state of the environment before each transition, n rows each; None if the
+            environment has no states that it can be put in.
+        task: its name.
+        made_by: what made them, as plain data, for people.
+        achieved_reward: the reward of an achieved goal.
+
+    Raises:
+        ValueError: an entry is missing, there is no episode, or lengths, ends or states do not fit.
+
+    Example:
+        >>> from torchrl_her_envs import make_controller, make_env
+        >>> env = make_env("hand_v0", num_envs=3, seed=0)
+        >>> episodes = env.rollout(50, make_controller(env), break_when_any_done=False)
+        >>> own = Demonstrations.from_rollout(episodes, task="hand_v0", first=True)
+        >>> len(own), own.achieved.tolist(), len(own.rows) == int(own.lengths.sum())
+        (3, [True, True, True], True)
+    """
+
+    rows: TensorDictBase
+    lengths: Tensor
+    states: dict[str, Tensor] | None = field(default=None, kw_only=True)
+    task: str = field(default="", kw_only=True)
+    made_by: dict[str, Any] = field(default_factory=dict, kw_only=True)
+    achieved_reward: float = field(default=0.0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        known = set(self.rows.keys(True, True))
+        if missing := [key for key in _ENTRIES if key not in known]:
+            raise ValueError(f"demonstrations need the entry {missing[0]!r}, got {sorted(known, key=str)}")
+        object.__setattr__(self, "rows", self.rows.select(*_ENTRIES))
+        if self.lengths.ndim != 1 or len(self.lengths) == 0 or int(self.lengths.min()) < 1:
+            raise ValueError(f"demonstrations need lengths [E] of at least 1, got {self.lengths.tolist()}")
+        n = int(self.lengths.sum())
+        if self.rows.batch_size != (n,):
+            raise ValueError(
+                f"episodes of {n} transitions in all cannot have rows {list(self.rows.batch_size)}"
+            )
+        ends = self.lengths.cumsum(0) - 1
+        if self.rows["next", "done"].flatten().nonzero().flatten().tolist() != ends.tolist():
+            raise ValueError("the last transition of each demonstration must be done, and no other one")
+        for name, own in (self.states or {}).items():
+            if own.shape[:1] != (n,):
+                raise ValueError(f"states must have {n} rows, got {list(own.shape)} of {name!r}")
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    @property
+    def begins(self) -> Tensor:
+        """[E] int64, the row of each episode's first transition."""
+        return self.lengths.cumsum(0) - self.lengths
+
+    @property
+    def episode(self) -> Tensor:
+        """[n] int64, the number of each transition's episode."""
+        return torch.arange(len(self)).repeat_interleave(self.lengths)
+
+    @property
+    def achieved(self) -> Tensor:
+        """[E] of bool: whether each episode achieved its goal at some step."""
+        steps = self.rows["next", "reward"].flatten() >= self.achieved_reward
+        return torch.zeros(len(self)).index_add(0, self.episode, steps.float()) > 0
+
+    @property
+    def digest(self) -> str:
+        """A short checksum of all transitions and states, by which files are told apart."""
+        sha, entries = hashlib.sha256(), dict(self.rows.items(True, True))
+        for name, own in {**entries, **(self.states or {}), "lengths": self.lengths}.items():
+            sha.update(str(name).encode())
+            sha.update(own.contiguous().flatten().view(torch.uint8).numpy().tobytes())
+        return sha.hexdigest()[:16]
+
+    def select(self, episodes: Tensor | Sequence[int]) -> Demonstrations:
+        """Some of the episodes, in the given order.
+
+        Args:
+            episodes: [m] int64, their numbers.
+        """
+        index = torch.as_tensor(episodes, dtype=torch.int64)
+        lengths, begins = self.lengths[index], self.begins[index]
+        offset = torch.arange(int(lengths.sum())) - (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
+        return self.take(begins.repeat_interleave(lengths) + offset, lengths)
+
+    def take(self, index: Tensor, lengths: Tensor, *, rows: TensorDictBase | None = None) -> Demonstrations:
+        """Some of the transitions, which are episodes of these lengths.
+
+        Args:
+            index: [m] int64, which transitions.
+            lengths: [e] int64, which sum to m.
+
+        Keyword Args:
+            rows: [n], of which they are taken; those that there are if None.
+        """
+        states = None if self.states is None else {name: own[index] for name, own in self.states.items()}
+        taken = (self.rows if rows is None else rows)[index]
+        return replace(self, rows=taken, lengths=lengths, states=states)
+
+    def first(self, count: int) -> Demonstrations:
+        """The first episodes.
+
+        Raises:
+            ValueError: there are fewer, or ``count`` is below 1.
+        """
+        if not 1 <= count <= len(self):
+            raise ValueError(f"there are {len(self)} demonstrations of {self.task}, {count} were asked for")
+        return self.select(range(count))
+
+    def to(self, dtype: torch.dtype) -> Demonstrations:
+        """The same with floating-point entries of this type; states stay as they are."""
+        return replace(self, rows=self.rows.apply(lambda x: x.to(dtype) if x.is_floating_point() else x))
+
+    @classmethod
+    def from_rollout(
+        cls,
+        rollout: TensorDictBase,
+        *,
+        first: bool = False,
+        states: Mapping[str, Tensor] | None = None,
+        **facts: Any,
+    ) -> Demonstrations:
+        """Episodes of a rollout, environment after environment; one that is open at the end is truncated.
+
+        Args:
+            rollout: [N, T], time last.
+
+        Keyword Args:
+            first: whether only the first episode of each environment counts.
+            states: of the environments before each step, [N, T, ...] each.
+            **facts: the other arguments of the class.
+
+        Raises:
+            ValueError: an entry is missing.
+        """
+        rows = cut_episodes(rollout.select(*_ENTRIES, strict=False)).reshape(-1).clone()
+        if ("next", "done") not in rows.keys(True, True):
+            raise ValueError(
+                f"demonstrations need the entry ('next', 'done'), got {list(rollout.keys(True))}"
+            )
+        ends = rows["next", "done"].flatten().nonzero().flatten()
+        lengths = torch.diff(ends, prepend=ends.new_tensor([-1]))
+        flat = None if states is None else {name: own.flatten(0, 1) for name, own in states.items()}
+        own = cls(rows, lengths, states=flat, **facts)
+        if not first:
+            return own
+        env = own.begins // rollout.shape[1]
+        return own.select((torch.diff(env, prepend=env.new_tensor([-1])) > 0).nonzero().flatten())
+
+    @classmethod
+    def join(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
+        """The episodes of several, in order; what is known of them is that of the first."""
+        states = None
+        if parts[0].states is not None:
+            states = {
+                name: torch.cat([(own.states or {})[name] for own in parts]) for name in parts[0].states
+            }
+        rows: TensorDictBase = torch.cat([own.rows for own in parts])
+        return replace(parts[0], rows=rows, lengths=torch.cat([own.lengths for own in parts]), states=states)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Writes a file of tensors and plain data, with a checksum.
+
+        Args:
+            path: the file.
+
+        Keyword Args:
+            force: whether a file that is there is replaced.
+
+        Raises:
+            ValueError: there is one.
+            OSError: the file cannot be written.
+        """
+        check_free(path, force=force)
+        state = {
+            "kind": _KIND,
+            "rows": self.rows.to_dict(),
+            "lengths": self.lengths,
+            "states": self.states,
+            "task": self.task,
+            "made_by": self.made_by,
+            "achieved_reward": self.achieved_reward,
+        }
+        save_checkpoint(state, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Demonstrations:
+        """Reads a file that :meth:`save` wrote. Nothing in it is executed.
+
+        Raises:
+            ValueError: the file is damaged, or holds something else.
+            OSError: it cannot be read.
+
+        Example:
+            >>> import tempfile
+            >>> from torchrl_her import save_checkpoint
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     save_checkpoint({"kind": "something else"}, f"{folder}/demos.pt")
+            ...     Demonstrations.load(f"{folder}/demos.pt")
+            Traceback (most recent call last):
+            ValueError: ...demos.pt holds no demonstrations: `torchrl-her record` writes some
+        """
+        try:
+            state = load_checkpoint(path)
+        except CheckpointError as error:
+            raise ValueError(f"demonstrations cannot be read: {error}") from error
+        if not isinstance(state, dict) or state.get("kind") != _KIND:
+            raise ValueError(f"{path} holds no demonstrations: `torchrl-her record` writes some")
+        try:
+            lengths = state["lengths"]
+            rows = TensorDict.from_dict(state["rows"], batch_size=[int(lengths.sum())])
+            facts = {name: state[name] for name in ("states", "task", "made_by", "achieved_reward")}
+            return cls(rows, lengths, **facts)
+        except (KeyError, RuntimeError, AttributeError, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise ValueError(f"the demonstrations in {path} do not fit together: {reason}") from error
+
+
+def check_free(path: str | Path, *, force: bool = False) -> None:
+    """Refuses to write over a file.
+
+    Raises:
+        ValueError: it exists, and ``force`` is False.
+    """
+    if Path(path).exists() and not force:
+        raise ValueError(f"{path} exists already: choose another name, or --force (force=True) to replace it")

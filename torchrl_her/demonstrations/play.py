@@ -1,0 +1,63 @@
+"""Playing episodes that become demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_her.demonstrations.dataset import Demonstrations
+from torchrl_her.trainers.trainer import evaluate
+
+_COUNTED = ("key", "step", "episode")  # of the states: where random numbers and time stand
+
+
+def demonstrate(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    *,
+    max_steps: int,
+    achieved_reward: float = 0.0,
+    **facts: Any,
+) -> Demonstrations:
+    """The next episode of each environment, as a policy plays it without exploration.
+
+    The physical states are among them if the environment below the transforms has them: a method
+    ``world_state_dict``, which gives tensors with a row for each environment.
+
+    Args:
+        env: batched, [N].
+        policy: chooses actions.
+
+    Keyword Args:
+        max_steps: of an episode, T; one that is longer is truncated.
+        achieved_reward: the reward of an achieved goal.
+        **facts: ``task`` and ``made_by`` of :class:`~torchrl_her.demonstrations.Demonstrations`.
+
+    Example:
+        >>> from torchrl_her_envs import make_controller, make_env
+        >>> env = make_env("hand_v0", num_envs=3, seed=0)
+        >>> own = demonstrate(env, make_controller(env), max_steps=50, task="hand_v0")
+        >>> len(own), sorted(own.states)[:3]
+        (3, ['ball', 'ball_velocity', 'closed'])
+    """
+    with_states: Any = env
+    while with_states is not None and not callable(getattr(type(with_states), "world_state_dict", None)):
+        with_states = getattr(with_states, "base_env", None)
+    states: list[dict[str, Tensor]] = []
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        if with_states is not None:
+            states.append(with_states.world_state_dict())
+        return policy(tensordict)
+
+    rollout = evaluate(env, act, max_steps=max_steps)
+    names = [name for name in (states[0] if states else {}) if name not in _COUNTED]
+    stacked = {name: torch.stack([own[name] for own in states], 1) for name in names}
+    return Demonstrations.from_rollout(
+        rollout, first=True, states=stacked or None, achieved_reward=achieved_reward, **facts
+    )

@@ -1,0 +1,170 @@
+"""Batches of a run's own transitions and of demonstrations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
+
+from torchrl_her.demonstrations.dataset import Demonstrations
+from torchrl_her.objectives.cloning import DEMONSTRATION
+from torchrl_her.replay_buffers.runs.buffer import runs_of, sizes_of
+from torchrl_her.replay_buffers.writer import HERWriter
+from torchrl_her.trainers.learner import WEIGHT
+
+
+def write_demonstrations(
+    buffer: TensorDictReplayBuffer, demonstrations: Demonstrations, *, run: int = 0
+) -> None:
+    """Writes demonstrations into a run's block of a buffer, relabeled as the buffer's writer does it.
+
+    Args:
+        buffer: with a :class:`~torchrl_her.HERWriter`.
+        demonstrations: with the run's reward, see :func:`~torchrl_her.demonstrations.with_reward`.
+
+    Keyword Args:
+        run: which one.
+
+    Raises:
+        TypeError: the buffer has another writer.
+    """
+    if not isinstance(buffer.writer, HERWriter):
+        kind = type(buffer.writer).__name__
+        raise TypeError(f"demonstrations are written by a HERWriter, the buffer has a {kind}")
+    place = buffer.storage.device
+    rows = demonstrations.rows
+    buffer.writer.extend_run(rows if place in (None, "auto") else rows.to(place), run)
+
+
+def demonstration_rows(share: float, batch_size: int) -> int:
+    """How many rows of a batch are demonstrations: the share, rounded, but at least one and not all.
+
+    Example:
+        >>> demonstration_rows(0.125, 256), demonstration_rows(0.001, 256)
+        (32, 1)
+    """
+    if not 0.0 < share < 1.0:
+        raise ValueError(f"share must be in (0, 1), got {share}")
+    if batch_size < 2:
+        raise ValueError(f"batch_size must be at least 2 for batches of two kinds, got {batch_size}")
+    return min(max(1, round(share * batch_size)), batch_size - 1)
+
+
+class MixedReplay:
+    """A replay buffer of a run's own transitions and one of demonstrations, sampled as one.
+
+    In each batch the first rows are a run's own and the last ones demonstrations, which are marked by the
+    flag ``demonstration``. Entries that only one of the two has are left out. Importance weights of either
+    part are divided by their mean, so that a share of the rows has that share of the weight. New priorities
+    go to the buffer that a row came from.
+
+    What is written goes into the own buffer, whose writer and size this one shows. A
+    :class:`~torchrl_her.Trainer` takes it in place of a buffer.
+
+    Nair et al., Overcoming exploration in reinforcement learning with demonstrations, 2018 (arXiv
+    1709.10089).
+
+    Args:
+        own: the buffer that is trained from; for one run or several.
+        demonstrations: of as many runs, with the same transforms.
+
+    Keyword Args:
+        share: of a batch that are demonstrations; each batch has as many.
+        batch_size: rows of a batch of one run, as the trainer has it.
+        demonstration_key: of the flag, a bool [..., 1].
+
+    Raises:
+        ValueError: the share is not between 0 and 1, a batch has no room for both, or the buffers are for
+            different numbers of runs; when sampling, it is not for whole batches.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage
+        >>> own, shown = (TensorDictReplayBuffer(storage=LazyTensorStorage(9)) for _ in range(2))
+        >>> for buffer, x in ((own, 1.0), (shown, 2.0)):
+        ...     _ = buffer.extend(TensorDict({"x": torch.full((5, 1), x)}, [5]))
+        >>> mixed = MixedReplay(own, shown, share=0.25, batch_size=4)
+        >>> mixed.sample(8)["x"].flatten().tolist()
+        [1.0, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0, 2.0]
+    """
+
+    def __init__(
+        self,
+        own: TensorDictReplayBuffer,
+        demonstrations: TensorDictReplayBuffer,
+        *,
+        share: float = 0.125,
+        batch_size: int = 256,
+        demonstration_key: str = DEMONSTRATION,
+    ) -> None:
+        if runs_of(own) != runs_of(demonstrations):
+            raise ValueError(
+                f"the buffers must be for as many runs, got {runs_of(own)} and {runs_of(demonstrations)}"
+            )
+        self.own, self.demonstrations = own, demonstrations
+        self.runs, self.batch_size = runs_of(own), batch_size
+        self.shown = demonstration_rows(share, batch_size)
+        self.demonstration_key = demonstration_key
+
+    @property
+    def writer(self) -> Any:
+        """That of the own buffer."""
+        return self.own.writer
+
+    @property
+    def priority_key(self) -> str:
+        """Under which new priorities are found."""
+        return self.own.priority_key
+
+    def __len__(self) -> int:
+        return len(self.own)
+
+    def extend(self, data: TensorDictBase) -> Tensor:
+        """Writes a collected batch into the own buffer."""
+        return self.own.extend(data)
+
+    def sample(self, batch_size: int) -> TensorDictBase:
+        """Rows [R * S * B] of S batches of each run: R equal blocks of S batches each.
+
+        Under ``index``, demonstrations count on from the last row of the own storage.
+        """
+        steps, rest = divmod(batch_size, self.runs * self.batch_size)
+        if rest or not steps:
+            raise ValueError(
+                f"{batch_size} rows are no whole number of batches of {self.batch_size} for {self.runs} runs"
+            )
+        if not all(sizes_of(self.demonstrations)):
+            raise RuntimeError("there are runs without demonstrations: write_demonstrations writes them")
+        parts = []
+        for buffer, count in (
+            (self.own, self.batch_size - self.shown),
+            (self.demonstrations, self.shown),
+        ):
+            rows = buffer.sample(self.runs * steps * count).view(self.runs, steps, count)
+            if (weight := rows.get(WEIGHT, None)) is not None:
+                rows.set(WEIGHT, weight / weight.flatten(1).mean(1).view(-1, *[1] * (weight.ndim - 1)))
+            flag = torch.full((*rows.shape, 1), buffer is not self.own, device=rows["index"].device)
+            parts.append(rows.set(self.demonstration_key, flag))
+        parts[1].set("index", parts[1].get("index") + self.own.storage.max_size)
+        known = [set(part.keys(True, True)) for part in parts]
+        both = [part.select(*(known[0] & known[1])) for part in parts]
+        mixed: TensorDictBase = torch.cat(both, 2)
+        return mixed.reshape(batch_size)
+
+    def update_tensordict_priority(self, rows: TensorDictBase) -> None:
+        """Gives each row's sampler its new priority.
+
+        Args:
+            rows: [n], with ``index`` and the new priorities.
+        """
+        behind = self.own.storage.max_size
+        shown = rows.get("index").reshape(len(rows)) >= behind
+        if not bool(shown.all()):
+            self.own.update_tensordict_priority(rows[~shown])
+        if bool(shown.any()):
+            own = rows[shown]
+            own.set("index", own.get("index") - behind)
+            self.demonstrations.update_tensordict_priority(own)

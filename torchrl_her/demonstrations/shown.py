@@ -1,0 +1,96 @@
+"""Demonstrations as a run sees them: with its own reward, and as its layer of a curriculum shows them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchrl_her.curriculum.layers import Curriculum
+from torchrl_her.curriculum.transforms import take_columns
+from torchrl_her.demonstrations.dataset import Demonstrations
+from torchrl_her.goals.rewards import GoalReward, RewardFunction
+
+
+def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> Demonstrations:
+    """Demonstrations with a reward and ends of one's own: each ends where its goal terminates it first.
+
+    One that does not terminate any more is truncated at its end. One that had terminated without achieving
+    its goal, as by a fall, still does.
+
+    Args:
+        demonstrations: as recorded.
+        reward_fn: maps (achieved, desired) goals to (reward, terminated).
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> goal, at = torch.full((3, 1), 2.0), torch.arange(3.0).unsqueeze(-1)
+        >>> seen = {"observation": at, "achieved_goal": at, "desired_goal": goal}
+        >>> last = torch.tensor([[False], [False], [True]])
+        >>> ends = {"terminated": last, "truncated": last & False, "done": last}
+        >>> after = {**seen, "achieved_goal": at + 1, "reward": last.float() - 1.0, **ends}
+        >>> walk = Demonstrations(
+        ...     TensorDict({**seen, "action": at, "next": after}, [3]), torch.tensor([3])
+        ... )
+        >>> near = with_reward(walk, GoalReward(0.5))
+        >>> near.lengths.tolist(), near.rows["next", "reward"].flatten().tolist()
+        ([2], [-1.0, 0.0])
+    """
+    after = demonstrations.rows["next"]
+    recorded = after["terminated"] & (after["reward"] < demonstrations.achieved_reward)
+    reward, terminated = reward_fn(after["achieved_goal"], after["desired_goal"])
+    terminated = terminated.view_as(recorded) | recorded
+    kept, lengths = _until_first(terminated.flatten(), demonstrations)
+    last = torch.zeros_like(terminated)
+    last[kept[lengths.cumsum(0) - 1]] = True
+    changes = {
+        "reward": reward.view(recorded.shape).to(after["reward"].dtype),
+        "terminated": terminated,
+        "truncated": (after["truncated"] | ~terminated) & last,
+        "done": last,
+    }
+    rows = demonstrations.rows.copy().set("next", after.copy().update(changes))
+    return demonstrations.take(kept, lengths, rows=rows)
+
+
+def in_layer(demonstrations: Demonstrations, curriculum: Curriculum, layer: int) -> Demonstrations:
+    """Demonstrations of the full task as a layer shows them, like :class:`~torchrl_her.StateToObs`.
+
+    They end where the layer's goal is achieved. What the environment below terminated says nothing about the
+    layer's goal, so others are truncated at their end.
+
+    Args:
+        demonstrations: whose observation with the desired goal behind it is the state of the curriculum.
+        curriculum: its layers.
+        layer: which one, from 0.
+
+    Raises:
+        ValueError: observation and goal are not as wide as the curriculum's state.
+    """
+    rows, goal = demonstrations.rows.copy(), curriculum.goal_width
+    index = curriculum.state_index[[layer]]
+    widths = [curriculum.observation_width, goal, goal]
+    after = rows["next"].copy()
+    for own in (rows, after):
+        state = torch.cat((own["observation"], own["desired_goal"]), -1)
+        if state.shape[-1] != curriculum.state_width:
+            raise ValueError(
+                f"the curriculum needs states of width {curriculum.state_width}, demonstrations of "
+                f"{demonstrations.task} have {state.shape[-1]}"
+            )
+        shown = take_columns(torch.nn.functional.pad(state, (0, 1)), index).split(widths, -1)
+        own.update(dict(zip(("observation", "achieved_goal", "desired_goal"), shown, strict=True)))
+    after["terminated"] = torch.zeros_like(after["terminated"])
+    rows.set("next", after)
+    seen = replace(demonstrations, rows=rows, achieved_reward=0.0)
+    return with_reward(seen, GoalReward(curriculum.layers[layer].threshold))
+
+
+def _until_first(end: Tensor, demonstrations: Demonstrations) -> tuple[Tensor, Tensor]:
+    """The rows [m] up to the first end [n] of each episode, and how many of each episode, [E]."""
+    of, rows = demonstrations.episode, torch.arange(len(end))
+    first = torch.full_like(demonstrations.lengths, len(end))
+    first = first.scatter_reduce(0, of[end], rows[end], "amin")
+    kept = rows <= first[of]
+    return rows[kept], of[kept].bincount(minlength=len(demonstrations))

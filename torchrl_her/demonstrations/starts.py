@@ -1,0 +1,230 @@
+"""Episodes that start at states of demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import Transform
+
+from torchrl_her.demonstrations.dataset import Demonstrations
+from torchrl_her.demonstrations.walk import WalkBack
+
+
+class DemonstrationStarts(Transform):
+    """Starts a share of the episodes at states of demonstrations, with the goals of these.
+
+    At first episodes start a few steps before the end of a demonstration, so that the goal is near. When
+    enough of them achieve it, starts walk back, see :class:`~torchrl_her.demonstrations.WalkBack`. They have
+    all their steps before them. Other episodes start as the environment says.
+
+    The environment below must have a method ``start_at(states, which)``, as those of this library's throwing
+    and toy tasks have (:meth:`torchrl_her_envs.BatchedEnv.start_at`). Put the transform first, right around
+    it. If a later transform changes what ends an episode, as :class:`~torchrl_her.StateToObs` does, put
+    :meth:`outcomes` behind that one.
+
+    The environments of R runs are R equal blocks of the batch. Each run has its own random numbers and walks
+    back by itself. All of it is part of the ``state_dict``.
+
+    Args:
+        demonstrations: with physical states. Only those that achieve their goal are used. One for all runs,
+            or R of them.
+
+    Keyword Args:
+        share: of the episodes.
+        runs: R.
+        generators: sources of random numbers, one for each run, or None for torch's own.
+        width, stride, threshold, samples: of :class:`~torchrl_her.demonstrations.WalkBack`.
+
+    Attributes:
+        walk: how far starts have walked back.
+
+    Raises:
+        ValueError: the share is outside of [0, 1], there are no states, or no demonstration achieves its
+            goal; when used, the environment cannot be started at a state, or is not R equal blocks.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torchrl_her_envs import make_controller, make_env
+        >>> from torchrl_her.demonstrations import demonstrate
+        >>> env = make_env("hand_v1", num_envs=8, seed=0)
+        >>> shown = demonstrate(env, make_controller(env), max_steps=50)
+        >>> starts = DemonstrationStarts(shown, share=1.0)
+        >>> _ = TransformedEnv(env, starts).reset()
+        >>> bool(env.worlds.free.all())  # all balls fly already
+        True
+    """
+
+    def __init__(
+        self,
+        demonstrations: Demonstrations | Sequence[Demonstrations],
+        *,
+        share: float = 0.5,
+        runs: int = 1,
+        generators: Sequence[torch.Generator] | None = None,
+        width: int = 4,
+        stride: int = 2,
+        threshold: float = 0.5,
+        samples: int = 50,
+    ) -> None:
+        super().__init__()
+        if not 0.0 <= share <= 1.0:
+            raise ValueError(f"share must be in [0, 1], got {share}")
+        single = isinstance(demonstrations, Demonstrations)
+        given = [demonstrations] * runs if isinstance(demonstrations, Demonstrations) else demonstrations
+        if len(given) != runs or (generators is not None and len(generators) != runs):
+            raise ValueError(f"{runs} runs need demonstrations and a generator for each, got {len(given)}")
+        first = usable(given[0])
+        self._shown = [first if single else usable(own) for own in given]
+        self.share, self.runs = share, runs
+        self._generators = [None] * runs if generators is None else list(generators)
+        self.walk = WalkBack(
+            [int(own.lengths.max()) for own in self._shown],
+            width=width,
+            stride=stride,
+            threshold=threshold,
+            samples=samples,
+        )
+        self._back: Tensor | None = None  # [N], how many steps before the end the present episodes started
+        self._asks_elsewhere = False
+
+    def show(self, demonstrations: Demonstrations, *, run: int = 0) -> None:
+        """Gives a run other demonstrations, such as those of its next layer, and begins its walk anew."""
+        self._shown[run] = usable(demonstrations)
+        self.walk.restart(run, int(self._shown[run].lengths.max()))
+
+    def outcomes(self) -> Transform:
+        """A transform that sees how episodes end, in place of this one."""
+        self._asks_elsewhere = True
+        return _Outcomes(self)
+
+    def note(self, after: TensorDictBase) -> None:
+        """Counts the episodes that started at a demonstration and are over.
+
+        Args:
+            after: [N], a step's ``next``.
+        """
+        if self._back is None:
+            return
+        over = after.get("done").flatten() & (self._back > 0)
+        if not bool(over.any()):
+            return
+        achieved = after.get("terminated").flatten()
+        for run, (own, ended) in enumerate(
+            zip(achieved.chunk(self.runs), over.chunk(self.runs), strict=True)
+        ):
+            self.walk.record(run, own[ended].tolist())
+        self._back[over] = 0
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if not self._asks_elsewhere:
+            self.note(next_tensordict)
+        return next_tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        env = self._environment()
+        count = tensordict_reset.batch_size.numel()
+        if count % self.runs:
+            raise ValueError(f"{count} environments cannot be shared out among {self.runs} runs")
+        mask = tensordict.get("_reset", None)
+        begun = torch.ones(count, dtype=torch.bool) if mask is None else mask.flatten()
+        if self._back is None or len(self._back) != count:
+            self._back = torch.zeros(count, dtype=torch.int64)
+        self._back[begun] = 0
+        which, states = self._draw(begun)
+        if len(which) == 0:
+            return tensordict_reset
+        return tensordict_reset.update(env.start_at(states, which))
+
+    def _draw(self, begun: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Which of the environments [N] that begin start at demonstrations, and their states."""
+        assert self._back is not None
+        each = len(begun) // self.runs
+        chosen: list[Tensor] = []
+        parts: list[dict[str, Tensor]] = []
+        for run, (own, generator) in enumerate(zip(begun.chunk(self.runs), self._generators, strict=True)):
+            new = own.nonzero().flatten()
+            if len(new) == 0:
+                continue  # as when the run is alone: it draws nothing
+            u = torch.rand(len(new), 3, generator=generator, dtype=torch.float64)
+            started = u[:, 0] < self.share
+            shown, (least, most) = self._shown[run], self.walk.window(run)
+            u = u[started]
+            episode = (u[:, 1] * len(shown)).long()
+            back = least + (u[:, 2] * (most - least + 1)).long()
+            lengths = shown.lengths[episode]
+            back = torch.minimum(back, lengths)
+            rows = shown.begins[episode] + lengths - back
+            which = new[started] + run * each
+            self._back[which] = back
+            chosen.append(which)
+            parts.append({name: entry[rows] for name, entry in (shown.states or {}).items()})
+        if not chosen:
+            return torch.empty(0, dtype=torch.int64), {}
+        return torch.cat(chosen), {name: torch.cat([own[name] for own in parts]) for name in parts[0]}
+
+    def _environment(self) -> Any:
+        """The environment below, which can be started at a state."""
+        env: Any = self.container
+        while env is not None and not callable(getattr(type(env), "start_at", None)):
+            below = getattr(env, "base_env", None)
+            if below is None:
+                name = getattr(env, "task_name", type(env).__name__)
+                raise ValueError(
+                    f"{name} cannot be started at states of demonstrations: it has no method start_at, as "
+                    "the throwing and toy tasks have"
+                )
+            env = below
+        return env
+
+    # Part of the state_dict, which collectors have among their own
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The walk, the episodes under way, and the sources of random numbers."""
+        return {
+            "walk": self.walk.state_dict(),
+            "back": None if self._back is None else self._back.clone(),
+            "generators": [None if own is None else own.get_state() for own in self._generators],
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Puts back what :meth:`get_extra_state` gave."""
+        self.walk.load_state_dict(state["walk"])
+        self._back = None if state["back"] is None else state["back"].clone()
+        for generator, own in zip(self._generators, state["generators"], strict=True):
+            if generator is not None and own is not None:
+                generator.set_state(own)
+
+
+class _Outcomes(Transform):
+    """Tells starts how episodes end."""
+
+    def __init__(self, starts: DemonstrationStarts) -> None:
+        super().__init__()
+        self.__dict__["starts"] = starts  # which is in the environment already, and not a part of this one
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.starts.note(next_tensordict)
+        return next_tensordict
+
+
+def usable(demonstrations: Demonstrations) -> Demonstrations:
+    """Those that episodes can start at: they have physical states and achieve their goal.
+
+    Raises:
+        ValueError: there are none.
+    """
+    if not demonstrations.states:
+        raise ValueError(
+            f"demonstrations of {demonstrations.task} hold no physical states that episodes could start at"
+        )
+    good = demonstrations.achieved.nonzero().flatten()
+    if len(good) == 0:
+        raise ValueError(
+            f"none of {len(demonstrations)} demonstrations of {demonstrations.task} achieves its goal, "
+            "so no episode can start near it"
+        )
+    return demonstrations.select(good)

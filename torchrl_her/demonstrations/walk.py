@@ -1,0 +1,124 @@
+"""How far from the end of a demonstration episodes start: a walk back from the goal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+
+def step_back(
+    back: int, outcomes: Sequence[bool], *, stride: int, threshold: float, samples: int, longest: int
+) -> tuple[int, list[bool]]:
+    """Where starts are after some more episodes that began there.
+
+    Args:
+        back: the greatest number of steps before the end at which episodes start.
+        outcomes: of the episodes since the last step back, oldest first: whether they achieved their goal.
+
+    Keyword Args:
+        stride: of a step back.
+        threshold: share of successes at which there is one.
+        samples: number of episodes of which it is the share: the latest ones.
+        longest: ``back`` is at most this.
+
+    Returns:
+        ``(back, outcomes)``, the second one empty after a step back.
+
+    Example:
+        >>> options = {"stride": 3, "threshold": 0.5, "samples": 4, "longest": 9}
+        >>> step_back(2, [False, True, True], **options)
+        (2, [False, True, True])
+        >>> step_back(2, [False, False, False, True, True], **options)
+        (5, [])
+        >>> step_back(8, [True] * 4, **options)
+        (9, [])
+    """
+    latest = list(outcomes)[-samples:]
+    if len(latest) < samples or sum(latest) < threshold * samples:
+        return back, latest
+    return min(longest, back + stride), []
+
+
+class WalkBack:
+    """Starts of episodes that walk back from the ends of demonstrations, for each of R runs by itself.
+
+    Salimans and Chen, Learning Montezuma's Revenge from a single demonstration, 2018 (arXiv 1812.03381);
+    Florensa et al., Reverse curriculum generation for reinforcement learning, 2017 (arXiv 1707.05300).
+
+    Args:
+        longest: R, transitions of the longest demonstration of each run.
+
+    Keyword Args:
+        width: number of steps among which starts are drawn: from ``back - width + 1`` to ``back`` steps
+            before the end.
+        stride, threshold, samples: of a step back, see :func:`step_back`.
+
+    Attributes:
+        back: R, the greatest number of steps before the end at which episodes start.
+
+    Raises:
+        ValueError: a number is below 1, or the threshold is not in (0, 1].
+
+    Example:
+        >>> walk = WalkBack([10], width=2, stride=3, threshold=0.5, samples=2)
+        >>> walk.window(0)
+        (1, 2)
+        >>> walk.record(0, [True, False])
+        >>> walk.window(0)
+        (4, 5)
+    """
+
+    def __init__(
+        self,
+        longest: Sequence[int],
+        *,
+        width: int = 4,
+        stride: int = 2,
+        threshold: float = 0.5,
+        samples: int = 50,
+    ) -> None:
+        for name, value in (("width", width), ("stride", stride), ("samples", samples)):
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        if not 0.0 < threshold <= 1.0:
+            raise ValueError(f"threshold must be in (0, 1], got {threshold}")
+        self.width, self.stride, self.threshold, self.samples = width, stride, threshold, samples
+        self._longest = list(longest)
+        self.back = [min(width, own) for own in longest]
+        self._outcomes: list[list[bool]] = [[] for _ in longest]
+
+    def window(self, run: int) -> tuple[int, int]:
+        """The least and the greatest number of steps before the end at which a run's episodes start."""
+        return max(1, self.back[run] - self.width + 1), self.back[run]
+
+    def record(self, run: int, outcomes: Sequence[bool]) -> None:
+        """Counts episodes of a run that started there and are over: whether they achieved their goal."""
+        for own in outcomes:  # one by one: several in a call may complete a step back
+            self.back[run], self._outcomes[run] = step_back(
+                self.back[run],
+                [*self._outcomes[run], own],
+                stride=self.stride,
+                threshold=self.threshold,
+                samples=self.samples,
+                longest=self._longest[run],
+            )
+
+    def restart(self, run: int, longest: int) -> None:
+        """Begins a run's walk anew, with other demonstrations."""
+        self._longest[run], self.back[run], self._outcomes[run] = longest, min(self.width, longest), []
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain data that :meth:`load_state_dict` takes."""
+        outcomes = [list(own) for own in self._outcomes]
+        return {"back": list(self.back), "outcomes": outcomes, "longest": list(self._longest)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: it is of another number of runs.
+        """
+        if len(state["back"]) != len(self.back):
+            raise ValueError(f"the state is that of {len(state['back'])} runs, not of {len(self.back)}")
+        self.back, self._longest = list(state["back"]), list(state["longest"])
+        self._outcomes = [list(own) for own in state["outcomes"]]
