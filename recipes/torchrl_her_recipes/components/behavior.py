@@ -21,6 +21,7 @@ from torchrl_her_recipes.components.novelty import rare_goals
 from torchrl_her_recipes.config.recipe import Recipe
 
 _SEED = 1 << 33  # so that proposals do not repeat the numbers of exploration
+_SAMPLES = 250  # goals of which a density is estimated, often and for many candidates
 _GREEDY = ("mega", "discover")
 
 
@@ -129,4 +130,6 @@ def _weights_of(recipe: Recipe, env: GoalEnv, space: GoalSpace | KernelSpace | N
     """The weights of one run's proposals; None for all alike."""
     if recipe.behavior.name == "ibs" and space is not None:
         return make_instructive(recipe, space)
-    return rare_goals(recipe, env) if recipe.behavior.prefers_rare(recipe.learner) else None
+    if not recipe.behavior.prefers_rare(recipe.learner):
+        return None
+    return rare_goals(recipe, env, samples=_SAMPLES)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,7 +14,8 @@ from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_her import GoalReward, GoalWeights, HERSampleUnit, HERWriter
-from torchrl_her.behavior import BehaviorGoals, GoalFactor, Offers
+from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor, Offers
+from torchrl_her.goals import RareGoals
 from torchrl_her.trainers import collector_state_dict, load_collector_state_dict
 
 from .line import WANTED, Line, walk
@@ -353,3 +356,32 @@ def test_environments_that_cannot_be_shared_out() -> None:
 def test_it_is_not_for_buffers() -> None:
     with pytest.raises(RuntimeError, match="sampled transitions have their goals already"):
         BehaviorGoals(REWARD)(TensorDict({"observation": torch.zeros(1)}, []))
+
+
+def test_it_works_where_the_environments_are(
+    device: torch.device, make_generator: Callable[[int], torch.Generator]
+) -> None:
+    def first_goals(place: torch.device, generators: list[torch.Generator]) -> TensorDictBase:
+        def nearness(observation: Tensor, goals: Tensor, counts: object) -> Tensor:
+            return -goals.abs().expand(-1, max(observation.shape[-2], goals.shape[1]), -1)
+
+        behavior = BehaviorGoals(
+            REWARD,
+            weights=[RareGoals(k=2, estimator="neighbors"), RareGoals(k=2, estimator="neighbors")],
+            factors=[Achievable(nearness, runs=2), Directed(nearness, runs=2)],
+            real_share=0.3,
+            greedy=True,
+            candidates=20,
+            memory=100,
+            runs=2,
+            generators=generators,
+        )
+        env = TransformedEnv(Line(4, device=place), behavior)
+        return env.rollout(20, walk, break_when_any_done=False, auto_cast_to_device=False)
+
+    rows = first_goals(device, [make_generator(seed) for seed in (0, 1)])
+    assert {entry.device for entry in rows.values(True, True)} == {device}
+    assert rows["proposed"].any()
+    if device.type == "cpu":
+        return
+    assert not rows["proposed"].all()
