@@ -1,6 +1,6 @@
 """Behavior goals: which goals the next episodes ask for, proposed from those that were achieved."""
 
-from torchrl_her.behavior.factors import Achievable, Directed, GoalFactor, Offers, Successes
+from torchrl_her.behavior.factors import Achievable, Directed, GoalFactor, Offers, Rare, Successes
 from torchrl_her.behavior.memory import AchievedGoals
 from torchrl_her.behavior.transform import BehaviorGoals
 from torchrl_her.behavior.values import GoalValues
@@ -13,5 +13,6 @@ __all__ = [
     "GoalFactor",
     "GoalValues",
     "Offers",
+    "Rare",
     "Successes",
 ]

@@ -9,6 +9,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_her.goals.density import log_kernel_density, log_neighbor_density
+
+_LEAST_SPREAD = 0.01  # of the widest dimension: one that hardly varies shall not make all goals rare
+_KERNEL_DIMENSIONS = 3
+
 Values = Callable[[Tensor, Tensor, Sequence[int]], Tensor]
 
 
@@ -21,6 +26,8 @@ class Offers(NamedTuple):
         start: [m, o], what is observed at the beginning of each episode.
         target: [m, g], the goal that the task itself asks for.
         counts: R numbers, how many of the m episodes are of each run.
+        known: R tensors [s, g], a sample of the goals that each run has achieved; empty for runs without such
+            episodes, and if no factor asks for it (``GoalFactor.samples``).
     """
 
     goals: Tensor
@@ -28,6 +35,7 @@ class Offers(NamedTuple):
     start: Tensor
     target: Tensor
     counts: Sequence[int]
+    known: Sequence[Tensor] = ()
 
     @property
     def run(self) -> Tensor:
@@ -41,11 +49,16 @@ class GoalFactor:
 
     The base class finds all goals alike.
 
+    Attributes:
+        samples: how many of the achieved goals ``Offers.known`` is to have.
+
     Example:
         >>> class NotTooFar(GoalFactor):
         ...     def __call__(self, offers):
         ...         return (offers.goals - offers.target.unsqueeze(1)).norm(dim=-1) < 1.0
     """
+
+    samples: int = 0
 
     def __call__(self, offers: Offers) -> Tensor:
         """[m, c] of at least 0, or of bool."""
@@ -96,6 +109,53 @@ class Successes:
         """Counts [R] episodes that ended, and those of them in which the goal was achieved."""
         kept = torch.exp(-ended.double() / self.memory)
         self.rate = kept * self.rate.to(kept.device) + (1 - kept) * achieved / ended.clamp(min=1)
+
+
+class Rare(GoalFactor):
+    """Prefers goals with few others around them: the inverse of their density among all that were achieved.
+
+    MEGA proposes the goal of the least density (Pitis et al., Maximum Entropy Gain Exploration for Long
+    Horizon Multi-goal RL, 2020, arXiv 2007.02832). As virtual goals, rare ones are preferred by
+    :class:`~torchrl_her.goals.RareGoals`.
+
+    Goals are divided by the standard deviations of those that were achieved. The density is a Gaussian kernel
+    estimate for up to three numbers, and one by the nearest neighbors for more.
+
+    Keyword Args:
+        samples: achieved goals that the density is estimated from.
+        sigma: width of the kernel, in standard deviations.
+        k: which neighbor.
+
+    Raises:
+        ValueError: an option is not positive.
+
+    Example:
+        >>> known = torch.tensor([[0.0], [0.1], [0.2], [5.0]])
+        >>> goals = torch.tensor([[[0.1], [5.0]]])
+        >>> offers = Offers(goals, goals, torch.zeros(1, 1), torch.zeros(1, 1), [1], [known])
+        >>> Rare()(offers).argmax().item()
+        1
+    """
+
+    def __init__(self, *, samples: int = 250, sigma: float = 0.2, k: int = 10) -> None:
+        for name, number in (("samples", samples), ("sigma", sigma), ("k", k)):
+            if not number > 0:
+                raise ValueError(f"{name} must be positive, got {number}")
+        self.samples, self.sigma, self.k = samples, sigma, k
+
+    def __call__(self, offers: Offers) -> Tensor:
+        parts = zip(offers.goals.split(list(offers.counts)), offers.known, strict=True)
+        logs = torch.cat([self._log_density(goals, known) for goals, known in parts if len(goals)])
+        return (logs.amin(1, keepdim=True) - logs).exp()  # 1 for the rarest
+
+    def _log_density(self, goals: Tensor, known: Tensor) -> Tensor:
+        spread = known.std(0, correction=0)
+        scale = spread.clamp(min=_LEAST_SPREAD * float(spread.max()))
+        scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+        points, samples = goals / scale, known / scale
+        if goals.shape[-1] <= _KERNEL_DIMENSIONS:
+            return log_kernel_density(points, samples, self.sigma).to(goals)
+        return log_neighbor_density(points, samples, min(self.k, len(samples))).to(goals)
 
 
 class Achievable(GoalFactor):
@@ -154,7 +214,7 @@ class Achievable(GoalFactor):
         self.cutoff = torch.full((runs,), cutoff, dtype=torch.float64)
 
     def __call__(self, offers: Offers) -> Tensor:
-        value = self.values(offers.start, offers.goals, offers.counts).mean(-1)
+        value = self.values(offers.start, offers.goals, offers.counts).mean(-1).nan_to_num(-math.inf)
         own = self.cutoff.to(value)[offers.run].unsqueeze(1)
         believed = value >= own
         return believed | (~believed.any(1, keepdim=True) & (value == value.amax(1, keepdim=True)))
@@ -185,7 +245,7 @@ class Directed(GoalFactor):
     so that achievable goals count more, as long as fewer than ``target`` of the proposed goals are achieved,
     and falls otherwise.
 
-    With a single critic S is 0. Weights that prefer rare goals then take its place.
+    With a single critic S is 0. :class:`Rare` then takes its place.
 
     Args:
         values: of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
@@ -239,8 +299,8 @@ class Directed(GoalFactor):
         near = self._bound(self.values(offers.start, offers.goals, offers.counts))
         far = self._bound(self.values(offers.reached, offers.target.unsqueeze(1), offers.counts))
         alpha = self.alpha.to(near)[offers.run].unsqueeze(1)
-        score = (alpha * near + (1 - alpha) * far) / self.temperature
-        return (score - score.amax(1, keepdim=True)).exp()
+        score = ((alpha * near + (1 - alpha) * far) / self.temperature).nan_to_num(-math.inf)
+        return (score - score.amax(1, keepdim=True)).exp().nan_to_num(0.0)
 
     def record(self, ended: Tensor, achieved: Tensor) -> None:
         self.successes.record(ended, achieved)

@@ -50,7 +50,7 @@ class AchievedGoals:
         return self._written.clamp(max=self.capacity).tolist()
 
     def add(self, goals: Tensor, observations: Tensor, *, which: Tensor | None = None) -> None:
-        """Adds goals of all runs; the oldest ones make room for them.
+        """Adds goals of all runs; the oldest ones make room for them. Those that are not finite are left out.
 
         Args:
             goals: [N, g], R equal blocks in the order of the runs.
@@ -66,19 +66,19 @@ class AchievedGoals:
             raise ValueError(f"{number} goals of each run do not fit into a memory of {self.capacity}")
         if self._rows is None:
             self._rows = self._empty(goals), self._empty(observations)
+        if self._written.device != goals.device or self._rows[0].device != goals.device:  # of a checkpoint
+            self._rows = self._rows[0].to(goals.device), self._rows[1].to(goals.device)
             self._written = self._written.to(goals.device)
+        finite = goals.isfinite().all(-1)
+        which = finite if which is None else finite & which.to(goals.device)
         run = torch.arange(self.runs, device=goals.device)
-        if which is None:
-            rank = torch.arange(number, device=goals.device).expand(self.runs, -1)
-            added = torch.full_like(self._written, number)
-        else:
-            blocks = which.view(self.runs, -1)
-            rank, added = blocks.cumsum(1) - 1, blocks.sum(1)
+        blocks = which.view(self.runs, -1)
+        rank, added = blocks.cumsum(1) - 1, blocks.sum(1)
         place = (self._written.unsqueeze(1) + rank) % self.capacity + run.unsqueeze(1) * self.capacity
         self._written += added
         flat = place.flatten()
         for own, new in zip(self._rows, (goals, observations), strict=True):
-            own[flat if which is None else flat[which]] = (new if which is None else new[which]).to(own)
+            own[flat[which]] = new[which].to(own)
 
     def draw(self, counts: Sequence[int], width: int, generators: Generators) -> Tensor:
         """Draws goals, all alike, for episodes of several runs.

@@ -14,6 +14,7 @@ from torchrl.envs import Transform
 from torchrl_her.behavior.factors import GoalFactor, Offers
 from torchrl_her.behavior.memory import AchievedGoals
 from torchrl_her.goals.factors import draw
+from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights
 from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
@@ -37,14 +38,15 @@ class BehaviorGoals(Transform):
     | --- | --- | --- | --- | --- |
     | uniform | none | | none | False |
     | IBS | :class:`~torchrl_her.Instructiveness` | proposed | none | False |
-    | MEGA | ``RareGoals`` | achieved | :class:`~torchrl_her.behavior.Achievable` | True |
-    | DISCOVER | none, with several critics | | :class:`~torchrl_her.behavior.Directed` | True |
+    | MEGA | none | | ``Rare``, ``Achievable`` | True |
+    | DISCOVER | none | | ``Directed``; with a single critic ``Rare``, too | True |
 
     In a curriculum, put it behind :class:`~torchrl_her.StateToObs` and before :class:`~torchrl_her.ZeroPad`.
     It acts in the last layer, which is the full task, if ``layer_key`` is given or :meth:`set_active` is
     called.
 
     The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
+    Episodes that end by a time limit count as ended only if that limit lies below this transform.
     Put the transform around a ParallelEnv and not inside of its workers, which would each have a memory of
     their own. All that it knows is a part of its ``state_dict()``, and so of the collector's.
 
@@ -55,6 +57,7 @@ class BehaviorGoals(Transform):
         weights: of goals; for several runs a list, one of each. None for all alike.
         factors: others by which the weights are multiplied.
         told: which goals the weights are told of by ``update``: those that are achieved, or those proposed.
+        remember: whether achieved goals are remembered; if not, ``memory.add`` says which goals there are.
         greedy: whether the goal of the greatest product is proposed, and not one in proportion to it.
         real_share: share of the episodes in which the task's own goal stays.
         candidates: goals of which one is proposed.
@@ -68,6 +71,7 @@ class BehaviorGoals(Transform):
             done_key: read, and all but the first two written.
         real_goal_key: where the task's own goal is written.
         proposed_key: where it is written whether the goal is a proposed one, bool [..., 1].
+        reached_key: where it is written whether a proposed goal was achieved in the episode, bool [..., 1].
         layer_key: of the layer [..., 1] that an episode is played in, if it has one.
         layer: the one in which goals are proposed.
 
@@ -88,8 +92,10 @@ class BehaviorGoals(Transform):
         >>> env = TransformedEnv(env, BehaviorGoals(GoalReward(0.1), real_share=0.0, goes_on=True))
         >>> _ = env.rollout(10)  # which is remembered
         >>> begun = env.reset()
-        >>> begun["proposed"].flatten().tolist(), (begun["desired_goal"] == begun["real_goal"]).any().item()
-        ([True, True, True, True], False)
+        >>> begun["proposed"].flatten().tolist()
+        [True, True, True, True]
+        >>> (begun["desired_goal"] == begun["real_desired_goal"]).any().item()
+        False
     """
 
     def __init__(
@@ -99,6 +105,7 @@ class BehaviorGoals(Transform):
         weights: GoalWeights | Sequence[GoalWeights] | None = None,
         factors: Sequence[GoalFactor] = (),
         told: Told = "achieved",
+        remember: bool = True,
         greedy: bool = False,
         real_share: float = 0.5,
         candidates: int = 100,
@@ -112,10 +119,11 @@ class BehaviorGoals(Transform):
         desired_goal_key: NestedKey = "desired_goal",
         reward_key: NestedKey = "reward",
         terminated_key: NestedKey = "terminated",
-        truncated_key: NestedKey = "truncated",
+        truncated_key: NestedKey | None = "truncated",
         done_key: NestedKey = "done",
-        real_goal_key: NestedKey = "real_goal",
+        real_goal_key: NestedKey = "real_desired_goal",
         proposed_key: NestedKey = "proposed",
+        reached_key: NestedKey = "proposed_reached",
         layer_key: NestedKey | None = None,
         layer: int = 0,
     ) -> None:
@@ -128,22 +136,30 @@ class BehaviorGoals(Transform):
         own = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
         if own and len(own) != runs:
             raise ValueError(f"{runs} runs need a list of {runs} weights, one of each run, got {len(own)}")
-        out_keys = [desired_goal_key, real_goal_key, proposed_key]
+        if truncated_key is None and not goes_on:
+            raise ValueError("goes_on=False needs a truncated_key, to say where the environment ended")
+        out_keys = [desired_goal_key, real_goal_key, proposed_key, reached_key]
         super().__init__(in_keys=[observation_key, achieved_goal_key, desired_goal_key], out_keys=out_keys)
         self.generators: Generators = check_generators(runs, generators) or [None]
         self.reward_fn, self.weights, self.factors = reward_fn, own, list(factors)
+        self.remember = remember
         self.told, self.greedy, self.real_share, self.candidates = told, greedy, real_share, candidates
         self.runs, self.achieved_reward, self.goes_on = runs, achieved_reward, goes_on
         self.memory = AchievedGoals(memory, runs=runs)
         self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
-        self.truncated_key, self.done_key = unravel_key(truncated_key), unravel_key(done_key)
+        self.truncated_key = None if truncated_key is None else unravel_key(truncated_key)
+        self.done_key = unravel_key(done_key)
         self.layer_key, self.layer = layer_key, layer
         self.ended = torch.zeros(runs, dtype=torch.int64)
         self.achieved = torch.zeros(runs, dtype=torch.int64)
         self._active = [True] * runs
 
     def set_active(self, active: bool, *, run: int = 0) -> None:
-        """Lets a run remember goals and propose them, or neither."""
+        """Lets a run remember goals and propose them, or neither. IBS begins anew when it begins."""
+        if active and not self._active[run] and self.weights:
+            self.weights[run].clear()
+            if isinstance(own := self.weights[run], InstructiveWeights):
+                own.restart()
         self._active[run] = active
 
     def success(self) -> Tensor:
@@ -187,44 +203,60 @@ class BehaviorGoals(Transform):
     # TorchRL's hooks
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        goal_key, real_key, proposed_key = self.out_keys
+        goal_key, real_key, proposed_key, reached_key = self.out_keys
         real = self._get(tensordict_reset, goal_key)
-        if len(real) % self.runs:
-            raise ValueError(f"{len(real)} environments cannot be shared out among {self.runs} runs")
+        number = real.shape[:-1].numel()
+        if number % self.runs:
+            raise ValueError(f"{number} environments cannot be shared out among {self.runs} runs")
         mask = tensordict.get("_reset", None)
         begins = torch.ones_like(real[..., :1], dtype=torch.bool) if mask is None else mask
         begins = begins.view(*real.shape[:-1], 1)
         proposed, goals = self._propose(tensordict_reset, begins.flatten())
         flags = proposed.view(begins.shape)
-        wanted = real if goals is None else real.index_put((flags.squeeze(-1),), goals.to(real))
+        wanted = real
+        if goals is not None:
+            wanted = _rows(real).index_put((proposed,), goals.to(real)).view(real.shape)
         # TorchRL leaves the environments that were not reset as they were.
-        for key, value in ((goal_key, wanted), (real_key, real), (proposed_key, flags)):
+        shown = (wanted, real, flags, torch.zeros_like(flags))
+        for key, value in zip((goal_key, real_key, proposed_key, reached_key), shown, strict=True):
             tensordict_reset.set(key, value)
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        goal_key, real_key, proposed_key = self.out_keys
+        goal_key, real_key, proposed_key, reached_key = self.out_keys
         proposed, real = self._get(tensordict, proposed_key), self._get(next_tensordict, goal_key)
         achieved = self._get(next_tensordict, self.in_keys[1])
         next_tensordict.set(real_key, real)
         next_tensordict.set(proposed_key, proposed)
-        self._remember(tensordict, next_tensordict, achieved)
+        next_tensordict.set(reached_key, torch.zeros_like(proposed))
+        if self.remember:
+            self._remember(tensordict, next_tensordict, achieved)
         if not bool(proposed.any()):
             return next_tensordict
         wanted = torch.where(proposed, tensordict.get(goal_key), real)
         reward, terminated = self.reward_fn(achieved, wanted)
-        before, ended = next_tensordict.get(self.reward_key), next_tensordict.get(self.terminated_key)
-        fell = ended & (before < self.achieved_reward)  # without its goal: so it does for any goal
+        before, ended = (
+            self._get(next_tensordict, self.reward_key),
+            self._get(next_tensordict, self.terminated_key),
+        )
+        fell = ended & (before < self.achieved_reward)
+        if bool(fell.any()):  # it ends so for any goal, unless the task's own goal has ended it
+            fell = fell & ~self.reward_fn(achieved, real)[1]
+        reached = self._get(tensordict, reached_key) | (proposed & (reward >= self.achieved_reward))
         terminated = torch.where(proposed, terminated | fell, ended)
-        truncated = next_tensordict.get(self.truncated_key)
-        if not self.goes_on:
-            truncated = truncated | (ended & ~terminated)
-        done = torch.where(proposed, terminated | truncated, next_tensordict.get(self.done_key))
+        done = terminated
+        if self.truncated_key is not None:
+            truncated = self._get(next_tensordict, self.truncated_key)
+            if not self.goes_on:
+                truncated = truncated | (ended & ~terminated)
+            next_tensordict.set(self.truncated_key, truncated)
+            done = terminated | truncated
+        done = torch.where(proposed, done, self._get(next_tensordict, self.done_key))
         reward = torch.where(proposed, reward.to(before), before)
-        keys = (goal_key, self.reward_key, self.terminated_key, self.truncated_key, self.done_key)
-        for key, value in zip(keys, (wanted, reward, terminated, truncated, done), strict=True):
+        keys = (goal_key, self.reward_key, self.terminated_key, self.done_key, reached_key)
+        for key, value in zip(keys, (wanted, reward, terminated, done, reached), strict=True):
             next_tensordict.set(key, value)
-        self._count(proposed & done, reward >= self.achieved_reward)
+        self._count(proposed & done, reached)
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -232,39 +264,41 @@ class BehaviorGoals(Transform):
         raise RuntimeError("BehaviorGoals is for environments: sampled transitions have their goals already")
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        goal_key, real_key, proposed_key = self.out_keys
+        goal_key, real_key, *flags = self.out_keys
         goal = observation_spec[goal_key]
         observation_spec[real_key] = goal.clone()
-        shape = (*goal.shape[:-1], 1)
-        observation_spec[proposed_key] = Binary(shape=shape, dtype=torch.bool, device=goal.device)
+        for key in flags:
+            shape = (*goal.shape[:-1], 1)
+            observation_spec[key] = Binary(shape=shape, dtype=torch.bool, device=goal.device)
         return observation_spec
 
     # The work
 
-    def _takes_part(self, tensordict: TensorDictBase, rows: int) -> Tensor | None:
+    def _takes_part(self, tensordict: TensorDictBase, goals: Tensor) -> Tensor | None:
         """The environments [N] in which goals are remembered and proposed; None for all."""
         part = None
         if not all(self._active):
-            part = torch.tensor(self._active).repeat_interleave(rows // self.runs)
+            active = torch.tensor(self._active, device=goals.device)
+            part = active.repeat_interleave(len(goals) // self.runs)
         if self.layer_key is not None:
-            own = self._get(tensordict, self.layer_key).reshape(rows) == self.layer
-            part = own if part is None else part.to(own.device) & own
+            own = self._get(tensordict, self.layer_key).reshape(-1) == self.layer
+            part = own if part is None else part & own
         return part
 
     def _remember(self, before: TensorDictBase, after: TensorDictBase, achieved: Tensor) -> None:
-        achieved = achieved.flatten(0, -2)
-        part = self._takes_part(before, len(achieved))
+        achieved = _rows(achieved)
+        part = self._takes_part(before, achieved)
         if part is not None and not bool(part.any()):
             return
-        self.memory.add(achieved, self._get(after, self.in_keys[0]).flatten(0, -2), which=part)
+        self.memory.add(achieved, _rows(self._get(after, self.in_keys[0])), which=part)
         if self.weights and self.told == "achieved":
             goals = achieved if part is None else achieved[part]
             self._weights_of_runs().update(goals, range(self.runs), self._counts(part, len(achieved)))
 
     def _propose(self, tensordict: TensorDictBase, begins: Tensor) -> tuple[Tensor, Tensor | None]:
         """Which of the environments [N] get a proposed goal, and these goals [m, g]."""
-        part = self._takes_part(tensordict, len(begins))
-        chosen = begins if part is None else begins & part.to(begins.device)
+        part = self._takes_part(tensordict, begins)
+        chosen = begins if part is None else begins & part
         known = torch.tensor([size > 0 for size in self.memory.sizes], device=begins.device)
         chosen = chosen & known.repeat_interleave(len(begins) // self.runs)
         if self.real_share > 0 and bool(chosen.any()):
@@ -277,9 +311,10 @@ class BehaviorGoals(Transform):
         offers = Offers(
             goals=self.memory.goals(index),
             reached=self.memory.observations(index),
-            start=self._get(tensordict, self.in_keys[0]).flatten(0, -2)[chosen],
-            target=self._get(tensordict, self.out_keys[0]).flatten(0, -2)[chosen],
+            start=_rows(self._get(tensordict, self.in_keys[0]))[chosen],
+            target=_rows(self._get(tensordict, self.out_keys[0]))[chosen],
             counts=counts,
+            known=self._sample(counts),
         )
         likelihood = self._likelihood(offers)
         if self.greedy:
@@ -299,6 +334,15 @@ class BehaviorGoals(Transform):
         if self.weights and self.told == "proposed":
             self._weights_of_runs().update(goals, range(self.runs), counts)
         return chosen, goals
+
+    def _sample(self, counts: Sequence[int]) -> Sequence[Tensor]:
+        """Some of the goals of each run that has episodes, as many as a factor asks for."""
+        number = max((factor.samples for factor in self.factors), default=0)
+        own = [min(1, count) for count in counts]
+        if number == 0:
+            return ()
+        goals = self.memory.goals(self.memory.draw(own, number, self.generators))
+        return [part.flatten(0, 1) for part in goals.split(own)]
 
     def _likelihood(self, offers: Offers) -> Tensor:
         """How likely each goal is to be proposed, [m, c]."""
@@ -335,3 +379,8 @@ class BehaviorGoals(Transform):
         if entry is None:
             raise KeyError(f"BehaviorGoals needs the entry {key!r}, got {list(tensordict.keys())}")
         return entry
+
+
+def _rows(entry: Tensor) -> Tensor:
+    """An entry [..., n] as [N, n], also that of a single environment."""
+    return entry.reshape(-1, entry.shape[-1])

@@ -5,7 +5,7 @@ from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, Curriculu
 from torchrl_her.curriculum.normalization import count_inputs, restart_inputs
 from torchrl_her.curriculum.orders import EpisodeLayers, TeacherStudent
 from torchrl_her.curriculum.switch import enter_layer, set_layer_goals
-from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
+from torchrl_her.curriculum.transforms import LayerOutcomes, StateToObs, ZeroPad
 
 __all__ = [
     "Curriculum",
@@ -13,6 +13,7 @@ __all__ = [
     "CurriculumProgress",
     "EpisodeLayers",
     "GuidedExploration",
+    "LayerOutcomes",
     "StateToObs",
     "TeacherStudent",
     "ZeroPad",

@@ -17,8 +17,9 @@ class EpisodeLayers(CurriculumProgress):
 
     Runs are always in the last layer, which is the full task; it is their episodes that are in layers.
     :class:`~torchrl_her.StateToObs` draws them, and writes each row's layer, so that one buffer holds rows
-    of all layers and :class:`~torchrl_her.ZeroPad` pads each by its own. After Luo et al., Relay Hindsight
-    Experience Replay, 2022 (arXiv 2208.00843).
+    of all layers and :class:`~torchrl_her.ZeroPad` pads each by its own.
+    :class:`~torchrl_her.curriculum.LayerOutcomes` tells how episodes ended. Random numbers are drawn on the
+    CPU. After Luo et al., Relay Hindsight Experience Replay, 2022 (arXiv 2208.00843).
 
     Args:
         curriculum: the layers.
@@ -118,6 +119,8 @@ class TeacherStudent(EpisodeLayers):
         generators: sources of random numbers, one of each run; None for torch's own, with one run only.
         memory: episodes of a layer after which an episode counts 1 / e of what it counted first.
         uniform_share: share of the episodes that are drawn from all layers alike.
+        still: progress that counts as standing still: it is added to that of all layers, so that chance alone
+            prefers none.
 
     Attributes:
         long, short: [R, L] of float64, success over recent episodes, and over the newest.
@@ -135,8 +138,8 @@ class TeacherStudent(EpisodeLayers):
         ... )
         >>> teacher = TeacherStudent(Curriculum([near, far], 2), uniform_share=0.2)
         >>> teacher.record_episodes(torch.tensor([[50, 50]]), torch.tensor([[40, 0]]))
-        >>> teacher.shares.tolist()  # only the first layer has made progress
-        [[0.9, 0.1]]
+        >>> [round(share, 2) for share in teacher.shares[0].tolist()]  # only the first one has made progress
+        [0.81, 0.19]
     """
 
     def __init__(
@@ -147,22 +150,24 @@ class TeacherStudent(EpisodeLayers):
         generators: Sequence[torch.Generator] | None = None,
         memory: float = 200.0,
         uniform_share: float = 0.2,
+        still: float = 0.02,
     ) -> None:
         if not memory > 0:
             raise ValueError(f"memory must be positive, got {memory}")
         if not 0 < uniform_share <= 1:
             raise ValueError(f"uniform_share must be in (0, 1], got {uniform_share}")
         super().__init__(curriculum, runs=runs, generators=generators)
-        self.memory, self.uniform_share = memory, uniform_share
+        if not still > 0:
+            raise ValueError(f"still must be positive, got {still}")
+        self.memory, self.uniform_share, self.still = memory, uniform_share, still
         self.long = torch.zeros(runs, len(curriculum), dtype=torch.float64)
         self.short = torch.zeros_like(self.long)
 
     @property
     def shares(self) -> Tensor:
-        alike, progress = super().shares, (self.short - self.long).abs()
-        total = progress.sum(1, keepdim=True)
-        preferred = torch.where(total > 0, progress / total, alike)
-        return self.uniform_share * alike + (1 - self.uniform_share) * preferred
+        progress = (self.short - self.long).abs() + self.still
+        preferred = progress / progress.sum(1, keepdim=True)
+        return self.uniform_share * super().shares + (1 - self.uniform_share) * preferred
 
     def record_episodes(self, ended: Tensor, achieved: Tensor) -> None:
         rate = (achieved / ended.clamp(min=1)).to(self.long)

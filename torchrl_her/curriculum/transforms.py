@@ -252,8 +252,6 @@ class StateToObs(_LayerTransform):
         next_tensordict.set(self.reward_key, terminated.to(achieved_goal.dtype) - 1.0)
         next_tensordict.set(self.terminated_key, terminated)
         next_tensordict.set(self.done_key, done)
-        if isinstance(self.progress, EpisodeLayers):
-            self._record(self.progress, next_tensordict, terminated, done)
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -305,19 +303,6 @@ class StateToObs(_LayerTransform):
         layers = torch.zeros(shape, dtype=torch.int64, device=state.device)
         return layers.masked_scatter(begins, drawn.to(state.device))
 
-    def _record(self, progress: EpisodeLayers, rows: TensorDictBase, achieved: Tensor, done: Tensor) -> None:
-        """Tells how the episodes that ended here have ended."""
-        if not bool(done.any()):
-            return
-        layers = len(self.curriculum)
-        place = rows.get(self.layer_key).reshape(progress.runs, -1)
-        place = place + layers * torch.arange(progress.runs, device=place.device).unsqueeze(1)
-        counts = [
-            place[flags.reshape(place.shape)].bincount(minlength=layers * progress.runs).view(-1, layers)
-            for flags in (done, done & achieved)
-        ]
-        progress.record_episodes(*(own.cpu() for own in counts))
-
     def _observe(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         """Sets what the layers see; returns the goals and the squared thresholds [B, 1]."""
         state = self._get(tensordict, self.in_keys[0], self.curriculum.state_width)
@@ -342,6 +327,48 @@ class StateToObs(_LayerTransform):
             return self._tables[1]
         index, squares = self._tables[1]
         return index[rows.flatten()], squares[rows.flatten()]
+
+
+class LayerOutcomes(Transform):
+    """Tells :class:`~torchrl_her.curriculum.EpisodeLayers` how the episodes of each layer have ended.
+
+    Put it behind all transforms that decide where episodes end. Episodes whose goal was proposed
+    (:class:`~torchrl_her.behavior.BehaviorGoals`) do not count: they say little of the layer's own goals.
+
+    Args:
+        progress: is told.
+
+    Keyword Args:
+        layer_key, proposed_key, terminated_key, done_key: read; there need not be a ``proposed_key``.
+    """
+
+    def __init__(
+        self,
+        progress: EpisodeLayers,
+        *,
+        layer_key: NestedKey = "layer",
+        proposed_key: NestedKey = "proposed",
+        terminated_key: NestedKey = "terminated",
+        done_key: NestedKey = "done",
+    ) -> None:
+        super().__init__()
+        self.progress, self.layer_key, self.proposed_key = progress, layer_key, proposed_key
+        self.terminated_key, self.done_key = terminated_key, done_key
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        done, proposed = next_tensordict.get(self.done_key), tensordict.get(self.proposed_key, None)
+        ended = done if proposed is None else done & ~proposed
+        if bool(ended.any()):
+            achieved = ended & next_tensordict.get(self.terminated_key)
+            layer, runs = tensordict.get(self.layer_key), self.progress.runs
+            layers = len(self.progress.curriculum)
+            place = layer.reshape(runs, -1) + layers * torch.arange(runs, device=layer.device).unsqueeze(1)
+            counts = [
+                place[flags.reshape(runs, -1)].bincount(minlength=layers * runs).view(runs, layers)
+                for flags in (ended, achieved)
+            ]
+            self.progress.record_episodes(*(own.cpu() for own in counts))
+        return next_tensordict
 
 
 class ZeroPad(_LayerTransform):

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+_GOLDEN = (5**0.5 - 1) / 2
+
 
 class GoalWeights:
     """How useful each achieved goal is as a virtual goal. Subclass it for a measure of your own.
@@ -127,9 +129,16 @@ def normalized_weights(logs: Tensor, goals: Tensor) -> Tensor:
 def spread_evenly(count: int, most: int, device: torch.device | None = None) -> Tensor:
     """Indices of ``count`` things: of all, or of ``most`` of them that are spread evenly.
 
+    There is one in each of as many equal parts, and where in its part it is changes from part to part. Always
+    at its begin, with one part for each episode or step, say, all of them would be of first transitions, or
+    of one environment.
+
     Example:
-        >>> spread_evenly(3, 5).tolist(), spread_evenly(10, 4).tolist()
-        ([0, 1, 2], [0, 2, 5, 7])
+        >>> spread_evenly(3, 5).tolist(), spread_evenly(12, 4).tolist()
+        ([0, 1, 2], [0, 4, 6, 11])
     """
     n = min(count, most)
-    return torch.arange(n, device=device) * count // max(n, 1)
+    part = torch.arange(n, device=device)
+    begin, end = part * count // max(n, 1), (part + 1) * count // max(n, 1)
+    share = (part.double() * _GOLDEN).frac()  # of neighbors as different as can be, and even over many parts
+    return begin + ((end - begin) * share).long()

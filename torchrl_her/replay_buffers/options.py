@@ -104,7 +104,7 @@ class HindsightOptions:
     done_key: NestedKey = "done"
     trajectory_key: NestedKey = ("collector", "traj_ids")
     env_ids_key: NestedKey = "env_ids"
-    real_goal_key: NestedKey = "real_goal"
+    real_goal_key: NestedKey = "real_desired_goal"
     layer_key: NestedKey = "layer"
     virtual_key: NestedKey | None = "virtual"
 

@@ -224,7 +224,13 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         return self._own_rewards.get(run, self.reward_fn)
 
     def set_reward(self, reward_fn: RewardFunction, *, run: int) -> None:
-        """Relabels the next episodes of a run with a reward function of its own."""
+        """Relabels the next episodes of a run with a reward function of its own.
+
+        Raises:
+            ValueError: layers have rewards here, not runs.
+        """
+        if self.layers:
+            raise ValueError(f"run {run} has no reward of its own: episodes are relabeled by their layers")
         if self.runs == 1:
             self.reward_fn = reward_fn
         else:
@@ -333,6 +339,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._held = Batch.from_state(state_dict, runs=self.runs)
         recent = state_dict.get("recent")  # states from before there were goals of other episodes have none
         recent = [recent] if isinstance(recent, dict) else recent  # those from before there were layers
+        if recent is not None and len(recent) != max(1, len(self.layers)):
+            raise ValueError(f"the state is that of {len(recent)} layers, not of {max(1, len(self.layers))}")
         self._recent = (
             self._no_goals(self.runs) if recent is None else [RecentGoals.from_state(own) for own in recent]
         )

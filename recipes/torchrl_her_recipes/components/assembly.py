@@ -63,7 +63,7 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     bounds = reward_bounds(goal_env(task)) if curriculum is None else rewards
     agent = make_agent(recipe, env, own, rewards=bounds, curriculum=curriculum, device=devices.learner)
     if behavior is not None:
-        behavior.factors += make_factors(recipe, agent, state)
+        behavior.factors += make_factors(recipe, agent, state, rewards)
     collector = (
         ProcessCollector(
             recipe,

@@ -6,22 +6,19 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor, GoalValues
+from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor, GoalValues, Rare
 from torchrl_her.curriculum.layers import Curriculum
 from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her.goals.rewards import EnvReward, GoalReward, RewardFunction
-from torchrl_her.goals.weights import GoalWeights
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top, make_curriculum
 from torchrl_her_recipes.components.devices import CPU, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs
 from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_instructive
 from torchrl_her_recipes.components.learner import Agent
-from torchrl_her_recipes.components.novelty import rare_goals
 from torchrl_her_recipes.config.recipe import Recipe
 
 _SEED = 1 << 33  # so that proposals do not repeat the numbers of exploration
-_SAMPLES = 250  # goals of which a density is estimated, often and for many candidates
 _GREEDY = ("mega", "discover")
 
 
@@ -55,13 +52,20 @@ def make_behavior(
             f"behavior={options.name} proposes goals that this process has collected: it needs processes=0, "
             f"got processes={recipe.collection.processes}"
         )
-    own = [_weights_of(recipe, task, space) for _ in recipe.seeds]
+    if options.goal_memory < recipe.collection.num_envs:
+        raise ValueError(
+            f"goal_memory={options.goal_memory} must be at least num_envs={recipe.collection.num_envs}, "
+            "whose goals come at once"
+        )
+    own = []
+    if options.name == "ibs" and space is not None:
+        own = [make_instructive(recipe, space) for _ in recipe.seeds]
     top: dict[str, Any] = {}
     if state is not None and state.progress.by_episode:
         top = {"layer_key": "layer", "layer": len(state.curriculum) - 1}
     behavior = BehaviorGoals(
         _reward_of(task, None if state is None else state.curriculum),
-        weights=[weights for weights in own if weights is not None] or None,
+        weights=own or None,
         told="proposed" if options.name == "ibs" else "achieved",
         greedy=options.name in _GREEDY,
         real_share=options.real_share,
@@ -92,6 +96,7 @@ def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = 
     task = goal_env(env)
     return BehaviorGoals(
         _reward_of(task, make_curriculum(recipe, env)),
+        remember=False,
         real_share=0.0,
         candidates=1,
         memory=evaluation_envs(recipe),
@@ -109,7 +114,9 @@ def _reward_of(env: GoalEnv, curriculum: Curriculum | None) -> RewardFunction:
     return GoalReward(curriculum.layers[-1].threshold)
 
 
-def make_factors(recipe: Recipe, agent: Agent, state: CurriculumState | None) -> list[GoalFactor]:
+def make_factors(
+    recipe: Recipe, agent: Agent, state: CurriculumState | None, rewards: tuple[float, float]
+) -> list[GoalFactor]:
     """The factors of proposed goals that ask the agent's networks."""
     name, runs = recipe.behavior.name, recipe.run.num_runs
     if name not in _GREEDY:
@@ -122,14 +129,19 @@ def make_factors(recipe: Recipe, agent: Agent, state: CurriculumState | None) ->
         before_critic=agent.norm,
     )
     if name == "mega":
-        return [Achievable(values, runs=runs, cutoff=recipe.behavior.cutoff)]
-    return [Directed(values, runs=runs)]
+        return [Rare(), Achievable(values, runs=runs, **_cutoff(recipe, rewards))]
+    several = getattr(recipe.learner, "critics", 1) > 1  # their disagreement shows what is new
+    return [*([] if several else [Rare()]), Directed(values, runs=runs)]
 
 
-def _weights_of(recipe: Recipe, env: GoalEnv, space: GoalSpace | KernelSpace | None) -> GoalWeights | None:
-    """The weights of one run's proposals; None for all alike."""
-    if recipe.behavior.name == "ibs" and space is not None:
-        return make_instructive(recipe, space)
-    if not recipe.behavior.prefers_rare(recipe.learner):
-        return None
-    return rare_goals(recipe, env, samples=_SAMPLES)
+def _cutoff(recipe: Recipe, rewards: tuple[float, float]) -> dict[str, float]:
+    """The cut-off of values, which the recipe gives for rewards of -1 and 0, for the rewards of the task."""
+    (missed, achieved), gamma = rewards, recipe.learner.gamma
+
+    def value(cutoff: float) -> float:
+        reached = min(1.0, max(0.0, 1.0 + cutoff * (1.0 - gamma)))  # gamma^d of a goal that takes d steps
+        return missed * (1.0 - reached) / (1.0 - gamma) + achieved * reached
+
+    first = value(recipe.behavior.cutoff)
+    floor = value(-1.0 / (1.0 - gamma))
+    return {"cutoff": first, "floor": floor, "step": abs(value(-1.0) - value(0.0))}

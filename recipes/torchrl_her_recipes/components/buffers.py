@@ -29,7 +29,7 @@ from torchrl_her_recipes.config.learners import priority_power
 from torchrl_her_recipes.config.recipe import Recipe
 
 # Entries of a collected batch that no loss reads: not stored.
-_NOT_STORED = ("state", "achieved_goal", "input", "is_init", "collector", "proposed")
+_NOT_STORED = ("state", "achieved_goal", "input", "is_init", "collector", "proposed", "proposed_reached")
 
 
 def make_buffer(

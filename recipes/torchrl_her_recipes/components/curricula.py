@@ -11,7 +11,7 @@ from torchrl.envs import CatTensors, Compose, EnvBase, InitTracker, Transform, T
 from torchrl_her.behavior import BehaviorGoals
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
 from torchrl_her.curriculum.orders import EpisodeLayers, TeacherStudent
-from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
+from torchrl_her.curriculum.transforms import LayerOutcomes, StateToObs, ZeroPad
 from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
 from torchrl_her_recipes.components.devices import CPU, make_generators
@@ -110,7 +110,8 @@ def _make_progress(recipe: Recipe, curriculum: Curriculum) -> CurriculumProgress
     """What decides in which layer episodes are played.
 
     Raises:
-        ValueError: processes collect, and would each have to know how the episodes of the others ended.
+        ValueError: processes collect, and would each have to know how the episodes of the others ended; or
+            the algorithm has weights that cannot tell layers apart.
     """
     options, runs = recipe.curriculum, recipe.run.num_runs
     if options.order == "threshold":
@@ -119,6 +120,12 @@ def _make_progress(recipe: Recipe, curriculum: Curriculum) -> CurriculumProgress
             runs=runs,
             window=options.window,
             success_threshold=options.success_threshold,
+        )
+    algorithm = get_algorithm(recipe.hindsight.algo)
+    if algorithm.weights:
+        raise ValueError(
+            f"{algorithm.name} must not be used with order={options.order}: its weights would take the goals "
+            "of all layers for one kind; choose order=threshold"
         )
     if recipe.collection.processes > 0:
         raise ValueError(
@@ -179,6 +186,8 @@ def in_layers(
         transforms.insert(0, CatTensors(_STATE, "state", del_keys=False, sort=False))
     if begins:
         transforms.append(InitTracker())
+    if isinstance(progress, EpisodeLayers):
+        transforms.append(LayerOutcomes(progress))
     if starts is not None:
         transforms = [starts, *transforms, starts.outcomes()]
     return TransformedEnv(env, Compose(*transforms))

@@ -114,6 +114,11 @@ def _without_grid(recipe: Recipe, env: Any) -> bool:
 
 def _kernel(recipe: Recipe, env: Any, box: Box | None) -> KernelSpace:
     """Goals of the task. Its own share for sigma grows with the root of their width, as distances do."""
+    if recipe.ibs.recent is not None:
+        raise ValueError(
+            f"recent={recipe.ibs.recent} has no effect on {recipe.task.name}, where q is a kernel density: "
+            "leave it out"
+        )
     goals = _desired_goals(recipe, env).double()
     low, high = (goals.amin(0), goals.amax(0)) if box is None else map(goals.new_tensor, box)
     width = float((high - low).max()) or 1.0

@@ -10,21 +10,17 @@ from torchrl_her_recipes.components.goal_space import MOST_DIMENSIONS, goal_widt
 from torchrl_her_recipes.config.recipe import Recipe
 
 
-def rare_goals(recipe: Recipe, env: Any, *, samples: int = 1_000) -> RareGoals:
+def rare_goals(recipe: Recipe, env: Any) -> RareGoals:
     """Goals with few others around them: by a kernel in a few dimensions, by the nearest neighbors in many.
 
     Args:
         recipe: of the run alone.
         env: of its task.
-
-    Keyword Args:
-        samples: goals that a density is estimated from.
     """
     return RareGoals(
         estimator="kernel" if goal_width(env) <= MOST_DIMENSIONS else "neighbors",
         sharpness=recipe.novelty.sharpness,
         memory=recipe.novelty.memory,
-        samples=samples,
     )
 
 

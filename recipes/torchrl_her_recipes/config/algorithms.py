@@ -27,7 +27,7 @@ class Algorithm:
         instructive: how virtual goals are weighted by their instructiveness (IBS): "simultaneous" by
             q* - q, so that a goal counts less the more often it was written; "sequential" by q* alone;
             None for equal weights.
-        curriculum: whether runs learn the layers of a curriculum one after the other (CHER).
+        curriculum: whether runs learn the layers of a curriculum (CHER).
         weights: a function that makes other weights, as ``module:function``. It is called once for each run,
             gets the recipe of that run alone (``recipe.run.seed`` is its seed) and the environment, and
             returns new :class:`~torchrl_her.GoalWeights`.

@@ -190,7 +190,7 @@ class NoveltyConfig(Group):
 
 @dataclass(frozen=True, kw_only=True)
 class CurriculumConfig(Group):
-    """The layers that runs learn one after the other (Curriculum-HER)."""
+    """The layers that runs learn, one after the other or at once (Curriculum-HER)."""
 
     name: str = option(
         "task",
@@ -259,10 +259,6 @@ class BehaviorConfig(Group):
         super().__post_init__()
         if not math.isfinite(self.cutoff):
             raise ValueError(f"behavior.cutoff must be finite, got {self.cutoff}")
-
-    def prefers_rare(self, learner: Any) -> bool:
-        """Whether rare goals are proposed. Several critics show by their disagreement what is new instead."""
-        return self.name == "mega" or (self.name == "discover" and getattr(learner, "critics", 1) == 1)
 
 
 @dataclass(frozen=True, kw_only=True)

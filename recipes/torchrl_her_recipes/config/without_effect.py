@@ -61,7 +61,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         all_of("curriculum", with_algo)
     elif not groups.learner.has_epsilon:
         idle["curriculum", "layer_epsilon"] = f"with learner={groups.learner.name}"
-    elif groups.curriculum.order != "threshold":
+    if algorithm.curriculum and groups.curriculum.order != "threshold":
         for name in ("window", "success_threshold", "layer_epsilon"):
             idle["curriculum", name] = f"with order={groups.curriculum.order}"
     behavior = groups.behavior.name
@@ -69,10 +69,17 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         all_of("behavior", "with behavior=real", but=("name",))
     elif behavior != "mega":
         idle["behavior", "cutoff"] = f"with behavior={behavior}"
-    read = {"ibs": "ibs"}.get(behavior, "novelty" if groups.behavior.prefers_rare(groups.learner) else "")
-    for group, name in list(idle):
-        if group == read and not (name in ("cells", "recent") and groups.ibs.estimator == "kernel"):
-            del idle[group, name]
+    if behavior == "uniform_achieved":
+        idle["behavior", "candidates"] = "with behavior=uniform_achieved"
+    if behavior != "real" and groups.behavior.real_share == 1.0:
+        for name in ("candidates", "goal_memory", "cutoff"):
+            idle["behavior", name] = "with real_share=1"
+    if not algorithm.hindsight or not groups.hindsight.sources:
+        idle["evaluation", "virtual_goals"] = with_algo if not algorithm.hindsight else "with k=0"
+    if behavior == "ibs":  # its goals are weighted by IBS, whatever virtual ones are
+        idle = {own: why for own, why in idle.items() if own[0] != "ibs"}
+        if groups.ibs.estimator == "kernel":
+            idle["ibs", "cells"] = idle["ibs", "recent"] = "with estimator=kernel"
     shown = groups.demonstrations
     if shown.episodes == 0:
         all_of("demonstrations", "with demonstrations.episodes=0", but=("episodes",))

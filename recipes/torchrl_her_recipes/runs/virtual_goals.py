@@ -27,40 +27,47 @@ def at_virtual_goals(components: Components, epoch: int) -> dict[str, Tensor]:
     env = components.virtual_env
     if env is None:
         return {}
-    if ask_for_virtual_goals(components, env, epoch):
-        shown = measure_rollout(components, play_greedily(components, env, epoch))
-    else:
-        shown = dict.fromkeys(_NAMES, torch.full((components.recipe.run.num_runs,), torch.nan))
-    state, runs = components.curriculum, range(components.recipe.run.num_runs)
-    below = torch.tensor([state is not None and not state.at_the_top(run) for run in runs])
-    return {f"virtual_{name}": shown[name].masked_fill(below, torch.nan) for name in _NAMES if name in shown}
+    found = torch.tensor(ask_for_virtual_goals(components, env, epoch))
+    shown = measure_rollout(components, play_greedily(components, env, epoch))
+    return {f"virtual_{name}": shown[name].masked_fill(~found, torch.nan) for name in _NAMES if name in shown}
 
 
-def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> bool:
+def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> list[bool]:
     """Lets the next episodes ask for virtual goals, drawn for each run from all that the buffer holds of it.
 
     Returns:
-        Whether all runs have virtual goals.
+        For each run, whether it has virtual goals of the full task. If not, its episodes ask for the
+        task's own.
     """
-    asking = _asking(env)
-    width = env.observation_spec["observation"].shape[-1]
-    number, drawn = asking.memory.capacity, []
+    asking, found = _asking(env), []
+    widths = (env.observation_spec[key].shape[-1] for key in ("desired_goal", "observation"))
+    number, (width, seen) = asking.memory.capacity, widths
+    every = torch.zeros(components.recipe.run.num_runs, number, width)
     for run, seed in enumerate(eval_seeds(components.recipe, epoch)):
-        begin, end = bounds_of_run(components.buffer, run)
-        if begin == end:
-            return False
-        generator = torch.Generator().manual_seed(seed)
-        rows = components.buffer.storage[torch.randint(begin, end, (_TRIES * number,), generator=generator)]
-        goals = rows.get("desired_goal")[rows.get("virtual").squeeze(-1)]
-        if len(goals) == 0:
-            return False
-        drawn.append(goals[torch.arange(number, device=goals.device) % len(goals)].to("cpu"))
+        goals = _virtual_goals(components, run, number, seed)
+        found.append(len(goals) > 0)
+        if found[-1]:
+            every[run] = goals[torch.arange(number) % len(goals)]
+        asking.set_active(found[-1], run=run)
         asking.memory.clear(run)
         if (own := asking.generators[run]) is not None:
             own.manual_seed(seed)
-    every = torch.cat(drawn)
-    asking.memory.add(every, every.new_zeros(len(every), width))
-    return True
+    asking.memory.add(every.flatten(0, 1), torch.zeros(every[..., 0].numel(), seen))
+    return found
+
+
+def _virtual_goals(components: Components, run: int, number: int, seed: int) -> Tensor:
+    """Virtual goals [n, g] of the full task that a run's rows have, about so many; none if there are none."""
+    state, none = components.curriculum, torch.empty(0, 1)
+    begin, end = bounds_of_run(components.buffer, run)
+    if begin == end or (state is not None and not state.at_the_top(run)):
+        return none
+    generator = torch.Generator().manual_seed(seed)
+    rows = components.buffer.storage[torch.randint(begin, end, (_TRIES * number,), generator=generator)]
+    fits = rows.get("virtual").squeeze(-1)
+    if state is not None and state.progress.by_episode:
+        fits = fits & (rows.get("layer").squeeze(-1) == len(state.curriculum) - 1)
+    return rows.get("desired_goal")[fits][:number].to("cpu", torch.float32)
 
 
 def _asking(env: EnvBase) -> BehaviorGoals:

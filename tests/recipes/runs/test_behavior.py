@@ -9,11 +9,12 @@ import pandas as pd
 import pytest
 import torch
 
-from torchrl_her import load_checkpoint
-from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor
-from torchrl_her.curriculum import EpisodeLayers, TeacherStudent
+from torchrl_her import Instructiveness, load_checkpoint
+from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor, Rare
+from torchrl_her.curriculum import EpisodeLayers, LayerOutcomes, TeacherStudent
 from torchrl_her.replay_buffers import rows_of_run
 from torchrl_her_recipes import Components, Recipe, build, make_recipe, resume, run
+from torchrl_her_recipes.components.behavior import _cutoff
 from torchrl_her_recipes.runs.curriculum import move_on
 
 from ..small import assert_same, small, stop_after
@@ -72,30 +73,25 @@ def test_goals_are_proposed_and_counted(way: str) -> None:
     table = run(build(recipe(way)), progress=False).rows
     assert 0.0 <= table[-1]["proposed_success"] <= 1.0
     stored = rows_of_run(components.buffer, 0)
-    assert not {"proposed", "real_goal", "achieved_goal"} & set(stored.keys())
+    assert not {"proposed", "real_desired_goal", "achieved_goal"} & set(stored.keys())
 
 
 @pytest.mark.parametrize(
     ("way", "factors"),
-    [("uniform_achieved", []), ("ibs", []), ("mega", [Achievable]), ("discover", [Directed])],
+    [("uniform_achieved", []), ("ibs", []), ("mega", [Rare, Achievable]), ("discover", [Directed])],
 )
 def test_each_way_has_its_factors(way: str, factors: list[type[GoalFactor]]) -> None:
     behavior = build(recipe(way)).behavior
     assert behavior is not None
     assert [type(own) for own in behavior.factors] == factors
     assert behavior.greedy == bool(factors)
-    assert [type(own).__name__ for own in behavior.weights] == {
-        "uniform_achieved": [],
-        "ibs": ["Instructiveness"],
-        "mega": ["RareGoals"],
-        "discover": [],  # TD3 has two critics
-    }[way]
+    assert [type(own).__name__ for own in behavior.weights] == ["Instructiveness"] * (way == "ibs")
 
 
 def test_a_single_critic_leaves_it_to_rare_goals_what_is_new() -> None:
     behavior = build(recipe("discover", learner="ddpg")).behavior
     assert behavior is not None
-    assert [type(own).__name__ for own in behavior.weights] == ["RareGoals"]
+    assert [type(own) for own in behavior.factors] == [Rare, Directed]  # TD3 above has two critics
 
 
 def test_evaluation_asks_for_the_tasks_goals() -> None:
@@ -116,6 +112,19 @@ def test_in_a_curriculum_goals_are_proposed_in_the_last_layer() -> None:
     components.collector.next()
     assert components.behavior.memory.sizes[0] == 0
     assert components.behavior.memory.sizes[1] > 0
+
+
+def test_ibs_proposals_begin_with_the_last_layer() -> None:
+    components = build(small(task="hand_v1", algo="cher", behavior="ibs"))
+    assert components.behavior is not None
+    assert components.curriculum is not None
+    (weights,) = components.behavior.weights
+    assert isinstance(weights, Instructiveness)
+    first = weights.sigma
+    components.trainer().epoch()
+    assert weights.sigma < first
+    move_on(components, components.curriculum, torch.ones(1, components.recipe.curriculum.window), 0)
+    assert weights.sigma == first
 
 
 def test_ibs_proposals_shrink_their_sigma_with_the_epochs() -> None:
@@ -148,7 +157,7 @@ def test_a_teacher_knows_both_layers() -> None:
     assert components.curriculum is not None
     teacher = components.curriculum.progress
     assert isinstance(teacher, TeacherStudent)
-    assert (teacher.long >= 0).all()
+    assert isinstance(components.env.transform[-1], LayerOutcomes)
     rows = run(build(recipe("teacher")), progress=False).rows
     assert 0.0 < rows[-1]["mean_layer"] < 1.0
     assert "layer" not in rows[-1]
@@ -162,6 +171,34 @@ def test_the_policy_itself_begins_episodes() -> None:
     assert components.guide.guided is not None
     top = batch["next", "layer"][:, -1] == 1
     assert ((components.guide.guided == 0) <= top).all()
+
+
+def test_a_teacher_is_told_of_the_layers_own_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = torch.zeros(2, dtype=torch.int64)
+
+    def record(self: TeacherStudent, ended: torch.Tensor, achieved: torch.Tensor) -> None:
+        told.add_(ended[0])
+
+    monkeypatch.setattr(TeacherStudent, "record_episodes", record)
+    components = build(recipe("teacher", guided_share=0.0))
+    ended = torch.zeros_like(told)
+    for _ in range(20):
+        batch = components.collector.next()
+        counts = batch["next", "done"] & ~batch["proposed"]
+        ended += batch["layer"][counts].bincount(minlength=2)
+    assert batch["proposed"].any()
+    assert torch.equal(told, ended)
+
+
+def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
+    behavior = build(recipe("mega", gamma=0.98)).behavior
+    assert behavior is not None
+    achievable = behavior.factors[1]
+    assert isinstance(achievable, Achievable)
+    assert (achievable.first, achievable.floor, achievable.step) == pytest.approx((-3.0, -50.0, 1.0))
+    assert _cutoff(recipe("mega", gamma=0.98), (0.0, 1.0)) == pytest.approx(
+        {"cutoff": 0.94, "floor": 0.0, "step": 0.02}  # gamma^d of a goal that is 3 steps' worth away
+    )
 
 
 # What cannot be
@@ -181,6 +218,14 @@ def test_the_policy_itself_begins_episodes() -> None:
             "window=5 has no effect with order=all_at_once",
         ),
         ({"algo": "her", "sigma": 0.3}, "sigma=0.3 has no effect"),
+        (
+            {"algo": "cher", "learner": "sac", "order": "all_at_once", "success_threshold": 0.5},
+            "success_threshold=0.5 has no effect with order=all_at_once",
+        ),
+        ({"behavior": "uniform_achieved", "candidates": 7}, "candidates=7 has no effect with behavior=unif"),
+        ({"behavior": "mega", "real_share": 1.0, "candidates": 7}, "candidates=7 has no effect with real_sh"),
+        ({"algo": "no_hindsight", "virtual_goals": True}, "virtual_goals=True has no effect with algo=no_h"),
+        ({"behavior": "ibs", "estimator": "kernel", "cells": 5}, "cells=5 has no effect with estimator=kern"),
     ],
 )
 def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
@@ -197,6 +242,16 @@ def test_options_of_ibs_have_an_effect_on_proposals() -> None:
 def test_processes_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="it needs processes=0, got processes=2"):
         build(small(**{"algo": "her", "task": "hand_v1", **options, "processes": 2}))
+
+
+def test_a_memory_below_what_comes_at_once_is_refused() -> None:
+    with pytest.raises(ValueError, match="goal_memory=7 must be at least num_envs=8"):
+        build(recipe("mega", **{"behavior.goal_memory": 7}))
+
+
+def test_weights_that_cannot_tell_layers_apart_are_refused() -> None:
+    with pytest.raises(ValueError, match="cher_rare must not be used with order=all_at_once"):
+        build(small(task="hand_v1", algo="cher_rare", order="all_at_once"))
 
 
 def test_instructive_goals_around_the_start_are_refused() -> None:

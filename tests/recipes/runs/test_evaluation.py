@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from torchrl_her.replay_buffers import rows_of_run
+from torchrl_her.replay_buffers import empty_run, rows_of_run
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import Components, build
 from torchrl_her_recipes.runs.curriculum import play_greedily
@@ -102,12 +102,43 @@ def test_episodes_may_ask_for_virtual_goals() -> None:
     assert all(value.isfinite().all() for value in rows.values())
     again = at_virtual_goals(components, 1)
     assert all(torch.equal(value, again[name]) for name, value in rows.items())
-    assert ask_for_virtual_goals(components, components.virtual_env, 1)
+    assert ask_for_virtual_goals(components, components.virtual_env, 1) == [True, True]
     wanted = components.virtual_env.reset()["desired_goal"].view(2, -1, 2)
     for run, goals in enumerate(wanted):
         own = rows_of_run(components.buffer, run)
         known = own["desired_goal"][own["virtual"].squeeze(-1)]
         assert all((known == goal).all(-1).any() for goal in goals)
+
+
+def test_a_run_without_virtual_goals_leaves_the_others_theirs() -> None:
+    components = build(small(task="hand_v1", algo="her", num_runs=2, virtual_goals=True))
+    components.trainer().epoch()
+    empty_run(components.buffer, 0)
+    assert at_virtual_goals(components, 1)["virtual_q"].isnan().tolist() == [True, False]
+
+
+def test_virtual_goals_are_asked_for_in_every_round() -> None:
+    components = build(small(task="hand_v0", algo="her", virtual_goals=True))
+    components.trainer().epoch()
+    env = components.virtual_env
+    assert env is not None
+    assert ask_for_virtual_goals(components, env, 1) == [True]
+    own = rows_of_run(components.buffer, 0)
+    known = own["desired_goal"][own["virtual"].squeeze(-1)]
+    for _ in range(3):
+        rows = env.rollout(10, break_when_any_done=False)
+        assert all((known == goal).all(-1).any() for goal in rows["desired_goal"][:, 0])
+
+
+def test_with_layers_for_episodes_they_are_goals_of_the_last() -> None:
+    components = build(small(task="hand_v1", algo="unfiltered_cher", order="all_at_once", virtual_goals=True))
+    components.trainer().epoch()
+    env = components.virtual_env
+    assert env is not None
+    assert ask_for_virtual_goals(components, env, 1) == [True]
+    own = rows_of_run(components.buffer, 0)
+    last = own["virtual"].squeeze(-1) & (own["layer"].squeeze(-1) == 1)
+    assert all((own["desired_goal"][last] == goal).all(-1).any() for goal in env.reset()["desired_goal"])
 
 
 def test_virtual_goals_of_lower_layers_are_not_those_of_the_task() -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchrl_her.behavior import Achievable, Directed, GoalFactor, Offers, Successes
+from torchrl_her.behavior import Achievable, Directed, GoalFactor, Offers, Rare, Successes
 
 
 def nearness(observation: Tensor, goals: Tensor, counts: Sequence[int]) -> Tensor:
@@ -117,3 +117,35 @@ def test_bad_options() -> None:
         Directed(nearness, temperature=0)
     with pytest.raises(ValueError, match="memory must be positive, got 0"):
         Successes(1, memory=0)
+
+
+@pytest.mark.parametrize("width", [1, 5])
+def test_the_rarest_goal_weighs_most_in_each_run(width: int) -> None:
+    crowd = torch.linspace(0.0, 1.0, 40).unsqueeze(-1).expand(-1, width)
+    known = [torch.cat((crowd, crowd[:1] + 9.0)), torch.cat((crowd + 9.0, crowd[:1]))]
+    goals = torch.stack((crowd[20], crowd[20] + 9.0)).expand(2, -1, -1)
+    offered = Offers(goals, goals, goals[:, 0], goals[:, 0], [1, 1], known)
+    weights = Rare(k=3)(offered)
+    assert weights.argmax(1).tolist() == [1, 0]
+    assert weights.amax(1).tolist() == [1.0, 1.0]
+    assert weights.amin() < 0.5
+
+
+def test_a_coordinate_that_never_changes_makes_no_goal_rare() -> None:
+    known = torch.tensor([[0.0, 5.0], [0.1, 5.0], [0.2, 5.0], [1.0, 5.0]])
+    goals = known[None, :, :]
+    weights = Rare()(Offers(goals, goals, goals[:, 0], goals[:, 0], [1], [known]))
+    assert weights.argmax().item() == 3
+    alike = torch.ones(1, 3, 2)
+    assert Rare()(Offers(alike, alike, alike[:, 0], alike[:, 0], [1], [alike[0]])).tolist() == [
+        [1.0, 1.0, 1.0]
+    ]
+
+
+def test_a_value_that_is_not_a_number_is_not_proposed() -> None:
+    def broken(observation: Tensor, goals: Tensor, counts: Sequence[int]) -> Tensor:
+        return torch.where(goals == 2.0, torch.nan, -goals)
+
+    given = offers([1.0, 2.0, 3.0])
+    assert Achievable(broken, cutoff=-9.0)(given).tolist() == [[True, False, True]]
+    assert Directed(broken, alpha=1.0)(given)[0].tolist() == pytest.approx([1.0, 0.0, 0.1353], abs=1e-4)

@@ -84,7 +84,7 @@ def test_later_ones_ask_for_what_was_achieved() -> None:
     assert first["next", "terminated"].flatten().tolist() == [False, False, True, False, False]
     assert torch.equal(first["next", "done"], first["next", "terminated"])
     assert first["next", "desired_goal"].flatten().tolist() == [3.0] * 5
-    assert first["next", "real_goal"].flatten().tolist() == [WANTED] * 5
+    assert first["next", "real_desired_goal"].flatten().tolist() == [WANTED] * 5
     assert rows["proposed"].all()
     assert rows["next", "proposed"].all()
 
@@ -108,12 +108,16 @@ def test_a_goal_stays_while_others_begin_anew() -> None:
 
 
 def test_an_episode_that_misses_is_truncated_as_it_would_be() -> None:
-    env, _ = made(1, weights=Told(4.0), line={"steps": 3})
-    env.base_env.place += 1
-    for _ in range(2):  # 4 is never achieved in three steps from 0, so it is not known either
-        rows = played(env, 3)
+    env, behavior = made(1, weights=Told(3.0), line={"steps": 3})
+    played(env, 3)
+    first = env.reset()
+    env.base_env.place -= 5.0
+    rows = env.rollout(3, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    assert rows["proposed"].all()
     assert rows["next", "truncated"].flatten().tolist() == [False, False, True]
-    assert not rows["proposed"].any()
+    assert not rows["next", "terminated"].any()
+    assert rows["next", "reward"].flatten().tolist() == [-1.0] * 3
+    assert behavior.success().tolist() == [0.0]
 
 
 def test_the_tasks_goal_does_not_end_an_episode_with_another() -> None:
@@ -316,8 +320,8 @@ def test_actual_goals_are_those_of_the_task(part: str) -> None:
         )
         buffer.extend(rows.reshape(-1))
         sampled = buffer.sample()
-    assert "real_goal" not in sampled.keys()
-    assert "real_goal" not in sampled["next"].keys()
+    assert "real_desired_goal" not in sampled.keys()
+    assert "real_desired_goal" not in sampled["next"].keys()
     virtual = sampled["virtual"].squeeze(-1)
     assert set(sampled["desired_goal"][virtual].flatten().tolist()) == {WANTED}
     assert set(sampled["desired_goal"][~virtual].flatten().tolist()) == {3.0}
@@ -385,3 +389,83 @@ def test_it_works_where_the_environments_are(
     if device.type == "cpu":
         return
     assert not rows["proposed"].all()
+
+
+def test_a_single_environment_without_a_batch() -> None:
+    behavior = BehaviorGoals(REWARD, weights=Told(3.0), real_share=0.0, generators=[torch.Generator()])
+    behavior._step(
+        TensorDict({"proposed": torch.tensor([False]), "proposed_reached": torch.tensor([False])}, []),
+        TensorDict(
+            {
+                "observation": torch.tensor([30.0]),
+                "achieved_goal": torch.tensor([3.0]),
+                "desired_goal": torch.tensor([WANTED]),
+                "reward": torch.tensor([-1.0]),
+                **dict.fromkeys(("terminated", "truncated", "done"), torch.tensor([False])),
+            },
+            [],
+        ),
+    )
+    seen = {"observation": torch.tensor([0.0]), "desired_goal": torch.tensor([WANTED])}
+    begun = behavior._reset(TensorDict(), TensorDict(seen, []))
+    assert begun["desired_goal"].tolist() == [3.0]
+    assert begun["proposed"].tolist() == [True]
+
+
+def test_a_success_counts_at_whatever_step_it_was() -> None:
+    def lasting(achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
+        """As in tasks of Gymnasium-Robotics: nothing terminates."""
+        reward, _ = REWARD(achieved, desired)
+        return reward, torch.zeros_like(reward, dtype=torch.bool)
+
+    generator = torch.Generator().manual_seed(0)
+    behavior = BehaviorGoals(lasting, weights=Told(2.0), real_share=0.0, generators=[generator])
+    env = TransformedEnv(Line(1), behavior)
+    played(env)
+    rows = played(env)
+    assert rows["next", "reward"].flatten().tolist() == [-1.0, 0.0, -1.0, -1.0, -1.0]
+    assert rows["next", "proposed_reached"].flatten().tolist() == [False, True, True, True, True]
+    assert behavior.success().tolist() == [1.0]
+
+
+def test_a_success_with_another_reward_is_no_fall() -> None:
+    class Costly(Line):
+        """Each step costs a little, also the last one."""
+
+        def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+            after = super()._step(tensordict)
+            return after.set("reward", after["reward"] - 0.01)
+
+    generator = torch.Generator().manual_seed(0)
+    behavior = BehaviorGoals(REWARD, weights=Told(2.0), real_share=0.0, generators=[generator], goes_on=True)
+    env = TransformedEnv(Costly(1, steps=20), behavior)
+    played(env, 3)
+    first = env.reset()
+    env.base_env.place += 8.0
+    rows = env.rollout(1, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    assert rows["next", "achieved_goal"].item() == WANTED
+    assert not rows["next", "done"].any()
+
+
+def test_without_a_time_limit() -> None:
+    behavior = BehaviorGoals(
+        REWARD,
+        real_share=0.0,
+        weights=Told(2.0),
+        truncated_key=None,
+        goes_on=True,
+        generators=[torch.Generator()],
+    )
+    env = TransformedEnv(Line(1, steps=1000), behavior)
+    played(env, 10)
+    env.reset()
+    rows = played(env, 3)
+    assert rows["next", "done"].flatten().tolist() == [False, True, False]
+    with pytest.raises(ValueError, match="goes_on=False needs a truncated_key"):
+        BehaviorGoals(REWARD, truncated_key=None)
+
+
+def test_goals_that_are_not_finite_are_not_remembered() -> None:
+    _, behavior = made(2)
+    behavior.memory.add(torch.tensor([[torch.nan], [1.0]]), torch.zeros(2, 1))
+    assert behavior.memory.sizes == [1]

@@ -13,7 +13,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_her import Curriculum, GoalReward, GoalWeights, HERWriter, StateToObs, ZeroPad
-from torchrl_her.curriculum import EpisodeLayers, TeacherStudent, count_inputs
+from torchrl_her.curriculum import EpisodeLayers, LayerOutcomes, TeacherStudent, count_inputs
 from torchrl_her.modules import RunningNorm
 from torchrl_her.replay_buffers import LayerRule, RunsSampler
 
@@ -39,7 +39,7 @@ class Fixed(EpisodeLayers):
 
 
 def shown(progress: EpisodeLayers, num_envs: int, **options: int) -> TransformedEnv:
-    transforms = StateToObs(THREE, progress), ZeroPad(THREE, progress)
+    transforms = StateToObs(THREE, progress), ZeroPad(THREE, progress), LayerOutcomes(progress)
     return TransformedEnv(TinyEnv((num_envs,), **options), Compose(*transforms))
 
 
@@ -80,13 +80,23 @@ def test_progress_is_preferred_whether_up_or_down() -> None:
     teacher.record_episodes(ended, torch.tensor([[100, 50, 0]]))
     # short - long: (1 - e^-2) - (1 - e^-1) = 0.2325, half of it for the second layer
     assert (teacher.short - teacher.long)[0].tolist() == pytest.approx([0.2325, 0.1163, 0.0], abs=1e-4)
-    assert teacher.shares[0].tolist() == pytest.approx([0.1 + 0.7 * 2 / 3, 0.1 + 0.7 / 3, 0.1])
+    each = [0.2525 / 0.4088, 0.1363 / 0.4088, 0.02 / 0.4088]  # each with 0.02 for standing still
+    assert teacher.shares[0].tolist() == pytest.approx([0.1 + 0.7 * own for own in each], abs=1e-3)
     for _ in range(40):
         teacher.record_episodes(ended, torch.tensor([[100, 50, 0]]))  # nothing changes any more
-    forgets = torch.tensor([[0, 0, 0]])
-    teacher.record_episodes(forgets, forgets)
+    assert teacher.shares[0].tolist() == pytest.approx([1 / 3] * 3)
     teacher.record_episodes(ended, torch.tensor([[0, 50, 0]]))  # the first layer is forgotten
-    assert teacher.shares[0].tolist() == pytest.approx([0.8, 0.1, 0.1], abs=1e-6)
+    assert teacher.shares[0].tolist() == pytest.approx([0.1 + 0.7 * 0.2525 / 0.2925, *[0.1479] * 2], abs=1e-3)
+
+
+def test_chance_in_a_learned_layer_does_not_starve_another() -> None:
+    teacher, generator = TeacherStudent(THREE), torch.Generator().manual_seed(0)
+    shares = []
+    for _ in range(2_000):
+        achieved = (torch.rand(1, 3, generator=generator) < torch.tensor([[0.97, 0.9, 0.0]])).long()
+        teacher.record_episodes(torch.ones(1, 3, dtype=torch.int64), achieved)
+        shares.append(teacher.shares[0, 2].item())
+    assert sum(shares[500:]) / 1_500 > 0.25  # a third, if nothing moved at all
 
 
 def test_runs_have_progress_of_their_own() -> None:
@@ -94,7 +104,7 @@ def test_runs_have_progress_of_their_own() -> None:
     teacher = TeacherStudent(THREE, runs=2, generators=generators, uniform_share=0.3)
     teacher.record_episodes(torch.tensor([[9, 9, 9], [0, 0, 9]]), torch.tensor([[9, 0, 0], [0, 0, 5]]))
     assert teacher.shares.argmax(1).tolist() == [0, 2]
-    assert teacher.shares[1].tolist() == pytest.approx([0.1, 0.1, 0.8])
+    assert teacher.shares[1, 0] == teacher.shares[1, 1]
 
 
 def test_a_teacher_goes_on_from_its_state() -> None:
@@ -154,6 +164,15 @@ def test_it_is_told_how_the_episodes_of_each_layer_end() -> None:
     env = shown(progress, 4, horizon=1)  # the last layer's goal is near enough from the beginning
     act(env, env.reset(), 10.0, 0.0, 0.0, 0.0)
     assert progress.told == [([[2, 0, 0], [0, 1, 1]], [[1, 0, 0], [0, 0, 1]])]
+
+
+def test_episodes_with_proposed_goals_do_not_count() -> None:
+    progress = Fixed(0, 0)
+    outcomes = LayerOutcomes(progress)
+    flags = torch.tensor([[True], [True]])
+    before = TensorDict({"layer": torch.tensor([[0], [2]]), "proposed": torch.tensor([[True], [False]])}, [2])
+    outcomes._step(before, TensorDict({"done": flags, "terminated": flags}, [2]))
+    assert progress.told == [([[0, 0, 1]], [[0, 0, 1]])]
 
 
 def test_specs_hold() -> None:

@@ -104,8 +104,8 @@ def test_the_memory_is_a_ring() -> None:
         (0, 3, [0, 1, 2]),
         (3, 2, [1, 2, 3, 4]),
         (5, 2, [3, 4, 5, 6]),
-        (7, 8, [7, 9, 11, 13]),  # more than fit: every second one
-        (15, 1, [9, 11, 13, 15]),
+        (7, 8, [7, 10, 11, 14]),  # more than fit: one of every two
+        (15, 1, [10, 11, 14, 15]),
         (16, 4, [16, 17, 18, 19]),
     ):
         weights.update(torch.arange(begin, begin + size).float().unsqueeze(-1))
@@ -115,15 +115,22 @@ def test_the_memory_is_a_ring() -> None:
 
 def test_goals_are_spread_evenly() -> None:
     assert spread_evenly(5, 10).tolist() == [0, 1, 2, 3, 4]
-    assert spread_evenly(10, 5).tolist() == [0, 2, 4, 6, 8]
+    assert spread_evenly(10, 5).tolist() == [0, 3, 4, 7, 8]
     assert spread_evenly(0, 5).tolist() == []
+
+
+def test_goals_of_all_environments_are_looked_at() -> None:
+    # Goals come environment after environment at each step; a fixed stride would meet one of them alone.
+    for environments in (8, 10, 20, 64):
+        seen = spread_evenly(10_000, 1_000) % environments
+        assert len(seen.unique()) == environments
 
 
 def test_densities_are_estimated_from_some_of_the_memory() -> None:
     known, asked = random(900, 2), random(50, 2, seed=1)
     some, few = RareGoals(samples=300), RareGoals()
     some.update(known)
-    few.update(known[::3])
+    few.update(known[spread_evenly(900, 300)])
     assert torch.equal(some(asked), few(asked))
 
 

@@ -11,11 +11,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_her.goals.strategies import RECENT
+from torchrl_her.goals.weights import spread_evenly
 from torchrl_her.replay_buffers.episodes import Episodes
 from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
 
 Goals = tuple[Tensor | None, ...]
-_GOLDEN = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True)
@@ -115,23 +115,7 @@ def _last(before: Tensor | None, new: Tensor, size: int) -> Tensor | None:
         return before
     if len(new) > size:
         # They are environment after environment, so the last of them would be those of few environments.
-        return new[_spread(len(new), size, new.device)]
+        return new[spread_evenly(len(new), size, new.device)]
     if before is None:
         return new.clone()  # not a view of the whole batch
     return torch.cat((before[max(0, len(before) + len(new) - size) :].to(new), new))
-
-
-def _spread(count: int, size: int, device: torch.device) -> Tensor:
-    """So many places below ``count``, in order of size, one in each of as many equal parts.
-
-    Where in its part a place is changes from part to part. Always at its begin, with one part for each
-    episode, say, all places would be those of first transitions.
-
-    Example:
-        >>> _spread(12, 4, torch.device("cpu")).tolist()
-        [0, 4, 6, 11]
-    """
-    part = torch.arange(size, device=device)
-    begin, end = part * count // size, (part + 1) * count // size
-    share = (part.double() * _GOLDEN).frac()  # of neighbors as different as can be, and even over many parts
-    return begin + ((end - begin) * share).long()
