@@ -168,7 +168,7 @@ def test_every_preset_runs(preset: Path) -> None:
             ["play", "nowhere"],
             "nowhere is neither the folder of a run, nor the file of an exported policy, nor one",
         ),
-        (["fly"], "unknown command 'fly'; the commands are train, record, play, export, plot, study, report, list"),
+        (["fly"], "unknown command 'fly'; the commands are train, record, play, export, plot, study, report"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

@@ -51,7 +51,7 @@ class KernelInstructiveness(InstructiveWeights):
 
     Raises:
         ValueError: an option is out of its range, goals are not finite, or of another width than the real
-        ones.
+            ones.
 
     Example:
         >>> real = torch.tensor([[1.0] * 15, [2.0] * 15])
