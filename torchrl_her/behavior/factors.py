@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_her.goals.density import log_kernel_density, log_neighbor_density
+from torchrl_her.goals.density import goal_scale, log_kernel_density, log_neighbor_density
 
-_LEAST_SPREAD = 0.01  # of the widest dimension: one that hardly varies shall not make all goals rare
 _KERNEL_DIMENSIONS = 3
 
 Values = Callable[[Tensor, Tensor, Sequence[int]], Tensor]
@@ -149,9 +148,7 @@ class Rare(GoalFactor):
         return (logs.amin(1, keepdim=True) - logs).exp()  # 1 for the rarest
 
     def _log_density(self, goals: Tensor, known: Tensor) -> Tensor:
-        spread = known.std(0, correction=0)
-        scale = spread.clamp(min=_LEAST_SPREAD * float(spread.max()))
-        scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+        scale = goal_scale(known)
         points, samples = goals / scale, known / scale
         if goals.shape[-1] <= _KERNEL_DIMENSIONS:
             return log_kernel_density(points, samples, self.sigma).to(goals)

@@ -16,7 +16,7 @@ from torchrl_her.behavior.memory import AchievedGoals
 from torchrl_her.goals.factors import draw
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.rewards import RewardFunction
-from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights
+from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights, weights_by_run
 from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
 
 Told = Literal["achieved", "proposed"]
@@ -133,9 +133,7 @@ class BehaviorGoals(Transform):
             raise ValueError(f"candidates must be at least 1, got {candidates}")
         if told not in get_args(Told):
             raise ValueError(f"told must be one of {', '.join(get_args(Told))}, got {told!r}")
-        own = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
-        if own and len(own) != runs:
-            raise ValueError(f"{runs} runs need a list of {runs} weights, one of each run, got {len(own)}")
+        own = weights_by_run(weights, runs)
         if truncated_key is None and not goes_on:
             raise ValueError("goes_on=False needs a truncated_key, to say where the environment ended")
         out_keys = [desired_goal_key, real_goal_key, proposed_key, reached_key]
@@ -235,10 +233,8 @@ class BehaviorGoals(Transform):
             return next_tensordict
         wanted = torch.where(proposed, tensordict.get(goal_key), real)
         reward, terminated = self.reward_fn(achieved, wanted)
-        before, ended = (
-            self._get(next_tensordict, self.reward_key),
-            self._get(next_tensordict, self.terminated_key),
-        )
+        before = self._get(next_tensordict, self.reward_key)
+        ended = self._get(next_tensordict, self.terminated_key)
         fell = ended & (before < self.achieved_reward)
         if bool(fell.any()):  # it ends so for any goal, unless the task's own goal has ended it
             fell = fell & ~self.reward_fn(achieved, real)[1]

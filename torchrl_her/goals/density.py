@@ -13,7 +13,23 @@ from torch import Tensor
 from torchrl_her.goals.grid import Numbers
 
 _CHUNK = 1 << 20  # distances held at once: 8 MiB of float64
+_LEAST_SCALE = 0.01  # of the widest dimension
 _FARTHEST = 1e140  # coordinates, in sigmas, beyond which squares of float64 would overflow
+
+
+def goal_scale(samples: Tensor) -> Tensor:
+    """The standard deviations [g] of samples [n, g], by which goals of different units are divided.
+
+    One that is less than a hundredth of the greatest counts as that: a number that hardly varies shall not
+    make all goals rare. All are 1 if nothing varies.
+
+    Example:
+        >>> goal_scale(torch.tensor([[0.0, 5.0], [4.0, 5.0]])).tolist()
+        [2.0, 0.019999999552965164]
+    """
+    scale = samples.std(0, correction=0)
+    widest = float(scale.max())
+    return scale.clamp_min(_LEAST_SCALE * widest) if widest > 0 else torch.ones_like(scale)
 
 
 def log_kernel_density(points: Tensor, samples: Tensor, sigma: Numbers) -> Tensor:

@@ -8,14 +8,13 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from torchrl_her.goals.density import log_kernel_density, log_neighbor_density
+from torchrl_her.goals.density import goal_scale, log_kernel_density, log_neighbor_density
 from torchrl_her.goals.grid import Numbers
 from torchrl_her.goals.weights import GoalWeights, normalized_weights, spread_evenly
 
 Estimator = Literal["kernel", "neighbors"]
 
 _LEVEL = 128  # samples whose median density is that of an ordinary goal
-_LEAST_SCALE = 0.01  # of the widest dimension: one that hardly varies shall not make all goals rare
 _LEAST_DISTANCE = 1e-3  # in standard deviations: nearer goals count as equal
 _SHARPEST = 3.0  # dimensions from which on the default of sharpness falls
 
@@ -132,9 +131,7 @@ class RareGoals(GoalWeights):
         """What densities are estimated from, until the memory changes."""
         assert self.goals is not None
         samples = self.goals[spread_evenly(len(self.goals), self.samples, self.goals.device)].double()
-        scale = samples.std(0, correction=0)
-        widest = float(scale.max())
-        scale = scale.clamp_min(_LEAST_SCALE * widest) if widest > 0 else torch.ones_like(scale)
+        scale = goal_scale(samples)
         samples = samples / scale
         # Densities of some goals among the others, of which they are no part.
         asked = torch.arange(len(samples), device=samples.device) % max(2, len(samples) // _LEVEL) == 0

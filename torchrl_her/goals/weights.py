@@ -91,6 +91,18 @@ class WeightsOfRuns:
                 self.own[run].update(part)
 
 
+def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: int) -> list[GoalWeights]:
+    """The weights of R runs as a list; empty if all goals are alike.
+
+    Raises:
+        ValueError: there are not as many as runs.
+    """
+    own = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
+    if own and len(own) != runs:
+        raise ValueError(f"{runs} runs need a list of {runs} weights, one of each run, got {len(own)}")
+    return own
+
+
 def checked_weights(weight: Tensor) -> Tensor:
     """Weights as floating-point numbers.
 

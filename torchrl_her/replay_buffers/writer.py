@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
 from torchrl_her.goals.rewards import RewardFunction
-from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
+from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, weights_by_run
 from torchrl_her.replay_buffers.draw import draw_for_runs
 from torchrl_her.replay_buffers.episodes import Episodes, find_episodes, time_order
 from torchrl_her.replay_buffers.keys import device_of, entry_of, in_root_and_next
@@ -164,9 +164,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     ) -> None:
         self.generators, self.on_write = check_generators(runs, generators), on_write
         self.layers = check_layers(layers)
-        own = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
-        if own and len(own) != runs:
-            raise ValueError(f"{runs} runs need a list of {runs} weights, one of each run, got {len(own)}")
+        own = weights_by_run(weights, runs)
         super().__init__(reward_fn, options, weights=own[0] if own and runs == 1 else None, **changes)
         self._weights = own  # of several runs
         self.runs = runs
