@@ -18,6 +18,9 @@ from .config.study import load_study as load_study
 from .config.study import study_names as study_names
 from .reports.page import write_report as write_report
 from .reports.tidy import write_results as write_results
+from .runs.callbacks import Callback as Callback
+from .runs.callbacks import EarlyStopping as EarlyStopping
+from .runs.callbacks import RunView as RunView
 from .runs.folder import RunFolder as RunFolder
 from .runs.play import load_actor as load_actor
 from .runs.play import play as play

@@ -31,6 +31,8 @@ class RunFolder:
         self.config = self.path / "config.yaml"
         self.checkpoint = self.path / "checkpoint.pt"  # the newest
         self.policy = self.path / "policy.pt"
+        self.best = self.path / "best.pt"
+        self.about = self.path / "run.json"
         self.metrics = self.path / "metrics.csv"
         self.curves = self.path / "curves.png"
         self.goals = self.path / "virtual_goals.png"
@@ -59,8 +61,18 @@ class RunFolder:
             "platform": platform.platform(),
             "versions": {name: version(name) for name in _PACKAGES},
         }
-        (self.path / "run.json").write_text(json.dumps(about, indent=2) + "\n")
+        _write_whole(self.about, json.dumps(about, indent=2) + "\n")
         _write_whole(self.config, yaml.safe_dump(recipe.to_dict(), sort_keys=False))
+
+    def describe_best(self, epoch: int, success: float) -> None:
+        """Adds to what :meth:`describe` wrote which evaluation the best policy is of.
+
+        Args:
+            epoch: of the evaluation.
+            success: in it, the median of the runs.
+        """
+        about = json.loads(self.about.read_text()) | {"best": {"epoch": epoch, "success": success}}
+        _write_whole(self.about, json.dumps(about, indent=2) + "\n")
 
     def recipe(self) -> Recipe:
         """The recipe of the run.

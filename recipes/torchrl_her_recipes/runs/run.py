@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,8 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import build
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.config.imports import permit_task
+from torchrl_her_recipes.runs.best import BestPolicy
+from torchrl_her_recipes.runs.callbacks import Callback, Callbacks, RunView, Stopped
 from torchrl_her_recipes.runs.curriculum import layer_success, move_on, play_greedily
 from torchrl_her_recipes.runs.evaluation import measure, written
 from torchrl_her_recipes.runs.film import film_policy
@@ -40,11 +42,13 @@ class RunResult:
         rows: the table of metrics, with a row for each epoch and run.
         folder: the folder with all files of the run, or None.
         interrupted: whether it was stopped by Ctrl-C or a signal.
+        stopped: whether a callback stopped it before its last epoch.
     """
 
     rows: list[dict[str, float]]
     folder: Path | None
     interrupted: bool = False
+    stopped: bool = False
 
     @property
     def successes(self) -> list[float]:
@@ -62,16 +66,30 @@ def last_success(rows: list[dict[str, float]]) -> list[float]:
     return [row["success"] for row in rows if row["epoch"] == rows[-1]["epoch"]]
 
 
-def run(components: Components, folder: str | Path | None = None, *, progress: bool = True) -> RunResult:
+def run(
+    components: Components,
+    folder: str | Path | None = None,
+    *,
+    callbacks: Sequence[Callback] = (),
+    progress: bool = True,
+) -> RunResult:
     """Trains for as many epochs as the recipe says.
 
     Args:
         components: from :func:`~torchrl_her_recipes.build`; you may have replaced some of them.
         folder: where the run writes its files; None writes nothing.
+        callbacks: called on the way; they may stop the run.
         progress: whether to show a progress bar.
 
     Raises:
         ValueError: the folder holds a run already.
+
+    Example:
+        >>> from torchrl_her_recipes import EarlyStopping, build, make_recipe
+        >>> recipe = make_recipe(task="hand_v0", epochs=3, epoch_frames=320, num_envs=8, episodes=2)
+        >>> result = run(build(recipe), callbacks=[EarlyStopping("frames", at_least=640)], progress=False)
+        >>> result.stopped, [row["frames"] for row in result.rows]
+        (True, [320, 640])
     """
     home, trainer = None if folder is None else RunFolder(folder), components.trainer()
     with torch.random.fork_rng(devices=[]):
@@ -79,9 +97,10 @@ def run(components: Components, folder: str | Path | None = None, *, progress: b
         torch.manual_seed(components.recipe.run.seed)
         if home is not None:
             home.create()
-            _save(components, trainer, home)  # before config.yaml: a folder that has one can be resumed
+            # Before config.yaml: a folder that has one can be resumed.
+            _save(components, trainer, home, BestPolicy())
             home.describe(components.recipe)
-        return _run(components, trainer, home, [], progress=progress)
+        return _run(components, trainer, home, [], BestPolicy(), callbacks, progress=progress)
 
 
 def resume(
@@ -89,6 +108,7 @@ def resume(
     *,
     components: Components | None = None,
     options: Mapping[str, Any] | None = None,
+    callbacks: Sequence[Callback] = (),
     progress: bool = True,
     allow_import: bool = False,
 ) -> RunResult:
@@ -103,6 +123,7 @@ def resume(
         components: newly made ones, if those of the run were not the ones of its recipe.
         options: other values of ``epochs``, ``checkpoint_interval`` or ``keep_checkpoints``, which are
             written into the folder's configuration.
+        callbacks: called on the way; they may stop the run. Those of its beginning are not remembered.
         progress: whether to show a progress bar.
         allow_import: whether the module that the run's task may name may be imported.
 
@@ -133,7 +154,12 @@ def resume(
         rows = home.rows()[
             : trainer.epochs * components.recipe.run.num_runs
         ]  # without those that are newer than the checkpoint
-        return _run(components, trainer, home, rows, progress=progress)
+        best = BestPolicy(state.get("best"))  # older runs have none
+        if best.state is None:
+            home.best.unlink(missing_ok=True)  # newer than the checkpoint
+        else:
+            _save_best(best, trainer, home)
+        return _run(components, trainer, home, rows, best, callbacks, progress=progress)
 
 
 def _newest_state(home: RunFolder, *, keep: int) -> dict[str, Any]:
@@ -155,21 +181,32 @@ def _run(
     trainer: Trainer,
     home: RunFolder | None,
     rows: list[dict[str, float]],
+    best: BestPolicy,
+    callbacks: Sequence[Callback],
     *,
     progress: bool,
 ) -> RunResult:
     recipe = components.recipe
+    hooks = Callbacks(callbacks, RunView(components, trainer, rows, home))
     threads = torch.get_num_threads()
     torch.set_num_threads(recipe.run.threads)
     torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
     bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
-    interrupted = saved = False
+    interrupted = stopped = saved = False
     unlogged = 0  # rows that are not on the disk yet
     with soft_interrupt() as check:  # also while things are saved at the end
+
+        def between_batches() -> None:
+            check()
+            hooks.batch()
+
         try:
-            while trainer.epochs < recipe.run.epochs:
-                new = _epoch(components, trainer, bar, check, rows[-1]["seconds"] if rows else 0.0)
+            hooks.start()
+            while trainer.epochs < recipe.run.epochs and not stopped:
+                seconds = rows[-1]["seconds"] if rows else 0.0
+                new = _epoch(components, trainer, bar, between_batches, seconds, best)
                 rows += new
+                stopped = hooks.epoch()
                 for line in saturation_notices(rows, recipe):
                     _say(bar, line)
                 if home is not None:
@@ -177,14 +214,17 @@ def _run(
                     with _despite_a_full_disk("table", trainer):
                         home.log(rows, unlogged)
                         unlogged = 0
+                    _save_best(best, trainer, home)
                     saved = trainer.epochs % recipe.run.checkpoint_interval == 0 and _save(
-                        components, trainer, home
+                        components, trainer, home, best
                     )
                     if saved:
                         with _despite_a_full_disk("map of goals", trainer):
                             _save_goals(components, home)
         except Interrupted:
             interrupted, saved = True, False
+        except Stopped:
+            stopped, saved = True, False
         finally:
             bar.close()
             components.close()
@@ -192,20 +232,31 @@ def _run(
             torch.set_flush_denormal(False)
         if home is not None:
             if not saved:
-                _save(components, trainer, home)
+                _save(components, trainer, home, best)
             _finish(components, rows, home)
-    return RunResult(rows=rows, folder=None if home is None else home.path, interrupted=interrupted)
+        hooks.end()
+    return RunResult(
+        rows=rows,
+        folder=None if home is None else home.path,
+        interrupted=interrupted,
+        stopped=stopped and trainer.epochs < recipe.run.epochs,
+    )
 
 
 def _epoch(
-    components: Components, trainer: Trainer, bar: tqdm, check: Callable[[], None], seconds: float
+    components: Components,
+    trainer: Trainer,
+    bar: tqdm,
+    between_batches: Callable[[], None],
+    seconds: float,
+    best: BestPolicy,
 ) -> list[dict[str, float]]:
     """One epoch and its evaluation, as rows of the table: one for each run."""
 
     def on_batch(trainer: Trainer) -> None:
         bar.set_description_str(f"{trainer.updates} updates", refresh=False)
         bar.update(trainer.frames - bar.n)
-        check()
+        between_batches()
 
     began = time.perf_counter()
     measured = trainer.epoch(on_batch)
@@ -228,6 +279,7 @@ def _epoch(
             progress = components.curriculum.progress
             values["mean_layer" if progress.by_episode else "layer"] = progress.mean_layer(run)
         rows.append({**counters, **times, **values, **written(components, run)})
+    best.see(rows, components.greedy)  # before a new layer changes it
     if components.curriculum is not None and samples is not None:
         for line in move_on(components, components.curriculum, samples, trainer.frames):
             _say(bar, line)
@@ -241,14 +293,22 @@ def _say(bar: tqdm, line: str) -> None:
         bar.write(line)
 
 
-def _save(components: Components, trainer: Trainer, home: RunFolder) -> bool:
+def _save(components: Components, trainer: Trainer, home: RunFolder, best: BestPolicy) -> bool:
     """Writes a checkpoint; returns whether it could."""
+    state = run_state(components, trainer) | {"best": best.state}
     with _despite_a_full_disk("checkpoint", trainer):
-        save_checkpoint(
-            run_state(components, trainer), home.checkpoint, keep=components.recipe.run.keep_checkpoints
-        )
+        save_checkpoint(state, home.checkpoint, keep=components.recipe.run.keep_checkpoints)
         return True
     return False
+
+
+def _save_best(best: BestPolicy, trainer: Trainer, home: RunFolder) -> None:
+    """Writes the best policy if there is a new one."""
+    if best.state is not None and best.is_new:
+        with _despite_a_full_disk("best policy", trainer):
+            save_checkpoint(best.state, home.best)
+            home.describe_best(best.state["epoch"], best.state["success"])
+            best.is_new = False
 
 
 @contextmanager

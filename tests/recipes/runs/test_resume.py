@@ -60,7 +60,7 @@ def press_ctrl_c(components: Components, batch: int) -> Components:
 
 def assert_same_runs(first: Path, second: Path) -> None:
     """Two folders: all weights, buffers and generators, and the tables but for the time."""
-    for name in ("checkpoint.pt", "policy.pt"):
+    for name in ("checkpoint.pt", "policy.pt", "best.pt"):
         assert_same(load_checkpoint(first / name), load_checkpoint(second / name))
     tables = [pd.read_csv(folder / "metrics.csv").drop(columns="seconds") for folder in (first, second)]
     pd.testing.assert_frame_equal(*tables, check_exact=True)
