@@ -33,6 +33,8 @@ from .runs.record import record_demonstrations as record_demonstrations
 from .runs.run import RunResult as RunResult
 from .runs.run import resume as resume
 from .runs.run import run as run
+from .runs.waste import Waste as Waste
+from .runs.waste import find_waste as find_waste
 from .studies.pictures import plot_runs as plot_runs
 from .studies.plan import duration as duration
 from .studies.study import plan_study as plan_study

@@ -116,6 +116,19 @@ class RunFolder:
                 self._events.add_scalar(f"{name}/run_{row['run']}", value, int(row["frames"]))
         self._events.flush()  # what is behind a checkpoint must be on the disk when the run goes on from it
 
+    @property
+    def parts(self) -> list[Path]:
+        """The files that there are only while others are written: a killed run leaves them behind."""
+        whole = (self.config, self.about, self.metrics, self.checkpoint, self.policy, self.best)
+        return [path.with_name(path.name + ".part") for path in whole] + [
+            self.goal_map.with_suffix(".part.npz")
+        ]
+
+    @property
+    def older_checkpoints(self) -> list[Path]:
+        """The checkpoints before the newest one."""
+        return sorted(self.path.glob(f"{self.checkpoint.stem}.*{self.checkpoint.suffix}"))
+
     def rows(self) -> list[dict[str, float]]:
         """The table so far.
 

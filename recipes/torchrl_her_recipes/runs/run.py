@@ -20,6 +20,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import build
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.config.imports import permit_task
+from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.best import BestPolicy
 from torchrl_her_recipes.runs.callbacks import Callback, Callbacks, RunView, Stopped
 from torchrl_her_recipes.runs.curriculum import layer_success, move_on, play_greedily
@@ -114,6 +115,9 @@ def resume(
 ) -> RunResult:
     """Continues a run from its newest complete checkpoint, or extends one that has ended.
 
+    A finished run can be given more epochs only if its recipe said ``keep_buffer=True``. Otherwise its
+    checkpoint has no replay buffer any more, and all that is made again are its pictures and its policy.
+
     With the tasks of this library the result is bit for bit that of a run that never stopped. So it is with
     an environment of your own if it keeps no state from one epoch to the next; after a stop in the middle
     of an epoch, however, the rest of that epoch consists of new episodes.
@@ -121,15 +125,15 @@ def resume(
     Args:
         folder: of the run.
         components: newly made ones, if those of the run were not the ones of its recipe.
-        options: other values of ``epochs``, ``checkpoint_interval`` or ``keep_checkpoints``, which are
-            written into the folder's configuration.
+        options: other values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints`` or ``keep_buffer``,
+            which are written into the folder's configuration.
         callbacks: called on the way; they may stop the run. Those of its beginning are not remembered.
         progress: whether to show a progress bar.
         allow_import: whether the module that the run's task may name may be imported.
 
     Raises:
-        ValueError: there is no run in the folder, no checkpoint is complete or none has the replay buffer,
-            an option would change what was trained, fewer epochs are asked for than were done, both
+        ValueError: there is no run in the folder, no checkpoint is complete, there is no replay buffer to go
+            on with, an option would change what was trained, fewer epochs are asked for than were done, both
             options and components are given, or the components differ from those of the run.
     """
     home = RunFolder(folder)
@@ -139,7 +143,11 @@ def resume(
     state = _newest_state(home, keep=recipe.run.keep_checkpoints)
     if allow_import:
         permit_task(recipe.task.name)
-    components = components or build(recipe.extended(**options) if options else recipe)
+    wanted = recipe.extended(**options) if options else recipe
+    has_buffer = bool(state.get("buffer"))
+    if not has_buffer:
+        _check_needs_no_buffer(home, wanted if components is None else components.recipe, state)
+    components = components or build(wanted)
     trainer = components.trainer()
     with torch.random.fork_rng(devices=[]):
         load_run_state(components, trainer, state)
@@ -159,21 +167,35 @@ def resume(
             home.best.unlink(missing_ok=True)  # newer than the checkpoint
         else:
             _save_best(best, trainer, home)
-        return _run(components, trainer, home, rows, best, callbacks, progress=progress)
+        return _run(
+            components, trainer, home, rows, best, callbacks, has_buffer=has_buffer, progress=progress
+        )
 
 
 def _newest_state(home: RunFolder, *, keep: int) -> dict[str, Any]:
-    """The newest checkpoint that is whole. Without the replay buffer a run cannot go on."""
+    """The newest checkpoint that is whole.
+
+    Raises:
+        ValueError: there is none.
+    """
     try:
-        state = load_newest_checkpoint(home.checkpoint, keep=keep)
+        return load_newest_checkpoint(home.checkpoint, keep=keep)
     except FileNotFoundError:
-        state = {}
-    if not state.get("buffer"):
+        raise ValueError(f"the run in {home.path} cannot go on: {home.checkpoint.name} is missing") from None
+
+
+def _check_needs_no_buffer(home: RunFolder, recipe: Recipe, state: dict[str, Any]) -> None:
+    """Refuses to train on without the replay buffer, or to keep one that is lost.
+
+    Raises:
+        ValueError: the run has epochs to go, or its recipe wants the buffer to be kept.
+    """
+    done = state["trainer"]["epochs"]
+    if recipe.run.epochs > done or recipe.run.keep_buffer:
         raise ValueError(
-            f"the run in {home.path} cannot go on: its replay buffer was not kept "
-            f"({home.checkpoint.name} {'has none' if state else 'is missing'})"
+            f"the run in {home.path} cannot go on after its {done} epochs: its checkpoint has no replay "
+            "buffer; only runs that are trained with keep_buffer=true keep it when they have finished"
         )
-    return state
 
 
 def _run(
@@ -185,6 +207,7 @@ def _run(
     callbacks: Sequence[Callback],
     *,
     progress: bool,
+    has_buffer: bool = True,
 ) -> RunResult:
     recipe = components.recipe
     hooks = Callbacks(callbacks, RunView(components, trainer, rows, home))
@@ -215,12 +238,9 @@ def _run(
                         home.log(rows, unlogged)
                         unlogged = 0
                     _save_best(best, trainer, home)
-                    saved = trainer.epochs % recipe.run.checkpoint_interval == 0 and _save(
+                    saved = trainer.epochs % recipe.run.checkpoint_interval == 0 and _save_all(
                         components, trainer, home, best
                     )
-                    if saved:
-                        with _despite_a_full_disk("map of goals", trainer):
-                            _save_goals(components, home)
         except Interrupted:
             interrupted, saved = True, False
         except Stopped:
@@ -232,8 +252,8 @@ def _run(
             torch.set_flush_denormal(False)
         if home is not None:
             if not saved:
-                _save(components, trainer, home, best)
-            _finish(components, rows, home)
+                (_save_all if has_buffer else _save)(components, trainer, home, best)
+            _finish(components, trainer, rows, home, has_buffer)
         hooks.end()
     return RunResult(
         rows=rows,
@@ -293,13 +313,29 @@ def _say(bar: tqdm, line: str) -> None:
         bar.write(line)
 
 
+def _save_all(components: Components, trainer: Trainer, home: RunFolder, best: BestPolicy) -> bool:
+    """Writes the histogram of virtual goals and then a checkpoint; returns whether it could write the latter.
+
+    In this order, since the last checkpoint has no buffer to make the histogram of.
+    """
+    with _despite_a_full_disk("map of goals", trainer):
+        _save_goals(components, home)
+    return _save(components, trainer, home, best)
+
+
 def _save(components: Components, trainer: Trainer, home: RunFolder, best: BestPolicy) -> bool:
-    """Writes a checkpoint; returns whether it could."""
-    state = run_state(components, trainer) | {"best": best.state}
+    """Writes a checkpoint; returns whether it could. That of the last epoch is without the replay buffer."""
+    buffer = components.recipe.run.keep_buffer or not _has_ended(components, trainer)
+    state = run_state(components, trainer, buffer=buffer) | {"best": best.state}
     with _despite_a_full_disk("checkpoint", trainer):
         save_checkpoint(state, home.checkpoint, keep=components.recipe.run.keep_checkpoints)
         return True
     return False
+
+
+def _has_ended(components: Components, trainer: Trainer) -> bool:
+    """Whether the last epoch is done."""
+    return trainer.epochs >= components.recipe.run.epochs
 
 
 def _save_best(best: BestPolicy, trainer: Trainer, home: RunFolder) -> None:
@@ -320,13 +356,18 @@ def _despite_a_full_disk(what: str, trainer: Trainer) -> Iterator[None]:
         warnings.warn(f"no {what} after {trainer.frames:,} frames, the run goes on: {error}", stacklevel=4)
 
 
-def _finish(components: Components, rows: list[dict[str, float]], home: RunFolder) -> None:
+def _finish(
+    components: Components, trainer: Trainer, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool
+) -> None:
     """Draws the pictures and then writes the policy, whose file tells that the run has ended."""
-    _draw(components, rows, home)
+    _draw(components, rows, home, has_buffer)
     save_checkpoint({"actor": dict(components.greedy.state_dict())}, home.policy)
+    if _has_ended(components, trainer):
+        for path in home.older_checkpoints:
+            path.unlink(missing_ok=True)
 
 
-def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder) -> None:
+def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool) -> None:
     recipe = components.recipe
     home.close()
     title = f"{recipe.task.name}, {recipe.hindsight.algo}, " + (
@@ -334,7 +375,7 @@ def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder)
     )
     if rows:
         plot_curves(rows, home.curves, title=title)
-    goals = _save_goals(components, home)
+    goals = _save_goals(components, home) if has_buffer else _saved_goals(home)
     task = goal_env(components.env)
     if goals is not None and goals.target.ndim == 2 and task.goal_box() is not None:
         plot_goals(goals, task, home.goals, title=f"virtual goals: {title}")
@@ -346,6 +387,11 @@ def median_run(rows: list[dict[str, float]]) -> int:
     """The index of the run with the median success in the last evaluation."""
     values = last_success(rows)
     return sorted(range(len(values)), key=values.__getitem__)[len(values) // 2]
+
+
+def _saved_goals(home: RunFolder) -> GoalMap | None:
+    """The histogram of virtual goals that was written when the run still had its buffer, if there was one."""
+    return GoalMap.load(home.goal_map) if home.goal_map.is_file() else None
 
 
 def _save_goals(components: Components, home: RunFolder) -> GoalMap | None:
