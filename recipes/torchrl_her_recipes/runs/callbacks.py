@@ -158,12 +158,14 @@ class Callbacks:
         Raises:
             Stopped: one of them wants the run to stop.
         """
-        if any(own.on_batch(self.run) for own in self.callbacks):  # a list: all of them are called
+        wanted = [own.on_batch(self.run) for own in self.callbacks]  # of all of them, also after a True
+        if any(wanted):
             raise Stopped
 
     def epoch(self) -> bool:
         """Says that an evaluation is done; returns whether one of them wants the run to stop."""
-        return any(own.on_epoch(self.run) for own in self.callbacks)
+        wanted = [own.on_epoch(self.run) for own in self.callbacks]
+        return any(wanted)
 
     def end(self) -> None:
         """Says that everything was written."""
