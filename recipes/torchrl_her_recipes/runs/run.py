@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from torchrl_her.trainers.checkpoint import load_newest_checkpoint, save_checkpoint
 from torchrl_her.trainers.trainer import Trainer
@@ -30,6 +29,7 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap, goal_map
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.plots import plot_curves, plot_goals
+from torchrl_her_recipes.runs.progress import Progress
 from torchrl_her_recipes.runs.saturation import saturation_notices
 from torchrl_her_recipes.runs.state import load_run_state, run_state
 from torchrl_her_recipes.runs.virtual_goals import at_virtual_goals
@@ -80,7 +80,7 @@ def run(
         components: from :func:`~torchrl_her_recipes.build`; you may have replaced some of them.
         folder: where the run writes its files; None writes nothing.
         callbacks: called on the way; they may stop the run.
-        progress: whether to show a progress bar.
+        progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
 
     Raises:
         ValueError: the folder holds a run already.
@@ -128,7 +128,7 @@ def resume(
         options: other values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints`` or ``keep_buffer``,
             which are written into the folder's configuration.
         callbacks: called on the way; they may stop the run. Those of its beginning are not remembered.
-        progress: whether to show a progress bar.
+        progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
         allow_import: whether the module that the run's task may name may be imported.
 
     Raises:
@@ -214,7 +214,7 @@ def _run(
     threads = torch.get_num_threads()
     torch.set_num_threads(recipe.run.threads)
     torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
-    bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
+    shown = Progress(recipe, trainer, show=progress)
     interrupted = stopped = saved = False
     unlogged = 0  # rows that are not on the disk yet
     with soft_interrupt() as check:  # also while things are saved at the end
@@ -227,11 +227,11 @@ def _run(
             hooks.start()
             while trainer.epochs < recipe.run.epochs and not stopped:
                 seconds = rows[-1]["seconds"] if rows else 0.0
-                new = _epoch(components, trainer, bar, between_batches, seconds, best)
+                new = _epoch(components, trainer, shown, between_batches, seconds, best)
                 rows += new
                 stopped = hooks.epoch()
                 for line in saturation_notices(rows, recipe):
-                    _say(bar, line)
+                    shown.say(line)
                 if home is not None:
                     unlogged += len(new)
                     with _despite_a_full_disk("table", trainer):
@@ -246,7 +246,7 @@ def _run(
         except Stopped:
             stopped, saved = True, False
         finally:
-            bar.close()
+            shown.close()
             components.close()
             torch.set_num_threads(threads)
             torch.set_flush_denormal(False)
@@ -266,16 +266,15 @@ def _run(
 def _epoch(
     components: Components,
     trainer: Trainer,
-    bar: tqdm,
+    shown: Progress,
     between_batches: Callable[[], None],
     seconds: float,
     best: BestPolicy,
 ) -> list[dict[str, float]]:
     """One epoch and its evaluation, as rows of the table: one for each run."""
 
-    def on_batch(trainer: Trainer) -> None:
-        bar.set_description_str(f"{trainer.updates} updates", refresh=False)
-        bar.update(trainer.frames - bar.n)
+    def on_batch(_trainer: Trainer) -> None:
+        shown.batch()
         between_batches()
 
     began = time.perf_counter()
@@ -302,15 +301,9 @@ def _epoch(
     best.see(rows, components.greedy)  # before a new layer changes it
     if components.curriculum is not None and samples is not None:
         for line in move_on(components, components.curriculum, samples, trainer.frames):
-            _say(bar, line)
-    bar.set_postfix(success=f"{statistics.median(last_success(rows)):.2f}")
+            shown.say(line)
+    shown.epoch(rows)
     return rows
-
-
-def _say(bar: tqdm, line: str) -> None:
-    """A line above the progress bar, if there is one."""
-    if not bar.disable:
-        bar.write(line)
 
 
 def _save_all(components: Components, trainer: Trainer, home: RunFolder, best: BestPolicy) -> bool:
