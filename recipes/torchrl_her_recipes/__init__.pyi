@@ -18,6 +18,9 @@ from .config.study import load_study as load_study
 from .config.study import study_names as study_names
 from .reports.page import write_report as write_report
 from .reports.tidy import write_results as write_results
+from .runs.callbacks import Callback as Callback
+from .runs.callbacks import EarlyStopping as EarlyStopping
+from .runs.callbacks import RunView as RunView
 from .runs.folder import RunFolder as RunFolder
 from .runs.play import load_actor as load_actor
 from .runs.play import play as play
@@ -30,6 +33,8 @@ from .runs.record import record_demonstrations as record_demonstrations
 from .runs.run import RunResult as RunResult
 from .runs.run import resume as resume
 from .runs.run import run as run
+from .runs.waste import Waste as Waste
+from .runs.waste import find_waste as find_waste
 from .studies.pictures import plot_runs as plot_runs
 from .studies.plan import duration as duration
 from .studies.study import plan_study as plan_study

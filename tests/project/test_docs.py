@@ -45,6 +45,7 @@ def conf() -> ModuleType:
 @pytest.mark.parametrize(
     ("page", "number"),
     [
+        ("callbacks.md", 3),
         ("demonstrations.md", 4),
         ("devices.md", 1),
         ("index.md", 1),
@@ -54,7 +55,10 @@ def conf() -> ModuleType:
         ("weights.md", 3),
     ],
 )
-def test_a_page_s_python_runs_from_top_to_bottom(page: str, number: int) -> None:
+def test_a_page_s_python_runs_from_top_to_bottom(
+    page: str, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     assert len(blocks(page)) == number
     names: dict[str, object] = {"__name__": page}
     for block in blocks(page):

@@ -19,6 +19,7 @@ SMALL: dict[str, Any] = {
     "buffer_size": 20_000,
     "episodes": 4,
     "checkpoint_interval": 1,
+    "keep_buffer": True,  # so that tests can compare it, and give finished runs more epochs
 }
 
 

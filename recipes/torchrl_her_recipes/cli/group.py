@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import click
 
+from torchrl_her_recipes.cli.clean import clean
 from torchrl_her_recipes.cli.listing import listing
 from torchrl_her_recipes.cli.play import export, play
 from torchrl_her_recipes.cli.plot import plot
@@ -76,7 +77,7 @@ def group(context: click.Context) -> None:
         context.exit(BAD_INPUT)
 
 
-for _command in (train, record, play, export, plot, study, report, listing):
+for _command in (train, record, play, export, plot, study, report, clean, listing):
     group.add_command(_command)
 
 

@@ -15,6 +15,9 @@ from torchrl_her_recipes.config.shipped import policy_names
 
 _SUFFIXES = (".gif", ".mp4")
 _RUN = click.Path(path_type=Path)
+_best = click.option(
+    "--best", is_flag=True, help="the policy of the evaluation with the best success, not the last one"
+)
 
 
 def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
@@ -26,16 +29,18 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 @click.argument("source", metavar="RUN|FILE.pt|TASK", shell_complete=_complete)
 @click.option("--out", type=_RUN, help="the .gif or .mp4 (default: RUN/play.gif, FILE.gif or TASK.gif)")
 @click.option("--run", type=click.IntRange(0), default=0, help="which, of several side by side")
+@_best
 @click.option("--goals", type=click.IntRange(1), default=6, show_default=True, help="how many, side by side")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of the goals and starts")
 @click.option(
     "--size", type=click.IntRange(32), default=240, show_default=True, help="pixels of one environment"
 )
 @allow_import
-def play(source: str, out: Path | None, run: int, goals: int, seed: int, size: int) -> int:
+def play(source: str, out: Path | None, run: int, best: bool, goals: int, seed: int, size: int) -> int:
     """Make a GIF of a policy.
 
-    RUN is the folder of a run, FILE.pt what `torchrl-her export` wrote, TASK one of the trained policies.
+    RUN is the folder of a run, or policy.pt or best.pt in it, FILE.pt what `torchrl-her export` wrote, TASK
+    one of the trained policies.
     """
     path = Path(source)
     if not path.exists() and source not in policy_names():
@@ -47,7 +52,7 @@ def play(source: str, out: Path | None, run: int, goals: int, seed: int, size: i
     film = out or _film_of(path)
     if film.suffix not in _SUFFIXES:
         raise ValueError(f"cannot write {film.name!r}: its suffix must be one of {', '.join(_SUFFIXES)}")
-    achieved = recipes.play(source, film, run=run, goals=goals, seed=seed, size=size)
+    achieved = recipes.play(source, film, run=run, best=best, goals=goals, seed=seed, size=size)
     click.echo(f"{achieved} of {goals} goals achieved: {film}")
     return 0
 
@@ -56,6 +61,8 @@ def _film_of(source: Path) -> Path:
     """Where the film of a policy goes: in the folder of its run, or beside its file."""
     if source.is_dir():
         return source / "play.gif"
+    if source == recipes.RunFolder(source.parent).policy and source.is_file():
+        return source.with_name("play.gif")  # policy.gif is what the run itself filmed at its end
     return source.with_suffix(".gif") if source.is_file() else Path(f"{source}.gif")
 
 
@@ -64,13 +71,18 @@ def _film_of(source: Path) -> Path:
 @click.option("--out", type=_RUN, help="the .pt file (default: RUN/TASK.pt)")
 @click.option("--run", "index", type=click.IntRange(0), help="which, of several (default: the median)")
 @click.option("--task", help="that it is for, if not the run's own")
+@_best
 @allow_import
-def export(run: Path, out: Path | None, index: int | None, task: str | None) -> int:
-    """Write the policy of the run in the folder RUN as a file, for `torchrl-her play` and load_policy."""
-    if not run.is_dir():
+def export(run: Path, out: Path | None, index: int | None, task: str | None, best: bool) -> int:
+    """Write the policy of the run in the folder RUN as a file, for `torchrl-her play` and load_policy.
+
+    RUN may also be best.pt in that folder.
+    """
+    if not run.exists():
         raise ValueError(f"{run} is no folder of a run: it has no config.yaml")
-    name = task or recipes.RunFolder(run).recipe().task.name
-    file = out or run / f"{file_name(name)}.pt"
-    policy = recipes.export_policy(run, file, run=index, task=task)
+    folder = run if run.is_dir() else run.parent
+    name = task or recipes.RunFolder(folder).recipe().task.name
+    file = out or folder / f"{file_name(name)}.pt"
+    policy = recipes.export_policy(run, file, run=index, task=task, best=best)
     click.echo(f"seed {policy.recipe.run.seed}, success {policy.success:.0%} on {policy.task}: {file}")
     return 0

@@ -353,6 +353,9 @@ class RunConfig(Group):
     epochs: int = option(30, "epochs; each ends with an evaluation", at_least=1)
     checkpoint_interval: int = option(10, "epochs between two checkpoints", at_least=1)
     keep_checkpoints: int = option(2, "how many of the newest checkpoints are kept", at_least=1)
+    keep_buffer: bool = option(
+        False, "whether the checkpoint of a finished run keeps the replay buffer, for more epochs later"
+    )
     threads: int = option(1, "threads of torch: small networks are fastest with one", at_least=1)
     dtype: str = option("float32", "of observations and networks", choices=("float32", "float64"))
 

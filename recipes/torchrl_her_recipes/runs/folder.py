@@ -31,6 +31,8 @@ class RunFolder:
         self.config = self.path / "config.yaml"
         self.checkpoint = self.path / "checkpoint.pt"  # the newest
         self.policy = self.path / "policy.pt"
+        self.best = self.path / "best.pt"
+        self.about = self.path / "run.json"
         self.metrics = self.path / "metrics.csv"
         self.curves = self.path / "curves.png"
         self.goals = self.path / "virtual_goals.png"
@@ -59,8 +61,18 @@ class RunFolder:
             "platform": platform.platform(),
             "versions": {name: version(name) for name in _PACKAGES},
         }
-        (self.path / "run.json").write_text(json.dumps(about, indent=2) + "\n")
+        _write_whole(self.about, json.dumps(about, indent=2) + "\n")
         _write_whole(self.config, yaml.safe_dump(recipe.to_dict(), sort_keys=False))
+
+    def describe_best(self, epoch: int, success: float) -> None:
+        """Adds to what :meth:`describe` wrote which evaluation the best policy is of.
+
+        Args:
+            epoch: of the evaluation.
+            success: in it, the median of the runs.
+        """
+        about = json.loads(self.about.read_text()) | {"best": {"epoch": epoch, "success": success}}
+        _write_whole(self.about, json.dumps(about, indent=2) + "\n")
 
     def recipe(self) -> Recipe:
         """The recipe of the run.
@@ -103,6 +115,19 @@ class RunFolder:
             for name, value in row.items():
                 self._events.add_scalar(f"{name}/run_{row['run']}", value, int(row["frames"]))
         self._events.flush()  # what is behind a checkpoint must be on the disk when the run goes on from it
+
+    @property
+    def parts(self) -> list[Path]:
+        """The files that there are only while others are written: a killed run leaves them behind."""
+        whole = (self.config, self.about, self.metrics, self.checkpoint, self.policy, self.best)
+        return [path.with_name(path.name + ".part") for path in whole] + [
+            self.goal_map.with_suffix(".part.npz")
+        ]
+
+    @property
+    def older_checkpoints(self) -> list[Path]:
+        """The checkpoints before the newest one."""
+        return sorted(self.path.glob(f"{self.checkpoint.stem}.*{self.checkpoint.suffix}"))
 
     def rows(self) -> list[dict[str, float]]:
         """The table so far.

@@ -8,7 +8,6 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_her.modules.networks import take_run
-from torchrl_her.trainers.checkpoint import load_checkpoint
 from torchrl_her.trainers.metrics import success
 from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
@@ -21,31 +20,43 @@ from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.shipped import policy_names
 from torchrl_her_recipes.runs.film import FPS
 from torchrl_her_recipes.runs.folder import RunFolder
+from torchrl_her_recipes.runs.kept import KeptPolicy
 from torchrl_her_recipes.runs.policies import load_trained
 
 
-def load_actor(folder: str | Path, *, run: int = 0, allow_import: bool = False) -> TensorDictModuleBase:
-    """The greedy policy that a run ended with.
+def load_actor(
+    folder: str | Path, *, run: int = 0, best: bool = False, allow_import: bool = False
+) -> TensorDictModuleBase:
+    """The greedy policy that a run ended with, or its best one.
 
     Args:
-        folder: of the run.
+        folder: of the run, or ``policy.pt`` or ``best.pt`` in it.
         run: which one, if there are several side by side.
+        best: whether to take the policy of the evaluation with the best median success.
         allow_import: whether the module that the run's task may name may be imported.
 
     Raises:
-        ValueError: this is no folder of a run, there is no such run, its policy is damaged, or its task
-            names a module that must not be imported.
+        ValueError: this is no folder of a run, there is no such run, its policy is damaged, it has no best
+            policy, or its task names a module that must not be imported.
         OSError: the run has not saved a policy yet.
     """
-    home = RunFolder(folder)
-    recipe = home.recipe()
+    kept = KeptPolicy.of(folder, best=best)
+    if kept is None:
+        home = RunFolder(folder)
+        kept = KeptPolicy(home, home.policy)  # whose recipe says what is missing
+    return _actor_of(kept, run, allow_import)
+
+
+def _actor_of(kept: KeptPolicy, run: int, allow_import: bool) -> TensorDictModuleBase:
+    recipe = kept.home.recipe()
     if not 0 <= run < recipe.run.num_runs:
-        raise ValueError(f"there is no run {run} in {folder}; it has runs 0 to {recipe.run.num_runs - 1}")
+        runs = recipe.run.num_runs
+        raise ValueError(f"there is no run {run} in {kept.home.path}; it has runs 0 to {runs - 1}")
     if allow_import:
         permit_task(recipe.task.name)
     env = make_played_env(recipe, 1, [0])
     actor = make_player(recipe.replace(num_runs=1), env, curriculum=make_curriculum(recipe, env))
-    actor.load_state_dict(take_run(load_checkpoint(home.policy)["actor"], run, recipe.run.num_runs))
+    actor.load_state_dict(take_run(kept.load()["actor"], run, recipe.run.num_runs))
     return actor
 
 
@@ -54,6 +65,7 @@ def play(
     out: str | Path,
     *,
     run: int = 0,
+    best: bool = False,
     goals: int = 6,
     seed: int = 0,
     size: int = 240,
@@ -62,10 +74,12 @@ def play(
     """Writes a video of a policy, for several goals side by side.
 
     Args:
-        source: the folder of a run, the .pt file of an exported policy, or the name of a task whose policy
-            comes with the package.
+        source: the folder of a run, ``policy.pt`` or ``best.pt`` in it, the .pt file of an exported policy,
+            or the name of a task whose policy comes with the package.
         out: a .gif or .mp4 file.
         run: which one, if there are several side by side in the folder.
+        best: whether to take the best policy of the folder: that of the evaluation with the best median
+            success.
         goals: how many.
         seed: of the goals and starts.
         size: pixels of one environment.
@@ -75,11 +89,11 @@ def play(
         How many of the goals were achieved.
 
     Raises:
-        ValueError: there is neither such a run nor such a policy, nothing of it can be drawn, or its task
-            names a module that must not be imported.
+        ValueError: there is neither such a run nor such a policy, ``best`` without the folder of a run,
+            nothing of it can be drawn, or its task names a module that must not be imported.
         OSError: the run has not saved a policy yet.
     """
-    env, actor, achieved = _played(source, run, goals, seed, allow_import)
+    env, actor, achieved = _played(source, run, best, goals, seed, allow_import)
     if not goal_env(env).can_render:
         raise ValueError(f"{source} cannot be filmed: its environment gives no pictures")
     write_video(record_episodes(env, actor, size=size, achieved_reward=achieved), out, fps=FPS)
@@ -89,20 +103,20 @@ def play(
 
 
 def _played(
-    source: str | Path, run: int, goals: int, seed: int, allow_import: bool
+    source: str | Path, run: int, best: bool, goals: int, seed: int, allow_import: bool
 ) -> tuple[EnvBase, TensorDictModuleBase, float]:
     """Environments, the policy that plays in them, and the reward of an achieved goal."""
-    if not Path(source).is_dir() and (str(source) in policy_names() or Path(source).is_file()):
+    kept = KeptPolicy.of(source, best=best)
+    if kept is None and (str(source) in policy_names() or Path(source).is_file()):
         trained = load_trained(source, allow_import=allow_import)
         env = make_task_envs(trained.recipe.replace(task=trained.task), goals, [seed], pictures=True)
         return env, trained.actor, reward_range(goal_env(env))[1]
-    home = RunFolder(source)
-    if not home.path.is_dir():
+    if kept is None:
         known = ", ".join(policy_names())
         raise ValueError(
             f"{source} is neither the folder of a run, nor the file of an exported policy, nor one of the "
             f"trained policies: {known}"
         )
-    recipe, actor = home.recipe(), load_actor(source, run=run, allow_import=allow_import)
+    recipe, actor = kept.home.recipe(), _actor_of(kept, run, allow_import)
     env = make_played_env(recipe, goals, [seed], pictures=True)
     return env, actor, played_rewards(recipe, env)[1]

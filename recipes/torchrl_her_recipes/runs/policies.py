@@ -23,7 +23,7 @@ from torchrl_her_recipes.components.normalization import acting, make_norm
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.shipped import TRAINED, policy_names
-from torchrl_her_recipes.runs.folder import RunFolder
+from torchrl_her_recipes.runs.kept import KeptPolicy
 from torchrl_her_recipes.runs.run import median_run
 
 _KEYS = ("observation", "desired_goal")
@@ -91,18 +91,30 @@ def check_plays(policy: TrainedPolicy, env: EnvBase, task: str) -> None:
         raise ValueError(f"a policy of {policy.task} cannot play {task}: it has other widths")
 
 
-def load_policy(name: str | Path) -> TensorDictModuleBase:
+def load_policy(
+    name: str | Path, *, run: int | None = None, best: bool = False, allow_import: bool = False
+) -> TensorDictModuleBase:
     """The greedy policy of a task, trained: reads ``observation`` and ``desired_goal``, writes ``action``.
 
-    Nothing is imported for it, whatever module the task of a file names: it is weights alone.
+    Nothing is imported for a file, whatever module its task names: it is weights alone. For a run,
+    environments of its task are made.
 
     Args:
-        name: of a task, or the path of a .pt file that :func:`export_policy` wrote.
+        name: of a task, the path of a .pt file that :func:`export_policy` wrote, or the folder of a run.
+        run: which one, of several side by side in a folder; the median of them if None.
+        best: whether to take the best policy of the folder: that of the evaluation with the best median
+            success.
+        allow_import: whether the module that the task of a run may name may be imported.
 
     Raises:
-        ValueError: there is no such policy, or the file is damaged.
+        ValueError: there is no such policy, it is not one of ``make_actor``, the file is damaged, ``best``
+            without the folder of a run, or the run's task names a module that must not be imported.
+        OSError: the run has not saved a policy yet.
     """
-    return load_trained(name).actor
+    kept = KeptPolicy.of(name, best=best)
+    if kept is None:
+        return load_trained(name).actor
+    return _policy_of(_state_of(kept, run, None, allow_import)).actor
 
 
 def export_policy(
@@ -111,15 +123,17 @@ def export_policy(
     *,
     run: int | None = None,
     task: str | None = None,
+    best: bool = False,
     allow_import: bool = False,
 ) -> TrainedPolicy:
     """Writes the policy of a finished run as a small file of its own.
 
     Args:
-        folder: of the run.
+        folder: of the run, or ``policy.pt`` or ``best.pt`` in it.
         out: the .pt file.
         run: which one, of several side by side; the median of them if None.
         task: that the policy is for, if not the run's own: one that shows and wants the same.
+        best: whether to take the policy of the evaluation with the best median success, not the last.
         allow_import: whether the module that the run's task may name may be imported.
 
     Returns:
@@ -127,23 +141,37 @@ def export_policy(
 
     Raises:
         ValueError: this is no folder of a run, it has no such run, its policy is not one of ``make_actor``,
-            the task is one that it cannot play, or the run's names a module that must not be imported.
+            it has no best policy, the task is one that it cannot play, or the run's names a module that must
+            not be imported.
         OSError: the run has not saved a policy yet.
     """
-    home = RunFolder(folder)
-    recipe, rows = home.recipe(), home.rows()
+    kept = KeptPolicy.of(folder, best=best)
+    if kept is None:
+        raise ValueError(f"{folder} is no folder of a run: it has no config.yaml")
+    state = _state_of(kept, run, task, allow_import)
+    state["success"] = measure_success(_policy_of(state))
+    save_checkpoint(state, out)
+    return _policy_of(state)
+
+
+def _state_of(kept: KeptPolicy, run: int | None, task: str | None, allow_import: bool) -> dict[str, Any]:
+    """What the file of an exported policy holds; its success is not measured yet."""
+    recipe, rows = kept.home.recipe(), kept.home.rows()
     if not rows:
-        raise ValueError(f"the run in {folder} has not been evaluated yet")
+        raise ValueError(f"the run in {kept.home.path} has not been evaluated yet")
+    weights = kept.load()
+    rows = [row for row in rows if row["epoch"] <= weights.get("epoch", math.inf)]
     chosen = median_run(rows) if run is None else run
     if chosen not in range(recipe.run.num_runs):
-        raise ValueError(f"there is no run {chosen} in {folder}; it has runs 0 to {recipe.run.num_runs - 1}")
+        runs = recipe.run.num_runs
+        raise ValueError(f"there is no run {chosen} in {kept.home.path}; it has runs 0 to {runs - 1}")
     for named in (task, recipe.task.name if allow_import else None):
         if named is not None:
             permit_task(named)
     played = recipe.replace(task=task or recipe.task.name)
     env = make_task_envs(recipe, 1, [0])
     widths, actions = _widths(env)
-    actor = take_run(load_checkpoint(home.policy)["actor"], chosen, recipe.run.num_runs)
+    actor = take_run(weights["actor"], chosen, recipe.run.num_runs)
     state = {
         "task": played.task.name,
         "widths": widths,
@@ -158,9 +186,7 @@ def export_policy(
         raise ValueError(
             f"a policy of {recipe.task.name} cannot play {played.task.name}: it has other widths"
         )
-    state["success"] = measure_success(_policy_of(state))
-    save_checkpoint(state, out)
-    return _policy_of(state)
+    return state
 
 
 def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int = 1 << 41) -> float:

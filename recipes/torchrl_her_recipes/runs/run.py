@@ -5,14 +5,13 @@ from __future__ import annotations
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from torchrl_her.trainers.checkpoint import load_newest_checkpoint, save_checkpoint
 from torchrl_her.trainers.trainer import Trainer
@@ -20,6 +19,9 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import build
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.config.imports import permit_task
+from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.runs.best import BestPolicy
+from torchrl_her_recipes.runs.callbacks import Callback, Callbacks, RunView, Stopped
 from torchrl_her_recipes.runs.curriculum import layer_success, move_on, play_greedily
 from torchrl_her_recipes.runs.evaluation import measure, written
 from torchrl_her_recipes.runs.film import film_policy
@@ -27,6 +29,7 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap, goal_map
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.plots import plot_curves, plot_goals
+from torchrl_her_recipes.runs.progress import Progress
 from torchrl_her_recipes.runs.saturation import saturation_notices
 from torchrl_her_recipes.runs.state import load_run_state, run_state
 from torchrl_her_recipes.runs.virtual_goals import at_virtual_goals
@@ -40,11 +43,13 @@ class RunResult:
         rows: the table of metrics, with a row for each epoch and run.
         folder: the folder with all files of the run, or None.
         interrupted: whether it was stopped by Ctrl-C or a signal.
+        stopped: whether a callback stopped it before its last epoch.
     """
 
     rows: list[dict[str, float]]
     folder: Path | None
     interrupted: bool = False
+    stopped: bool = False
 
     @property
     def successes(self) -> list[float]:
@@ -62,16 +67,30 @@ def last_success(rows: list[dict[str, float]]) -> list[float]:
     return [row["success"] for row in rows if row["epoch"] == rows[-1]["epoch"]]
 
 
-def run(components: Components, folder: str | Path | None = None, *, progress: bool = True) -> RunResult:
+def run(
+    components: Components,
+    folder: str | Path | None = None,
+    *,
+    callbacks: Sequence[Callback] = (),
+    progress: bool = True,
+) -> RunResult:
     """Trains for as many epochs as the recipe says.
 
     Args:
         components: from :func:`~torchrl_her_recipes.build`; you may have replaced some of them.
         folder: where the run writes its files; None writes nothing.
-        progress: whether to show a progress bar.
+        callbacks: called on the way; they may stop the run.
+        progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
 
     Raises:
         ValueError: the folder holds a run already.
+
+    Example:
+        >>> from torchrl_her_recipes import EarlyStopping, build, make_recipe
+        >>> recipe = make_recipe(task="hand_v0", epochs=3, epoch_frames=320, num_envs=8, episodes=2)
+        >>> result = run(build(recipe), callbacks=[EarlyStopping("frames", at_least=640)], progress=False)
+        >>> result.stopped, [row["frames"] for row in result.rows]
+        (True, [320, 640])
     """
     home, trainer = None if folder is None else RunFolder(folder), components.trainer()
     with torch.random.fork_rng(devices=[]):
@@ -79,9 +98,10 @@ def run(components: Components, folder: str | Path | None = None, *, progress: b
         torch.manual_seed(components.recipe.run.seed)
         if home is not None:
             home.create()
-            _save(components, trainer, home)  # before config.yaml: a folder that has one can be resumed
+            # Before config.yaml: a folder that has one can be resumed.
+            _save(components, trainer, home, BestPolicy())
             home.describe(components.recipe)
-        return _run(components, trainer, home, [], progress=progress)
+        return _run(components, trainer, home, [], BestPolicy(), callbacks, progress=progress)
 
 
 def resume(
@@ -89,10 +109,14 @@ def resume(
     *,
     components: Components | None = None,
     options: Mapping[str, Any] | None = None,
+    callbacks: Sequence[Callback] = (),
     progress: bool = True,
     allow_import: bool = False,
 ) -> RunResult:
     """Continues a run from its newest complete checkpoint, or extends one that has ended.
+
+    A finished run can be given more epochs only if its recipe said ``keep_buffer=True``. Otherwise its
+    checkpoint has no replay buffer any more, and all that is made again are its pictures and its policy.
 
     With the tasks of this library the result is bit for bit that of a run that never stopped. So it is with
     an environment of your own if it keeps no state from one epoch to the next; after a stop in the middle
@@ -101,14 +125,15 @@ def resume(
     Args:
         folder: of the run.
         components: newly made ones, if those of the run were not the ones of its recipe.
-        options: other values of ``epochs``, ``checkpoint_interval`` or ``keep_checkpoints``, which are
-            written into the folder's configuration.
-        progress: whether to show a progress bar.
+        options: other values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints`` or ``keep_buffer``,
+            which are written into the folder's configuration.
+        callbacks: called on the way; they may stop the run. Those of its beginning are not remembered.
+        progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
         allow_import: whether the module that the run's task may name may be imported.
 
     Raises:
-        ValueError: there is no run in the folder, no checkpoint is complete or none has the replay buffer,
-            an option would change what was trained, fewer epochs are asked for than were done, both
+        ValueError: there is no run in the folder, no checkpoint is complete, there is no replay buffer to go
+            on with, an option would change what was trained, fewer epochs are asked for than were done, both
             options and components are given, or the components differ from those of the run.
     """
     home = RunFolder(folder)
@@ -118,7 +143,11 @@ def resume(
     state = _newest_state(home, keep=recipe.run.keep_checkpoints)
     if allow_import:
         permit_task(recipe.task.name)
-    components = components or build(recipe.extended(**options) if options else recipe)
+    wanted = recipe.extended(**options) if options else recipe
+    has_buffer = bool(state.get("buffer"))
+    if not has_buffer:
+        _check_needs_no_buffer(home, wanted if components is None else components.recipe, state)
+    components = components or build(wanted)
     trainer = components.trainer()
     with torch.random.fork_rng(devices=[]):
         load_run_state(components, trainer, state)
@@ -133,21 +162,40 @@ def resume(
         rows = home.rows()[
             : trainer.epochs * components.recipe.run.num_runs
         ]  # without those that are newer than the checkpoint
-        return _run(components, trainer, home, rows, progress=progress)
+        best = BestPolicy(state.get("best"))  # older runs have none
+        if best.state is None:
+            home.best.unlink(missing_ok=True)  # newer than the checkpoint
+        else:
+            _save_best(best, trainer, home)
+        return _run(
+            components, trainer, home, rows, best, callbacks, has_buffer=has_buffer, progress=progress
+        )
 
 
 def _newest_state(home: RunFolder, *, keep: int) -> dict[str, Any]:
-    """The newest checkpoint that is whole. Without the replay buffer a run cannot go on."""
+    """The newest checkpoint that is whole.
+
+    Raises:
+        ValueError: there is none.
+    """
     try:
-        state = load_newest_checkpoint(home.checkpoint, keep=keep)
+        return load_newest_checkpoint(home.checkpoint, keep=keep)
     except FileNotFoundError:
-        state = {}
-    if not state.get("buffer"):
+        raise ValueError(f"the run in {home.path} cannot go on: {home.checkpoint.name} is missing") from None
+
+
+def _check_needs_no_buffer(home: RunFolder, recipe: Recipe, state: dict[str, Any]) -> None:
+    """Refuses to train on without the replay buffer, or to keep one that is lost.
+
+    Raises:
+        ValueError: the run has epochs to go, or its recipe wants the buffer to be kept.
+    """
+    done = state["trainer"]["epochs"]
+    if recipe.run.epochs > done or recipe.run.keep_buffer:
         raise ValueError(
-            f"the run in {home.path} cannot go on: its replay buffer was not kept "
-            f"({home.checkpoint.name} {'has none' if state else 'is missing'})"
+            f"the run in {home.path} cannot go on after its {done} epochs: its checkpoint has no replay "
+            "buffer; only runs that are trained with keep_buffer=true keep it when they have finished"
         )
-    return state
 
 
 def _run(
@@ -155,57 +203,79 @@ def _run(
     trainer: Trainer,
     home: RunFolder | None,
     rows: list[dict[str, float]],
+    best: BestPolicy,
+    callbacks: Sequence[Callback],
     *,
     progress: bool,
+    has_buffer: bool = True,
 ) -> RunResult:
     recipe = components.recipe
+    hooks = Callbacks(callbacks, RunView(components, trainer, rows, home))
     threads = torch.get_num_threads()
     torch.set_num_threads(recipe.run.threads)
     torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
-    bar = tqdm(total=recipe.total_frames, initial=trainer.frames, unit="frames", disable=not progress)
-    interrupted = saved = False
+    shown = Progress(recipe, trainer, show=progress)
+    interrupted = stopped = saved = False
     unlogged = 0  # rows that are not on the disk yet
     with soft_interrupt() as check:  # also while things are saved at the end
+
+        def between_batches() -> None:
+            check()
+            hooks.batch()
+
         try:
-            while trainer.epochs < recipe.run.epochs:
-                new = _epoch(components, trainer, bar, check, rows[-1]["seconds"] if rows else 0.0)
+            hooks.start()
+            while trainer.epochs < recipe.run.epochs and not stopped:
+                seconds = rows[-1]["seconds"] if rows else 0.0
+                new = _epoch(components, trainer, shown, between_batches, seconds, best)
                 rows += new
+                stopped = hooks.epoch()
                 for line in saturation_notices(rows, recipe):
-                    _say(bar, line)
+                    shown.say(line)
                 if home is not None:
                     unlogged += len(new)
                     with _despite_a_full_disk("table", trainer):
                         home.log(rows, unlogged)
                         unlogged = 0
-                    saved = trainer.epochs % recipe.run.checkpoint_interval == 0 and _save(
-                        components, trainer, home
+                    _save_best(best, trainer, home)
+                    saved = trainer.epochs % recipe.run.checkpoint_interval == 0 and _save_all(
+                        components, trainer, home, best
                     )
-                    if saved:
-                        with _despite_a_full_disk("map of goals", trainer):
-                            _save_goals(components, home)
         except Interrupted:
             interrupted, saved = True, False
+        except Stopped:
+            stopped, saved = True, False
         finally:
-            bar.close()
+            shown.close()
             components.close()
             torch.set_num_threads(threads)
             torch.set_flush_denormal(False)
         if home is not None:
             if not saved:
-                _save(components, trainer, home)
-            _finish(components, rows, home)
-    return RunResult(rows=rows, folder=None if home is None else home.path, interrupted=interrupted)
+                (_save_all if has_buffer else _save)(components, trainer, home, best)
+            _finish(components, trainer, rows, home, has_buffer)
+        hooks.end()
+    return RunResult(
+        rows=rows,
+        folder=None if home is None else home.path,
+        interrupted=interrupted,
+        stopped=stopped and trainer.epochs < recipe.run.epochs,
+    )
 
 
 def _epoch(
-    components: Components, trainer: Trainer, bar: tqdm, check: Callable[[], None], seconds: float
+    components: Components,
+    trainer: Trainer,
+    shown: Progress,
+    between_batches: Callable[[], None],
+    seconds: float,
+    best: BestPolicy,
 ) -> list[dict[str, float]]:
     """One epoch and its evaluation, as rows of the table: one for each run."""
 
-    def on_batch(trainer: Trainer) -> None:
-        bar.set_description_str(f"{trainer.updates} updates", refresh=False)
-        bar.update(trainer.frames - bar.n)
-        check()
+    def on_batch(_trainer: Trainer) -> None:
+        shown.batch()
+        between_batches()
 
     began = time.perf_counter()
     measured = trainer.epoch(on_batch)
@@ -228,27 +298,46 @@ def _epoch(
             progress = components.curriculum.progress
             values["mean_layer" if progress.by_episode else "layer"] = progress.mean_layer(run)
         rows.append({**counters, **times, **values, **written(components, run)})
+    best.see(rows, components.greedy)  # before a new layer changes it
     if components.curriculum is not None and samples is not None:
         for line in move_on(components, components.curriculum, samples, trainer.frames):
-            _say(bar, line)
-    bar.set_postfix(success=f"{statistics.median(last_success(rows)):.2f}")
+            shown.say(line)
+    shown.epoch(rows)
     return rows
 
 
-def _say(bar: tqdm, line: str) -> None:
-    """A line above the progress bar, if there is one."""
-    if not bar.disable:
-        bar.write(line)
+def _save_all(components: Components, trainer: Trainer, home: RunFolder, best: BestPolicy) -> bool:
+    """Writes the histogram of virtual goals and then a checkpoint; returns whether it could write the latter.
+
+    In this order, since the last checkpoint has no buffer to make the histogram of.
+    """
+    with _despite_a_full_disk("map of goals", trainer):
+        _save_goals(components, home)
+    return _save(components, trainer, home, best)
 
 
-def _save(components: Components, trainer: Trainer, home: RunFolder) -> bool:
-    """Writes a checkpoint; returns whether it could."""
+def _save(components: Components, trainer: Trainer, home: RunFolder, best: BestPolicy) -> bool:
+    """Writes a checkpoint; returns whether it could. That of the last epoch is without the replay buffer."""
+    buffer = components.recipe.run.keep_buffer or not _has_ended(components, trainer)
+    state = run_state(components, trainer, buffer=buffer) | {"best": best.state}
     with _despite_a_full_disk("checkpoint", trainer):
-        save_checkpoint(
-            run_state(components, trainer), home.checkpoint, keep=components.recipe.run.keep_checkpoints
-        )
+        save_checkpoint(state, home.checkpoint, keep=components.recipe.run.keep_checkpoints)
         return True
     return False
+
+
+def _has_ended(components: Components, trainer: Trainer) -> bool:
+    """Whether the last epoch is done."""
+    return trainer.epochs >= components.recipe.run.epochs
+
+
+def _save_best(best: BestPolicy, trainer: Trainer, home: RunFolder) -> None:
+    """Writes the best policy if there is a new one."""
+    if best.state is not None and best.is_new:
+        with _despite_a_full_disk("best policy", trainer):
+            save_checkpoint(best.state, home.best)
+            home.describe_best(best.state["epoch"], best.state["success"])
+            best.is_new = False
 
 
 @contextmanager
@@ -260,13 +349,18 @@ def _despite_a_full_disk(what: str, trainer: Trainer) -> Iterator[None]:
         warnings.warn(f"no {what} after {trainer.frames:,} frames, the run goes on: {error}", stacklevel=4)
 
 
-def _finish(components: Components, rows: list[dict[str, float]], home: RunFolder) -> None:
+def _finish(
+    components: Components, trainer: Trainer, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool
+) -> None:
     """Draws the pictures and then writes the policy, whose file tells that the run has ended."""
-    _draw(components, rows, home)
+    _draw(components, rows, home, has_buffer)
     save_checkpoint({"actor": dict(components.greedy.state_dict())}, home.policy)
+    if _has_ended(components, trainer):
+        for path in home.older_checkpoints:
+            path.unlink(missing_ok=True)
 
 
-def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder) -> None:
+def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool) -> None:
     recipe = components.recipe
     home.close()
     title = f"{recipe.task.name}, {recipe.hindsight.algo}, " + (
@@ -274,7 +368,7 @@ def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder)
     )
     if rows:
         plot_curves(rows, home.curves, title=title)
-    goals = _save_goals(components, home)
+    goals = _save_goals(components, home) if has_buffer else _saved_goals(home)
     task = goal_env(components.env)
     if goals is not None and goals.target.ndim == 2 and task.goal_box() is not None:
         plot_goals(goals, task, home.goals, title=f"virtual goals: {title}")
@@ -286,6 +380,11 @@ def median_run(rows: list[dict[str, float]]) -> int:
     """The index of the run with the median success in the last evaluation."""
     values = last_success(rows)
     return sorted(range(len(values)), key=values.__getitem__)[len(values) // 2]
+
+
+def _saved_goals(home: RunFolder) -> GoalMap | None:
+    """The histogram of virtual goals that was written when the run still had its buffer, if there was one."""
+    return GoalMap.load(home.goal_map) if home.goal_map.is_file() else None
 
 
 def _save_goals(components: Components, home: RunFolder) -> GoalMap | None:

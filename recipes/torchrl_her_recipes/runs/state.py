@@ -23,8 +23,18 @@ from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
 
 
-def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
-    """All that a run is, as tensors and plain data. Rows are the buffer's own: save it at once."""
+def run_state(components: Components, trainer: Trainer, *, buffer: bool = True) -> dict[str, Any]:
+    """All that a run is, as tensors and plain data. Rows are the buffer's own: save it at once.
+
+    Args:
+        components: of the run.
+        trainer: its training loop.
+
+    Keyword Args:
+        buffer: whether with the replay buffer and that of demonstrations, which are nearly all of it. Without
+            them a run cannot go on.
+    """
+    shown = components.demonstrations
     return {
         "recipe": components.recipe.to_dict(),
         "made_of": _made_of(components),
@@ -37,10 +47,8 @@ def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
         "average": None if components.average is None else dict(components.average.state_dict()),
         "guide": None if components.guide is None else components.guide.state_dict(),
         "guided": None if components.guide is None else components.guide.guided,
-        "buffer": buffer_state_dict(components.buffer, copy=False),
-        "demonstrations": None
-        if components.demonstrations is None
-        else components.demonstrations.state_dict(),
+        "buffer": buffer_state_dict(components.buffer, copy=False) if buffer else None,
+        "demonstrations": None if shown is None or not buffer else shown.state_dict(),
         "generators": [generator.get_state() for generator in components.generators],
         "torch_generator": torch.get_rng_state(),  # for losses that draw, as SAC's
         "cuda_generator": None if (gpu := _gpu_of(components)) is None else torch.cuda.get_rng_state(gpu),
@@ -50,8 +58,18 @@ def run_state(components: Components, trainer: Trainer) -> dict[str, Any]:
     }
 
 
+def without_buffer(state: dict[str, Any]) -> dict[str, Any]:
+    """What :func:`run_state` gives of the same run without its buffers.
+
+    Example:
+        >>> without_buffer({"loss": {}, "buffer": {"rows": []}, "demonstrations": None})
+        {'loss': {}, 'buffer': None, 'demonstrations': None}
+    """
+    return state | {"buffer": None, "demonstrations": None}
+
+
 def load_run_state(components: Components, trainer: Trainer, state: dict[str, Any]) -> None:
-    """Puts freshly built components where :func:`run_state` was taken.
+    """Puts freshly built components where :func:`run_state` was taken; their buffer stays empty without one.
 
     Raises:
         ValueError: the components are of other types or have other settings than those of the run.
@@ -76,7 +94,8 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
     if components.guide is not None:
         components.guide.load_state_dict(state["guide"])
         components.guide.guided = state["guided"]
-    load_buffer_state_dict(components.buffer, state["buffer"])
+    if state["buffer"] is not None:
+        load_buffer_state_dict(components.buffer, state["buffer"])
     for generator, own in zip(components.generators, state["generators"], strict=True):
         generator.set_state(own)
     torch.set_rng_state(state["torch_generator"])
@@ -88,7 +107,7 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
         progress = components.curriculum.progress
         for run in range(0 if progress.by_episode else components.recipe.run.num_runs):
             set_layer_goals(components.buffer.writer, progress.layer_of(run), run=run)
-    if components.demonstrations is not None:
+    if components.demonstrations is not None and state["demonstrations"] is not None:
         components.demonstrations.load_state_dict(state["demonstrations"])
     load_collector_state_dict(components.collector, state["collector"])
     trainer.load_state_dict(state["trainer"])

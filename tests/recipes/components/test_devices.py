@@ -88,9 +88,9 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> No
     options = {**CURRICULUM, **SHORT, "learner.device": name, "num_runs": 2, "checkpoint_interval": 1}
     whole = run(build(small(epochs=3, **options)), tmp_path / "whole", progress=False)
     run(build(small(epochs=2, **options)), tmp_path / "parts", progress=False)
+    layers = load_checkpoint(tmp_path / "parts" / "checkpoint.pt")["guide"]["layer"]
     again = resume(tmp_path / "parts", options={"epochs": 3}, progress=False)
     assert [row["success"] for row in again.rows] == [row["success"] for row in whole.rows]
-    layers = load_checkpoint(tmp_path / "parts" / "checkpoint.1.pt")["guide"]["layer"]
     assert 0 in layers.tolist()  # so that guided episodes went on
     ends = [load_checkpoint(tmp_path / own / "checkpoint.pt")["loss"] for own in ("whole", "parts")]
     assert_same(*ends)

@@ -122,11 +122,13 @@ def test_what_export_wrote_is_played(
     assert main(["play", "run", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == alone.replace("mine.gif", "run/play.gif")
     assert Path("mine.gif").read_bytes() == Path("run/play.gif").read_bytes()
-    for other in ("run/policy.pt", "run/checkpoint.pt"):
-        assert main(["play", other]) == 2
-        assert (
-            f"torchrl-her: {other} is no exported policy: `torchrl-her export RUN`" in capsys.readouterr().err
-        )
+    filmed = Path("run/policy.gif").read_bytes()
+    assert main(["play", "run/policy.pt", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
+    assert Path("mine.gif").read_bytes() == Path("run/play.gif").read_bytes()
+    assert Path("run/policy.gif").read_bytes() == filmed
+    assert main(["play", "run/checkpoint.pt"]) == 2
+    said = "torchrl-her: run/checkpoint.pt is no exported policy: `torchrl-her export RUN`"
+    assert said in capsys.readouterr().err
     Path("notes.txt").write_text("not a policy")
     assert main(["play", "notes.txt"]) == 2
     assert "notes.txt is not a checkpoint of torchrl-her" in capsys.readouterr().err

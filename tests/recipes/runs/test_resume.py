@@ -16,8 +16,8 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchrl_her import load_checkpoint, save_checkpoint
-from torchrl_her_recipes import Components, Recipe, build, cli, resume, run
+from torchrl_her import load_checkpoint
+from torchrl_her_recipes import Callback, Components, Recipe, RunView, build, cli, resume, run
 from torchrl_her_recipes.runs import state as run_state
 from torchrl_her_recipes.runs.folder import RunFolder
 
@@ -60,7 +60,7 @@ def press_ctrl_c(components: Components, batch: int) -> Components:
 
 def assert_same_runs(first: Path, second: Path) -> None:
     """Two folders: all weights, buffers and generators, and the tables but for the time."""
-    for name in ("checkpoint.pt", "policy.pt"):
+    for name in ("checkpoint.pt", "policy.pt", "best.pt"):
         assert_same(load_checkpoint(first / name), load_checkpoint(second / name))
     tables = [pd.read_csv(folder / "metrics.csv").drop(columns="seconds") for folder in (first, second)]
     pd.testing.assert_frame_equal(*tables, check_exact=True)
@@ -210,9 +210,15 @@ def test_epochs_extend_a_finished_run_and_an_interrupted_one(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["seed=3"], "keep_checkpoints only; seed=3 would change what it has trained: start a new run"),
-        (["epochs=4", "learner.gamma=0.9"], "keep_checkpoints only; learner.gamma=0.9 would change what"),
-        (["preset=demo"], "keep_checkpoints only; preset=demo would change what it has trained"),
+        (
+            ["seed=3"],
+            "keep_checkpoints, keep_buffer only; seed=3 would change what it has trained: start a new run",
+        ),
+        (
+            ["epochs=4", "learner.gamma=0.9"],
+            "keep_checkpoints, keep_buffer only; learner.gamma=0.9 would change what",
+        ),
+        (["preset=demo"], "keep_checkpoints, keep_buffer only; preset=demo would change what it has trained"),
         (["epoch=4"], "no option 'epoch'; did you mean epochs?"),
         (["epochs=4", "run.epochs=5"], "epochs=4 and run.epochs=5 set the same option"),
         (["epochs=4,5"], "epochs must be one value, got 4,5"),
@@ -244,18 +250,78 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_without_its_buffer_a_run_cannot_go_on(
+def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(
+    no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = small(epochs=2, epoch_frames=480, keep_buffer=False)
+    run(build(recipe), tmp_path, progress=False)
+    assert [path.name for path in tmp_path.glob("checkpoint*")] == ["checkpoint.pt"]
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is None
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    said = (
+        f"torchrl-her: the run in {tmp_path} cannot go on after its 2 epochs: its checkpoint has no replay "
+        "buffer; only runs that are trained with keep_buffer=true keep it when they have finished\n"
+    )
+    for arguments in (["epochs=3"], ["epochs=3", "keep_buffer=true"], ["keep_buffer=true"]):
+        assert cli.main(["train", "--resume", str(tmp_path), *arguments]) == 2
+        assert capsys.readouterr().err == said
+    with pytest.raises(ValueError, match="cannot go on after its 2 epochs"):
+        resume(tmp_path, components=build(recipe.replace(epochs=3)))
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_finished_run_draws_its_pictures_again_without_its_buffer(tmp_path: Path) -> None:
+    recipe = small(epochs=2, epoch_frames=480, keep_buffer=False, algo="filtered_her_ibs")
+    run(build(recipe), tmp_path, progress=False)
+    names = ("curves.png", "virtual_goals.png", "policy.gif", "policy.pt")
+    same = (
+        "curves.png",
+        "virtual_goals.png",
+        "policy.pt",
+        "goal_map.npz",
+        "best.pt",
+    )  # the film shows others
+    before = {name: (tmp_path / name).read_bytes() for name in same}
+    for name in names:
+        (tmp_path / name).unlink()
+    assert len(resume(tmp_path, progress=False).rows) == 2
+    assert {name: (tmp_path / name).read_bytes() for name in same} == before
+    assert (tmp_path / "policy.gif").stat().st_size > 1_000
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is None
+
+
+def test_a_buffer_that_was_kept_goes_when_it_is_not_wanted_any_more(
+    no_pictures: None, tmp_path: Path
+) -> None:
+    run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is not None
+    resume(tmp_path, options={"epochs": 2, "keep_buffer": False}, progress=False)
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is None
+
+
+def test_a_default_run_is_small_when_it_has_finished_and_ends_as_one_that_keeps_its_buffer(
+    no_pictures: None, tmp_path: Path
+) -> None:
+    options: dict[str, Any] = {"epochs": 2, "epoch_frames": 480, "task": "hand_v1", "algo": "cher_ibs"}
+    for name, keep in (("kept", True), ("small", False)):
+        run(build(small(**options, keep_buffer=keep)), tmp_path / name, progress=False)
+    kept, own = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("kept", "small"))
+    apart = {"buffer", "demonstrations", "recipe"}
+    assert_same(
+        *({name: value for name, value in state.items() if name not in apart} for state in (kept, own))
+    )
+    # The capacity of the buffer, not what is in it, is what a longer run fills.
+    assert (tmp_path / "small" / "checkpoint.pt").stat().st_size < 2_000_000
+
+
+def test_without_a_checkpoint_a_run_cannot_go_on(
     no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
-    for path in tmp_path.glob("checkpoint*.pt"):
-        save_checkpoint(load_checkpoint(path) | {"buffer": None}, path)
-    said = f"the run in {tmp_path} cannot go on: its replay buffer was not kept (checkpoint.pt"
-    for why in ("has none", "is missing"):
-        assert cli.main(["train", "--resume", str(tmp_path), "epochs=3"]) == 2
-        assert capsys.readouterr().err == f"torchrl-her: {said} {why})\n"
-        for path in tmp_path.glob("checkpoint*.pt"):
-            path.unlink()
+    (tmp_path / "checkpoint.pt").unlink()
+    assert cli.main(["train", "--resume", str(tmp_path), "epochs=3"]) == 2
+    said = f"torchrl-her: the run in {tmp_path} cannot go on: checkpoint.pt is missing\n"
+    assert capsys.readouterr().err == said
 
 
 def test_options_and_components_are_not_given_together(ended: Path) -> None:
@@ -263,17 +329,31 @@ def test_options_and_components_are_not_given_together(ended: Path) -> None:
         resume(ended, components=build(small()), options={"epochs": 3})
 
 
-def test_the_last_checkpoints_are_kept(no_pictures: None, tmp_path: Path) -> None:
-    run(build(small(epochs=4, epoch_frames=400, keep_checkpoints=3)), tmp_path, progress=False)
+class Stop(Callback):
+    """Stops a run after some epochs."""
+
+    def __init__(self, epochs: int) -> None:
+        self.epochs = epochs
+
+    def on_epoch(self, run: RunView) -> bool:
+        return run.trainer.epochs == self.epochs
+
+
+def test_the_last_checkpoints_are_kept_until_the_run_has_finished(no_pictures: None, tmp_path: Path) -> None:
+    recipe = small(epochs=5, epoch_frames=400, keep_checkpoints=3)
+    run(build(recipe), tmp_path, callbacks=[Stop(4)], progress=False)
     epochs = {path.name: load_checkpoint(path)["trainer"]["epochs"] for path in tmp_path.glob("checkpoint*")}
     assert epochs == {"checkpoint.pt": 4, "checkpoint.1.pt": 3, "checkpoint.2.pt": 2}
+    resume(tmp_path, progress=False)
+    assert [path.name for path in tmp_path.glob("checkpoint*")] == ["checkpoint.pt"]
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["trainer"]["epochs"] == 5
 
 
 @pytest.mark.filterwarnings("always")
 def test_on_the_command_line_a_warning_is_one_line(
     no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run(build(small(epochs=2, epoch_frames=800)), tmp_path, progress=False)
+    run(build(small(epochs=3, epoch_frames=800)), tmp_path, callbacks=[Stop(2)], progress=False)
     damage(tmp_path / "checkpoint.pt")
     assert cli.main(["train", "--resume", str(tmp_path)]) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "damaged" in line]
@@ -282,8 +362,8 @@ def test_on_the_command_line_a_warning_is_one_line(
 
 def test_the_one_before_a_damaged_checkpoint_is_used(no_pictures: None, tmp_path: Path) -> None:
     recipe = small(epochs=3, epoch_frames=800)
-    for name in ("whole", "part"):
-        run(build(recipe), tmp_path / name, progress=False)
+    for name, callbacks in (("whole", []), ("part", [Stop(2)])):
+        run(build(recipe), tmp_path / name, callbacks=callbacks, progress=False)
     damage(tmp_path / "part" / "checkpoint.pt")
     said = (
         r"part/checkpoint\.pt is damaged: its checksum does not match; checkpoint\.1\.pt, the one before, is"
@@ -294,7 +374,7 @@ def test_the_one_before_a_damaged_checkpoint_is_used(no_pictures: None, tmp_path
 
 
 def test_damaged_checkpoints_alone_are_refused(no_pictures: None, tmp_path: Path) -> None:
-    run(build(small(epochs=1)), tmp_path, progress=False)
+    run(build(small(epochs=2)), tmp_path, callbacks=[Stop(1)], progress=False)
     for path in tmp_path.glob("checkpoint*.pt"):
         damage(path)
     with pytest.raises(

@@ -1,0 +1,173 @@
+"""Callbacks: code of your own that a run calls on its way, and that may stop it."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from torchrl_her.trainers.trainer import Trainer
+from torchrl_her_recipes.components.components import Components
+from torchrl_her_recipes.runs.folder import RunFolder
+
+
+@dataclass(frozen=True)
+class RunView:
+    """What a callback sees of a run, always as it is now.
+
+    Attributes:
+        components: what the run consists of.
+        trainer: the training loop, with its counters ``frames``, ``updates`` and ``epochs``.
+        rows: the table of metrics so far, with a row for each epoch and run.
+        folder: where the run writes its files, or None.
+    """
+
+    components: Components
+    trainer: Trainer
+    rows: list[dict[str, float]]
+    folder: RunFolder | None
+
+
+class Callback:
+    """Is called by a run on its way. Override the methods that you need; here they do nothing.
+
+    ``on_batch`` and ``on_epoch`` may return True to stop the run in good order: its checkpoint, pictures and
+    policy are written as at its end, and :func:`~torchrl_her_recipes.resume` can go on from there. All
+    callbacks are called, in their order, also if an earlier one asks for a stop. What they raise ends the run
+    at once, and ``on_end`` is then not called.
+
+    Checkpoints hold nothing of a callback. One that decides from ``rows`` decides after a resumption as it
+    would have without it.
+
+    Example:
+        >>> class FrameLimit(Callback):
+        ...     def on_batch(self, run: RunView) -> bool:
+        ...         return run.trainer.frames >= 100_000
+    """
+
+    def on_start(self, run: RunView) -> None:
+        """Called before the first batch, also when a run goes on."""
+
+    def on_batch(self, run: RunView) -> bool | None:
+        """Called after each collected batch and its gradient steps; returns whether to stop."""
+        return None
+
+    def on_epoch(self, run: RunView) -> bool | None:
+        """Called after each evaluation; returns whether to stop.
+
+        Its rows are at the end of ``rows``. What is changed here, numbers in these rows included, is in the
+        table and the checkpoint of this epoch.
+        """
+        return None
+
+    def on_end(self, run: RunView) -> None:
+        """Called when everything was written, also after Ctrl-C or a stop."""
+
+
+class EarlyStopping(Callback):
+    """Stops a run when the median of a metric was good enough in some evaluations in a row.
+
+    The median is that of the runs side by side.
+
+    Args:
+        metric: a column of the table of metrics.
+
+    Keyword Args:
+        at_least: the smallest value that is good enough.
+        at_most: the largest value that is good enough, for metrics such as ``distance``. Give one of the two.
+        epochs: evaluations in a row.
+
+    Raises:
+        ValueError: both bounds or none are given, ``epochs`` is below 1; when running, the table has no such
+            column.
+
+    Example:
+        >>> stopping = EarlyStopping("success", at_least=0.9, epochs=2)
+        >>> rows = [{"run": 0, "epoch": epoch, "success": 0.95} for epoch in (1, 2)]
+        >>> stopping.reached(rows[:1]), stopping.reached(rows)
+        (False, True)
+    """
+
+    def __init__(
+        self,
+        metric: str = "success",
+        *,
+        at_least: float | None = None,
+        at_most: float | None = None,
+        epochs: int = 1,
+    ) -> None:
+        if (at_least is None) == (at_most is None):
+            raise ValueError(f"give at_least or at_most, got at_least={at_least} and at_most={at_most}")
+        if epochs < 1:
+            raise ValueError(f"epochs must be at least 1, got {epochs}")
+        self.metric, self.at_least, self.at_most, self.epochs = metric, at_least, at_most, epochs
+
+    def on_epoch(self, run: RunView) -> bool:
+        """Whether the metric has been good enough for as many evaluations as it should."""
+        return self.reached(run.rows)
+
+    def reached(self, rows: Sequence[dict[str, float]]) -> bool:
+        """Whether the last evaluations of a table are all good enough. NaN is not.
+
+        Args:
+            rows: the table, with a row for each epoch and run.
+
+        Raises:
+            ValueError: it has no column with the name of the metric.
+        """
+        last = sorted({row["epoch"] for row in rows})[-self.epochs :]
+        if rows and not any(self.metric in row for row in rows) and rows[-1].get("updates", 1) > 0:
+            # Losses are measured from the first update on.
+            raise ValueError(f"metric must be one of {', '.join(rows[-1])}, got {self.metric!r}")
+        return len(last) == self.epochs and all(
+            self._is_good([row.get(self.metric, math.nan) for row in rows if row["epoch"] == epoch])
+            for epoch in last
+        )
+
+    def _is_good(self, values: Iterable[float]) -> bool:
+        if self.at_least is not None:
+            return statistics.median(-math.inf if math.isnan(own) else own for own in values) >= self.at_least
+        assert self.at_most is not None
+        return statistics.median(math.inf if math.isnan(own) else own for own in values) <= self.at_most
+
+
+class Stopped(Exception):
+    """A callback asked in the middle of an epoch to stop the run."""
+
+
+class Callbacks:
+    """Some callbacks as one.
+
+    Args:
+        callbacks: in the order in which they are called.
+        run: what they see.
+    """
+
+    def __init__(self, callbacks: Sequence[Callback], run: RunView) -> None:
+        self.callbacks, self.run = callbacks, run
+
+    def start(self) -> None:
+        """Says that the run begins, or goes on."""
+        for own in self.callbacks:
+            own.on_start(self.run)
+
+    def batch(self) -> None:
+        """Says that a batch was learned from.
+
+        Raises:
+            Stopped: one of them wants the run to stop.
+        """
+        wanted = [own.on_batch(self.run) for own in self.callbacks]  # of all of them, also after a True
+        if any(wanted):
+            raise Stopped
+
+    def epoch(self) -> bool:
+        """Says that an evaluation is done; returns whether one of them wants the run to stop."""
+        wanted = [own.on_epoch(self.run) for own in self.callbacks]
+        return any(wanted)
+
+    def end(self) -> None:
+        """Says that everything was written."""
+        for own in self.callbacks:
+            own.on_end(self.run)

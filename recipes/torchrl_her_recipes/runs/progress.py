@@ -1,0 +1,65 @@
+"""How a run shows how far it is: a bar on a terminal, lines where its output goes elsewhere."""
+
+from __future__ import annotations
+
+import statistics
+import sys
+from collections.abc import Sequence
+
+from tqdm import tqdm
+
+from torchrl_her.trainers.trainer import Trainer
+from torchrl_her_recipes.config.recipe import Recipe
+
+
+class Progress:
+    """Shows how far a run is, on the standard error stream.
+
+    On a terminal it is a bar; where that goes into a file or to another program, a line for each epoch.
+
+    Args:
+        recipe: of the run.
+        trainer: its training loop.
+
+    Keyword Args:
+        show: whether to show anything.
+    """
+
+    def __init__(self, recipe: Recipe, trainer: Trainer, *, show: bool) -> None:
+        self.trainer, self.epochs = trainer, recipe.run.epochs
+        self.show, self.lines = show, show and not sys.stderr.isatty()
+        self.bar = tqdm(
+            total=recipe.total_frames,
+            initial=trainer.frames,
+            unit="frames",
+            disable=not show or self.lines,
+        )
+
+    def batch(self) -> None:
+        """Says that a batch was learned from."""
+        self.bar.set_description_str(f"{self.trainer.updates} updates", refresh=False)
+        self.bar.update(self.trainer.frames - self.bar.n)
+
+    def epoch(self, rows: Sequence[dict[str, float]]) -> None:
+        """Says how the evaluation of an epoch went.
+
+        Args:
+            rows: of this evaluation, one for each run.
+        """
+        success = statistics.median(row["success"] for row in rows)
+        self.bar.set_postfix(success=f"{success:.2f}")
+        if self.lines:
+            line = (
+                f"epoch {rows[0]['epoch']:.0f} of {self.epochs}: {rows[0]['frames']:,.0f} frames, "
+                f"{rows[0]['updates']:,.0f} updates, {rows[0]['seconds']:.0f} s, success {success:.0%}"
+            )
+            tqdm.write(line, file=sys.stderr)
+
+    def say(self, line: str) -> None:
+        """Writes a notice to the standard output, above the bar if there is one."""
+        if self.show:
+            tqdm.write(line)
+
+    def close(self) -> None:
+        """Ends the bar."""
+        self.bar.close()
