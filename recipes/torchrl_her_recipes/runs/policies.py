@@ -90,7 +90,7 @@ def read_card(name: str | Path) -> PolicyCard:
 
     Example:
         >>> read_card("robot_v1").expects()
-        'observation [13], desired_goal [2] and action [3]'
+        'observation [15], desired_goal [2] and action [3]'
     """
     path = _path_of(name)
     return read_onnx(path).card if path.suffix == SUFFIX else _named(path, _card_of, _read(path))
