@@ -74,7 +74,7 @@ def export_policy(
     out, page = Path(out), card_path(out)
     as_onnx = _format_of(out, format) == "onnx"
     if as_onnx:
-        need_onnx()  # before anything takes long
+        need_onnx(writes=True)  # before anything takes long
     if card:
         check_free(page)
     if Path(source).is_dir() or not (str(source) in policy_names() or Path(source).is_file()):

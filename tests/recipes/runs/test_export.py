@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from torchrl_her import load_checkpoint, save_checkpoint
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import (
     build,
@@ -88,7 +90,7 @@ def test_on_the_command_line(
             ["other.pt", "--out", "a.pt", "--format", "onnx"],
             "format=onnx must have the suffix .onnx, got 'a.pt'",
         ),
-        (["other.pt", "--out", "a.onnx", "--task", "robot_v0"], "observation [9], desired_goal [2] and"),
+        (["other.pt", "--out", "a.onnx", "--task", "robot_v0"], "observation [5], desired_goal [2] and"),
         (["nowhere"], "nowhere is no folder of a run: it has no config.yaml; nor is it the file"),
     ):
         assert main(["export", *wrong]) == 2
@@ -109,14 +111,68 @@ def test_on_the_command_line(
         assert said.count("\n") == 1
 
 
+@pytest.mark.parametrize("missing", ["onnx", "onnxruntime", "onnxscript"])
 def test_without_the_extra_nothing_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], missing: str
 ) -> None:
-    monkeypatch.setitem(sys.modules, "onnx", None)
+    monkeypatch.setitem(sys.modules, missing, None)
     assert main(["export", "hand_reach", "--out", str(tmp_path / "a.onnx")]) == 2
     said = capsys.readouterr().err
-    assert said == "torchrl-her: ONNX files need onnx and onnxruntime: pip install '.[onnx]'\n"
+    assert said == "torchrl-her: ONNX files need onnx, onnxruntime and onnxscript: pip install '.[onnx]'\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def _wide(state: dict[str, Any]) -> None:
+    state["recipe"]["learner"]["hidden"] = 10_000_000
+
+
+def _claims_much(state: dict[str, Any]) -> None:
+    state["recipe"]["learner"]["hidden"] = 100_000
+    state["actor"] = {
+        name: torch.zeros(()).expand([100_000 if side == 64 else side for side in value.shape])
+        for name, value in state["actor"].items()
+    }
+
+
+def _no_widths(state: dict[str, Any]) -> None:
+    del state["card"]["widths"]
+
+
+def _other_learner(state: dict[str, Any]) -> None:
+    state["recipe"]["learner"]["name"] = "theirs"
+
+
+def _no_weights(state: dict[str, Any]) -> None:
+    state["actor"] = [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_wide, "must be (1, 7, 10000000), got (1, 7, 64)"),
+        (_claims_much, "weights must have a place for each of their numbers"),
+        (_no_widths, "a policy's card lacks widths"),
+        (_other_learner, "unknown learner 'theirs'"),
+        (_no_weights, "bad.pt is no exported policy: "),
+    ],
+)
+def test_files_that_somebody_made_give_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[dict[str, Any]], None],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    export_policy("hand_reach", "good.pt", card=False)
+    state = load_checkpoint("good.pt")
+    change(state)
+    save_checkpoint(state, "bad.pt")
+    assert main(["play", "bad.pt"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("torchrl-her: bad.pt is no exported policy: ")
+    assert message in said
+    assert said.count("\n") == 1
 
 
 def test_a_policy_that_no_longer_fits_its_task_is_not_played(

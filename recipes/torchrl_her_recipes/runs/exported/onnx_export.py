@@ -62,7 +62,7 @@ def write_onnx(
         ImportError: onnx, onnxruntime or onnxscript is missing.
         OSError: the file cannot be written.
     """
-    need_onnx()
+    need_onnx(writes=True)
     path, own = Path(path), TensorPolicy(policy)
     card = replace(card, dtype="float32", action_dtype="int64" if card.discrete else "float32")
     proto = _graph_of(own, card)
@@ -114,21 +114,18 @@ def _graph_of(own: TensorPolicy, card: PolicyCard) -> Any:
     """The policy as a protobuf, without what tells of the machine that made it."""
     inputs = tuple(torch.zeros(2, card.widths[key]) for key in KEYS)  # 2: torch takes 1 for a constant
     batch = torch.export.Dim("batch")
-    try:
-        with _silent():
-            program = torch.onnx.export(
-                own,
-                inputs,
-                dynamo=True,
-                dynamic_shapes=tuple({0: batch} for _ in KEYS),
-                input_names=list(KEYS),
-                output_names=["action"],
-                opset_version=_OPSET,
-                external_data=False,
-                verbose=False,
-            )
-    except ImportError as error:
-        raise ImportError("torch's exporter needs onnxscript: pip install '.[onnx]'") from error
+    with _silent():
+        program = torch.onnx.export(
+            own,
+            inputs,
+            dynamo=True,
+            dynamic_shapes=tuple({0: batch} for _ in KEYS),
+            input_names=list(KEYS),
+            output_names=["action"],
+            opset_version=_OPSET,
+            external_data=False,
+            verbose=False,
+        )
     assert program is not None
     proto = program.model_proto
     for each in (*proto.graph.node, *proto.graph.initializer, *proto.graph.value_info):

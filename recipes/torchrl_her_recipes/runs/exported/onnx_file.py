@@ -49,18 +49,25 @@ class OnnxFile:
     recipe: Recipe
 
 
-def need_onnx() -> tuple[ModuleType, ModuleType]:
+def need_onnx(*, writes: bool = False) -> tuple[ModuleType, ModuleType]:
     """The packages ``onnx`` and ``onnxruntime``.
+
+    Keyword Args:
+        writes: whether ``onnxscript`` is needed, too, as torch's exporter is written with it.
 
     Raises:
         ImportError: one of them is missing; the message names the extra.
     """
     try:
-        # Both are an extra that few need, and take a second to import.
+        # All are an extra that few need, and take a second to import.
         import onnx  # noqa: PLC0415
         import onnxruntime  # noqa: PLC0415
+
+        if writes:
+            import onnxscript  # noqa: F401, PLC0415
     except ImportError as error:
-        raise ImportError("ONNX files need onnx and onnxruntime: pip install '.[onnx]'") from error
+        what = "onnx, onnxruntime and onnxscript" if writes else "onnx and onnxruntime"
+        raise ImportError(f"ONNX files need {what}: pip install '.[onnx]'") from error
     return onnx, onnxruntime
 
 
