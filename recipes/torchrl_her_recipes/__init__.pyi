@@ -21,13 +21,15 @@ from .reports.tidy import write_results as write_results
 from .runs.callbacks import Callback as Callback
 from .runs.callbacks import EarlyStopping as EarlyStopping
 from .runs.callbacks import RunView as RunView
+from .runs.export import export_policy as export_policy
+from .runs.exported.card import PolicyCard as PolicyCard
 from .runs.folder import RunFolder as RunFolder
 from .runs.play import load_actor as load_actor
 from .runs.play import play as play
 from .runs.policies import TrainedPolicy as TrainedPolicy
-from .runs.policies import export_policy as export_policy
 from .runs.policies import load_policy as load_policy
 from .runs.policies import load_trained as load_trained
+from .runs.policies import read_card as read_card
 from .runs.record import Recorded as Recorded
 from .runs.record import record_demonstrations as record_demonstrations
 from .runs.run import RunResult as RunResult

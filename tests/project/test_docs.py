@@ -65,6 +65,19 @@ def test_a_page_s_python_runs_from_top_to_bottom(
         exec(compile(block, page, "exec"), names)
 
 
+def test_a_policy_is_exported_loaded_and_played_by_onnxruntime(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("onnx", "onnxruntime", "onnxscript"):
+        pytest.importorskip(name, reason="needs the extra onnx")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "export.md"}
+    assert len(blocks("export.md")) == 3
+    for block in blocks("export.md"):
+        exec(compile(block, "export.md", "exec"), names)
+    assert Path("hand_v1.md").exists()
+
+
 def test_the_own_script_trains_and_measures_what_it_has_learned() -> None:
     text = "\n".join(blocks("own_script.md"))
     assert len(blocks("own_script.md")) == 4

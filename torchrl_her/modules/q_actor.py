@@ -50,6 +50,38 @@ class QNet(nn.Module):
         return self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
 
 
+class BestAction(nn.Module):
+    """(observation, goal) to the action of the greatest value.
+
+    Args:
+        net: gives the values; it may be shared.
+
+    Example:
+        >>> best = BestAction(QNet(6, 4))
+        >>> best(torch.zeros(2, 3), torch.zeros(2, 3)).dtype
+        torch.int64
+    """
+
+    def __init__(self, net: QNet) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """[..., widths] of the inputs to integers [...]."""
+        return self.net(*inputs).argmax(-1)
+
+    def regret(self, action: Tensor, *inputs: Tensor) -> Tensor:
+        """By how much the value of an action [...] is below the greatest one, [...].
+
+        Example:
+            >>> best, seen = BestAction(QNet(6, 4)), (torch.zeros(2, 3), torch.zeros(2, 3))
+            >>> best.regret(best(*seen), *seen).tolist()
+            [0.0, 0.0]
+        """
+        values = self.net(*inputs)
+        return values.amax(-1) - values.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+
+
 class _ChosenValue(nn.Module):
     """(observation, goal, action) to the action's value [..., 1]."""
 

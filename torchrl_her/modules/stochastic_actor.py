@@ -55,6 +55,35 @@ class StochasticActorNet(nn.Module):
         return location, scale.clamp(_LEAST_SCALE, _GREATEST_SCALE).exp()
 
 
+class SquashedLocation(nn.Module):
+    """The greedy action of a stochastic actor: the location of its normal distribution, squashed and scaled.
+
+    Args:
+        net: of the actor; it may be shared.
+        low: the least actions [width].
+        high: the greatest ones.
+
+    Example:
+        >>> greedy = SquashedLocation(StochasticActorNet(3, 1), torch.tensor([0.0]), torch.tensor([10.0]))
+        >>> greedy(torch.zeros(2, 2), torch.zeros(2, 1)).shape
+        torch.Size([2, 1])
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, net: StochasticActorNet, low: Tensor, high: Tensor) -> None:
+        super().__init__()
+        self.net = net
+        self.register_buffer("low", low.clone(), persistent=False)
+        self.register_buffer("high", high.clone(), persistent=False)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """[..., widths] of the inputs to [..., actions]."""
+        location, _ = self.net(*inputs)
+        return (self.high + self.low) / 2 + (self.high - self.low) / 2 * location.tanh()
+
+
 def make_stochastic_actor(
     widths: Sequence[int],
     action_spec: Bounded,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import click
 from click.shell_completion import CompletionItem
@@ -26,7 +27,7 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 
 
 @click.command(short_help="a GIF of a run's policy, an exported one, or one that comes with the package")
-@click.argument("source", metavar="RUN|FILE.pt|TASK", shell_complete=_complete)
+@click.argument("source", metavar="RUN|FILE|TASK", shell_complete=_complete)
 @click.option("--out", type=_RUN, help="the .gif or .mp4 (default: RUN/play.gif, FILE.gif or TASK.gif)")
 @click.option("--run", type=click.IntRange(0), default=0, help="which, of several side by side")
 @_best
@@ -39,8 +40,8 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 def play(source: str, out: Path | None, run: int, best: bool, goals: int, seed: int, size: int) -> int:
     """Make a GIF of a policy.
 
-    RUN is the folder of a run, or policy.pt or best.pt in it, FILE.pt what `torchrl-her export` wrote, TASK
-    one of the trained policies.
+    RUN is the folder of a run, or policy.pt or best.pt in it, FILE what `torchrl-her export` wrote (.pt or
+    .onnx), TASK one of the trained policies.
     """
     path = Path(source)
     if not path.exists() and source not in policy_names():
@@ -66,23 +67,57 @@ def _film_of(source: Path) -> Path:
     return source.with_suffix(".gif") if source.is_file() else Path(f"{source}.gif")
 
 
-@click.command(short_help="a run's policy as a small file of its own")
-@click.argument("run", metavar="RUN", type=_RUN)
-@click.option("--out", type=_RUN, help="the .pt file (default: RUN/TASK.pt)")
+@click.command(short_help="a run's policy as a small file of its own, for TorchRL or as ONNX")
+@click.argument("source", metavar="RUN|FILE.pt|TASK", shell_complete=_complete)
+@click.option("--out", type=_RUN, help="the .pt or .onnx file (default: RUN/TASK.pt, FILE.onnx or TASK.onnx)")
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["torch", "onnx"]),
+    help="torch: for load_policy; onnx: for onnxruntime, too (default: what --out ends with, or torch)",
+)
 @click.option("--run", "index", type=click.IntRange(0), help="which, of several (default: the median)")
 @click.option("--task", help="that it is for, if not the run's own")
+@click.option(
+    "--card/--no-card",
+    default=True,
+    show_default=True,
+    help="write a page about the policy beside it, FILE.md",
+)
 @_best
 @allow_import
-def export(run: Path, out: Path | None, index: int | None, task: str | None, best: bool) -> int:
-    """Write the policy of the run in the folder RUN as a file, for `torchrl-her play` and load_policy.
+def export(
+    source: str,
+    out: Path | None,
+    form: Literal["torch", "onnx"] | None,
+    index: int | None,
+    task: str | None,
+    card: bool,
+    best: bool,
+) -> int:
+    """Write a policy as a file, for `torchrl-her play` and load_policy.
 
-    RUN may also be best.pt in that folder.
+    RUN is the folder of a run, or best.pt in it. FILE.pt, which export wrote, or TASK, one of the trained
+    policies, can be written in another format.
     """
-    if not run.exists():
-        raise ValueError(f"{run} is no folder of a run: it has no config.yaml")
-    folder = run if run.is_dir() else run.parent
-    name = task or recipes.RunFolder(folder).recipe().task.name
-    file = out or folder / f"{file_name(name)}.pt"
-    policy = recipes.export_policy(run, file, run=index, task=task, best=best)
+    file = out or _file_of(source, task, ".onnx" if form == "onnx" else ".pt")
+    policy = recipes.export_policy(source, file, run=index, task=task, best=best, format=form, card=card)
     click.echo(f"seed {policy.recipe.run.seed}, success {policy.success:.0%} on {policy.task}: {file}")
     return 0
+
+
+def _file_of(source: str, task: str | None, suffix: str) -> Path:
+    """Where a policy goes if nothing is said: in the folder of its run, or beside its file."""
+    path = Path(source)
+    home = recipes.RunFolder.of(path)
+    if home is not None:
+        return home.path / f"{file_name(task or home.recipe().task.name)}{suffix}"
+    if source not in policy_names() and not path.is_file():
+        raise ValueError(
+            f"{source} is no folder of a run: it has no config.yaml; nor is it the file of an exported policy"
+            f"{what_there_is(source, policy_names(), 'trained policies')}"
+        )
+    file = path.with_suffix(suffix) if path.is_file() else Path(f"{source}{suffix}")
+    if file == path:
+        raise ValueError(f"{source} would be replaced by itself: give --out or --format onnx")
+    return file

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
@@ -85,6 +86,27 @@ class LearnerBuilder(ABC):
     @abstractmethod
     def networks(self, runs: int) -> Networks:
         """The actor and the critics of some runs side by side."""
+
+    def player(self, runs: int) -> TensorDictModule:
+        """The actor alone; override this where critics need not be made for it."""
+        return self.networks(runs)[0]
+
+    def greedy(self, actor: TensorDictModule) -> nn.Module:
+        """What an exported policy plays: (observation, goal), as tensors, to the greedy action.
+
+        Args:
+            actor: of a single run, from :meth:`player`; its weights are shared.
+
+        Raises:
+            ValueError: the actor writes more than the action. Then a builder overrides this.
+        """
+        if list(actor.out_keys) != ["action"]:
+            raise ValueError(
+                f"a policy of learner={self.recipe.learner.name} cannot be exported: its actor writes "
+                f"{', '.join(map(str, actor.out_keys))} and not the action alone; override "
+                f"{type(self).__name__}.greedy"
+            )
+        return actor.module
 
     @abstractmethod
     def loss(

@@ -40,6 +40,21 @@ class RunFolder:
         self.video = self.path / "policy.gif"
         self._events: SummaryWriter | None = None
 
+    @classmethod
+    def of(cls, source: str | Path) -> RunFolder | None:
+        """The folder of a run that somebody means; None if that is no folder, and no policy's file in one.
+
+        Args:
+            source: the folder, or ``policy.pt`` or ``best.pt`` in it.
+
+        Example:
+            >>> RunFolder.of("runs/nowhere.pt")
+        """
+        path = Path(source)
+        home = cls(path if path.is_dir() else path.parent)
+        policy_in_it = path in (home.policy, home.best) and path.is_file() and home.config.is_file()
+        return home if path.is_dir() or policy_in_it else None
+
     def create(self) -> None:
         """Makes the folder.
 

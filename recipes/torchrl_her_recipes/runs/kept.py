@@ -36,15 +36,12 @@ class KeptPolicy:
         Example:
             >>> KeptPolicy.of("runs/nowhere.pt")
         """
-        path = Path(source)
-        if path.is_dir():
-            home = RunFolder(path)
+        home = RunFolder.of(source)
+        if home is not None and home.path == Path(source):
             return cls(home, home.best if best else home.policy)
         if best:
             raise ValueError(f"best goes with the folder of a run, and {source} is none")
-        home = RunFolder(path.parent)
-        found = path in (home.policy, home.best) and path.is_file() and home.config.is_file()
-        return cls(home, path) if found else None
+        return None if home is None else cls(home, Path(source))
 
     def load(self) -> dict[str, Any]:
         """The weights of all runs, as ``actor``; of a best policy also its ``epoch`` and ``success``.

@@ -74,8 +74,8 @@ def play(
     """Writes a video of a policy, for several goals side by side.
 
     Args:
-        source: the folder of a run, ``policy.pt`` or ``best.pt`` in it, the .pt file of an exported policy,
-            or the name of a task whose policy comes with the package.
+        source: the folder of a run, ``policy.pt`` or ``best.pt`` in it, the .pt or .onnx file of an exported
+            policy, or the name of a task whose policy comes with the package.
         out: a .gif or .mp4 file.
         run: which one, if there are several side by side in the folder.
         best: whether to take the best policy of the folder: that of the evaluation with the best median
@@ -110,6 +110,7 @@ def _played(
     if kept is None and (str(source) in policy_names() or Path(source).is_file()):
         trained = load_trained(source, allow_import=allow_import)
         env = make_task_envs(trained.recipe.replace(task=trained.task), goals, [seed], pictures=True)
+        trained.card.check_plays(env, trained.task)
         return env, trained.actor, reward_range(goal_env(env))[1]
     if kept is None:
         known = ", ".join(policy_names())

@@ -19,7 +19,7 @@ from torchrl_her_envs.registry import GYM
 from torchrl_her_envs.throwing.experts.controller import make_controller
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.recipe import Recipe, make_recipe
-from torchrl_her_recipes.runs.policies import check_plays, load_trained
+from torchrl_her_recipes.runs.policies import load_trained
 
 EXPERT = "expert"
 _AT_ONCE, _OF_GYM_AT_ONCE = 100, 10  # environments
@@ -104,7 +104,7 @@ def _find_policy(
                 "export` wrote or the name of a trained policy"
             ) from None
     trained = load_trained(policy, allow_import=allow_import)
-    check_plays(trained, env, task)
+    trained.card.check_plays(env, task)
     return trained.actor, f"{policy}, a policy of {trained.task}"
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from torchrl_her import evaluate, success
+from torchrl_her import evaluate, load_checkpoint, save_checkpoint, success
 from torchrl_her_envs import TASKS, make_env
 from torchrl_her_recipes import build, export_policy, load_actor, load_policy, load_trained, run
 from torchrl_her_recipes.cli import main
@@ -69,19 +69,19 @@ def test_export_takes_the_median_run(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    run(build(small(epochs=1, learner="sac")), folder, progress=False)
     other = tmp_path / "other"
     run(build(small(task="hand_v0", epochs=1)), other, progress=False)
     with pytest.raises(ValueError, match="a policy of hand_v0 cannot play robot_v0: it has other widths"):
         export_policy(other, tmp_path / "policy.pt", task="robot_v0")
     with pytest.raises(ValueError, match="unknown task 'nope'"):
         export_policy(other, tmp_path / "policy.pt", task="nope")
-    with pytest.raises(ValueError, match="cannot be exported: its network is not one of"):
-        export_policy(folder, tmp_path / "policy.pt")
     with pytest.raises(ValueError, match="there is no run 4 in .*; it has runs 0 to 0"):
-        export_policy(folder, tmp_path / "policy.pt", run=4)
-    assert not (tmp_path / "policy.pt").exists()
+        export_policy(other, tmp_path / "policy.pt", run=4)
+    state = load_checkpoint(other / "policy.pt")
+    save_checkpoint({"actor": {"own": state["actor"].popitem()[1]}}, other / "policy.pt")
+    with pytest.raises(ValueError, match="a policy of learner=auto in .* cannot be exported: these are not"):
+        export_policy(other, tmp_path / "policy.pt")
+    assert list(tmp_path.iterdir()) == [other]
     with pytest.raises(ValueError, match="there is no policy 'hand_v9'; there are hand_reach"):
         load_policy("hand_v9")
 

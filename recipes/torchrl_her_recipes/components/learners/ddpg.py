@@ -17,9 +17,12 @@ class DDPGBuilder(LearnerBuilder):
     """See :func:`~torchrl_her.make_ddpg_loss`."""
 
     def networks(self, runs: int) -> Networks:
-        actor = self.actor(runs).to(self.dtype)
+        actor = self.player(runs)
         critics = [self.critic(runs).to(self.dtype) for _ in range(getattr(self.options, "critics", 1))]
         return actor, critics
+
+    def player(self, runs: int) -> TensorDictModule:
+        return self.actor(runs).to(self.dtype)
 
     def actor(self, runs: int) -> TensorDictModule:
         """The deterministic actor of some runs side by side."""

@@ -7,11 +7,12 @@ from typing import cast
 
 import torch
 from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.modules import QValueActor
 from torchrl.objectives import LossModule
 
 from torchrl_her.modules.exploration import DecayingEpsilonGreedy, Exploration
-from torchrl_her.modules.q_actor import make_q_actor
+from torchrl_her.modules.q_actor import BestAction, QNet, make_q_actor
 from torchrl_her.objectives.dqn import make_dqn_loss
 from torchrl_her_recipes.components.learner import LearnerBuilder, Networks
 
@@ -28,6 +29,9 @@ class DQNBuilder(LearnerBuilder):
             **self.options.critic_shape,
         )
         return actor.to(self.dtype), [critic]  # which has the same weights
+
+    def greedy(self, actor: TensorDictModule) -> nn.Module:
+        return BestAction(next(each for each in actor.modules() if isinstance(each, QNet)))
 
     def loss(
         self,

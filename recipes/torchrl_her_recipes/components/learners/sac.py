@@ -8,9 +8,14 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.objectives import LossModule
 
-from torchrl_her.modules.stochastic_actor import make_stochastic_actor
+from torchrl_her.modules.stochastic_actor import (
+    SquashedLocation,
+    StochasticActorNet,
+    make_stochastic_actor,
+)
 from torchrl_her.objectives.sac import make_sac_loss
 from torchrl_her_recipes.components.learners.ddpg import DDPGBuilder
 
@@ -22,6 +27,11 @@ class SACBuilder(DDPGBuilder):
         return make_stochastic_actor(
             self.widths, self.action_spec, runs=runs, in_keys=self.in_keys, **self.options.actor_shape
         )
+
+    def greedy(self, actor: TensorDictModule) -> nn.Module:
+        net = next(each for each in actor.modules() if isinstance(each, StochasticActorNet))
+        spec = self.action_spec
+        return SquashedLocation(net, spec.low.to(self.dtype), spec.high.to(self.dtype))
 
     def loss(
         self,

@@ -1,0 +1,1 @@
+"""Exported policies: what they expect, their networks, ONNX files, and model cards."""

@@ -1,0 +1,197 @@
+"""What an exported policy expects, and where it comes from: plain values that need no network."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from importlib.metadata import version
+from typing import Any
+
+from torchrl.data import Categorical
+from torchrl.envs import EnvBase
+
+from torchrl_her_envs.common.goal_env import goal_env
+
+KEYS = ("observation", "desired_goal")
+
+_PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict")
+_WIDEST = 1 << 16  # of an entry or an action; more is a damaged file
+_FLOATS = ("float32", "float64")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyCard:
+    """What an exported policy reads and writes, and what made it.
+
+    Attributes:
+        task: that it is for.
+        widths: of ``observation`` and ``desired_goal``: each is [..., width].
+        dtype: of both.
+        action_shape: of one action: [width], or [] for an integer.
+        action_dtype: ``"int64"`` for an integer, otherwise that of the inputs.
+        low, high: the least and the greatest actions that the task takes, one number for each entry.
+        normalize_clip: normalized inputs are clipped to plus and minus this; None if the policy does not
+            normalize. It normalizes by itself: what it reads is what the task shows.
+        algorithm, learner, seed, frames: what trained it, for so many environment steps.
+        success: in 1,000 greedy episodes of the task, with starts and goals that no training has seen.
+        versions: of the packages that exported it; empty in files that are older than this card.
+
+    Raises:
+        ValueError: a value that no policy has.
+
+    Example:
+        >>> from torchrl_her_recipes import read_card
+        >>> card = read_card("hand_v1")
+        >>> card.widths, card.action_shape, card.success > 0.9
+        ({'observation': 9, 'desired_goal': 2}, (3,), True)
+    """
+
+    task: str
+    widths: dict[str, int]
+    dtype: str = "float32"
+    action_shape: tuple[int, ...]
+    action_dtype: str = "float32"
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    normalize_clip: float | None = None
+    algorithm: str
+    learner: str
+    seed: int
+    frames: int
+    success: float = math.nan
+    versions: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("task", "algorithm", "learner"):
+            _check(name, isinstance(getattr(self, name), str), "be a name", getattr(self, name))
+        for name in ("seed", "frames"):
+            _check(
+                name, _is_count(getattr(self, name)), "be a whole number of at least 0", getattr(self, name)
+            )
+        named = isinstance(self.widths, dict) and tuple(self.widths) == KEYS
+        wide = named and all(map(_is_width, self.widths.values()))
+        _check("widths", wide, f"be {' and '.join(KEYS)}, each from 1 to {_WIDEST}", self.widths)
+        _check("dtype", self.dtype in _FLOATS, f"be one of {', '.join(_FLOATS)}", self.dtype)
+        allowed = ("int64",) if self.discrete else _FLOATS
+        _check("action_dtype", self.action_dtype in allowed, f"be {' or '.join(allowed)}", self.action_dtype)
+        flat = len(self.action_shape) < 2 and all(map(_is_width, self.action_shape))
+        _check("action_shape", flat, f"have one width from 1 to {_WIDEST}, or none", self.action_shape)
+        entries = math.prod(self.action_shape)
+        for name in ("low", "high"):
+            own = getattr(self, name)
+            fits = len(own) == entries and all(map(_is_number, own))
+            _check(name, fits, f"have {entries} numbers", own)
+        if self.discrete:
+            fits = self.low == (0,) and 1 <= self.high[0] < _WIDEST
+            _check("high", fits, f"be the last of the actions from 0, below {_WIDEST}", self.high)
+        _check("success", _is_number(self.success), "be a number", self.success)
+        clip = self.normalize_clip
+        _check("normalize_clip", clip is None or (_is_number(clip) and clip > 0), "be above 0 or None", clip)
+        words = isinstance(self.versions, dict) and all(
+            isinstance(each, str) for pair in self.versions.items() for each in pair
+        )
+        _check("versions", words, "name packages and their versions", self.versions)
+
+    @property
+    def discrete(self) -> bool:
+        """Whether an action is one integer."""
+        return not self.action_shape
+
+    def to_dict(self) -> dict[str, Any]:
+        """All values, as plain data."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: object) -> PolicyCard:
+        """A card from what :meth:`to_dict` gave.
+
+        Raises:
+            ValueError: a value is missing or unknown, or one that no policy has.
+        """
+        known = [own.name for own in fields(cls)]
+        if not isinstance(values, Mapping) or (unknown := [name for name in values if name not in known]):
+            got = type(values).__name__ if not isinstance(values, Mapping) else ", ".join(map(str, unknown))
+            raise ValueError(f"a policy's card must have {', '.join(known)}, got {got}")
+        own = dict(values)
+        for name in ("action_shape", "low", "high"):
+            _check(name, isinstance(own.get(name), list | tuple), "be a list", own.get(name))
+            own[name] = tuple(own[name])
+        if missing := [name for name in known if name not in own]:
+            raise ValueError(f"a policy's card lacks {', '.join(missing)}")
+        return cls(**own)
+
+    def expects(self) -> str:
+        """What it reads and writes, in words.
+
+        Example:
+            >>> from torchrl_her_recipes import read_card
+            >>> read_card("hand_v1").expects()
+            'observation [9], desired_goal [2] and action [3]'
+        """
+        return _words(self.widths, self.action_shape, self.high)
+
+    def check_plays(self, env: EnvBase, task: str) -> None:
+        """Refuses environments that show or want something else than what the policy reads and writes.
+
+        Args:
+            env: the environments.
+            task: what theirs is called.
+
+        Raises:
+            ValueError: they do; the message has both.
+        """
+        own = describe_env(env)
+        wanted = {"widths": self.widths, "action_shape": self.action_shape}
+        counts = own["high"] == self.high if self.discrete else True
+        if {name: own[name] for name in wanted} != wanted or not counts:
+            theirs = _words(own["widths"], own["action_shape"], own["high"])
+            raise ValueError(
+                f"a policy of {self.task} cannot play {task}: it has other widths, {self.expects()}, and "
+                f"{task} has {theirs}"
+            )
+
+
+def describe_env(env: EnvBase) -> dict[str, Any]:
+    """The entries of a :class:`PolicyCard` that environments tell: widths, actions and their limits.
+
+    Example:
+        >>> from torchrl_her_envs import make_env
+        >>> own = describe_env(make_env("bit_flip", bits=4))
+        >>> own["widths"], own["action_shape"], own["high"]
+        ({'observation': 4, 'desired_goal': 4}, (), (3.0,))
+    """
+    shown, action = goal_env(env).observation_spec, env.action_spec_unbatched
+    own = {"widths": {key: int(shown[key].shape[-1]) for key in KEYS}}
+    if isinstance(action, Categorical):
+        last = float(action.space.n - 1)
+        return {**own, "action_shape": (), "action_dtype": "int64", "low": (0.0,), "high": (last,)}
+    limits = {name: tuple(getattr(action.space, name).double().tolist()) for name in ("low", "high")}
+    return {**own, "action_shape": tuple(action.shape), **limits}
+
+
+def present_versions() -> dict[str, str]:
+    """The installed versions of this library and what it is made of."""
+    return {name: version(name) for name in _PACKAGES}
+
+
+def _words(widths: Mapping[str, int], shape: tuple[int, ...], high: tuple[float, ...]) -> str:
+    seen = ", ".join(f"{key} [{width}]" for key, width in widths.items())
+    return f"{seen} and " + (f"action [{shape[0]}]" if shape else f"action of {int(high[0]) + 1} choices")
+
+
+def _check(name: str, fits: bool, wanted: str, got: object) -> None:
+    if not fits:
+        raise ValueError(f"{name} of a policy must {wanted}, got {str(got)[:80]!r}")
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _is_width(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= _WIDEST
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

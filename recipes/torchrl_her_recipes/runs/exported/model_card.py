@@ -1,0 +1,109 @@
+"""Model cards: a page about an exported policy, written from the run that trained it."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+from jinja2 import Environment, StrictUndefined
+
+from torchrl_her_envs.registry import get_task_spec
+from torchrl_her_recipes.config.options import default_of
+from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.shortcuts import GROUPS, locate
+from torchrl_her_recipes.runs.exported.card import PolicyCard
+from torchrl_her_recipes.runs.exported.onnx_file import SUFFIX
+
+_TEMPLATE = Path(__file__).parents[2] / "templates" / "model_card.md"
+_MARK = "<!-- written by torchrl-her export; it may be replaced by the next export -->"
+
+
+def card_path(policy: str | Path) -> Path:
+    """Where the model card of a policy's file goes: beside it.
+
+    Example:
+        >>> card_path("mine.onnx").name
+        'mine.md'
+    """
+    return Path(policy).with_suffix(".md")
+
+
+def check_free(path: Path) -> None:
+    """Refuses to replace a page that is not a model card, or that somebody has taken over.
+
+    Raises:
+        ValueError: the file exists and does not begin as written model cards do.
+    """
+    if path.exists() and not path.read_text(errors="replace").startswith(_MARK):
+        raise ValueError(
+            f"{path} exists and is no model card that export wrote: choose another --out, or --no-card "
+            "(in Python card=False)"
+        )
+
+
+def write_model_card(path: Path, file: str, card: PolicyCard, recipe: Recipe) -> None:
+    """Writes the model card of a policy.
+
+    Args:
+        path: of the page.
+        file: the name of the policy's file, beside it.
+        card: what the policy expects.
+        recipe: of the run that trained it; of a single seed.
+
+    Raises:
+        OSError: the page cannot be written.
+    """
+    page = Environment(undefined=StrictUndefined, autoescape=False)  # Markdown; a policy's file is checked
+    page.filters |= {"quote": shlex.quote, "side": _side, "tojson": json.dumps}
+    text = page.from_string(_TEMPLATE.read_text()).render(
+        mark=_MARK,
+        file=file,
+        card=card,
+        command=training_command(recipe),
+        trained_on=recipe.task.name,
+        summary=get_task_spec(card.task).summary,
+        is_onnx=file.endswith(SUFFIX),
+    )
+    path.write_text(text.rstrip() + "\n")
+
+
+def training_command(recipe: Recipe) -> str:
+    """The command that trains a recipe.
+
+    Example:
+        >>> from torchrl_her_recipes import make_recipe
+        >>> training_command(make_recipe(task="hand_v1", algo="cher", seed=3))
+        'torchrl-her train task=hand_v1 algo=cher seed=3'
+    """
+    words = []
+    for group, own in recipe.to_dict().items():
+        options = {each.name: each for each in fields(getattr(recipe, group))}
+        for name, value in own.items():
+            named = name == "name" and group in GROUPS
+            always = (group, name) in (("task", "name"), ("hindsight", "algo"), ("run", "seed"))
+            if always or value != default_of(options[name]):
+                words.append(shlex.quote(f"{group if named else _short(group, name)}={_text(value)}"))
+    return " ".join(["torchrl-her train", *words])
+
+
+def _short(group: str, name: str) -> str:
+    """The name of an option, with its group where it is not unique."""
+    try:
+        return name if locate(name) == (group, name) else f"{group}.{name}"
+    except ValueError:
+        return f"{group}.{name}"
+
+
+def _text(value: Any) -> str:
+    """A value as YAML on one line."""
+    text = yaml.safe_dump(value, default_flow_style=True, width=1 << 20).strip()
+    return text.removesuffix("...").strip()
+
+
+def _side(values: tuple[float, ...]) -> str:
+    """The limits of actions: one number if all are the same."""
+    return f"{values[0]:g}" if len(set(values)) == 1 else f"[{', '.join(f'{each:g}' for each in values)}]"

@@ -1,0 +1,157 @@
+"""The network of an exported policy, made from what its card says, without the task's environments."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any, cast
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_her.modules.normalization import RunningNorm, normalize
+from torchrl_her.modules.normalized import NormalizedPolicy
+from torchrl_her_recipes.components.agents import find_learner
+from torchrl_her_recipes.components.learner import LearnerBuilder
+from torchrl_her_recipes.components.normalization import acting, make_norm
+from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.values import load_name
+from torchrl_her_recipes.runs.exported.card import KEYS, PolicyCard
+
+_CONSTANTS = ("mean", "std", "limit")  # of the normalization of an entry
+
+
+class _Shown:
+    """What builders of learners ask of an environment, as a policy's card says it."""
+
+    def __init__(self, card: PolicyCard) -> None:
+        self.observation_spec = Composite({key: Unbounded(card.widths[key]) for key in KEYS})
+        self.action_spec = self.action_spec_unbatched = _action_spec(card)
+
+
+def _action_spec(card: PolicyCard) -> TensorSpec:
+    if card.discrete:
+        return Categorical(int(card.high[0]) + 1, dtype=torch.int64)
+    low, high = (torch.tensor(side, dtype=torch.float32) for side in (card.low, card.high))
+    return Bounded(low, high, shape=card.action_shape, dtype=torch.float32)
+
+
+def load_network(card: PolicyCard, recipe: Recipe, weights: Mapping[str, Tensor]) -> TensorDictModuleBase:
+    """The greedy policy of some weights: reads ``observation`` and ``desired_goal``, writes ``action``.
+
+    Args:
+        card: says the widths.
+        recipe: says what the network is like; of a single run.
+        weights: ``state_dict()`` of its actor, with its normalization if there is one.
+
+    Raises:
+        ValueError: these are not the weights of such an actor. Nothing of its size was made then.
+    """
+    check_weights(card, recipe, weights)
+    builder = _builder(card, recipe)
+    actor = builder.player(1)
+    player = _with_norm(actor, card, recipe)
+    player.load_state_dict(dict(weights))
+    greedy = TensorDictModule(builder.greedy(actor), in_keys=list(KEYS), out_keys=["action"])
+    norm = player.norm if isinstance(player, NormalizedPolicy) else None
+    return acting(greedy, norm).requires_grad_(False)
+
+
+def check_weights(card: PolicyCard, recipe: Recipe, weights: Mapping[str, Tensor]) -> None:
+    """Refuses weights that are not those of the actor that a recipe describes.
+
+    Shapes come from a file, so they are compared before memory is taken for them.
+
+    Raises:
+        ValueError: they are not.
+    """
+    name = recipe.learner.name
+    own = {key: tuple(value.shape) for key, value in weights.items() if isinstance(value, Tensor)}
+    if recipe.learner.depth > len(weights) or len(own) < len(weights):
+        raise ValueError(f"these are not the weights of an actor of learner={name}")
+    if loose := [key for key, value in weights.items() if not value.is_contiguous()]:
+        raise ValueError(f"weights must have a place for each of their numbers, got {loose[0]!r} without")
+    builder = _builder(card, recipe)
+    with torch.device("meta"):  # shapes alone
+        actor = builder.player(1)
+        wanted = {
+            key: tuple(value.shape) for key, value in _with_norm(actor, card, recipe).state_dict().items()
+        }
+    if own != wanted:
+        odd = next(key for key in {**wanted, **own} if own.get(key) != wanted.get(key))
+        raise ValueError(
+            f"these are not the weights of an actor of learner={name}: {odd} must be "
+            f"{wanted.get(odd, 'missing')}, got {own.get(odd, 'nothing')}"
+        )
+
+
+def _builder(card: PolicyCard, recipe: Recipe) -> LearnerBuilder:
+    shown = cast(EnvBase, _Shown(card))
+    return load_name(find_learner(recipe, shown).builder)(recipe, shown, KEYS)
+
+
+def _with_norm(actor: TensorDictModule, card: PolicyCard, recipe: Recipe) -> TensorDictModuleBase:
+    return acting(actor, make_norm(recipe, card.widths))
+
+
+class TensorPolicy(nn.Module):
+    """A policy as a function of tensors alone, in float32, with its normalization inside.
+
+    Args:
+        policy: of :func:`load_network`; it is copied.
+
+    Attributes:
+        net: the network behind the normalization.
+
+    Example:
+        >>> from torchrl_her_recipes import load_policy
+        >>> TensorPolicy(load_policy("hand_v1"))(torch.zeros(5, 9), torch.zeros(5, 2)).shape
+        torch.Size([5, 3])
+    """
+
+    def __init__(self, policy: TensorDictModuleBase) -> None:
+        super().__init__()
+        norm = policy.norm if isinstance(policy, NormalizedPolicy) else None
+        own: Any = policy.actor if isinstance(policy, NormalizedPolicy) else policy
+        self.net: Any = copy.deepcopy(own.module).float().eval()
+        self.normalizes = norm is not None
+        if norm is not None:
+            for key in KEYS:
+                for name, value in zip(_CONSTANTS, _constants(norm, key), strict=True):
+                    self.register_buffer(f"{key}_{name}", value)
+
+    def normalized(self, *inputs: Tensor) -> list[Tensor]:
+        """What the network sees of an observation and a desired goal."""
+        if not self.normalizes:
+            return list(inputs)
+        constants = [[getattr(self, f"{key}_{name}") for name in _CONSTANTS] for key in KEYS]
+        return [normalize(value, *own) for value, own in zip(inputs, constants, strict=True)]
+
+    def forward(self, observation: Tensor, desired_goal: Tensor) -> Tensor:
+        """[rows, widths] of the inputs to [rows, actions], or to integers [rows]."""
+        return self.net(*self.normalized(observation, desired_goal))
+
+    @torch.no_grad()
+    def deviation(self, action: Tensor, observation: Tensor, desired_goal: Tensor) -> Tensor:
+        """How far actions are from this policy's own, [rows].
+
+        It is the greatest difference of an action's entries. For integers it is by how much the value of
+        the action is below the greatest one, since two actions may have the same value.
+        """
+        seen = self.normalized(observation, desired_goal)
+        if not action.is_floating_point():
+            if not hasattr(self.net, "regret"):  # a network of somebody else's learner
+                return (action != self.net(*seen)).float()
+            return self.net.regret(action, *seen)
+        return (action - self.net(*seen)).abs().amax(-1)
+
+
+def _constants(norm: RunningNorm, key: str) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, deviation and limit of an entry, as :meth:`RunningNorm.normalize` uses them."""
+    n, mean, var = norm.moments_of(key)
+    std = var.sqrt().clamp(min=norm.least_std)
+    limit = torch.where(n > 0, norm.clip, torch.inf)
+    return mean.float(), std.float(), limit.float()

@@ -1,0 +1,68 @@
+"""Policies of tiny networks that nobody trained, made without a run."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_her.modules import RunningNorm
+from torchrl_her_recipes import PolicyCard, make_recipe
+from torchrl_her_recipes.components.agents import make_player
+from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.runs.exported.card import describe_env
+from torchrl_her_recipes.runs.exported.network import load_network
+from torchrl_her_recipes.runs.policies import TrainedPolicy
+
+needs_onnx = pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxruntime", "onnxscript")),
+    reason="needs the extra onnx",
+)
+
+LEARNERS: list[dict[str, Any]] = [
+    {"learner": "ddpg"},
+    {"learner": "td3", "norm": "layer"},
+    {"learner": "sac", "activation": "tanh"},
+    {"learner": "redq", "critics": 3},
+    {"learner": "tqc", "activation": "elu"},
+    {"learner": "dqn", "task": "bit_flip", "norm": "layer"},
+]
+
+
+def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, **options: Any) -> TrainedPolicy:
+    """A policy whose actions differ from state to state, with statistics of inputs if it normalizes."""
+    recipe = make_recipe(task=task, algo="her", hidden=8, **options)
+    env = make_task_envs(recipe, 1, [0])
+    player = make_player(recipe, env)
+    with torch.no_grad():
+        for weight in player.parameters():
+            weight.copy_(0.5 * torch.randn_like(weight))
+    own = describe_env(env)
+    card = PolicyCard(
+        task=task,
+        **own,
+        normalize_clip=recipe.learner.normalize_clip if recipe.learner.normalize else None,
+        algorithm="her",
+        learner=recipe.learner.name,
+        seed=0,
+        frames=100,
+        success=0.5,
+        versions={"torchrl-her": "0.1.0"},
+    )
+    if scale != 1.0:
+        card = replace(card, low=tuple(-scale for _ in card.low), high=tuple(2 * scale for _ in card.high))
+    for module in player.modules():
+        if isinstance(module, RunningNorm):
+            module.update(states(card, 200, mean=3.0))
+    return TrainedPolicy(card, load_network(card, recipe, player.state_dict()), recipe)
+
+
+def states(card: PolicyCard, rows: int, *, mean: float = 0.0) -> TensorDictBase:
+    """Random inputs of a policy."""
+    return TensorDict(
+        {key: mean + 2 * torch.randn(rows, width) for key, width in card.widths.items()}, batch_size=[rows]
+    )
