@@ -107,6 +107,19 @@ def refuse_padded(name: str, transitions: TensorDictBase) -> None:
         )
 
 
+def refuse_layers(name: str, transitions: TensorDictBase, options: HindsightOptions) -> None:
+    """Raises an error if transitions carry a layer, and one reward would relabel those of all layers.
+
+    Raises:
+        ValueError: they do.
+    """
+    if options.k > 0 and options.layer_key in transitions.keys(True):
+        raise ValueError(
+            f"{name} got transitions that carry their layer ({options.layer_key!r}), and has one reward for "
+            "all of them: use HERWriter(layers=[...]), or another layer_key if that entry is something else"
+        )
+
+
 def refuse_priorities(name: str, storage: Storage, transitions: TensorDictBase) -> None:
     """Raises an error if a batch of several dimensions brings its own priorities, which TorchRL cannot set.
 

@@ -37,6 +37,7 @@ from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_re
 from torchrl_her.replay_buffers.neighbors import (
     MASK,
     refuse_consuming,
+    refuse_layers,
     refuse_n_steps,
     refuse_padded,
     refuse_shared,
@@ -361,6 +362,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                 )
             refuse_n_steps("HERSampleUnit", rows)
             refuse_padded("HERSampleUnit", rows)
+            refuse_layers("HERSampleUnit", rows, self.options)
             dims, shape = storage.ndim, rows.shape[: storage.ndim]
             grid = shape if dims == 1 else torch.Size([shape[0], shape[1:].numel()])
             ids, done = rows.get(self._keys.trajectory, None), entry_of(rows, self._keys.done)

@@ -22,7 +22,7 @@ from torchrl_her.replay_buffers.episodes import Episodes, find_episodes, time_or
 from torchrl_her.replay_buffers.keys import device_of, entry_of, in_root_and_next
 from torchrl_her.replay_buffers.lanes import broken, ends_of_held
 from torchrl_her.replay_buffers.layer_rules import LayerRule, check_layers, split_layers
-from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer
+from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer, refuse_layers
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.runs.batches import Batch
 from torchrl_her.replay_buffers.runs.counts import (
@@ -390,6 +390,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         if os.getpid() != self._process:
             raise RuntimeError(f"HERWriter writes only in the process that made its buffer: {SHARED}")
         refuse_beside_writer("HERWriter", self._storage, data, self.options, runs=self.runs)
+        if not self.layers:
+            refuse_layers("HERWriter", data, self.options)
 
     def _write_episodes(self, batch: Batch, held: int) -> tuple[Tensor, Tensor, list[RecentGoals]]:
         """Writes all episodes that end in a batch.

@@ -10,6 +10,7 @@ import os
 import pickle
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from torchrl.data.replay_buffers.sample_units import Sequence
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, SliceSampler
 from torchrl.envs.transforms import MultiStepTransform
 
-from torchrl_her import EnvReward, GoalReward, GoalWeights, HERWriter
+from torchrl_her import EnvReward, GoalReward, GoalWeights, HERSampleUnit, HERWriter
 from torchrl_her.replay_buffers.runs import RunsSampler
 
 from ..her_data import WANTED, make_batch, tag
@@ -655,6 +656,25 @@ def test_padded_trajectories_are_refused() -> None:
     batch["collector", "mask"] = torch.ones(2, 3, dtype=torch.bool)
     with pytest.raises(ValueError, match="split_trajs=False"):
         make_buffer().extend(batch)
+
+
+@pytest.mark.parametrize("unit", [False, True])
+def test_rows_of_several_layers_are_refused_where_one_reward_relabels_them(unit: bool) -> None:
+    batch = make_batch([[3]]).set("layer", torch.zeros(1, 3, 1, dtype=torch.int64))
+    if unit:
+        hindsight = HERSampleUnit(REWARD)
+        storage = LazyTensorStorage(10)
+        buffer = TensorDictReplayBuffer(
+            storage=storage, sample_unit=hindsight, collate_fn=hindsight.relabel, batch_size=2
+        )
+        buffer.extend(batch.reshape(-1))
+        refused = buffer.sample
+    else:
+        refused = partial(make_buffer().extend, batch)
+    with pytest.raises(ValueError, match=r"carry their layer \('layer'\).* HERWriter\(layers=\[...\]\)"):
+        refused()
+    make_buffer(layer_key="floor").extend(batch)
+    make_buffer(k=0).extend(batch)
 
 
 def test_rows_that_wait_in_vain_are_noticed() -> None:
