@@ -46,4 +46,8 @@ from .studies.pictures import plot_runs as plot_runs
 from .studies.plan import duration as duration
 from .studies.study import plan_study as plan_study
 from .studies.study import run_study as run_study
+from .studies.sweep import SweepResult as SweepResult
+from .studies.sweep import plan_sweep as plan_sweep
+from .studies.sweep import run_sweep as run_sweep
+from .studies.sweep import unfinished_sweep as unfinished_sweep
 from .studies.workers import make_workers as make_workers

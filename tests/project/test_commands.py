@@ -34,6 +34,7 @@ def _nothing_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         raise Reached
 
     monkeypatch.setattr(torchrl_her_recipes, "build", build)
+    monkeypatch.setattr(torchrl_her_recipes, "plan_sweep", lambda runs, _folder: build(runs))
     monkeypatch.chdir(tmp_path)
     for folder in ("docs", "benchmarks"):
         Path(folder).symlink_to(ROOT / folder)

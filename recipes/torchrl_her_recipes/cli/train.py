@@ -9,7 +9,7 @@ import yaml
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `build`
 from torchrl_her_recipes.cli.permission import allow_import
-from torchrl_her_recipes.cli.say import BAD_INPUT_ERRORS, INTERRUPTED, fail, one_line, success_line
+from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, success_line
 from torchrl_her_recipes.cli.train_options import (
     OptionsCommand,
     RunRequest,
@@ -22,6 +22,7 @@ from torchrl_her_recipes.config.imports import foreign_module, imported_modules
 
 @click.command(cls=OptionsCommand, short_help="train, or go on with a run")
 @click.option("-m", "--multirun", is_flag=True, help="a sweep: algo=her,cher seed=0,1 are four runs")
+@click.option("--jobs", type=click.IntRange(1), help="runs of a sweep at once (default: one for each core)")
 @click.option(
     "--resume",
     metavar="RUN",
@@ -31,11 +32,13 @@ from torchrl_her_recipes.config.imports import foreign_module, imported_modules
 @click.option("--show", is_flag=True, help="print all options of the run as YAML, and train nothing")
 @allow_import
 @click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
-def train(options: tuple[str, ...], multirun: bool, resume: Path | None, show: bool) -> int:
+def train(options: tuple[str, ...], multirun: bool, jobs: int | None, resume: Path | None, show: bool) -> int:
     """Train a policy; for instance: torchrl-her train task=hand_v0 algo=filtered_her seed=0
 
     Options are named by themselves (gamma=0.95) or with their group (learner.gamma=0.95).
     """
+    if jobs is not None and not multirun:
+        raise click.UsageError("--jobs is for a sweep: give -m as well")
     if resume is not None:
         if multirun or show:
             raise click.UsageError("--resume cannot be given together with -m or --show")
@@ -49,7 +52,9 @@ def train(options: tuple[str, ...], multirun: bool, resume: Path | None, show: b
         shown = [yaml.safe_dump(each.recipe.to_dict(), sort_keys=False) for each in wanted]
         click.echo("---\n".join(shown), nl=False)
         return 0
-    return _say_end(_train(wanted[0])) if len(wanted) == 1 else _sweep(wanted)
+    if multirun:
+        return _sweep(wanted, jobs, anew=not any(option.startswith("folder=") for option in options))
+    return _say_end(_train(wanted[0]))
 
 
 def _train(wanted: RunRequest) -> recipes.RunResult:
@@ -60,27 +65,32 @@ def _train(wanted: RunRequest) -> recipes.RunResult:
     return recipes.run(components, wanted.folder)
 
 
-def _sweep(wanted: list[RunRequest]) -> int:
-    """Several runs, one after the other: if one fails, the others are trained nevertheless."""
-    codes, successes = [], []
-    for each in wanted:
-        try:
-            result = _train(each)
-        except BAD_INPUT_ERRORS as error:
-            codes.append(fail(f"{each.folder}: {one_line(error)}"))
-            continue
-        codes.append(_say_end(result))
-        if result.interrupted:
-            return INTERRUPTED  # Ctrl-C ends the whole sweep
-        successes += result.successes
-    if successes:
-        click.echo(f"the whole sweep: {success_line(successes)}{_failed(codes)}")
-    return max(codes)
-
-
-def _failed(codes: list[int]) -> str:
-    failed = sum(code != 0 for code in codes)
-    return f"; {failed} of {len(codes)} failed" if failed else ""
+def _sweep(wanted: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
+    """Several runs, on all cores: if one fails, the others are trained nevertheless."""
+    runs = {each.folder.name: each.recipe for each in wanted}
+    folder = wanted[0].folder.parent
+    if anew:  # the same command goes on with what it has begun
+        folder = recipes.unfinished_sweep(runs, folder.parent) or folder
+    plan, workers = recipes.plan_sweep(runs, folder), recipes.make_workers(jobs=jobs)
+    to_go = plan.to_go
+    click.echo(f"sweep: {len(to_go)} of {len(runs)} runs to go: {folder}")
+    click.echo("\n".join(plan.table()))
+    if to_go:
+        together = min(workers.at_once, len(to_go))
+        click.echo(f"about {recipes.duration(plan.wall_clock(to_go, together))}, {together} at once")
+    result = recipes.run_sweep(runs, folder, workers=workers)
+    for label, reason in result.failed.items():
+        fail(f"{folder / label} failed: {reason}")
+    for label, successes in result.successes.items():
+        click.echo(f"{label}: {success_line(successes)}")
+    if every := [success for successes in result.successes.values() for success in successes]:
+        left = len(runs) - len(result.successes)
+        unfinished = f"; {left} of {len(runs)} did not end" if left else ""
+        click.echo(f"the whole sweep: {success_line(every)}{unfinished}")
+    if result.interrupted:
+        click.echo("interrupted: the same command goes on with it")
+        return INTERRUPTED
+    return FAILED if result.failed else 0
 
 
 def _say_start(folder: Path) -> None:

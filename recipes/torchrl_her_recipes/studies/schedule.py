@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-
-from tqdm import tqdm
+from contextlib import closing
 
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
-from torchrl_her_recipes.studies.jobs import Job, Outcome, kept_progress
-from torchrl_her_recipes.studies.plan import Plan, duration
+from torchrl_her_recipes.studies.jobs import Outcome, kept_progress
+from torchrl_her_recipes.studies.overview import Overview
+from torchrl_her_recipes.studies.plan import Plan
 from torchrl_her_recipes.studies.workers_local import Workers
 
 _TICK = 1.0  # seconds
-_BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [{elapsed}{postfix}]"
-_STOPPING = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [saving what there is]"
 
 
 def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str, Outcome]:
@@ -26,7 +24,7 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
     Args:
         plan: what to do; it is kept up to date.
         workers: who does it; they are closed in the end.
-        progress: whether to show a bar.
+        progress: whether to show a bar, or a few lines where there is no terminal.
 
     Returns:
         What came of each job, by label.
@@ -37,7 +35,7 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
     jobs = plan.to_go
     outcomes: dict[str, Outcome] = {}
     with (
-        tqdm(total=plan.steps, unit_scale=True, bar_format=_BAR, disable=not progress) as bar,
+        closing(Overview(plan, workers, show=progress)) as overview,
         ThreadPoolExecutor(max(len(jobs), 1)) as threads,
         soft_interrupt() as check,
     ):
@@ -49,13 +47,14 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
                     job = waiting.pop(future)
                     outcomes[job.label] = _outcome(future)
                     plan.update({job.label: kept_progress(job)})
-                _show(bar, plan, workers, list(waiting.values()))
+                    overview.ended(job, outcomes[job.label])
+                overview.show(list(waiting.values()))
                 check()
 
         try:
             watch(check)
         except Interrupted:
-            bar.bar_format = _STOPPING
+            overview.stopping()
             workers.stop()
             watch(lambda: None)
         finally:
@@ -66,12 +65,3 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
 def _outcome(future: Future[Outcome]) -> Outcome:
     error = future.exception()
     return future.result() if error is None else Outcome(error=" ".join(f"{error!r}".split()))
-
-
-def _show(bar: tqdm, plan: Plan, workers: Workers, left: Sequence[Job]) -> None:
-    """Brings plan and bar up to date."""
-    working = workers.progress()
-    plan.update(working)
-    bar.n = plan.steps - plan.steps_to_go(plan.jobs)
-    to_go = duration(plan.wall_clock(left, workers.at_once))
-    bar.set_postfix_str(f"{len(working)} running, {len(left) - len(working)} waiting, about {to_go} to go")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from pathlib import Path
 from threading import Event
 
@@ -80,8 +81,9 @@ def test_one_that_fails_holds_no_other_back(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_is_passed_on_and_all_are_waited_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     workers = Actors(presses=1, a=None, b=Outcome(), c=None)
     work = plan(tmp_path, "a", "b", "c")
     outcomes = run_jobs(work, workers)
@@ -91,6 +93,20 @@ def test_ctrl_c_is_passed_on_and_all_are_waited_for(
     assert "3.20k/9.60k steps" in shown  # an epoch of a and of c
     assert "2 running, 0 waiting, about" in shown
     assert "saving what there is" in shown
+
+
+def test_where_there_is_no_terminal_a_few_lines_are_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    workers = Actors(presses=1, a=None, b=Outcome(error="why"), c=Outcome(), d=None)
+    run_jobs(plan(tmp_path, "a", "b", "c", "d"), workers)
+    said, lines = capsys.readouterr()
+    assert said == ""
+    *ended, share, stopping, one, other = lines.splitlines()
+    assert sorted(ended) == ["b: failed", "c: done"]
+    assert share.startswith("25% of all steps: 2 running, 0 waiting, about ")
+    assert stopping == "saving what there is"
+    assert sorted([one, other]) == ["a: interrupted", "d: interrupted"]
 
 
 def test_a_second_one_ends_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
