@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,8 +14,6 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from torchrl_her_envs.common.goal_env import Box, GoalEnv
 from torchrl_her_recipes.config.metrics import AXES, PANELS
 from torchrl_her_recipes.runs.goal_map import GoalMap
-
-matplotlib.use("agg")
 
 Rows = Sequence[dict[str, float]]
 
