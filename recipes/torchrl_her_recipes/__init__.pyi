@@ -26,6 +26,7 @@ from .runs.exported.card import PolicyCard as PolicyCard
 from .runs.folder import RunFolder as RunFolder
 from .runs.play import load_actor as load_actor
 from .runs.play import play as play
+from .runs.play import play_beside as play_beside
 from .runs.policies import TrainedPolicy as TrainedPolicy
 from .runs.policies import load_policy as load_policy
 from .runs.policies import load_trained as load_trained
@@ -37,6 +38,8 @@ from .runs.run import resume as resume
 from .runs.run import run as run
 from .runs.waste import Waste as Waste
 from .runs.waste import find_waste as find_waste
+from .runs.watch import Seen as Seen
+from .runs.watch import watch as watch
 from .studies.pictures import plot_runs as plot_runs
 from .studies.plan import duration as duration
 from .studies.study import plan_study as plan_study
