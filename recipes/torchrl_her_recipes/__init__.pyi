@@ -9,6 +9,9 @@ from .config.learners import LEARNERS as LEARNERS
 from .config.learners import LearnerConfig as LearnerConfig
 from .config.learners import LearnerSpec as LearnerSpec
 from .config.learners import register_learner as register_learner
+from .config.loggers import LOGGERS as LOGGERS
+from .config.loggers import LoggerSpec as LoggerSpec
+from .config.loggers import register_logger as register_logger
 from .config.options import option as option
 from .config.recipe import Recipe as Recipe
 from .config.recipe import make_recipe as make_recipe
@@ -24,6 +27,7 @@ from .runs.callbacks import RunView as RunView
 from .runs.export import export_policy as export_policy
 from .runs.exported.card import PolicyCard as PolicyCard
 from .runs.folder import RunFolder as RunFolder
+from .runs.log_to import LogTo as LogTo
 from .runs.play import load_actor as load_actor
 from .runs.play import play as play
 from .runs.play import play_beside as play_beside
@@ -36,6 +40,7 @@ from .runs.record import record_demonstrations as record_demonstrations
 from .runs.run import RunResult as RunResult
 from .runs.run import resume as resume
 from .runs.run import run as run
+from .runs.show import show_file as show_file
 from .runs.waste import Waste as Waste
 from .runs.waste import find_waste as find_waste
 from .runs.watch import Seen as Seen

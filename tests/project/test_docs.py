@@ -49,6 +49,7 @@ def conf() -> ModuleType:
         ("demonstrations.md", 4),
         ("devices.md", 1),
         ("index.md", 1),
+        ("loggers.md", 2),
         ("normalization.md", 2),
         ("novelty.md", 4),
         ("replay_buffers.md", 4),

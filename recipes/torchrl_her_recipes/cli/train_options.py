@@ -136,6 +136,7 @@ def _written(group: str, name: str, default: Any) -> str:
     """How an option is given on the command line, with its default."""
     key = group if name == "name" else f"{group}.{name}" if group in LONG_ONLY else name
     shown = str(default).lower() if isinstance(default, bool) else default
+    shown = f"[{','.join(default)}]" if isinstance(default, tuple) else shown
     return key if default is None else f"{key}={shown}"
 
 
