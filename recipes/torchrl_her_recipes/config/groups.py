@@ -359,8 +359,8 @@ class RunConfig(Group):
     )
     log: Any = option(
         ("tensorboard",),
-        "loggers, as [csv,tensorboard]: csv, tensorboard, or a registered name; [] for the table of metrics "
-        "alone, which is always written",
+        "loggers, as [csv,wandb]: csv, tensorboard, wandb, mlflow, or registered ones; [] for none besides "
+        "the table of metrics, which is always written",
     )
     threads: int = option(1, "threads of torch: small networks are fastest with one", at_least=1)
     dtype: str = option("float32", "of observations and networks", choices=("float32", "float64"))

@@ -45,6 +45,8 @@ def register_logger(spec: LoggerSpec) -> None:
 for _spec in (
     LoggerSpec(name="csv", factory=f"{_HERE}.csv_files:open_csv"),
     LoggerSpec(name="tensorboard", factory=f"{_HERE}.tensorboard:open_tensorboard"),
+    LoggerSpec(name="wandb", factory=f"{_HERE}.wandb_run:open_wandb", needs="wandb"),
+    LoggerSpec(name="mlflow", factory=f"{_HERE}.mlflow_run:open_mlflow", needs="mlflow"),
 ):
     register_logger(_spec)
 

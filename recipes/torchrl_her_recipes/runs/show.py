@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageSequence
 from tensorboard.compat.proto.summary_pb2 import Summary
-from torchrl.record.loggers import CSVLogger, TensorboardLogger
+from torchrl.record.loggers import CSVLogger, MLFlowLogger, TensorboardLogger, WandbLogger
 from torchrl.record.loggers.common import Logger
 
 
@@ -41,6 +41,22 @@ def _(logger: TensorboardLogger, name: str, path: Path, step: int) -> None:
         width, height = picture.size
     image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=path.read_bytes())
     logger.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=name, image=image)]), step)
+
+
+@show_file.register
+def _(logger: WandbLogger, name: str, path: Path, step: int) -> None:
+    import wandb  # noqa: PLC0415  (an extra)
+
+    media = wandb.Video(str(path), format="gif") if path.suffix == ".gif" else wandb.Image(str(path))
+    logger.log_metrics({name: media}, step=step)
+
+
+@show_file.register
+def _(logger: MLFlowLogger, _name: str, path: Path, _step: int) -> None:
+    from mlflow import MlflowClient  # noqa: PLC0415  (an extra)
+
+    client = MlflowClient(logger.log_dir)  # that is the address of the service
+    client.log_artifact(logger.experiment.info.run_id, str(path), "pictures")
 
 
 def read_film(path: Path) -> torch.Tensor:

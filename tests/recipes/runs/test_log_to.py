@@ -97,7 +97,7 @@ def test_pictures_and_the_film_are_shown_to_those_that_can(finished: Path) -> No
     assert read_film(finished / "policy.gif").shape[2] == 3
 
 
-@pytest.mark.parametrize("after", [1, 3])
+@pytest.mark.parametrize("after", [pytest.param(1, marks=pytest.mark.full), 3])
 def test_after_a_kill_and_a_resumption_each_step_is_there_once(after: int, tmp_path: Path) -> None:
     killed_run(tmp_path, ["csv", "tensorboard"], after=after)
     before = csv_steps(tmp_path / "csv" / "scalars" / "success" / "run_0.csv")
