@@ -46,6 +46,7 @@ def conf() -> ModuleType:
     ("page", "number"),
     [
         ("callbacks.md", 3),
+        ("choosing.md", 1),
         ("demonstrations.md", 4),
         ("devices.md", 1),
         ("index.md", 1),

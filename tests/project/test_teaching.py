@@ -1,11 +1,15 @@
-"""Pages for newcomers: the gallery, and the command line as the program itself describes it."""
+"""Pages for newcomers: notebooks that run, the gallery, the command line as the program describes it."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -14,6 +18,7 @@ from torchrl_her_envs.throwing.tasks import TASKS
 from torchrl_her_recipes.config.shipped import policy_facts
 
 DOCS = Path(__file__).parents[2] / "docs"
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 
 
 def script(name: str) -> ModuleType:
@@ -61,3 +66,63 @@ def test_a_film_is_made_of_a_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(gallery, name, value)
     assert re.fullmatch(r"hand_reach: [01] of 1 goals achieved, \d+ kB", gallery.make_film("hand_reach"))
     assert (tmp_path / "hand_reach.gif").exists()
+
+
+def shown(notebook: dict[str, Any]) -> list[list[str]]:
+    """What each cell of code shows: kinds of outputs, "image/png" for a picture."""
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    return [
+        [next(iter(output.get("data", {output.get("name"): ""}))) for output in cell["outputs"]]
+        for cell in cells
+    ]
+
+
+@pytest.mark.long
+def test_the_notebooks_run_and_show_the_figures_that_they_are_committed_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("nbclient", reason="needs the extra notebooks")
+    for name in ("JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "IPYTHONDIR"):
+        monkeypatch.setenv(name, str(tmp_path / name.lower()))
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel's own, as when a user runs it
+    command = [sys.executable, str(DOCS / "make_notebooks.py"), "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert len(NOTEBOOKS) == 3
+    for path in NOTEBOOKS:
+        notebook = json.loads((tmp_path / path.name).read_text())
+        assert shown(notebook) == shown(json.loads(path.read_text())), path.stem
+        assert sum(kinds.count("image/png") for kinds in shown(notebook)) >= 3, path.stem
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_small_and_says_nothing_of_a_machine(path: Path) -> None:
+    notebook = json.loads(path.read_text())
+    assert path.stat().st_size < 300_000
+    assert set(notebook["metadata"]) == {"kernelspec", "language_info"}
+    assert notebook["metadata"]["kernelspec"]["name"] == "python3"
+    for cell in notebook["cells"]:
+        assert cell["metadata"] == {}
+        assert cell.get("execution_count") is None
+        assert all(output.get("execution_count") is None for output in cell.get("outputs", []))
+        assert not any(output.get("metadata") for output in cell.get("outputs", []))
+        assert "stderr" not in [output.get("name") for output in cell.get("outputs", [])]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_a_page_whose_links_lead_somewhere(path: Path) -> None:
+    conf = script("conf")
+    text = path.read_text()
+    source = "\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"])
+    links = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", source)
+    assert links
+    assert all((path.parent / link).exists() for link in links)
+    page = conf.notebook_page(text, path.stem)
+    pictures = re.findall(r"data:image/png;base64,", page)
+    assert len(pictures) == sum(kinds.count("image/png") for kinds in shown(json.loads(text)))
+    assert page.startswith("# ")
+    for link in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", re.sub(r"```.*?```", "", page, flags=re.DOTALL)):
+        assert (path.parent / link).exists(), link  # within docs, too
+        assert (path.parent / link).resolve().is_relative_to(DOCS), link
+    contents = (DOCS / "index.md").read_text()
+    assert re.search(f"^notebooks/{path.stem}$", contents, re.MULTILINE)
