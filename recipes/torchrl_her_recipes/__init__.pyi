@@ -15,7 +15,11 @@ from .config.loggers import register_logger as register_logger
 from .config.options import option as option
 from .config.recipe import Recipe as Recipe
 from .config.recipe import make_recipe as make_recipe
+from .config.search import Search as Search
 from .config.shipped import load_preset as load_preset
+from .config.spaces import Space as Space
+from .config.spaces import load_space as load_space
+from .config.spaces import space_for as space_for
 from .config.study import Study as Study
 from .config.study import load_study as load_study
 from .config.study import study_names as study_names
@@ -40,6 +44,8 @@ from .runs.record import record_demonstrations as record_demonstrations
 from .runs.run import RunResult as RunResult
 from .runs.run import resume as resume
 from .runs.run import run as run
+from .runs.score import run_score as run_score
+from .runs.score import score as score
 from .runs.show import show_file as show_file
 from .runs.waste import Waste as Waste
 from .runs.waste import find_waste as find_waste
@@ -50,3 +56,4 @@ from .studies.plan import duration as duration
 from .studies.study import plan_study as plan_study
 from .studies.study import run_study as run_study
 from .studies.workers import make_workers as make_workers
+from .tuning.tune import tune as tune
