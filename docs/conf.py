@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 from importlib.metadata import version as version_of
 from pathlib import Path
@@ -20,6 +21,7 @@ version = release = version_of("torchrl-her")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["examples"]  # a program
+source_suffix = {".rst": "restructuredtext", ".md": "markdown", ".ipynb": "markdown"}
 
 # Pages in Markdown. They are read in the repository, too, so links in them are those of the repository.
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
@@ -105,9 +107,46 @@ def make_report_pages(app: Sphinx, error: Exception | None) -> None:
             report_page.write_page(read_results(RESULTS / name), out)
 
 
-def on_read(*event: Any) -> None:
+def notebook_page(text: str, name: str) -> str:
+    """A notebook as a page in Markdown: its cells, and the texts and pictures that they showed.
+
+    Example:
+        >>> cell = {"cell_type": "code", "source": ["1 + 1"]}
+        >>> shown = {"output_type": "execute_result", "data": {"text/plain": ["2"]}}
+        >>> print(notebook_page(json.dumps({"cells": [{**cell, "outputs": [shown]}]}), "sum"))
+        ```python
+        1 + 1
+        ```
+        <BLANKLINE>
+        ```text
+        2
+        ```
+        <BLANKLINE>
+        {download}`This page as a notebook <sum.ipynb>`
+    """
+    parts = []
+    for cell in json.loads(text)["cells"]:
+        source = "".join(cell["source"])
+        for file, page in PAGES.items():  # notebooks lie one folder deeper
+            source = source.replace(f"](../{file}", f"](../{page}")
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            if "image/png" in data:
+                picture = "".join(data["image/png"]).replace("\n", "")
+                parts.append(f"![What the cell shows](data:image/png;base64,{picture})")
+            else:
+                shown = "".join(output.get("text", data.get("text/plain", "")))
+                parts.append(f"```text\n{shown.rstrip()}\n```")
+    return "\n\n".join([*parts, f"{{download}}`This page as a notebook <{name}.ipynb>`"])
+
+
+def on_read(app: Sphinx, *event: Any) -> None:
     """A page, or what it includes, was read: its text comes last, in a list."""
-    event[-1][0] = link_to_pages(event[-1][0])
+    *_, name, text = event
+    if str(app.env.doc2path(str(name))).endswith(".ipynb"):
+        text[0] = notebook_page(text[0], Path(str(name)).name)
+    text[0] = link_to_pages(text[0])
 
 
 class Unquoted(str):

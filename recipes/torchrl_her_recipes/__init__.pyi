@@ -15,7 +15,11 @@ from .config.loggers import register_logger as register_logger
 from .config.options import option as option
 from .config.recipe import Recipe as Recipe
 from .config.recipe import make_recipe as make_recipe
+from .config.search import Search as Search
 from .config.shipped import load_preset as load_preset
+from .config.spaces import Space as Space
+from .config.spaces import load_space as load_space
+from .config.spaces import space_for as space_for
 from .config.study import Study as Study
 from .config.study import load_study as load_study
 from .config.study import study_names as study_names
@@ -30,6 +34,7 @@ from .runs.folder import RunFolder as RunFolder
 from .runs.log_to import LogTo as LogTo
 from .runs.play import load_actor as load_actor
 from .runs.play import play as play
+from .runs.play import play_beside as play_beside
 from .runs.policies import TrainedPolicy as TrainedPolicy
 from .runs.policies import load_policy as load_policy
 from .runs.policies import load_trained as load_trained
@@ -39,9 +44,13 @@ from .runs.record import record_demonstrations as record_demonstrations
 from .runs.run import RunResult as RunResult
 from .runs.run import resume as resume
 from .runs.run import run as run
+from .runs.score import run_score as run_score
+from .runs.score import score as score
 from .runs.show import show_file as show_file
 from .runs.waste import Waste as Waste
 from .runs.waste import find_waste as find_waste
+from .runs.watch import Seen as Seen
+from .runs.watch import watch as watch
 from .studies.pictures import plot_runs as plot_runs
 from .studies.plan import duration as duration
 from .studies.study import plan_study as plan_study
@@ -51,3 +60,4 @@ from .studies.sweep import plan_sweep as plan_sweep
 from .studies.sweep import run_sweep as run_sweep
 from .studies.sweep import unfinished_sweep as unfinished_sweep
 from .studies.workers import make_workers as make_workers
+from .tuning.tune import tune as tune

@@ -51,9 +51,9 @@ def make_own_env(
     Args:
         path: ``"module:name"`` of a function or class that gives a TorchRL ``EnvBase``; the module is
             imported. If it takes ``num_envs``, it is called once with it, and with ``seed`` and ``max_steps``
-            if it takes them, and must give environments of batch size ``[num_envs]``. If not, it is called
-            ``num_envs`` times, and must give environments without a batch size, which are stepped one after
-            the other.
+            if it takes them, and must give environments of batch size ``[num_envs]``; ``seed`` is a number,
+            or R numbers if there are several. If not, it is called ``num_envs`` times, and must give
+            environments without a batch size, which are stepped one after the other.
         num_envs: number of environments.
         seed: of all environments; R seeds for R equal blocks of them.
         max_steps: length of an episode; the environment's attribute ``max_steps`` if None.
@@ -80,6 +80,8 @@ def make_own_env(
     signed = make.__init__ if isinstance(make, type) else make  # type: ignore[misc]
     taken = inspect.signature(signed).parameters
     _check_options(path, taken, options)
+    if not isinstance(seed, int) and len(seed) == 1:
+        (seed,) = seed  # of a single run: what an environment of one's own expects
 
     def make_many(count: int) -> list[EnvBase]:
         ours = {"num_envs": count, "seed": seed if count == num_envs else 0, "max_steps": max_steps}

@@ -72,12 +72,25 @@ def extending(options: tuple[str, ...]) -> dict[str, Any]:
     Raises:
         ValueError: a mistake in an argument, or one that would change what the run has trained already.
     """
+    values = single(options)
+    check_extending(values)
+    return values
+
+
+def single(options: tuple[str, ...]) -> dict[str, Any]:
+    """The values that arguments give, where each is one value.
+
+    Args:
+        options: the arguments, ``NAME=VALUE`` each.
+
+    Raises:
+        ValueError: a mistake in an argument.
+    """
     pairs = [parse_override(text, ARGUMENTS) for text in options]
     check_once(pairs, ARGUMENTS)
     for name, text in pairs:
         _check_single(name, text)
     (values,) = sweep(pairs)
-    check_extending(values)
     return values
 
 

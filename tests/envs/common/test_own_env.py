@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 import pytest
@@ -61,6 +62,24 @@ def test_seeds_give_each_environment_the_same_in_every_batch_and_leave_torch_alo
     torch.manual_seed(4)
     both.set_seeds([1, 2])
     assert torch.equal(torch.rand(1), expected)
+
+
+def test_a_function_is_given_one_seed_as_a_number_and_several_as_they_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    points, seen = importlib.import_module(HERE), []
+
+    def make_seeded(num_envs: int, seed: Any) -> Any:
+        seen.append(seed)
+        return points.make_points(num_envs)
+
+    monkeypatch.setattr(points, "make_seeded", make_seeded, raising=False)
+    for seed in (5, [5]):
+        make_own_env(f"{HERE}:make_seeded", num_envs=2, seed=seed)
+    assert seen == [5, 0, 5, 0]  # each time, one more is made to be tried
+    with pytest.raises(ValueError, match="needs a method set_seeds"):
+        make_own_env(f"{HERE}:make_seeded", num_envs=2, seed=[5, 6])
+    assert seen[4] == [5, 6]
 
 
 def test_a_batch_serves_several_runs_only_if_it_can_seed_them() -> None:

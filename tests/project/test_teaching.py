@@ -1,0 +1,128 @@
+"""Pages for newcomers: notebooks that run, the gallery, the command line as the program describes it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from torchrl_her_envs.throwing.tasks import TASKS
+from torchrl_her_recipes.config.shipped import policy_facts
+
+DOCS = Path(__file__).parents[2] / "docs"
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
+
+
+def script(name: str) -> ModuleType:
+    """A script of the documentation, as a module."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_on_the_command_line_is_what_the_program_says() -> None:
+    made = script("make_command_line").page()
+    assert (DOCS / "command_line.md").read_text() == made, "run: python docs/make_command_line.py"
+    assert "### Options of `hindsight`" in made
+    assert max(map(len, made.splitlines())) <= 110
+
+
+def test_the_gallery_shows_every_task_with_what_its_policy_achieves() -> None:
+    text = (DOCS / "gallery.md").read_text()
+    shown = re.findall(r"!\[(\w+)\]\(images/gallery/(\w+)\.gif\)", text)
+    assert sorted(shown) == sorted((name, name) for name in TASKS)
+    for name, facts in policy_facts().items():
+        cells = next(row for row in re.findall(r"(\| !\[.*\n\|.*\n)", text) if f"[{name}]" in row)
+        pictures, achieved = (line.strip("| ").split(" | ") for line in cells.splitlines())
+        mine = achieved[next(index for index, one in enumerate(pictures) if f"[{name}]" in one)]
+        share, _, rest = mine.partition(" %, ")
+        assert abs(int(share) / 100 - facts["success"]) < 0.0051, name
+        assert rest.endswith(f", {facts['frames']:,} steps"), name
+
+
+def test_the_films_are_small_and_move() -> None:
+    films = sorted((DOCS / "images" / "gallery").glob("*.gif"))
+    assert [film.stem for film in films] == sorted(TASKS)
+    assert all(film.stat().st_size < 250_000 for film in films)
+    for film in films:
+        with Image.open(film) as image:
+            assert image.n_frames > 5
+
+
+def test_a_film_is_made_of_a_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gallery = script("make_gallery")
+    for name, value in {"GALLERY": tmp_path, "GOALS": 1, "SIZE": 40}.items():
+        monkeypatch.setattr(gallery, name, value)
+    assert re.fullmatch(r"hand_reach: [01] of 1 goals achieved, \d+ kB", gallery.make_film("hand_reach"))
+    assert (tmp_path / "hand_reach.gif").exists()
+
+
+def shown(notebook: dict[str, Any]) -> list[list[str]]:
+    """What each cell of code shows: kinds of outputs, "image/png" for a picture."""
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    return [
+        [next(iter(output.get("data", {output.get("name"): ""}))) for output in cell["outputs"]]
+        for cell in cells
+    ]
+
+
+@pytest.mark.long
+def test_the_notebooks_run_and_show_the_figures_that_they_are_committed_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("nbclient", reason="needs the extra notebooks")
+    for name in ("JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "IPYTHONDIR"):
+        monkeypatch.setenv(name, str(tmp_path / name.lower()))
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel's own, as when a user runs it
+    command = [sys.executable, str(DOCS / "make_notebooks.py"), "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert len(NOTEBOOKS) == 3
+    for path in NOTEBOOKS:
+        notebook = json.loads((tmp_path / path.name).read_text())
+        assert shown(notebook) == shown(json.loads(path.read_text())), path.stem
+        assert sum(kinds.count("image/png") for kinds in shown(notebook)) >= 3, path.stem
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_small_and_says_nothing_of_a_machine(path: Path) -> None:
+    notebook = json.loads(path.read_text())
+    assert path.stat().st_size < 300_000
+    assert set(notebook["metadata"]) == {"kernelspec", "language_info"}
+    assert notebook["metadata"]["kernelspec"]["name"] == "python3"
+    for cell in notebook["cells"]:
+        assert cell["metadata"] == {}
+        assert cell.get("execution_count") is None
+        assert all(output.get("execution_count") is None for output in cell.get("outputs", []))
+        assert not any(output.get("metadata") for output in cell.get("outputs", []))
+        assert "stderr" not in [output.get("name") for output in cell.get("outputs", [])]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_a_page_whose_links_lead_somewhere(path: Path) -> None:
+    conf = script("conf")
+    text = path.read_text()
+    source = "\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"])
+    links = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", source)
+    assert links
+    assert all((path.parent / link).exists() for link in links)
+    page = conf.notebook_page(text, path.stem)
+    pictures = re.findall(r"data:image/png;base64,", page)
+    assert len(pictures) == sum(kinds.count("image/png") for kinds in shown(json.loads(text)))
+    assert page.startswith("# ")
+    for link in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", re.sub(r"```.*?```", "", page, flags=re.DOTALL)):
+        assert (path.parent / link).exists(), link  # within docs, too
+        assert (path.parent / link).resolve().is_relative_to(DOCS), link
+    contents = (DOCS / "index.md").read_text()
+    assert re.search(f"^notebooks/{path.stem}$", contents, re.MULTILINE)
