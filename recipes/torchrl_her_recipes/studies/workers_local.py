@@ -93,10 +93,16 @@ class LocalWorkers:
         self._stopped = True
         for _, worker in list(self._busy.values()):
             worker.kill()
-        for place in [self._places.get() for _ in range(self.at_once)]:
-            if place is not None:
-                place.end()
-            self._places.put(None)
+        places: list[_Worker | None] = []
+        try:
+            while len(places) < self.at_once:
+                places.append(self._places.get())
+            for place in places:
+                if place is not None:
+                    place.end()
+        finally:  # also after a Ctrl-C: it may be closed once more
+            for _ in places:
+                self._places.put(None)
 
 
 def _cores() -> int:

@@ -78,6 +78,19 @@ def test_a_process_that_dies_takes_only_its_job_along(
     assert children() == []  # the next job gets a new one
 
 
+def test_ctrl_c_while_they_are_closed_blocks_nobody() -> None:
+    class Slow:
+        def end(self) -> str:
+            raise KeyboardInterrupt
+
+    workers = LocalWorkers(2)
+    workers._places.get()
+    workers._places.put(Slow())  # type: ignore[arg-type]
+    with pytest.raises(KeyboardInterrupt):
+        workers.close()
+    workers.close()
+
+
 def children() -> list[int]:
     """Worker processes of this one."""
     command = ["pgrep", "-P", str(os.getpid()), "-f", "worker_main"]
