@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from tqdm import tqdm
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `tune`
 from torchrl_her_recipes.cli.overrides import ARGUMENTS
@@ -74,7 +75,7 @@ def tune(
     click.echo(f"search: {home}")
     click.echo(f"varied: {', '.join(entry.name for entry in search.space)}")
     workers: Any = recipes.make_workers(jobs=jobs)
-    result = recipes.tune(search, home, trials=trials, minutes=minutes, workers=workers, say=click.echo)
+    result = recipes.tune(search, home, trials=trials, minutes=minutes, workers=workers, say=tqdm.write)
     return _say(result)
 
 
