@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,8 +76,13 @@ def tune(
     click.echo(f"search: {home}")
     click.echo(f"varied: {', '.join(entry.name for entry in search.space)}")
     workers: Any = recipes.make_workers(jobs=jobs)
-    result = recipes.tune(search, home, trials=trials, minutes=minutes, workers=workers, say=tqdm.write)
+    result = recipes.tune(search, home, trials=trials, minutes=minutes, workers=workers, say=_say_trial)
     return _say(result)
+
+
+def _say_trial(line: str) -> None:
+    tqdm.write(line)  # above the bar, if there is one
+    sys.stdout.flush()  # to be seen at once in a file, too
 
 
 def _say(result: SearchResult) -> int:

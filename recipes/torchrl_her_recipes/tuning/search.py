@@ -121,7 +121,8 @@ def run_search(
     except Timeout as error:
         raise ValueError(f"another process is searching in {home.path}") from error
     except (StorageInternalError, SQLAlchemyError) as error:
-        why = " ".join(str(getattr(error.__cause__, "orig", error)).split())
+        cause = error.__cause__ or error
+        why = " ".join(str(getattr(cause, "orig", cause)).split())
         raise OSError(f"{home.database} cannot be used ({why}); the same command goes on") from error
     finally:
         workers.close()
