@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import torchrl_her_recipes
-from torchrl_her_recipes import cli
+from torchrl_her_recipes import Search, cli
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "RESULTS.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -55,6 +55,21 @@ def test_study(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert " batched runs to go, " in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("command", commands("tune"))
+def test_tune(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[Search] = []
+
+    def tune(search: Search, *_arguments: object, **_options: object) -> None:
+        tried.append(search)
+        raise Reached
+
+    monkeypatch.setattr(torchrl_her_recipes, "tune", tune)
+    with pytest.raises(Reached):
+        cli.main(shlex.split(command))
+    assert tried[0].recipe.run.num_runs in (3, 5)
+
+
 def test_there_are_commands_to_try() -> None:
+    assert len(commands("tune")) > 2
     assert len(commands("train")) > 15
     assert len(commands("study")) > 8

@@ -11,6 +11,10 @@ from typing import Any
 
 import pytest
 
+import torchrl_her_recipes
+
+from ..recipes.studies.here import Here
+
 DOCS = Path(__file__).parents[2] / "docs"
 PACKAGES = ("torchrl_her", "torchrl_her_envs", "torchrl_her_recipes")
 LIBRARY = (
@@ -51,6 +55,7 @@ def conf() -> ModuleType:
         ("devices.md", 1),
         ("from_torchrl.md", 2),
         ("index.md", 1),
+        ("loggers.md", 2),
         ("normalization.md", 2),
         ("novelty.md", 4),
         ("replay_buffers.md", 4),
@@ -78,6 +83,19 @@ def test_a_policy_is_exported_loaded_and_played_by_onnxruntime(
     for block in blocks("export.md"):
         exec(compile(block, "export.md", "exec"), names)
     assert Path("hand_v1.md").exists()
+
+
+def test_options_are_searched_for_as_the_guide_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("optuna", reason="needs the extra tune")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(torchrl_her_recipes, "make_workers", lambda **_options: Here())
+    names: dict[str, Any] = {"__name__": "tuning.md"}
+    assert len(blocks("tuning.md")) == 3
+    for block in blocks("tuning.md"):
+        exec(compile(block, "tuning.md", "exec"), names)
+    assert Path("runs/tune/best.yaml").exists()
+    assert names["best"] in names["scores"]
+    assert len(names["study"].trials) == 2
 
 
 def test_the_own_script_trains_and_measures_what_it_has_learned() -> None:

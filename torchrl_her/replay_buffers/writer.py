@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
+from torchrl_her.files.reading import read_tensors
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, weights_by_run
 from torchrl_her.replay_buffers.draw import draw_for_runs
@@ -354,7 +355,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     def loads(self, path: str | Path) -> None:
         super().loads(path)
-        self.load_state_dict(torch.load(Path(path) / _STATE_FILE, weights_only=True))
+        self.load_state_dict(read_tensors(Path(path) / _STATE_FILE))
 
     def _empty(self, empty_write_count: bool = True) -> None:
         super()._empty(empty_write_count)

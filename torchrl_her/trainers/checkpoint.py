@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pickle
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from torchrl.collectors import BaseCollector
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.storages import Storage
 
+from torchrl_her.files.reading import MoreThanDataError, load_tensors
 from torchrl_her.replay_buffers.runs.buffer import bounds_of_run, runs_of, sizes_of
 from torchrl_her.replay_buffers.runs.storage import Field, PackedStorage, unpack
 from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_state_dict
@@ -159,12 +159,11 @@ def load_checkpoint(path: str | Path, *, map_location: torch.device | str = "cpu
             raise CheckpointError(f"{path} is damaged: its checksum does not match")
         file.seek(_BODY)
         try:
-            return torch.load(file, map_location=map_location, weights_only=True)
-        except pickle.UnpicklingError as error:
-            raise CheckpointError(f"{path} holds more than tensors and plain data") from error
-        except Exception as error:  # of any type: a file with a right checksum may still hold anything
-            reason = str(error).split("\n")[0]
-            raise CheckpointError(f"{path} cannot be read: {reason}") from error
+            return load_tensors(file, map_location=map_location)
+        except MoreThanDataError as error:
+            raise CheckpointError(f"{path} holds {error}") from error
+        except ValueError as error:  # a file with a right checksum may still hold anything
+            raise CheckpointError(f"{path} cannot be read: {error}") from error
 
 
 def load_newest_checkpoint(path: str | Path, *, keep: int = 2) -> dict[str, Any]:

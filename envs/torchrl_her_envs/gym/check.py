@@ -21,7 +21,6 @@ SUCCESS = "is_success"
 _OUR_OPTIONS = ("max_steps", "parallel", "termination", "achieved_reward", "pictures")
 _EPISODES = 8  # whose goals the environment's functions are tried with
 _TRIED_STEPS = 100
-_PICTURES = "rgb_array"
 
 
 def spec_of(env: gymnasium.Env) -> EnvSpec:
@@ -64,11 +63,6 @@ _OWN_ID = (
     "an environment of your own is named module:ID, as in task=gym:my_module:MyEnv-v0, "
     "where importing my_module registers MyEnv-v0"
 )
-
-
-def draws(env: gymnasium.Env) -> bool:
-    """Whether an environment gives pictures if it is made with ``render_mode="rgb_array"``."""
-    return _PICTURES in env.metadata.get("render_modes", [])
 
 
 def _wrong_options(id: str, options: dict[str, Any]) -> str:

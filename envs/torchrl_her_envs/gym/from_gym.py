@@ -34,7 +34,6 @@ from torchrl_her_envs.gym.check import (
     SUCCESS,
     TERMINATED,
     check_goal_env,
-    draws,
     goals_to_try,
     has_compute_terminated,
     make_one,
@@ -42,6 +41,7 @@ from torchrl_her_envs.gym.check import (
     spec_of,
     try_steps,
 )
+from torchrl_her_envs.gym.drawing import PICTURES, cannot_draw, choose_renderer, draws
 from torchrl_her_envs.gym.fetch import fetch_layers, fetch_names
 from torchrl_her_envs.gym.goal_functions import GoalFunction
 from torchrl_her_envs.gym.layout import Layout
@@ -95,7 +95,8 @@ def make_gym_env(
         reference_env = opened.enter_context(closing(make_one(id, options)))
         check_goal_env(id, reference_env)
         if pictures and draws(reference_env) and "render_mode" not in options:
-            options["render_mode"] = "rgb_array"
+            choose_renderer()
+            options["render_mode"] = PICTURES
             reference_env = opened.enter_context(closing(make_one(id, options)))
         # By its spec rather than its id: new processes then need neither register it nor load TorchRL.
         make = partial(
@@ -212,7 +213,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
     @property
     def can_render(self) -> bool:
         """Whether it was made with ``render_mode="rgb_array"``."""
-        return self._reference_env.render_mode == "rgb_array"
+        return self._reference_env.render_mode == PICTURES
 
     def layers(self) -> list[dict[str, Any]]:
         """The layers of the Fetch tasks; an error for other environments, which have none of their own."""
@@ -287,22 +288,28 @@ class GymGoalEnv(TaskTraits, GymWrapper):
             Pictures [len(worlds), height, width, 3] of uint8; without the first dimension for one index.
 
         Raises:
-            ValueError: they were made without pictures, or an index is out of range.
+            ValueError: they were made without pictures, an index is out of range, or the machine lacks what
+                drawing needs.
         """
         if not self.can_render:
             mode = self._reference_env.render_mode
             raise ValueError(f'pictures need render_mode="rgb_array", got {mode!r}')
         chosen = choose_indices(self.batch_size[0], worlds)
-        if isinstance(self._env, SyncVectorEnv):
-            drawn = [self._env.envs[index].render() for index in chosen]
-        else:  # in other processes, which all draw at once
-            everything = self._env.render()
-            drawn = [everything[index] for index in chosen]
+        try:
+            drawn = self._drawn(chosen)
+        except Exception as error:  # whatever a renderer raises
+            raise ValueError(cannot_draw(self.task_name, error)) from error
         pictures = [torch.from_numpy(np.array(picture)) for picture in drawn]
         if size is not None:
             pictures = [resized(picture, size) for picture in pictures]
         pictures = [captioned(picture, caption) for picture in pictures]
         return pictures[0] if isinstance(worlds, int) else torch.stack(pictures)
+
+    def _drawn(self, chosen: Sequence[int]) -> Sequence[Any]:
+        if isinstance(self._env, SyncVectorEnv):
+            return [self._env.envs[index].render() for index in chosen]
+        everything = self._env.render()  # in other processes, which all draw at once
+        return [everything[index] for index in chosen]
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Closes all environments."""

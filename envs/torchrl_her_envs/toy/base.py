@@ -14,8 +14,11 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical
 
 from torchrl_her_envs.common.batched_env import BatchedEnv
+from torchrl_her_envs.common.goal_env import choose_indices
+from torchrl_her_envs.common.rendering.pictures import captioned
 from torchrl_her_envs.common.seeding import as_seeds, uniform
 from torchrl_her_envs.toy.goals import LatticeGoals
+from torchrl_her_envs.toy.pictures import WIDTH, Sheet, draw
 
 MOST_STEPS = (1 << 20) - 1  # steps of an episode that random numbers are set aside for
 
@@ -127,7 +130,34 @@ class ToyEnv(BatchedEnv):
         apart = (achieved_goal - desired_goal).square().sum(-1, keepdim=True)
         return apart < self.threshold**2
 
+    # Pictures
+
+    @property
+    def can_render(self) -> bool:
+        return True
+
+    def render(
+        self,
+        worlds: int | Sequence[int] | None = None,
+        *,
+        size: int | None = None,
+        trail: Sequence[Tensor] = (),
+        caption: str = "",
+    ) -> Tensor:
+        """Draws environments as they are now; see :meth:`torchrl_her_envs.TaskTraits.render`.
+
+        Pictures are three fifths as high as they are wide.
+        """
+        chosen = choose_indices(self.batch_size[0], worlds)
+        width = WIDTH if size is None else size
+        pictures = [captioned(draw(width, partial(self._draw, world=world)), caption) for world in chosen]
+        return pictures[0] if isinstance(worlds, int) else torch.stack(pictures)
+
     # What each toy environment says
+
+    @abstractmethod
+    def _draw(self, sheet: Sheet, world: int) -> None:
+        """Draws one environment as it is now."""
 
     @abstractmethod
     def _start(self, which: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrl_her_envs.toy.base import ToyEnv, check_flag, check_whole
 from torchrl_her_envs.toy.goals import LatticeGoals
+from torchrl_her_envs.toy.pictures import Sheet, draw_bits
 
 _MOST_BITS = 127  # a start takes two random numbers a bit and one more, and a step has 256 of them
 
@@ -70,6 +71,9 @@ class BitFlip(ToyEnv):
             seed=seed,
         )
         self.bits, self.useless_action = bits, useless_action
+
+    def _draw(self, sheet: Sheet, world: int) -> None:
+        draw_bits(sheet, self.worlds.place[world].tolist(), self.worlds.goal[world].tolist())
 
     def _start(self, which: Tensor) -> tuple[Tensor, Tensor]:
         u = self._uniform(which, 2 * self.bits + 1)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_her_envs.toy.base import MOST_STEPS, ToyEnv, check_flag, check_whole
 from torchrl_her_envs.toy.goals import LatticeGoals
+from torchrl_her_envs.toy.pictures import Sheet, draw_chain
 
 
 class Chain(ToyEnv):
@@ -118,6 +119,9 @@ class Chain(ToyEnv):
         ends = range(links, self.length + 1, links)
         parts = {f"part_{end // links}": list(range(end - links, end)) for end in ends}
         return parts | super().state_names()
+
+    def _draw(self, sheet: Sheet, world: int) -> None:
+        draw_chain(sheet, int(self.worlds.place[world].sum()), self.length)
 
     def _start(self, which: Tensor) -> tuple[Tensor, Tensor]:
         links = torch.zeros(len(which), self.length, dtype=torch.int64)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrl_her_envs.toy.base import ToyEnv, check_whole
 from torchrl_her_envs.toy.goals import LatticeGoals
+from torchrl_her_envs.toy.pictures import Sheet, draw_treasure
 
 _LINE = 100  # length of the line
 
@@ -69,6 +70,10 @@ class TreasureHunt(ToyEnv):
             num_envs=num_envs,
             seed=seed,
         )
+
+    def _draw(self, sheet: Sheet, world: int) -> None:
+        pirate, treasure = (int(own[world, 0]) for own in (self.worlds.place, self.worlds.goal))
+        draw_treasure(sheet, pirate / self._last, treasure / self._last)
 
     def _start(self, which: Tensor) -> tuple[Tensor, Tensor]:
         u = self._uniform(which, 2)

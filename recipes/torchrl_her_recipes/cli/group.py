@@ -26,6 +26,7 @@ from torchrl_her_recipes.cli.say import (
 )
 from torchrl_her_recipes.cli.study import report, study
 from torchrl_her_recipes.cli.train import train
+from torchrl_her_recipes.cli.tune import tune
 from torchrl_her_recipes.config.imports import import_modules
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.versions import own_version
@@ -77,7 +78,7 @@ def group(context: click.Context) -> None:
         context.exit(BAD_INPUT)
 
 
-for _command in (train, record, play, export, plot, study, report, clean, listing):
+for _command in (train, record, play, export, plot, study, report, tune, clean, listing):
     group.add_command(_command)
 
 

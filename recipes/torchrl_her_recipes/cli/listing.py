@@ -8,10 +8,13 @@ from torchrl_her_envs.registry import GYM, get_task_spec, task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.learners import LEARNERS
 from torchrl_her_recipes.config.shipped import policy_facts, preset_names, preset_summary
+from torchrl_her_recipes.config.spaces import space_names, space_summary
 from torchrl_her_recipes.config.study import load_study, study_names
 
 
-@click.command("list", short_help="tasks, algorithms, learners, studies, trained policies and presets")
+@click.command(
+    "list", short_help="tasks, algorithms, learners, studies, policies, spaces of searches, presets"
+)
 def listing() -> int:
     """List what there is."""
     sections = {
@@ -24,6 +27,7 @@ def listing() -> int:
         "trained policies": {
             name: f"{facts['success']:.0%} success" for name, facts in policy_facts().items()
         },
+        "spaces": {name: space_summary(name) for name in space_names()},
         "presets": {name: preset_summary(name) for name in preset_names()},
     }
     for title, entries in sections.items():

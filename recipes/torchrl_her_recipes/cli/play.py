@@ -16,6 +16,7 @@ from torchrl_her_recipes.config.shipped import policy_names
 
 _SUFFIXES = (".gif", ".mp4")
 _RUN = click.Path(path_type=Path)
+_IN_A_WINDOW = 480  # pixels of one environment
 _best = click.option(
     "--best", is_flag=True, help="the policy of the evaluation with the best success, not the last one"
 )
@@ -26,45 +27,89 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
     return [*names, CompletionItem(incomplete, type="file")]
 
 
-@click.command(short_help="a GIF of a run's policy, an exported one, or one that comes with the package")
+@click.command(short_help="a policy at work: of a run, an exported one, or one that comes with the package")
 @click.argument("source", metavar="RUN|FILE|TASK", shell_complete=_complete)
+@click.option("--window", is_flag=True, help="show it live in a window, with keys, instead of writing a film")
+@click.option(
+    "--compare",
+    "others",
+    metavar="RUN|FILE|TASK",
+    multiple=True,
+    shell_complete=_complete,
+    help="another policy of the same task beside it, with the same starts and goals; may be repeated",
+)
 @click.option("--out", type=_RUN, help="the .gif or .mp4 (default: RUN/play.gif, FILE.gif or TASK.gif)")
-@click.option("--run", type=click.IntRange(0), default=0, help="which, of several side by side")
+@click.option("--run", type=click.IntRange(0), default=0, help="which, of several side by side in RUN")
 @_best
-@click.option("--goals", type=click.IntRange(1), default=6, show_default=True, help="how many, side by side")
+@click.option("--goals", type=click.IntRange(1), help="how many, side by side (default: 6, in a window 1)")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of the goals and starts")
 @click.option(
-    "--size", type=click.IntRange(32), default=240, show_default=True, help="pixels of one environment"
+    "--size", type=click.IntRange(32), help="pixels of one environment (default: 240, in a window 480)"
 )
 @allow_import
-def play(source: str, out: Path | None, run: int, best: bool, goals: int, seed: int, size: int) -> int:
-    """Make a GIF of a policy.
+def play(
+    source: str,
+    window: bool,
+    others: tuple[str, ...],
+    out: Path | None,
+    run: int,
+    best: bool,
+    goals: int | None,
+    seed: int,
+    size: int | None,
+) -> int:
+    """Show a policy: as a GIF or MP4, or live in a window.
 
     RUN is the folder of a run, or policy.pt or best.pt in it, FILE what `torchrl-her export` wrote (.pt or
     .onnx), TASK one of the trained policies.
+
+    Keys in the window: space pauses, n or the right arrow takes one step, r goes on to the next goals, + and
+    - change the speed, q or escape quits.
     """
-    path = Path(source)
-    if not path.exists() and source not in policy_names():
-        known = what_there_is(source, policy_names(), "trained policies")
-        raise ValueError(
-            f"{source} is neither the folder of a run, nor the file of an exported policy, nor one of the "
-            f"trained policies{known}"
+    sources = (source, *others)
+    for name in sources:
+        _check_source(name)
+    if window:
+        if out is not None:
+            raise click.UsageError("--window and --out cannot be given together")
+        seen = recipes.watch(
+            sources, run=run, best=best, goals=goals or 1, seed=seed, size=size or _IN_A_WINDOW
         )
-    film = out or _film_of(path)
-    if film.suffix not in _SUFFIXES:
+        for name, (achieved, ended) in zip(sources, seen, strict=True):
+            click.echo(f"{achieved} of {ended} goals achieved: {name}")
+        return 0
+    film = out or _film_of(Path(source), compared=bool(others))
+    if film.suffix.lower() not in _SUFFIXES:
         raise ValueError(f"cannot write {film.name!r}: its suffix must be one of {', '.join(_SUFFIXES)}")
+    goals, size = goals or 6, size or 240
+    if others:
+        counts = recipes.play_beside(sources, film, run=run, best=best, goals=goals, seed=seed, size=size)
+        for name, achieved in zip(sources, counts, strict=True):
+            click.echo(f"{achieved} of {goals} goals achieved: {name}")
+        click.echo(film)
+        return 0
     achieved = recipes.play(source, film, run=run, best=best, goals=goals, seed=seed, size=size)
     click.echo(f"{achieved} of {goals} goals achieved: {film}")
     return 0
 
 
-def _film_of(source: Path) -> Path:
+def _check_source(source: str) -> None:
+    if not Path(source).exists() and source not in policy_names():
+        known = what_there_is(source, policy_names(), "trained policies")
+        raise ValueError(
+            f"{source} is neither the folder of a run, nor the file of an exported policy, nor one of the "
+            f"trained policies{known}"
+        )
+
+
+def _film_of(source: Path, *, compared: bool) -> Path:
     """Where the film of a policy goes: in the folder of its run, or beside its file."""
+    name = "compare.gif" if compared else "play.gif"
     if source.is_dir():
-        return source / "play.gif"
+        return source / name
     if source == recipes.RunFolder(source.parent).policy and source.is_file():
-        return source.with_name("play.gif")  # policy.gif is what the run itself filmed at its end
-    return source.with_suffix(".gif") if source.is_file() else Path(f"{source}.gif")
+        return source.with_name(name)  # policy.gif is what the run itself filmed at its end
+    return source.with_name(f"{source.stem if source.is_file() else source.name}{'_compare' * compared}.gif")
 
 
 @click.command(short_help="a run's policy as a small file of its own, for TorchRL or as ONNX")

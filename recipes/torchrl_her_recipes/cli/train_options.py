@@ -72,12 +72,25 @@ def extending(options: tuple[str, ...]) -> dict[str, Any]:
     Raises:
         ValueError: a mistake in an argument, or one that would change what the run has trained already.
     """
+    values = single(options)
+    check_extending(values)
+    return values
+
+
+def single(options: tuple[str, ...]) -> dict[str, Any]:
+    """The values that arguments give, where each is one value.
+
+    Args:
+        options: the arguments, ``NAME=VALUE`` each.
+
+    Raises:
+        ValueError: a mistake in an argument.
+    """
     pairs = [parse_override(text, ARGUMENTS) for text in options]
     check_once(pairs, ARGUMENTS)
     for name, text in pairs:
         _check_single(name, text)
     (values,) = sweep(pairs)
-    check_extending(values)
     return values
 
 
@@ -136,6 +149,7 @@ def _written(group: str, name: str, default: Any) -> str:
     """How an option is given on the command line, with its default."""
     key = group if name == "name" else f"{group}.{name}" if group in LONG_ONLY else name
     shown = str(default).lower() if isinstance(default, bool) else default
+    shown = f"[{','.join(default)}]" if isinstance(default, tuple) else shown
     return key if default is None else f"{key}={shown}"
 
 

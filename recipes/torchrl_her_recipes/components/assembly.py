@@ -29,11 +29,9 @@ from torchrl_her_recipes.components.demonstrations import load_demonstrations, r
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.components.goal_space import goal_space
+from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.recipe import Recipe
-
-# Evaluation has seeds of its own, far from those of training.
-_EVAL_SEED = 1 << 32
 
 
 def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
@@ -147,4 +145,4 @@ def make_collector(
 
 def eval_seeds(recipe: Recipe, epoch: int) -> list[int]:
     """The seeds of an evaluation: for each run and epoch its own, and never one of training."""
-    return [_EVAL_SEED + (seed << 20) + epoch for seed in recipe.seeds]
+    return [Stream.EVALUATION + (seed << 20) + epoch for seed in recipe.seeds]

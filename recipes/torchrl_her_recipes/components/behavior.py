@@ -12,13 +12,12 @@ from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her.goals.rewards import EnvReward, GoalReward, RewardFunction
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top, make_curriculum
-from torchrl_her_recipes.components.devices import CPU, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs
 from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_instructive
 from torchrl_her_recipes.components.learner import Agent
+from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.config.recipe import Recipe
 
-_SEED = 1 << 33  # so that proposals do not repeat the numbers of exploration
 _GREEDY = ("mega", "discover")
 
 
@@ -72,7 +71,7 @@ def make_behavior(
         candidates=options.candidates,
         memory=options.goal_memory,
         runs=recipe.run.num_runs,
-        generators=make_generators([seed + _SEED for seed in recipe.seeds], CPU),
+        generators=generators_of(recipe, Stream.PROPOSED_GOALS),
         achieved_reward=rewards[1],
         goes_on=task.goes_on,
         **top,
@@ -101,7 +100,7 @@ def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = 
         candidates=1,
         memory=evaluation_envs(recipe),
         runs=recipe.run.num_runs,
-        generators=make_generators([seed + _SEED for seed in recipe.seeds], CPU),
+        generators=generators_of(recipe, Stream.PROPOSED_GOALS),
         achieved_reward=rewards[1],
         goes_on=task.goes_on,
     )

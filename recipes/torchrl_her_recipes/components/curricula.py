@@ -14,12 +14,11 @@ from torchrl_her.curriculum.orders import EpisodeLayers, TeacherStudent
 from torchrl_her.curriculum.transforms import LayerOutcomes, StateToObs, ZeroPad
 from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
-from torchrl_her_recipes.components.devices import CPU, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
+from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
-_SEED = 1 << 34  # so that drawn layers do not repeat the numbers of exploration
 _STATE = ["observation", "desired_goal"]  # what the state is made of, in this order
 
 
@@ -133,9 +132,7 @@ def _make_progress(recipe: Recipe, curriculum: Curriculum) -> CurriculumProgress
             f"got processes={recipe.collection.processes}"
         )
     kind = TeacherStudent if options.order == "teacher_student" else EpisodeLayers
-    return kind(
-        curriculum, runs=runs, generators=make_generators([seed + _SEED for seed in recipe.seeds], CPU)
-    )
+    return kind(curriculum, runs=runs, generators=generators_of(recipe, Stream.LAYERS))
 
 
 def make_played_env(

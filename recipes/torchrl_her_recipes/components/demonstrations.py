@@ -18,11 +18,9 @@ from torchrl_her.goals.rewards import EnvReward
 from torchrl_her.trainers.checkpoint import buffer_state_dict, load_buffer_state_dict
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
-from torchrl_her_recipes.components.devices import CPU, make_generators
+from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
-
-_SEEDS = 1 << 40  # of the starts: random numbers of their own, far from those of everything else
 
 
 @dataclass
@@ -160,7 +158,7 @@ def _make_starts(recipe: Recipe, own: RunDemonstrations) -> DemonstrationStarts:
         [own.shown(run) for run in range(runs)],
         share=options.starts_share,
         runs=runs,
-        generators=make_generators([_SEEDS + seed for seed in recipe.seeds], CPU),
+        generators=generators_of(recipe, Stream.DEMONSTRATED_STARTS),
         width=options.starts_width,
         stride=options.starts_stride,
         threshold=options.starts_threshold,

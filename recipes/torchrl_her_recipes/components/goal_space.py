@@ -21,13 +21,13 @@ from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her_envs.common.goal_env import Box, goal_env
 from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
 
 _SAMPLES = 10_000  # goals, if they do not fill a box
 _RESETS = 1_000  # episodes whose goals are collected, if the environment has no distribution of goals
-_SEED = 1 << 40  # of these episodes, far from the seeds of training and evaluation
 MOST_DIMENSIONS = 3  # that a grid is kept over
 
 
@@ -155,7 +155,7 @@ def _desired_goals(recipe: Recipe, env: Any) -> Tensor:
     distribution = getattr(env, "goal_distribution", None)
     if distribution is not None:
         return distribution.sample(_SAMPLES, generator=torch.Generator().manual_seed(0))
-    envs = make_task_envs(recipe, recipe.collection.num_envs, [_SEED])
+    envs = make_task_envs(recipe, recipe.collection.num_envs, [Stream.GOAL_SPACE])
     resets = -(-_RESETS // recipe.collection.num_envs)
     goals = torch.cat([envs.reset()["desired_goal"] for _ in range(resets)])
     envs.close()

@@ -11,6 +11,7 @@ from typing import Any
 from torchrl_her_envs.registry import check_options as check_task_options
 from torchrl_her_envs.registry import check_task, get_task_spec
 from torchrl_her_recipes.config.algorithms import check_goal_sources, check_strategy, get_algorithm
+from torchrl_her_recipes.config.loggers import check_loggers
 from torchrl_her_recipes.config.options import check_options, option
 from torchrl_her_recipes.config.values import read_yaml
 
@@ -356,10 +357,16 @@ class RunConfig(Group):
     keep_buffer: bool = option(
         False, "whether the checkpoint of a finished run keeps the replay buffer, for more epochs later"
     )
+    log: Any = option(
+        ("tensorboard",),
+        "loggers, as [csv,wandb]: csv, tensorboard, wandb, mlflow, or registered ones; [] for none besides "
+        "the table of metrics, which is always written",
+    )
     threads: int = option(1, "threads of torch: small networks are fastest with one", at_least=1)
     dtype: str = option("float32", "of observations and networks", choices=("float32", "float64"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "log", check_loggers(self.log))
         if self.seed + self.num_runs > _SEEDS:
             raise ValueError(f"seed must be below {_SEEDS - self.num_runs + 1}, got {self.seed}")

@@ -1,4 +1,4 @@
-"""The folder that a run leaves behind: configuration, metrics, events, checkpoint, pictures."""
+"""The folder that a run leaves behind: configuration, metrics, checkpoint, pictures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import yaml
-from torch.utils.tensorboard import SummaryWriter
 
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import read_mapping
@@ -20,7 +19,7 @@ _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict", "gymnasium", "pymu
 
 
 class RunFolder:
-    """Paths and tables of one run.
+    """Paths and the table of one run.
 
     Args:
         path: of the folder; :meth:`create` makes it.
@@ -38,7 +37,6 @@ class RunFolder:
         self.goals = self.path / "virtual_goals.png"
         self.goal_map = self.path / "goal_map.npz"
         self.video = self.path / "policy.gif"
-        self._events: SummaryWriter | None = None
 
     @classmethod
     def of(cls, source: str | Path) -> RunFolder | None:
@@ -111,12 +109,11 @@ class RunFolder:
         rows = self.rows() if self.config.exists() and self.policy.exists() else []
         return bool(rows) and rows[-1]["epoch"] >= self.recipe().run.epochs
 
-    def log(self, rows: Sequence[dict[str, float]], new: int) -> None:
-        """Writes the table, and the last rows of it to the events.
+    def write_table(self, rows: Sequence[dict[str, float]]) -> None:
+        """Writes the table of metrics.
 
         Args:
-            rows: the whole table: columns may join it on the way (losses, at the first update).
-            new: how many rows at its end are new.
+            rows: all of them: columns may join it on the way (losses, at the first update).
         """
         columns = list(dict.fromkeys(name for row in rows for name in row))
         table = io.StringIO()
@@ -124,12 +121,6 @@ class RunFolder:
         writer.writeheader()
         writer.writerows(rows)
         _write_whole(self.metrics, table.getvalue())
-        if self._events is None:
-            self._events = SummaryWriter(str(self.path / "tensorboard"), purge_step=int(rows[-new]["frames"]))
-        for row in rows[-new:]:
-            for name, value in row.items():
-                self._events.add_scalar(f"{name}/run_{row['run']}", value, int(row["frames"]))
-        self._events.flush()  # what is behind a checkpoint must be on the disk when the run goes on from it
 
     @property
     def parts(self) -> list[Path]:
@@ -157,12 +148,6 @@ class RunFolder:
                 return [{name: _number(text) for name, text in row.items()} for row in csv.DictReader(file)]
             except (AttributeError, TypeError, ValueError) as error:  # a line is cut short, or no numbers
                 raise ValueError(f"{self.metrics} is damaged: a line is no row of the table") from error
-
-    def close(self) -> None:
-        """Writes out what is still in memory."""
-        if self._events is not None:
-            self._events.close()
-            self._events = None
 
 
 def _write_whole(path: Path, text: str) -> None:

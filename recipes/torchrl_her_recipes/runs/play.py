@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from torch import Tensor
 
-from torchrl_her.modules.networks import take_run
-from torchrl_her.trainers.metrics import success
-from torchrl_her.trainers.trainer import evaluate
-from torchrl_her_envs.common.goal_env import goal_env, reward_range
-from torchrl_her_envs.common.rendering.recording import record_episodes
 from torchrl_her_envs.common.rendering.video import write_video
-from torchrl_her_recipes.components.agents import make_player
-from torchrl_her_recipes.components.curricula import make_curriculum, make_played_env, played_rewards
-from torchrl_her_recipes.components.envs import make_task_envs
-from torchrl_her_recipes.config.imports import permit_task
-from torchrl_her_recipes.config.shipped import policy_names
 from torchrl_her_recipes.runs.film import FPS
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.kept import KeptPolicy
-from torchrl_her_recipes.runs.policies import load_trained
+from torchrl_her_recipes.runs.players import Player, actor_of, check_comparable, find_player, labels_of
+from torchrl_her_recipes.runs.side_by_side import SideBySide
+
+_HOLD = 25  # times that the last frame is repeated
 
 
 def load_actor(
@@ -44,20 +39,7 @@ def load_actor(
     if kept is None:
         home = RunFolder(folder)
         kept = KeptPolicy(home, home.policy)  # whose recipe says what is missing
-    return _actor_of(kept, run, allow_import)
-
-
-def _actor_of(kept: KeptPolicy, run: int, allow_import: bool) -> TensorDictModuleBase:
-    recipe = kept.home.recipe()
-    if not 0 <= run < recipe.run.num_runs:
-        runs = recipe.run.num_runs
-        raise ValueError(f"there is no run {run} in {kept.home.path}; it has runs 0 to {runs - 1}")
-    if allow_import:
-        permit_task(recipe.task.name)
-    env = make_played_env(recipe, 1, [0])
-    actor = make_player(recipe.replace(num_runs=1), env, curriculum=make_curriculum(recipe, env))
-    actor.load_state_dict(take_run(kept.load()["actor"], run, recipe.run.num_runs))
-    return actor
+    return actor_of(kept, run, allow_import)
 
 
 def play(
@@ -93,31 +75,106 @@ def play(
             nothing of it can be drawn, or its task names a module that must not be imported.
         OSError: the run has not saved a policy yet.
     """
-    env, actor, achieved = _played(source, run, best, goals, seed, allow_import)
-    if not goal_env(env).can_render:
-        raise ValueError(f"{source} cannot be filmed: its environment gives no pictures")
-    write_video(record_episodes(env, actor, size=size, achieved_reward=achieved), out, fps=FPS)
-    env.set_seed(seed)
-    rollout = evaluate(env, actor, max_steps=goal_env(env).max_steps)
-    return int(success(rollout, achieved_reward=achieved).sum())
+    with shown(
+        [source], goals=goals, seed=seed, size=size, run=run, best=best, allow_import=allow_import
+    ) as episodes:
+        write_video(_film(episodes, seed), out, fps=FPS)
+        return episodes.achieved[0]
 
 
-def _played(
-    source: str | Path, run: int, best: bool, goals: int, seed: int, allow_import: bool
-) -> tuple[EnvBase, TensorDictModuleBase, float]:
-    """Environments, the policy that plays in them, and the reward of an achieved goal."""
-    kept = KeptPolicy.of(source, best=best)
-    if kept is None and (str(source) in policy_names() or Path(source).is_file()):
-        trained = load_trained(source, allow_import=allow_import)
-        env = make_task_envs(trained.recipe.replace(task=trained.task), goals, [seed], pictures=True)
-        trained.card.check_plays(env, trained.task)
-        return env, trained.actor, reward_range(goal_env(env))[1]
-    if kept is None:
-        known = ", ".join(policy_names())
-        raise ValueError(
-            f"{source} is neither the folder of a run, nor the file of an exported policy, nor one of the "
-            f"trained policies: {known}"
-        )
-    recipe, actor = kept.home.recipe(), _actor_of(kept, run, allow_import)
-    env = make_played_env(recipe, goals, [seed], pictures=True)
-    return env, actor, played_rewards(recipe, env)[1]
+def play_beside(
+    sources: Sequence[str | Path],
+    out: str | Path,
+    *,
+    run: int = 0,
+    best: bool = False,
+    goals: int = 6,
+    seed: int = 0,
+    size: int = 240,
+    allow_import: bool = False,
+) -> list[int]:
+    """Writes a video of several policies beside each other, each with the same starts and goals.
+
+    Args:
+        sources: of the policies, as for :func:`play`; all of the same task.
+        out: a .gif or .mp4 file.
+        run: which one of the first folder, if there are several side by side in it.
+        best: whether to take the best policy of the first folder.
+        goals: how many.
+        seed: of the goals and starts.
+        size: pixels of one environment.
+        allow_import: whether the modules that the tasks may name may be imported.
+
+    Returns:
+        How many of the goals each of them achieved.
+
+    Raises:
+        ValueError: as for :func:`play`, or the policies are not of the same task.
+        OSError: a run has not saved a policy yet.
+    """
+    with shown(
+        sources,
+        goals=goals,
+        seed=seed,
+        size=size,
+        run=run,
+        best=best,
+        allow_import=allow_import,
+        named=True,
+    ) as episodes:
+        write_video(_film(episodes, seed), out, fps=FPS)
+        return episodes.achieved
+
+
+@contextmanager
+def shown(
+    sources: Sequence[str | Path],
+    *,
+    goals: int,
+    seed: int,
+    size: int,
+    run: int,
+    best: bool,
+    allow_import: bool,
+    named: bool = False,
+) -> Iterator[SideBySide]:
+    """Policies that are to be seen beside each other; their environments are closed in the end.
+
+    Args:
+        sources: of the policies.
+
+    Keyword Args:
+        goals: how many each of them has at a time.
+        seed: of the goals and starts.
+        size: pixels of one environment.
+        run: which one of the first folder, if there are several side by side in it.
+        best: whether to take the best policy of the first folder.
+        allow_import: whether the modules that the tasks may name may be imported.
+        named: whether names and successes stand below the pictures.
+
+    Raises:
+        ValueError: see :func:`play_beside`.
+        OSError: a run has not saved a policy yet.
+    """
+    with ExitStack() as opened:
+        players: list[Player] = []
+        for source in sources:
+            own = (0, False) if players else (run, best)
+            player = find_player(
+                source, goals=goals, seed=seed, run=own[0], best=own[1], allow_import=allow_import
+            )
+            opened.callback(player.close)
+            players.append(player)
+        check_comparable(players)
+        labels = labels_of(players) if named else None
+        yield SideBySide([player.episodes(size=size) for player in players], labels)
+
+
+def _film(episodes: SideBySide, seed: int) -> list[Tensor]:
+    """All frames of some episodes, the last one held for a while."""
+    episodes.start(seed=seed)
+    frames = [episodes.frame()]
+    while episodes.running:
+        episodes.step()
+        frames.append(episodes.frame())
+    return frames + frames[-1:] * _HOLD

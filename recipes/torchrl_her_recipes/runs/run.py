@@ -6,7 +6,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import build
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.config.imports import permit_task
+from torchrl_her_recipes.config.loggers import check_installed
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.best import BestPolicy
 from torchrl_her_recipes.runs.callbacks import Callback, Callbacks, RunView, Stopped
@@ -28,6 +29,7 @@ from torchrl_her_recipes.runs.film import film_policy
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap, goal_map
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
+from torchrl_her_recipes.runs.log_to import LogByName
 from torchrl_her_recipes.runs.plots import plot_curves, plot_goals
 from torchrl_her_recipes.runs.progress import Progress
 from torchrl_her_recipes.runs.saturation import saturation_notices
@@ -83,7 +85,8 @@ def run(
         progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
 
     Raises:
-        ValueError: the folder holds a run already.
+        ValueError: the folder holds a run already, or a logger cannot begin.
+        ImportError: a logger's package is not installed.
 
     Example:
         >>> from torchrl_her_recipes import EarlyStopping, build, make_recipe
@@ -93,6 +96,8 @@ def run(
         (True, [320, 640])
     """
     home, trainer = None if folder is None else RunFolder(folder), components.trainer()
+    if home is not None:
+        check_installed(components.recipe.run.log)
     with torch.random.fork_rng(devices=[]):
         # Losses and policies of TorchRL draw from torch's own generator.
         torch.manual_seed(components.recipe.run.seed)
@@ -125,8 +130,8 @@ def resume(
     Args:
         folder: of the run.
         components: newly made ones, if those of the run were not the ones of its recipe.
-        options: other values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints`` or ``keep_buffer``,
-            which are written into the folder's configuration.
+        options: other values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``, ``keep_buffer`` or
+            ``log``, which are written into the folder's configuration.
         callbacks: called on the way; they may stop the run. Those of its beginning are not remembered.
         progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
         allow_import: whether the module that the run's task may name may be imported.
@@ -144,6 +149,7 @@ def resume(
     if allow_import:
         permit_task(recipe.task.name)
     wanted = recipe.extended(**options) if options else recipe
+    check_installed(wanted.run.log)
     has_buffer = bool(state.get("buffer"))
     if not has_buffer:
         _check_needs_no_buffer(home, wanted if components is None else components.recipe, state)
@@ -210,14 +216,16 @@ def _run(
     has_buffer: bool = True,
 ) -> RunResult:
     recipe = components.recipe
-    hooks = Callbacks(callbacks, RunView(components, trainer, rows, home))
+    loggers = [] if home is None else [LogByName(name) for name in recipe.run.log]
+    hooks = Callbacks([*callbacks, *loggers], RunView(components, trainer, rows, home))
     threads = torch.get_num_threads()
     torch.set_num_threads(recipe.run.threads)
     torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
     shown = Progress(recipe, trainer, show=progress)
     interrupted = stopped = saved = False
-    unlogged = 0  # rows that are not on the disk yet
-    with soft_interrupt() as check:  # also while things are saved at the end
+    with soft_interrupt() as check, ExitStack() as opened:  # also while things are saved at the end
+        for own in loggers:
+            opened.callback(own.close)
 
         def between_batches() -> None:
             check()
@@ -227,16 +235,13 @@ def _run(
             hooks.start()
             while trainer.epochs < recipe.run.epochs and not stopped:
                 seconds = rows[-1]["seconds"] if rows else 0.0
-                new = _epoch(components, trainer, shown, between_batches, seconds, best)
-                rows += new
+                rows += _epoch(components, trainer, shown, between_batches, seconds, best)
                 stopped = hooks.epoch()
                 for line in saturation_notices(rows, recipe):
                     shown.say(line)
                 if home is not None:
-                    unlogged += len(new)
                     with _despite_a_full_disk("table", trainer):
-                        home.log(rows, unlogged)
-                        unlogged = 0
+                        home.write_table(rows)
                     _save_best(best, trainer, home)
                     saved = trainer.epochs % recipe.run.checkpoint_interval == 0 and _save_all(
                         components, trainer, home, best
@@ -362,7 +367,6 @@ def _finish(
 
 def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool) -> None:
     recipe = components.recipe
-    home.close()
     title = f"{recipe.task.name}, {recipe.hindsight.algo}, " + (
         f"seed {recipe.run.seed}" if recipe.run.num_runs == 1 else f"{recipe.run.num_runs} runs"
     )

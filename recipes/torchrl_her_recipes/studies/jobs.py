@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import shutil
 import traceback
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchrl_her_recipes.components.assembly import build
 from torchrl_her_recipes.config.imports import import_modules, imported_modules, permit_task
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.values import load_name
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.run import RunResult, resume, run
 
@@ -26,11 +27,16 @@ class Job:
         label: names it within the study.
         recipe: what to run.
         folder: where to.
+        around: what surrounds the run where it is done, as ``module:name`` of a context manager that gives
+            the run's callbacks; empty if nothing does.
+        options: what it is called with, plain values by name.
     """
 
     label: str
     recipe: Recipe
     folder: Path
+    around: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
 
     def to_plain(self) -> dict[str, Any]:
         """The job as plain values for another process, with the modules that it must import first.
@@ -38,7 +44,8 @@ class Job:
         They register the tasks and learners that the recipe may name.
         """
         recipe, modules = self.recipe.to_dict(), imported_modules()
-        return {"label": self.label, "recipe": recipe, "folder": str(self.folder), "modules": modules}
+        plain = {"label": self.label, "recipe": recipe, "folder": str(self.folder), "modules": modules}
+        return plain | {"around": self.around, "options": self.options}
 
     @classmethod
     def from_plain(cls, values: dict[str, Any]) -> Job:
@@ -50,7 +57,8 @@ class Job:
         import_modules(values["modules"])
         recipe = Recipe.from_dict(values["recipe"])
         permit_task(recipe.task.name)  # it was checked where the study began
-        return cls(label=values["label"], recipe=recipe, folder=Path(values["folder"]))
+        around = {name: values[name] for name in ("around", "options")}
+        return cls(label=values["label"], recipe=recipe, folder=Path(values["folder"]), **around)
 
 
 class Progress(NamedTuple):
@@ -67,10 +75,12 @@ class Outcome:
     Attributes:
         interrupted: whether it was stopped; it can go on.
         error: why it failed, in one line; empty if it did not.
+        died: whether its process ended instead of saying so.
     """
 
     interrupted: bool = False
     error: str = ""
+    died: bool = False
 
 
 def can_resume(folder: Path) -> bool:
@@ -125,12 +135,13 @@ def run_job(job: Job) -> Outcome:
 
 
 def _train(job: Job) -> RunResult:
-    if can_resume(job.folder):
-        return resume(job.folder, progress=False)
-    home = RunFolder(job.folder)
-    for left in (home.config, home.metrics):  # by a run that ended before its first checkpoint
-        left.unlink(missing_ok=True)
-    return run(build(job.recipe), job.folder, progress=False)
+    with load_name(job.around)(**job.options) if job.around else nullcontext(()) as callbacks:
+        if can_resume(job.folder):
+            return resume(job.folder, callbacks=callbacks, progress=False)
+        home = RunFolder(job.folder)
+        for left in (home.config, home.metrics):  # by a run that ended before its first checkpoint
+            left.unlink(missing_ok=True)
+        return run(build(job.recipe), job.folder, callbacks=callbacks, progress=False)
 
 
 def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:

@@ -125,7 +125,7 @@ class _Worker:
             self._jobs.flush()
             return pickle.load(self._answers)
         except (OSError, EOFError, ValueError, pickle.UnpicklingError):  # its pipes are broken, or closed
-            return Outcome(error=self.end())
+            return Outcome(error=self.end(), died=True)
 
     def stop(self) -> None:
         with suppress(BrokenPipeError):  # it has ended already

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
 
 from torchrl_her import Curriculum, CurriculumLayer
-from torchrl_her_envs import make_gym_env
+from torchrl_her_envs import make_gym_env, record_episodes
+from torchrl_her_envs.common.rendering.video import write_video
 from torchrl_her_envs.gym.fetch import fetch_layers, fetch_names
 from torchrl_her_envs.gym.from_gym import GymGoalEnv
 
@@ -90,3 +92,19 @@ def test_other_environments_have_none(id: str) -> None:
 def test_they_say_so(env: GymGoalEnv) -> None:
     with pytest.raises(ValueError, match="has no curriculum: give its layers as curriculum=FILE.yaml"):
         env.layers()
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_films_without_a_display(suffix: str, tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    env = make_gym_env("FetchReach-v4", num_envs=2, seed=3, max_steps=3, pictures=True)
+    try:
+        frames = record_episodes(env, env.rand_action, size=64, hold=0)
+    except ValueError as error:
+        pytest.skip(str(error))
+    finally:
+        env.close()
+    assert len(frames) == 4
+    assert frames[0].shape == (64, 128, 3)
+    assert frames[0].float().std() > 20  # there is something to see
+    assert write_video(frames, tmp_path / f"film{suffix}").stat().st_size > 1_000

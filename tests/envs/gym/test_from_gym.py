@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import Any
 
 import gymnasium
@@ -16,6 +18,7 @@ from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 from torchrl_her import EnvReward, HERWriter
 from torchrl_her_envs import GymGoalEnv, goal_env, make_gym_env
+from torchrl_her_envs.gym.drawing import choose_renderer
 
 from .walk import LAST, WALK, Walk, walk
 
@@ -357,3 +360,32 @@ def test_goals_that_are_all_met_from_the_start_tell_nothing() -> None:
     """What a goal that is far away gives is not known then."""
     with pytest.raises(ValueError, match=r"is met gives 0.0, one far away 0.0; that must be less"):
         make_gym_env("torchrl_her_envs:torchrl_her/HandReach-v0", threshold=10.0)
+
+
+def test_what_a_machine_cannot_draw_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_self: Walk) -> None:
+        raise AttributeError("no context\nwas made")
+
+    env = walk(2, render_mode="rgb_array")
+    env.reset()
+    monkeypatch.setattr(Walk, "render", fail)
+    monkeypatch.delitem(sys.modules, "mujoco", raising=False)
+    with pytest.raises(ValueError, match="could not be drawn: AttributeError: no context was made$"):
+        env.render()
+    monkeypatch.setitem(sys.modules, "mujoco", sys)
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    with pytest.raises(
+        ValueError, match=r"was made \(MuJoCo was to draw by MUJOCO_GL=glfw; MUJOCO_GL may be"
+    ):
+        env.render()
+
+
+def test_mujoco_draws_without_a_display_unless_somebody_says_how(monkeypatch: pytest.MonkeyPatch) -> None:
+    for display, before, after in ((":0", None, None), (None, None, "egl"), (None, "osmesa", "osmesa")):
+        for name, value in (("DISPLAY", display), ("MUJOCO_GL", before)):
+            monkeypatch.setenv(name, value) if value else monkeypatch.delenv(name, raising=False)
+        monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+        monkeypatch.setattr(sys, "platform", "linux")
+        choose_renderer()
+        assert os.environ.get("MUJOCO_GL") == after
+        monkeypatch.delenv("MUJOCO_GL", raising=False)

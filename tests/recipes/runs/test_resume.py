@@ -212,13 +212,16 @@ def test_epochs_extend_a_finished_run_and_an_interrupted_one(
     [
         (
             ["seed=3"],
-            "keep_checkpoints, keep_buffer only; seed=3 would change what it has trained: start a new run",
+            "keep_buffer, log only; seed=3 would change what it has trained: start a new run",
         ),
         (
             ["epochs=4", "learner.gamma=0.9"],
-            "keep_checkpoints, keep_buffer only; learner.gamma=0.9 would change what",
+            "keep_checkpoints, keep_buffer, log only; learner.gamma=0.9 would change what",
         ),
-        (["preset=demo"], "keep_checkpoints, keep_buffer only; preset=demo would change what it has trained"),
+        (
+            ["preset=demo"],
+            "keep_buffer, log only; preset=demo would change what it has trained",
+        ),
         (["epoch=4"], "no option 'epoch'; did you mean epochs?"),
         (["epochs=4", "run.epochs=5"], "epochs=4 and run.epochs=5 set the same option"),
         (["epochs=4,5"], "epochs must be one value, got 4,5"),

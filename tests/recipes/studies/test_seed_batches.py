@@ -27,8 +27,7 @@ def leave(path: Path, recipe: Recipe, *, epochs: int) -> None:
         for epoch in range(1, epochs + 1)
         for run, seed in enumerate(recipe.seeds)
     ]
-    home.log(rows, new=len(rows))
-    home.close()
+    home.write_table(rows)
     counts = np.stack([np.eye(4)[seed % 4].reshape(2, 2) for seed in recipe.seeds])
     GoalMap(counts, np.full((2, 2), 0.25)).save(home.goal_map)
     home.policy.touch()

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from threading import Lock
 
 import pytest
 import yaml
@@ -19,31 +18,11 @@ import torchrl_her_recipes
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config.study import Study, load_study, study_names
 from torchrl_her_recipes.runs.folder import RunFolder
-from torchrl_her_recipes.studies.jobs import Job, Outcome, Progress, run_job
 from torchrl_her_recipes.studies.seed_batches import Batches
 from torchrl_her_recipes.studies.study import StudyResult, draw_study, run_study
 
 from ..small import SMALL, small
-
-
-class Here:
-    """Does jobs in this process, one after the other: TorchRL's exploration type is that of all threads."""
-
-    at_once = 1
-
-    def __init__(self) -> None:
-        self._place = Lock()
-
-    def run(self, job: Job) -> Outcome:
-        with self._place:
-            return run_job(job)
-
-    def progress(self) -> dict[str, Progress]:
-        return {}
-
-    def stop(self) -> None: ...
-
-    def close(self) -> None: ...
+from .here import Here
 
 
 @pytest.mark.parametrize("name", study_names())

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
+from torchrl_her.files.reading import read_tensors
 from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
 from torchrl_her.replay_buffers.runs.trees import SumTrees
 
@@ -375,4 +376,4 @@ def _dump(sampler: AnyRunsSampler, path: str | Path) -> None:
 
 
 def _load(sampler: AnyRunsSampler, path: str | Path) -> None:
-    sampler.load_state_dict(torch.load(Path(path) / _STATE_FILE, weights_only=True))
+    sampler.load_state_dict(read_tensors(Path(path) / _STATE_FILE))

@@ -13,6 +13,7 @@ from torchrl_her_envs.common.rendering.colors import INK, MARGIN, Color
 
 _BORDER = 1 / 60  # of a picture's height: width of a border
 _TEXT = 0.045  # of a picture's height: height of a caption
+_LINE, _LEAST_LINE, _MOST_LINE = 0.055, 11, 18  # of a line below a picture, of its width, and in pixels
 
 
 def resized(picture: Tensor, size: int) -> Tensor:
@@ -51,6 +52,46 @@ def captioned(picture: Tensor, words: str) -> Tensor:
     draw.rectangle(draw.textbbox(place, words, font=font, anchor="ra"), fill=MARGIN)
     draw.text(place, words, fill=INK, font=font, anchor="ra")
     return torch.from_numpy(np.array(image))
+
+
+def underlined(picture: Tensor, lines: Sequence[str]) -> Tensor:
+    """A picture [height, width, 3] of uint8 with lines of text below it; long ones are set smaller.
+
+    Example:
+        >>> underlined(torch.zeros(60, 90, 3, dtype=torch.uint8), ["5 of 6", "step 3"]).shape
+        torch.Size([92, 90, 3])
+    """
+    width = picture.shape[1]
+    height = round(min(max(_LINE * width, _LEAST_LINE), _MOST_LINE))
+    pitch = round(1.45 * height)
+    strip = Image.new("RGB", (width, pitch * len(lines)), MARGIN)
+    draw = ImageDraw.Draw(strip)
+    for row, words in enumerate(lines):
+        font = ImageFont.load_default(size=height)
+        long = font.getlength(words) / (0.96 * width)
+        font = ImageFont.load_default(size=max(6.0, height / max(long, 1.0)))
+        draw.text((width / 2, (row + 0.5) * pitch), words, fill=INK, font=font, anchor="mm")
+    return torch.cat([picture, torch.from_numpy(np.array(strip))])
+
+
+def beside(pictures: Sequence[Tensor], *, gap: int) -> Tensor:
+    """Pictures [height, width, 3] of uint8 in a row, with a gap between them, aligned at the top.
+
+    Example:
+        >>> high, low = (torch.zeros(height, 2, 3, dtype=torch.uint8) for height in (4, 3))
+        >>> beside([high, low], gap=1).shape
+        torch.Size([4, 5, 3])
+    """
+    high = max(picture.shape[0] for picture in pictures)
+    parts = []
+    for picture in pictures:
+        below = high - picture.shape[0]
+        parts += [_plain(high, gap), torch.cat([picture, _plain(below, picture.shape[1])])]
+    return torch.cat(parts[1:], 1)
+
+
+def _plain(height: int, width: int) -> Tensor:
+    return torch.tensor(MARGIN, dtype=torch.uint8).expand(height, width, 3)
 
 
 def bordered(picture: Tensor, color: Color) -> Tensor:

@@ -1,0 +1,37 @@
+"""How gymnasium's environments are drawn, and what to say where they cannot be."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import gymnasium
+
+PICTURES = "rgb_array"
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+_DRAWN_BY = "MUJOCO_GL"
+
+
+def draws(env: gymnasium.Env) -> bool:
+    """Whether an environment gives pictures if it is made with ``render_mode="rgb_array"``."""
+    return PICTURES in env.metadata.get("render_modes", [])
+
+
+def choose_renderer() -> None:
+    """Lets MuJoCo draw by EGL where there is no display, unless ``MUJOCO_GL`` says what to draw by.
+
+    By itself it would try to open a window there, and fail.
+    """
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS):
+        os.environ.setdefault(_DRAWN_BY, "egl")
+
+
+def cannot_draw(name: str, error: Exception) -> str:
+    """What to say if an environment cannot be drawn, in one line."""
+    hint = ""
+    if "mujoco" in sys.modules:
+        by = os.environ.get(_DRAWN_BY)
+        tried = "in a window" if by is None else f"by {_DRAWN_BY}={by}"
+        hint = f" (MuJoCo was to draw {tried}; {_DRAWN_BY} may be glfw, egl or osmesa)"
+    reason = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"{name} could not be drawn: {reason}{hint}"

@@ -1,0 +1,92 @@
+"""``torchrl-her tune``: a search for good options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `tune`
+from torchrl_her_recipes.cli.overrides import ARGUMENTS
+from torchrl_her_recipes.cli.permission import allow_import
+from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, file_name
+from torchrl_her_recipes.cli.train_options import complete, single
+from torchrl_her_recipes.config.imports import check_permitted
+from torchrl_her_recipes.config.recipe import make_recipe
+from torchrl_her_recipes.config.search import PRUNERS, SAMPLERS, Search
+from torchrl_her_recipes.config.shipped import load_preset
+from torchrl_her_recipes.config.shortcuts import merge
+from torchrl_her_recipes.config.spaces import load_space, space_for, space_names
+
+if TYPE_CHECKING:
+    from torchrl_her_recipes.tuning.search import SearchResult
+
+_SEEDS = 3  # of a trial
+
+
+@click.command(short_help="search for good options with Optuna, on all cores")
+@click.option("--trials", type=click.IntRange(1), help="how many in all (default: 50, without --minutes)")
+@click.option(
+    "--minutes", type=click.FloatRange(0.0, min_open=True), help="after which no trial begins any more"
+)
+@click.option("--jobs", type=click.IntRange(1), help="trials at once (default: one for each core)")
+@click.option(
+    "--space",
+    "space_name",
+    metavar="NAME|FILE",
+    help=f"the options that are varied: a YAML file, or {', '.join(space_names())} (default: the learner's)",
+)
+@click.option(
+    "--sampler", type=click.Choice(SAMPLERS), default="tpe", help="how trials are chosen (default: tpe)"
+)
+@click.option(
+    "--pruner",
+    type=click.Choice(PRUNERS),
+    default="median",
+    help="which trials are ended early: those below the median, all but a third at each rung of successive "
+    "halving, or none (default: median)",
+)
+@allow_import
+@click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
+def tune(
+    options: tuple[str, ...],
+    trials: int | None,
+    minutes: float | None,
+    jobs: int | None,
+    space_name: str | None,
+    sampler: Any,
+    pruner: Any,
+) -> int:
+    """Search for good options; for instance: torchrl-her tune preset=demo num_runs=3 --trials 30
+
+    Options are given as to train; those that are given are not varied. Each trial trains num_runs seeds side
+    by side. The same command goes on with a search.
+    """
+    given = single(options)
+    folder, preset = (given.pop(name, None) for name in ARGUMENTS[::-1])
+    base = merge({"num_runs": _SEEDS}, load_preset(preset) if preset else {})
+    recipe = make_recipe(base, **given)
+    check_permitted(recipe.task.name)
+    space = load_space(space_name) if space_name else space_for(recipe)
+    search = Search(recipe=recipe, space=space.without(given), sampler=sampler, pruner=pruner)
+    home = Path(folder or f"runs/tune_{file_name(recipe.task.name)}_{recipe.hindsight.algo}")
+    click.echo(f"search: {home}")
+    click.echo(f"varied: {', '.join(entry.name for entry in search.space)}")
+    workers: Any = recipes.make_workers(jobs=jobs)
+    result = recipes.tune(search, home, trials=trials, minutes=minutes, workers=workers, say=click.echo)
+    return _say(result)
+
+
+def _say(result: SearchResult) -> int:
+    for number, reason in result.failed.items():
+        fail(f"trial {number} failed: {reason}")
+    for line in result.standing.table():
+        click.echo(line)
+    best = result.standing.best
+    if best is not None:
+        click.echo(f"the best: torchrl-her train preset={result.folder / 'best.yaml'}")
+    if result.interrupted:
+        click.echo("interrupted: the same command goes on with it")
+        return INTERRUPTED
+    return FAILED if best is None else 0

@@ -1,0 +1,25 @@
+"""Random numbers of their own for the parts of a run, so that no two parts draw the same ones."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import torch
+
+from torchrl_her_recipes.components.devices import CPU, make_generators
+from torchrl_her_recipes.config.recipe import Recipe
+
+
+class Stream(IntEnum):
+    """How far the seeds of a part lie from those of the runs, which are below ``2 ** 31``."""
+
+    EVALUATION = 1 << 32
+    PROPOSED_GOALS = 1 << 33
+    LAYERS = 1 << 34
+    GOAL_SPACE = 1 << 40
+    DEMONSTRATED_STARTS = (1 << 40) + (1 << 32)
+
+
+def generators_of(recipe: Recipe, stream: Stream) -> list[torch.Generator]:
+    """The sources of random numbers of a part, one for each run."""
+    return make_generators([stream + seed for seed in recipe.seeds], CPU)

@@ -1,0 +1,88 @@
+"""The loggers by name: who is told the numbers of a run besides its own table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+from torchrl_her_recipes.config.options import nearest
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoggerSpec:
+    """A logger that ``log=[NAME]`` chooses.
+
+    Args:
+        name: of the logger, and of its folder in that of a run.
+        factory: what opens it, as ``module:function``; it is imported when a run begins. It is called with
+            the :class:`~torchrl_her_recipes.RunView` and a number of frames. It takes everything behind these
+            out of what it has logged before, and returns a TorchRL ``Logger`` and up to which frames that has
+            the table already: 0 for a new one.
+        needs: the package that it needs, which is also the name of the extra; empty for none.
+    """
+
+    name: str
+    factory: str
+    needs: str = ""
+
+
+_HERE = "torchrl_her_recipes.runs.loggers"
+LOGGERS: dict[str, LoggerSpec] = {}
+
+
+def register_logger(spec: LoggerSpec) -> None:
+    """Makes a logger known by its name.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    if spec.name in LOGGERS:
+        raise ValueError(f"there is a logger {spec.name!r} already")
+    LOGGERS[spec.name] = spec
+
+
+for _spec in (
+    LoggerSpec(name="csv", factory=f"{_HERE}.csv_files:open_csv"),
+    LoggerSpec(name="tensorboard", factory=f"{_HERE}.tensorboard:open_tensorboard"),
+    LoggerSpec(name="wandb", factory=f"{_HERE}.wandb_run:open_wandb", needs="wandb"),
+    LoggerSpec(name="mlflow", factory=f"{_HERE}.mlflow_run:open_mlflow", needs="mlflow"),
+):
+    register_logger(_spec)
+
+
+def check_loggers(value: Any) -> tuple[str, ...]:
+    """The names of some loggers, in their order; none for None.
+
+    Args:
+        value: a list of names, or one name.
+
+    Raises:
+        ValueError: there is no such logger, or it is named twice.
+
+    Example:
+        >>> check_loggers("csv"), check_loggers(["tensorboard", "csv"]), check_loggers(None)
+        (('csv',), ('tensorboard', 'csv'), ())
+    """
+    names = [value] if isinstance(value, str) else [] if value is None else value
+    known = ", ".join(LOGGERS)
+    if not isinstance(names, list | tuple):
+        raise ValueError(f"log must be a list of {known}, got {value!r}")
+    for name in names:
+        if not isinstance(name, str) or name not in LOGGERS:
+            raise ValueError(f"log must be some of {known}, got {name!r}{nearest(name, LOGGERS)}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"log names a logger twice: {', '.join(names)}")
+    return tuple(names)
+
+
+def check_installed(names: tuple[str, ...]) -> None:
+    """Refuses loggers whose package is missing.
+
+    Raises:
+        ImportError: it is not installed; the message names the extra.
+    """
+    for name in names:
+        needs = LOGGERS[name].needs
+        if needs and find_spec(needs) is None:
+            raise ImportError(f"log={name} needs {needs}: pip install '.[{needs}]'")

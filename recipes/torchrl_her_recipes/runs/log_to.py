@@ -1,0 +1,174 @@
+"""Tells loggers of TorchRL what comes of a run: its options, the rows of its table, its pictures."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from torchrl.record.loggers.common import Logger
+
+from torchrl_her_recipes.config.loggers import LOGGERS
+from torchrl_her_recipes.config.values import load_name
+from torchrl_her_recipes.runs.callbacks import Callback, RunView
+from torchrl_her_recipes.runs.show import show_file
+
+_OF_A_ROW = ("run", "seed")  # they say whose row it is, and are no metrics
+
+
+class LogTo(Callback):
+    """Tells one of TorchRL's loggers what comes of a run.
+
+    It is told the options at the start, each row of the table of metrics after its evaluation, at the step
+    that is its number of frames, and shown the pictures and the film at the end. Metrics are named
+    ``success/run_0``, for each run. It is not closed: it is yours.
+
+    When a run goes on, the logger is first told all rows so far, as it may be a new one.
+
+    Args:
+        logger: any of TorchRL's, or one of your own.
+
+    Keyword Args:
+        after: rows up to so many frames are left out, because the logger has them.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> from torchrl.record.loggers import CSVLogger
+        >>> from torchrl_her_recipes import LogTo, build, make_recipe, run
+        >>> recipe = make_recipe(task="hand_v0", epochs=2, epoch_frames=320, num_envs=8, episodes=2)
+        >>> with TemporaryDirectory() as folder:
+        ...     result = run(build(recipe), callbacks=[LogTo(CSVLogger("mine", folder))], progress=False)
+        ...     with open(f"{folder}/mine/scalars/updates/run_0.csv") as file:
+        ...         file.read().split()
+        ['320,0.0', '640,0.0']
+    """
+
+    def __init__(self, logger: Logger, *, after: int = 0) -> None:
+        self.logger, self.after = logger, after
+        self._told = after
+
+    def on_start(self, run: RunView) -> None:
+        """Tells the options, and the rows that there are."""
+        self._told = self.after
+        self.logger.log_hparams(flat(run.components.recipe.to_dict()))
+        self._tell(run.rows)
+
+    def on_epoch(self, run: RunView) -> None:
+        """Tells the new rows."""
+        self._tell(run.rows)
+
+    def on_end(self, run: RunView) -> None:
+        """Shows what pictures there are."""
+        if run.folder is not None:
+            for path in (run.folder.curves, run.folder.goals, run.folder.video):
+                if path.exists():
+                    show_file(self.logger, path.stem, path, run.trainer.frames)
+        self.logger.flush()
+
+    def _tell(self, rows: Sequence[Mapping[str, float]]) -> None:
+        for frames in sorted({int(row["frames"]) for row in rows if row["frames"] > self._told}):
+            metrics = {
+                f"{name}/run_{row['run']}": value
+                for row in rows
+                if row["frames"] == frames
+                for name, value in row.items()
+                if name not in _OF_A_ROW
+            }
+            self.logger.log_metrics(metrics, step=frames)
+            self._told = frames
+        self.logger.flush()  # what is behind a checkpoint must be there when the run goes on from it
+
+
+class LogByName(Callback):
+    """What ``log=NAME`` does: opens a logger in the run's folder, goes on in it, and closes it.
+
+    A logger that fails on the way does not end the run: it is opened anew after the next epoch, and told what
+    it has missed.
+
+    Args:
+        name: of the logger.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._teller: LogTo | None = None
+
+    def on_start(self, run: RunView) -> None:
+        """Opens the logger.
+
+        Raises:
+            ValueError: that fails.
+        """
+        self._kept = run.trainer.frames
+        try:
+            self._open(run)
+        except Exception as error:  # whatever a service raises
+            self.close()
+            raise ValueError(f"log={self.name} cannot begin: {_reason(error)}") from error
+
+    def on_epoch(self, run: RunView) -> None:
+        """Tells the new rows."""
+
+        def tell() -> None:
+            if self._teller is None:
+                self._open(run)
+            else:
+                self._teller.on_epoch(run)
+
+        self._kept = run.trainer.frames if self._tried(tell, run) else self._kept
+
+    def on_end(self, run: RunView) -> None:
+        """Shows the pictures, and closes the logger."""
+
+        def show() -> None:
+            if self._teller is None:
+                self._open(run)
+            assert self._teller is not None
+            self._teller.on_end(run)
+            self._teller.logger.close()
+            self._teller = None
+
+        self._tried(show, run)
+
+    def close(self) -> None:
+        """Closes what is open, also after an error."""
+        teller, self._teller = self._teller, None
+        if teller is not None:
+            try:
+                teller.logger.close()
+            except Exception as error:
+                warnings.warn(f"log={self.name} was not closed: {_reason(error)}", stacklevel=2)
+
+    def _open(self, run: RunView) -> None:
+        logger, known = load_name(LOGGERS[self.name].factory)(run, self._kept)
+        self._teller = LogTo(logger, after=known)
+        self._teller.on_start(run)
+
+    def _tried(self, what: Callable[[], None], run: RunView) -> bool:
+        try:
+            what()
+        except Exception as error:  # a full disk, a network that is down
+            after = f"after {run.trainer.frames:,} frames"
+            warnings.warn(f"log={self.name} fails {after}, the run goes on: {_reason(error)}", stacklevel=2)
+            self.close()
+            return False
+        return True
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def flat(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, bool | int | float | str]:
+    """Options by their long names; what is neither a number nor text is written as JSON.
+
+    Example:
+        >>> flat({"run": {"seed": 3, "log": ("csv",)}, "task": {"name": "hand_v0", "options": None}})
+        {'run.seed': 3, 'run.log': '["csv"]', 'task.name': 'hand_v0', 'task.options': 'null'}
+    """
+    return {
+        f"{group}.{name}": value if isinstance(value, bool | int | float | str) else json.dumps(value)
+        for group, values in groups.items()
+        for name, value in values.items()
+    }

@@ -1,0 +1,57 @@
+"""``log=tensorboard``: TorchRL's ``TensorboardLogger``, which can go on after a kill."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
+from torchrl.record.loggers import TensorboardLogger
+
+from torchrl_her_recipes.runs.callbacks import RunView
+
+_NAME = "tensorboard"
+_PATIENCE = 3  # seconds that a clock may have been set back
+
+
+class TensorboardEvents(TensorboardLogger):
+    """Writes events of TensorBoard; those that are there already are dropped from some step on.
+
+    Args:
+        exp_name: of the folder.
+        log_dir: where it is.
+
+    Keyword Args:
+        purge_step: the first step that does not count any more; None keeps all.
+    """
+
+    def __init__(self, exp_name: str, log_dir: str, *, purge_step: int | None = None) -> None:
+        self._purge_step = purge_step
+        super().__init__(exp_name, log_dir)
+
+    def _create_experiment(self) -> SummaryWriter:
+        return SummaryWriter(f"{self.log_dir}/{self.exp_name}", purge_step=self._purge_step)
+
+    def log_hparams(self, cfg: dict[str, Any]) -> None:
+        """Writes options into the same events; TorchRL's own makes another folder at each start."""
+        for summary in hparams(cfg, {}):
+            self.experiment.file_writer.add_summary(summary)
+
+
+def open_tensorboard(run: RunView, frames: int) -> tuple[TensorboardEvents, int]:
+    """A logger into ``tensorboard/`` of the run's folder; what was written behind ``frames`` is dropped."""
+    assert run.folder is not None
+    home = run.folder.path
+    before = list((home / _NAME).glob("events.*"))
+    if before:
+        _wait_for_the_next_second(before)
+    return TensorboardEvents(_NAME, str(home), purge_step=frames + 1), frames if before else 0
+
+
+def _wait_for_the_next_second(files: list[Path]) -> None:
+    """Files are read in the order of their names, which begin with the time in seconds: ours must be last."""
+    newest = max(int(path.name.split(".")[3]) for path in files)
+    while newest >= int(time.time()) > newest - _PATIENCE:
+        time.sleep(0.05)

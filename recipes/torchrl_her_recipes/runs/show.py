@@ -1,0 +1,66 @@
+"""Shows pictures and films to loggers, each in its own way."""
+
+from __future__ import annotations
+
+from functools import singledispatch
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageSequence
+from tensorboard.compat.proto.summary_pb2 import Summary
+from torchrl.record.loggers import CSVLogger, MLFlowLogger, TensorboardLogger, WandbLogger
+from torchrl.record.loggers.common import Logger
+
+
+@singledispatch
+def show_file(logger: Logger, name: str, path: Path, step: int) -> None:
+    """Shows a picture (``.png``) or a film (``.gif``) to a logger; one that cannot show it leaves it out.
+
+    A logger of your own kind is shown films by its ``log_video``. To show it pictures as well, register a
+    function for its class: ``@show_file.register``.
+
+    Args:
+        logger: who is to show it.
+        name: what it is called there.
+        path: of the file.
+        step: when it was made, in frames.
+    """
+    if path.suffix == ".gif":
+        logger.log_video(name, read_film(path), step=step)
+
+
+@show_file.register
+def _(logger: CSVLogger, name: str, path: Path, step: int) -> None:
+    """Tables show nothing."""
+
+
+@show_file.register
+def _(logger: TensorboardLogger, name: str, path: Path, step: int) -> None:
+    with Image.open(path) as picture:
+        width, height = picture.size
+    image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=path.read_bytes())
+    logger.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=name, image=image)]), step)
+
+
+@show_file.register
+def _(logger: WandbLogger, name: str, path: Path, step: int) -> None:
+    import wandb  # noqa: PLC0415  (an extra)
+
+    media = wandb.Video(str(path), format="gif") if path.suffix == ".gif" else wandb.Image(str(path))
+    logger.log_metrics({name: media}, step=step)
+
+
+@show_file.register
+def _(logger: MLFlowLogger, _name: str, path: Path, _step: int) -> None:
+    from mlflow import MlflowClient  # noqa: PLC0415  (an extra)
+
+    client = MlflowClient(logger.log_dir)  # that is the address of the service
+    client.log_artifact(logger.experiment.info.run_id, str(path), "pictures")
+
+
+def read_film(path: Path) -> torch.Tensor:
+    """The frames of a GIF as TorchRL's loggers take them, [1, T, 3, H, W] of uint8."""
+    with Image.open(path) as film:
+        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
+    return torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2).unsqueeze(0)

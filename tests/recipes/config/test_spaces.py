@@ -1,0 +1,165 @@
+"""Spaces of searches: those that come with the package, and how others are refused."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from torchrl_her_recipes import LEARNERS, Search, load_preset, load_space, make_recipe, space_for
+from torchrl_her_recipes.config.shipped import preset_names
+from torchrl_her_recipes.config.spaces import make_space, space_names
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_every_learner_has_a_space_that_its_recipes_take(learner: str) -> None:
+    task = "bit_flip" if learner == "dqn" else "hand_v0"
+    recipe = make_recipe(task=task, learner=learner)
+    space = space_for(recipe)
+    Search(recipe=recipe, space=space)
+    assert space.name == learner
+    assert space.values_of(recipe) is not None  # the defaults can be the first trial
+    assert {"learning_rate", "gamma", "k"} <= set(space.to_plain())
+
+
+def test_there_are_no_other_spaces() -> None:
+    assert set(space_names()) == set(LEARNERS)
+
+
+@pytest.mark.parametrize("preset", preset_names())
+def test_every_preset_can_be_searched_around(preset: str) -> None:
+    recipe = make_recipe(load_preset(preset))
+    assert len(Search(recipe=recipe, space=space_for(recipe)).space.entries) > 8
+
+
+def test_the_space_of_the_learner_that_auto_stands_for_and_of_options_that_have_an_effect() -> None:
+    assert space_for(make_recipe(task="bit_flip")).name == "dqn"
+    assert space_for(make_recipe(task="hand_v0")).name == "ddpg"
+    assert "k" not in space_for(make_recipe(algo="no_hindsight")).to_plain()
+
+
+def test_values_of_a_trial_that_have_no_effect_beside_others_are_left_out() -> None:
+    plain = {
+        "algo": {"kind": "choice", "values": ["her", "no_hindsight"]},
+        "k": {"kind": "int", "low": 1, "high": 8},
+    }
+    space, base = make_space("mine", plain), make_recipe(task="hand_v0")
+    assert space.recipe(base, {"algo": "her", "k": 7}).hindsight.k == 7
+    assert space.recipe(base, {"algo": "no_hindsight", "k": 7}).hindsight.algo == "no_hindsight"
+
+
+def test_a_space_is_what_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    text = "learner.gamma: {kind: float, low: 9e-1, high: 0.99}\nhidden: {kind: log_int, low: 8, high: '64'}"
+    path.write_text(text)
+    assert load_space(str(path)).to_plain() == {
+        "learner.gamma": {"kind": "float", "low": 0.9, "high": 0.99},
+        "hidden": {"kind": "log_int", "low": 8, "high": 64},
+    }
+    assert load_space(str(path)).without({"gamma": 0.95}).to_plain().keys() == {"hidden"}
+
+
+BOMB = "a: &a [x, x]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in pairwise("abcdefghi")
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "must hold options by name, got None"),
+        ("[1, 2]", r"must hold options by name, got \[1, 2\]"),
+        ("1: {kind: float}", "must hold options by name, got {1: "),
+        ("{}", "varies nothing"),
+        ("a: [", "cannot be read: while parsing"),
+        ("[" * 30_000, "cannot be read: its brackets are nested too deeply"),
+        ("#" * 70_000, "cannot be read: a space has at most 65,536 bytes"),
+        (BOMB, r"a of a space must have a kind, .* got \['x', 'x'\]"),
+        (f"{BOMB}\n".replace("a: &a", "gamma: &a"), "gamma of a space must have a kind"),
+        ("!!python/object/apply:os.system ['touch it']", "cannot be read: could not determine a constructor"),
+        ("gama: {kind: float, low: 0, high: 1}", "no option 'gama'; did you mean gamma?"),
+        ("gamma: 0.9", "gamma of a space must have a kind, as in .* got 0.9"),
+        ("gamma: {kind: flaot, low: 0, high: 1}", "kind of gamma must be one of .* got 'flaot'"),
+        (
+            "gamma: {kind: [float], low: 0, high: 1}",
+            r"kind of gamma must be one of .* got \['float'\]",
+        ),
+        ("gamma: {kind: float, low: 0.9}", "gamma is a float and needs high"),
+        (
+            "gamma: {kind: float, low: 0.9, hihg: 1}",
+            "gamma of a space has no 'hihg'; it has kind, low, ",
+        ),
+        ("gamma: {kind: float, low: 0.99, high: 0.9}", "low of gamma must be below high, got 0.99 and 0.9"),
+        ("gamma: {kind: float, low: 0.9, high: 0.9}", "low of gamma must be below high, got 0.9 and 0.9"),
+        ("gamma: {kind: float, low: .nan, high: 1}", "low of gamma must be finite, got nan"),
+        ("gamma: {kind: float, low: 0.1, high: .inf}", "high of gamma must be finite, got inf"),
+        ("gamma: {kind: float, low: much, high: 1}", "low of gamma must be a number, got 'much'"),
+        ("gamma: {kind: float, low: true, high: 1}", "low of gamma must be a number, got True"),
+        (
+            "gamma: {kind: float, low: 2026-01-01, high: 1}",
+            "low of gamma must be a number, got date",
+        ),
+        ("gamma: {kind: float, values: [1, 2]}", "gamma is a float and has low and high, not values"),
+        ("gamma: {kind: log_float, low: 0, high: 1}", "low of gamma, a log_float, must be above 0, got 0.0"),
+        ("k: {kind: int, low: 1.5, high: 3}", "low of k must be a whole number, got 1.5"),
+        ("k: {kind: choice, values: 3}", "values of k must be a list, got 3"),
+        ("k: {kind: choice, values: [3]}", "k must have 2 to 100 values, got 1"),
+        ("k: {kind: choice, values: [3, 3]}", "values of k must differ"),
+        ("k: {kind: choice, values: [3, [4]]}", "values of k must be numbers, texts, true or false"),
+        ("k: {kind: choice, low: 3, high: 4}", "k is a choice and has values, not low and high"),
+        ("seed: {kind: int, low: 1, high: 8}", "seed must be the same in all trials of a search"),
+        ("task: {kind: choice, values: [hand_v0, hand_v1]}", "task must be the same in all trials"),
+        (
+            "gamma: {kind: float, low: 0.1, high: 0.9}\nlearner.gamma: {kind: float, low: 0.1, high: 0.9}",
+            "two entries for gamma",
+        ),
+    ],
+)
+def test_what_is_no_space_is_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        load_space(str(path))
+    assert len(str(caught.value)) < 500
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "gamma: {kind: float, low: 0.9, high: 1.5}",
+            "does not fit: gamma must be above 0 and below 1",
+        ),
+        (
+            "norm: {kind: choice, values: [layer, big]}",
+            "does not fit: norm must be one of none, layer",
+        ),
+        ("quantiles: {kind: int, low: 10, high: 30}", "does not fit: learner=auto has no option quantiles"),
+        (
+            "window: {kind: int, low: 10, high: 30}",
+            "does not fit: window=10 has no effect with",
+        ),
+        (
+            "hidden: {kind: float, low: 10.5, high: 64}",
+            "does not fit: hidden must be a whole number",
+        ),
+    ],
+)
+def test_what_the_recipe_does_not_take_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        Search(recipe=make_recipe(task="hand_v0"), space=load_space(str(path)))
+
+
+def test_samplers_and_spaces_that_do_not_go_together() -> None:
+    recipe = make_recipe(task="hand_v0")
+    space = make_space("mine", {"k": {"kind": "int", "low": 1, "high": 4}})
+    with pytest.raises(ValueError, match="sampler=cmaes needs two options that are no choices"):
+        Search(recipe=recipe, space=space, sampler="cmaes")
+    with pytest.raises(ValueError, match="sampler must be one of tpe, random, cmaes, got 'grid'"):
+        Search(recipe=recipe, space=space, sampler="grid")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="all options of the space mine are given"):
+        space.without({"hindsight.k": 3})

@@ -1,0 +1,70 @@
+"""Searches shrunk to seconds, in processes that may be killed at any moment."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import pytest
+
+from torchrl_her_recipes import Search, make_recipe
+from torchrl_her_recipes.config.spaces import make_space
+from torchrl_her_recipes.tuning import results
+from torchrl_her_recipes.tuning.search import SearchResult, run_search
+
+from ..runs.killed import no_pictures, server
+from ..studies.here import Here
+
+SPACE = {
+    "learning_rate": {"kind": "log_float", "low": 1e-4, "high": 1e-2},
+    "k": {"kind": "int", "low": 1, "high": 8},
+    "hidden": {"kind": "choice", "values": [8, 16]},
+}
+RECIPE: dict[str, Any] = {
+    "task": "bit_flip",
+    "task.options": {"bits": 3},
+    "num_runs": 2,
+    "epochs": 3,
+    "epoch_frames": 80,
+    "num_envs": 8,
+    "warmup_frames": 0,
+    "frames_per_update": 10,
+    "batch_size": 16,
+    "buffer_size": 1_000,
+    "episodes": 20,
+    "compile": "never",
+    "checkpoint_interval": 1,
+    "hidden": 16,
+    "depth": 2,
+}
+
+
+def small_search(space: dict[str, Any] | None = None, *, sampler: Any = "tpe", **options: Any) -> Search:
+    """A search whose trials take a tenth of a second."""
+    pruner = options.pop("pruner", "median")
+    own = make_space("small", SPACE if space is None else space)
+    return Search(recipe=make_recipe(RECIPE, **options), space=own, sampler=sampler, pruner=pruner)
+
+
+def go_on(
+    search: Search, folder: Path, trials: int, *, pictures: bool = False, **options: Any
+) -> SearchResult:
+    """Searches in this process, without the pictures of runs, and perhaps without its own."""
+    with no_pictures(), pytest.MonkeyPatch.context() as patch:
+        if not pictures:
+            for name in ("plot_history", "plot_importance", "plot_options"):
+                patch.setattr(results, name, mock.Mock())
+        return run_search(search, folder, trials=trials, workers=Here(), progress=False, **options)
+
+
+def is_killed(search: Search, folder: Path, trials: int, *, after: float) -> bool:
+    """Lets a process go on with a search; returns whether it was killed before it came to the end."""
+    process = server().Process(target=go_on, args=(search, folder, trials))
+    process.start()
+    process.join(after)
+    process.kill()
+    process.join()
+    assert process.exitcode in (0, -signal.SIGKILL)
+    return process.exitcode != 0

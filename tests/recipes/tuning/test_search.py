@@ -1,0 +1,154 @@
+"""Searches: what they leave behind, that they go on where they were killed, and what they refuse."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from filelock import FileLock
+from PIL import Image
+
+from torchrl_her_recipes import load_preset, make_recipe, run_score
+from torchrl_her_recipes.studies.jobs import Job, Outcome
+from torchrl_her_recipes.tuning import search as searching
+
+from ..studies.here import Here
+from .searches import RECIPE, go_on, is_killed, small_search
+
+pytest.importorskip("optuna", reason="needs the extra tune")
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    with open(folder / "trials.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_search_leaves_the_best_as_a_preset_and_more_trials_can_be_added(tmp_path: Path) -> None:
+    lines: list[str] = []
+    first = go_on(small_search(), tmp_path, 2, say=lines.append)
+    assert [line.split(":")[0] for line in lines] == ["trial 0", "trial 1"]
+    assert len(first.standing.trials) == 2
+    assert not (tmp_path / "importance.png").exists()  # too early to tell
+    result = go_on(small_search(), tmp_path, 7, pictures=True)
+    assert result.standing.trials[:2] == first.standing.trials
+    best = result.standing.best
+    assert best is not None
+    assert best.score == result.best == max(trial.score or 0.0 for trial in result.standing.ranked)
+    assert sum(result.standing.importance.values()) == pytest.approx(1.0)
+
+    # The first trial is the recipe as it is, which any other has to beat.
+    own = make_recipe(RECIPE)
+    assert table(tmp_path)[0]["learning_rate"] == str(own.learner.learning_rate)
+    # Training with the preset repeats the best trial.
+    recipe = make_recipe(load_preset(str(tmp_path / "best.yaml")))
+    assert yaml.safe_load((tmp_path / f"trial_{best.number:04}/config.yaml").read_text()) == recipe.to_dict()
+    assert run_score(recipe) == best.score
+    for name in ("history", "importance", "options"):
+        with Image.open(tmp_path / f"{name}.png") as picture:
+            assert min(picture.size) > 200
+    left = [path.name for path in tmp_path.iterdir() if path.name != ".lock" and path.is_file()]
+    expected = ["best.yaml", "search.db", "search.yaml", "trials.csv"]
+    assert sorted(left) == sorted([*expected, "history.png", "importance.png", "options.png"])
+
+
+def _compare(folder: Path, sampler: str, *, trials: int, kills: list[float]) -> None:
+    """A search that is killed after some seconds, again and again, and one that is not."""
+    search = small_search(sampler=sampler, pruner="halving")
+    whole, killed = folder / "whole", folder / "killed"
+    go_on(search, whole, trials)
+    deaths = sum(is_killed(search, killed, trials, after=seconds) for seconds in kills)
+    assert deaths > 0
+    go_on(search, killed, trials)
+    assert table(killed) == table(whole)
+    assert (killed / "best.yaml").read_text() == (whole / "best.yaml").read_text().replace("whole", "killed")
+
+
+@pytest.mark.long
+def test_a_search_that_is_killed_ends_as_if_it_was_not(tmp_path: Path) -> None:
+    _compare(tmp_path, "tpe", trials=4, kills=[1.5, 2.0])
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("sampler", ["tpe", "random", "cmaes"])
+def test_a_long_search_that_is_killed_again_and_again_ends_as_if_it_was_not(
+    tmp_path: Path, sampler: str
+) -> None:
+    # The first ten trials of TPE are drawn at random.
+    _compare(tmp_path, sampler, trials=14, kills=[2.0 + 0.13 * number for number in range(12)])
+    assert {row["state"] for row in table(tmp_path / "whole")} == {"complete", "pruned"}
+
+
+def test_what_a_search_was_begun_with_is_asked_for_again(tmp_path: Path) -> None:
+    go_on(small_search(), tmp_path, 1)
+    for other, said in (
+        (
+            small_search(sampler="random"),
+            "a search with --sampler=tpe, not --sampler=random: repeat",
+        ),
+        (small_search(gamma=0.9), "a search with gamma=0.98, not gamma=0.9: repeat its options"),
+        (small_search(RANGE), "a search with space.learning_rate={'kind': 'log_float', .*, not space.learn"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            go_on(other, tmp_path, 1)
+
+
+RANGE = {"learning_rate": {"kind": "float", "low": 1e-4, "high": 1e-2}}
+
+
+def test_one_process_at_a_time_searches_in_a_folder(tmp_path: Path) -> None:
+    with (
+        FileLock(tmp_path / ".lock"),
+        pytest.raises(ValueError, match=f"another process is searching in {tmp_path}"),
+    ):
+        go_on(small_search(), tmp_path, 1)
+
+
+class Actors(Here):
+    """Play workers whose processes end in some way for some trials."""
+
+    def __init__(self, **outcomes: Any) -> None:
+        super().__init__()
+        self.outcomes, self.began = outcomes, list[str]()
+
+    def run(self, job: Job) -> Outcome:
+        self.began.append(job.label)
+        outcome = self.outcomes.get(job.label)
+        if isinstance(outcome, list):
+            outcome = outcome.pop(0) if outcome else None
+        return outcome or super().run(job)
+
+
+def test_a_trial_whose_process_dies_is_taken_up_again_and_one_that_fails_is_not(tmp_path: Path) -> None:
+    died, failed = Outcome(error="its process was ended by SIGKILL", died=True), Outcome(error="why")
+    workers = Actors(trial_0000=[died, died], trial_0001=failed, trial_0002=[died, died, died])
+    result = searching.run_search(small_search(), tmp_path, trials=4, workers=workers, progress=False)
+    assert [trial.state for trial in result.standing.trials] == ["complete", "failed", "failed", "complete"]
+    assert result.failed == {1: "why", 2: "its process was ended by SIGKILL"}
+    assert workers.began.count("trial_0000") == 3
+    again = go_on(small_search(), tmp_path, 4)
+    assert again.failed == result.failed
+
+
+def test_a_search_that_only_fails_ends(tmp_path: Path) -> None:
+    workers = Actors(**{f"trial_{number:04}": Outcome(error="why") for number in range(50)})
+    result = searching.run_search(small_search(), tmp_path, workers=workers, progress=False)
+    assert len(result.failed) == 5
+    assert result.best is None
+
+
+def test_no_trial_begins_when_the_time_is_up(tmp_path: Path) -> None:
+    result = searching.run_search(small_search(), tmp_path, minutes=1e-9, workers=Here(), progress=False)
+    assert result.standing.trials == []
+    with pytest.raises(ValueError, match="minutes must be above 0, got 0"):
+        searching.run_search(small_search(), tmp_path, minutes=0, workers=Here())
+    with pytest.raises(ValueError, match="trials must be at least 1, got 0"):
+        searching.run_search(small_search(), tmp_path, trials=0, workers=Here())
+
+
+def test_what_is_no_database_is_named(tmp_path: Path) -> None:
+    (tmp_path / "search.db").write_bytes(b"no database at all" * 100)
+    with pytest.raises(ValueError, match="search.db is not the database of a search: file is not a database"):
+        go_on(small_search(), tmp_path, 1)
