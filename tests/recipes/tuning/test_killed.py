@@ -22,23 +22,20 @@ TRIALS = 8
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("seed", range(3))
-def test_no_trial_is_lost_and_no_process_left_whoever_is_killed(tmp_path: Path, seed: int) -> None:
-    # Each seed kills everybody once, in an order and at moments of its own.
-    draw = random.Random(seed)
-    kills = draw.sample(("parent", "workers", "both", "Ctrl-C"), 4)
+@pytest.mark.parametrize("kill", ["parent", "workers", "both", "Ctrl-C"])
+def test_no_trial_is_lost_and_no_process_left_whoever_is_killed(tmp_path: Path, kill: str) -> None:
+    draw = random.Random(kill)
     options = [f"{name}={value}" for name, value in RECIPE.items() if name not in ("task.options", "hidden")]
     size = ["task.options.bits=3", "hidden=16", f"folder={tmp_path / 'search'}"]
     command = [sys.executable, "-P", "-m", "torchrl_her_recipes", "tune", *options, *size]
     command += ["--trials", str(TRIALS), "--jobs", "2", "--pruner", "halving"]
     known: set[int] = set()
-    for kill in kills:
+    for _ in range(2):
         with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL) as process:
             children = _wait_for_children(process)
             known |= children
-            time.sleep(draw.uniform(0.0, 20.0))
+            time.sleep(draw.uniform(0.0, 15.0))
             _kill(process, children, kill)
-            process.wait()
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     with open(tmp_path / "search" / "trials.csv", newline="") as file:
