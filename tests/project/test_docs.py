@@ -53,6 +53,7 @@ def conf() -> ModuleType:
         ("choosing.md", 1),
         ("demonstrations.md", 4),
         ("devices.md", 1),
+        ("from_torchrl.md", 2),
         ("index.md", 1),
         ("loggers.md", 2),
         ("normalization.md", 2),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import json
 import re
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 from PIL import Image
 
 from torchrl_her_envs.throwing.tasks import TASKS
+from torchrl_her_recipes import make_recipe
 from torchrl_her_recipes.config.shipped import policy_facts
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -126,3 +128,58 @@ def test_a_notebook_is_a_page_whose_links_lead_somewhere(path: Path) -> None:
         assert (path.parent / link).resolve().is_relative_to(DOCS), link
     contents = (DOCS / "index.md").read_text()
     assert re.search(f"^notebooks/{path.stem}$", contents, re.MULTILINE)
+
+
+@pytest.mark.long
+def test_both_programs_of_the_page_for_users_of_stable_baselines3_train(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("stable_baselines3")
+    monkeypatch.chdir(tmp_path)
+    theirs, ours = re.findall(r"```python\n(.*?)```", (DOCS / "from_sb3.md").read_text(), re.DOTALL)
+    for long, short in (
+        ("learn(20_000)", "learn(205)"),
+        ("learning_starts=1_000", "learning_starts=200"),
+        ("n_eval_episodes=100", "n_eval_episodes=2"),
+        ("warmup_frames=1_000", "warmup_frames=640"),
+        ("epoch_frames=5_000", "epoch_frames=640"),
+        ("episodes=100,", "episodes=10,"),
+    ):
+        assert (theirs + ours).count(long) == 1, long
+        theirs, ours = theirs.replace(long, short), ours.replace(long, short)
+    names: dict[str, Any] = {}
+    exec(compile(theirs, "from_sb3.md", "exec"), names)
+    assert -50.0 <= names["mean_return"] <= 0.0
+    exec(compile(ours, "from_sb3.md", "exec"), names)
+    assert 0.0 <= names["success"] <= 1.0
+
+
+def test_what_the_page_says_of_stable_baselines3_is_so() -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    page = (DOCS / "from_sb3.md").read_text()
+
+    def defaults(kind: type) -> dict[str, Any]:
+        return {name: one.default for name, one in inspect.signature(kind).parameters.items()}
+
+    td3 = defaults(sb3.TD3)
+    assert (td3["learning_starts"], td3["gamma"], td3["tau"]) == (100, 0.99, 0.005)
+    assert (td3["train_freq"], td3["gradient_steps"], td3["learning_rate"]) == (1, 1, 0.001)
+    assert (defaults(sb3.SAC)["learning_rate"], defaults(sb3.SAC)["ent_coef"]) == (0.0003, "auto")
+    her = defaults(sb3.HerReplayBuffer)
+    assert (her["n_sampled_goal"], her["goal_selection_strategy"]) == (4, "future")
+    ours = make_recipe(task="hand_v0", algo="her")
+    learner = make_recipe(task="hand_v0", algo="her", learner="sac").learner
+    assert (learner.gamma, learner.tau, learner.temperature, learner.learning_rate) == (
+        0.98,
+        0.02,
+        0.1,
+        0.001,
+    )
+    assert (ours.collection.warmup_frames, ours.collection.num_envs) == (3200, 64)
+    assert ours.collection.frames_per_update == 20
+    for words in (
+        "default 3,200 instead of 100",
+        "`gamma=0.98` instead of 0.99",
+        "`tau=0.02` instead of 0.005",
+    ):
+        assert words in page

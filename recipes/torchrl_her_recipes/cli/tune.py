@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from tqdm import tqdm
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `tune`
 from torchrl_her_recipes.cli.overrides import ARGUMENTS
@@ -74,8 +76,13 @@ def tune(
     click.echo(f"search: {home}")
     click.echo(f"varied: {', '.join(entry.name for entry in search.space)}")
     workers: Any = recipes.make_workers(jobs=jobs)
-    result = recipes.tune(search, home, trials=trials, minutes=minutes, workers=workers, say=click.echo)
+    result = recipes.tune(search, home, trials=trials, minutes=minutes, workers=workers, say=_say_trial)
     return _say(result)
+
+
+def _say_trial(line: str) -> None:
+    tqdm.write(line)  # above the bar, if there is one
+    sys.stdout.flush()  # to be seen at once in a file, too
 
 
 def _say(result: SearchResult) -> int:

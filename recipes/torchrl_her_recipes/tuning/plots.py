@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, PercentFormatter, StrMethodFormatter
 
 from torchrl_her_recipes.config.spaces import Entry, Space
 from torchrl_her_recipes.runs.plots import COLORS
@@ -72,6 +72,7 @@ def plot_options(trials: Sequence[TrialRow], space: Space, path: Path) -> None:
     columns = min(4, len(entries))
     rows = -(-len(entries) // columns)
     figure = Figure(figsize=(1.0 + 2.9 * columns, 0.6 + 2.3 * rows), layout="constrained")
+    figure.suptitle("scores over the options (open circles: pruned)")
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     for axes, entry in zip(grid.flat, entries, strict=False):
         done, pruned = (
@@ -80,11 +81,7 @@ def plot_options(trials: Sequence[TrialRow], space: Space, path: Path) -> None:
         )
         _scatter(axes, _places(entry, done), done, _places(entry, pruned), pruned)
         axes.set(xlabel=entry.name, ylim=(-0.03, 1.03))
-        if entry.kind == "choice":
-            axes.set_xticks(range(len(entry.values)), [str(value) for value in entry.values])
-            axes.set_xlim(-0.5, len(entry.values) - 0.5)
-        elif entry.kind.startswith("log"):
-            axes.set_xscale("log")
+        _scale(axes, entry)
         _percent(axes)
     for axes in grid.flat[len(entries) :]:
         axes.set_visible(False)
@@ -105,6 +102,27 @@ def _places(entry: Entry, trials: Sequence[TrialRow]) -> list[float]:
     return [
         entry.values.index(trial.values[entry.name]) + dx for trial, dx in zip(trials, spread, strict=True)
     ]
+
+
+def _scale(axes: Axes, entry: Entry) -> None:
+    """The whole range of an option along the x axis."""
+    if entry.kind == "choice":
+        axes.set_xticks(range(len(entry.values)), [str(value) for value in entry.values])
+        axes.set_xlim(-0.5, len(entry.values) - 0.5)
+        return
+    assert entry.low is not None
+    assert entry.high is not None
+    if entry.kind.startswith("log"):
+        margin = (entry.high / entry.low) ** 0.04
+        axes.set(xscale="log", xlim=(entry.low / margin, entry.high * margin))
+        decades = np.log10(entry.high / entry.low)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 2 else (1.0,)))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        return
+    margin = 0.04 * (entry.high - entry.low)
+    axes.set_xlim(entry.low - margin, entry.high + margin)
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=entry.kind == "int"))
 
 
 def _scatter(

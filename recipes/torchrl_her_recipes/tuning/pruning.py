@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import FileLock
+from optuna.exceptions import OptunaError
 from optuna.pruners import BasePruner, MedianPruner, NopPruner
 from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial
+from sqlalchemy.exc import SQLAlchemyError
 
 from torchrl_her_recipes.runs.callbacks import Callback, RunView
 from torchrl_her_recipes.runs.score import score
@@ -85,25 +88,32 @@ class Reporter(Callback):
 
     def on_epoch(self, run: RunView) -> bool:
         """Reports the score so far; whether the trial falls behind."""
-        epochs = sorted({int(row["epoch"]) for row in run.rows})
-        scores = {epoch: score(_until(run.rows, epoch)) for epoch in epochs}
+        try:
+            return self.report(run.rows, ended=run.trainer.epochs >= run.components.recipe.run.epochs)
+        except (OptunaError, SQLAlchemyError) as error:  # a full disk: the run itself goes on, too
+            why = " ".join(str(error.__cause__ or error).split())
+            warnings.warn(f"trial {self.number} goes on without being reported: {why}", stacklevel=2)
+            return False
+
+    def report(self, rows: Sequence[dict[str, float]], *, ended: bool = False) -> bool:
+        """Notes down the score after the last evaluation; whether the trial falls behind the others.
+
+        Args:
+            rows: the table so far.
+            ended: whether the trial has come to its end: then it cannot fall behind.
+        """
+        epochs = sorted({int(row["epoch"]) for row in rows})
+        scores = {epoch: score([row for row in rows if row["epoch"] <= epoch]) for epoch in epochs}
         frozen = self.study.get_trials(deepcopy=False)[self.number]
         trial = Trial(self.study, frozen._trial_id)
-        for epoch in epochs[-1:]:
-            if epoch not in frozen.intermediate_values:
-                trial.report(scores[epoch], epoch)
-        if run.trainer.epochs >= run.components.recipe.run.epochs:
-            return False  # it has come to its end
+        if epochs[-1] not in frozen.intermediate_values:  # it is, if the trial was killed after it
+            trial.report(scores[epochs[-1]], epochs[-1])
         now = copy.copy(frozen)
-        now.intermediate_values = scores
-        if not self.study.pruner.prune(self.study, now):
-            return False
-        trial.set_user_attr(PRUNED, epochs[-1])
-        return True
-
-
-def _until(rows: Sequence[dict[str, float]], epoch: int) -> list[dict[str, float]]:
-    return [row for row in rows if row["epoch"] <= epoch]
+        now.intermediate_values = scores  # without those of epochs that are to come again
+        behind = not ended and self.study.pruner.prune(self.study, now)
+        if behind:
+            trial.set_user_attr(PRUNED, epochs[-1])
+        return behind
 
 
 @contextmanager

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from filelock import FileLock, Timeout
+from optuna.exceptions import StorageInternalError
 from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial, TrialState
+from sqlalchemy.exc import SQLAlchemyError
 from tqdm import tqdm
 
 from torchrl_her_recipes.config.imports import check_permitted
@@ -18,7 +20,7 @@ from torchrl_her_recipes.config.search import Search
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.score import score
-from torchrl_her_recipes.studies.jobs import Job, Outcome, kept_progress
+from torchrl_her_recipes.studies.jobs import Job, Outcome, kept_progress, read_progress
 from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
 from torchrl_her_recipes.tuning.database import create_database, load_study
 from torchrl_her_recipes.tuning.folder import SearchFolder
@@ -86,6 +88,7 @@ def run_search(
         ValueError: the folder holds another search, somebody is at work in it, a limit is not positive, or
             the task names a module that must not be imported.
         ImportError: the sampler needs a package that is not installed.
+        OSError: the database cannot be used any more, for instance because the disk is full.
         KeyboardInterrupt: by a second Ctrl-C.
     """
     if trials is not None and trials < 1:
@@ -117,6 +120,10 @@ def run_search(
                 )
     except Timeout as error:
         raise ValueError(f"another process is searching in {home.path}") from error
+    except (StorageInternalError, SQLAlchemyError) as error:
+        cause = error.__cause__ or error
+        why = " ".join(str(getattr(cause, "orig", cause)).split())
+        raise OSError(f"{home.database} cannot be used ({why}); the same command goes on") from error
     finally:
         workers.close()
 
@@ -135,7 +142,7 @@ class _Rounds:
         self._failures = 0  # since this command began
         self._drawn = time.monotonic()
         self._left_over = [trial.number for trial in self._trials(TrialState.RUNNING)]
-        for trial in self._trials(TrialState.PRUNED):
+        for trial in self._trials(TrialState.PRUNED, TrialState.FAIL):
             self._drop_checkpoints(trial.number)  # if a search was killed before it did
 
     @property
@@ -165,9 +172,11 @@ class _Rounds:
         def collect() -> None:
             for future in wait(waiting, _TICK, FIRST_COMPLETED).done:
                 self._end(waiting.pop(future), _outcome(future))
-                bar.update(self._done - bar.n)
+            bar.n = self._done
+            bar.set_postfix_str(self._running(waiting.values()))
 
-        bar = tqdm(total=trials, initial=self._done, unit=" trials", disable=not progress)
+        # No bar in a file: there, lines say when a trial ends.
+        bar = tqdm(total=trials, initial=self._done, unit=" trials", disable=None if progress else True)
         with bar, ThreadPoolExecutor(max(self.workers.at_once, 1)) as threads, soft_interrupt() as check:
             try:
                 fill()
@@ -188,6 +197,14 @@ class _Rounds:
         """Writes what came of the search so far."""
         self._drawn = time.monotonic()
         return write_standing(self.search, self.home, self.study)
+
+    def _running(self, numbers: Iterable[int]) -> str:
+        """How far the trials are that are under way: their numbers, with epochs."""
+        epochs = self.search.recipe.run.epochs
+        return ", ".join(
+            f"trial {number}: {read_progress(self.home.trial(number)).epochs}/{epochs} epochs"
+            for number in sorted(numbers)
+        )
 
     @property
     def _done(self) -> int:
@@ -259,7 +276,7 @@ class _Rounds:
             Trial(self.study, self._trial(number)._trial_id).set_user_attr(_ERROR, error)
         self.study.tell(number, value, state=state)
         self.study.set_user_attr(_SECONDS, self.seconds)
-        if state == TrialState.PRUNED:
+        if state != TrialState.COMPLETE:
             self._drop_checkpoints(number)
         give_back_lock(home.path)
         self.say(self._line(number, error))
@@ -277,7 +294,7 @@ class _Rounds:
         return deaths.count(kept) < _DEATHS
 
     def _drop_checkpoints(self, number: int) -> None:
-        """Removes what a trial could go on from, which is large: one that was pruned never does."""
+        """Removes what a trial could go on from, which is large, and of no use to one that never does."""
         home = RunFolder(self.home.trial(number))
         for path in (home.checkpoint, *home.older_checkpoints):
             path.unlink(missing_ok=True)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from torchrl_her_recipes import Callback, EarlyStopping
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.studies import jobs
 from torchrl_her_recipes.studies.jobs import (
@@ -125,3 +128,19 @@ def test_a_job_goes_on_in_a_folder_that_has_travelled(job: Job, tmp_path: Path) 
     unpack(pack(job.folder, checkpoints=True), there.folder)
     assert run_job(there) == Outcome()
     assert read_progress(there.folder).epochs == 2
+
+
+@contextmanager
+def _stop_after(*, frames: int, told: str) -> Iterator[list[Callback]]:
+    """What surrounds the run of the test below."""
+    yield [EarlyStopping("frames", at_least=frames)]
+    Path(told).touch()
+
+
+def test_what_surrounds_a_run_travels_with_its_job_and_gives_it_callbacks(job: Job) -> None:
+    told = job.folder.with_name("told")
+    own = replace(job, around=f"{__name__}:_stop_after", options={"frames": 1_600, "told": str(told)})
+    assert Job.from_plain(own.to_plain()) == own
+    assert run_job(own) == Outcome()
+    assert read_progress(job.folder).epochs == 1  # of two
+    assert told.exists()

@@ -49,14 +49,15 @@ def small_search(space: dict[str, Any] | None = None, *, sampler: Any = "tpe", *
 
 
 def go_on(
-    search: Search, folder: Path, trials: int, *, pictures: bool = False, **options: Any
+    search: Search, folder: Path, trials: int | None, *, pictures: bool = False, **options: Any
 ) -> SearchResult:
     """Searches in this process, without the pictures of runs, and perhaps without its own."""
     with no_pictures(), pytest.MonkeyPatch.context() as patch:
         if not pictures:
             for name in ("plot_history", "plot_importance", "plot_options"):
                 patch.setattr(results, name, mock.Mock())
-        return run_search(search, folder, trials=trials, workers=Here(), progress=False, **options)
+        workers = options.pop("workers", None) or Here()
+        return run_search(search, folder, trials=trials, workers=workers, progress=False, **options)
 
 
 def is_killed(search: Search, folder: Path, trials: int, *, after: float) -> bool:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import csv
+import os
+import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +16,11 @@ from PIL import Image
 
 from torchrl_her_recipes import load_preset, make_recipe, run_score
 from torchrl_her_recipes.studies.jobs import Job, Outcome
-from torchrl_her_recipes.tuning import search as searching
 
 from ..studies.here import Here
 from .searches import RECIPE, go_on, is_killed, small_search
 
-pytest.importorskip("optuna", reason="needs the extra tune")
+optuna = pytest.importorskip("optuna", reason="needs the extra tune")
 
 
 def table(folder: Path) -> list[dict[str, str]]:
@@ -124,28 +126,72 @@ class Actors(Here):
 def test_a_trial_whose_process_dies_is_taken_up_again_and_one_that_fails_is_not(tmp_path: Path) -> None:
     died, failed = Outcome(error="its process was ended by SIGKILL", died=True), Outcome(error="why")
     workers = Actors(trial_0000=[died, died], trial_0001=failed, trial_0002=[died, died, died])
-    result = searching.run_search(small_search(), tmp_path, trials=4, workers=workers, progress=False)
-    assert [trial.state for trial in result.standing.trials] == ["complete", "failed", "failed", "complete"]
+    result = go_on(small_search(), tmp_path, 3, workers=workers)
+    assert [trial.state for trial in result.standing.trials] == ["complete", "failed", "failed"]
     assert result.failed == {1: "why", 2: "its process was ended by SIGKILL"}
     assert workers.began.count("trial_0000") == 3
-    again = go_on(small_search(), tmp_path, 4)
+    again = go_on(small_search(), tmp_path, 3)
     assert again.failed == result.failed
+
+
+class Pressed(Here):
+    """Play workers at whose first trial somebody presses Ctrl-C."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stopped = False
+
+    def run(self, job: Job) -> Outcome:
+        if not self.stopped:
+            os.kill(os.getpid(), signal.SIGINT)
+            while not self.stopped:
+                time.sleep(0.01)
+        return Outcome(interrupted=True)
+
+    def stop(self) -> None:
+        self.stopped = True
+
+
+def test_ctrl_c_ends_a_search_that_goes_on_with_the_same_trials(tmp_path: Path) -> None:
+    result = go_on(small_search(), tmp_path, 3, workers=Pressed())
+    assert result.interrupted
+    assert [trial.state for trial in result.standing.trials] == ["running"]
+    (begun,) = result.standing.trials
+    again = go_on(small_search(), tmp_path, 3)
+    assert not again.interrupted
+    assert [trial.state for trial in again.standing.trials] == ["complete"] * 3
+    assert again.standing.trials[0].values == begun.values
+
+
+def test_a_full_disk_ends_a_search_in_one_line_and_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on(small_search(), tmp_path, 1)
+
+    def full(*_arguments: object, **_options: object) -> None:
+        raise optuna.exceptions.StorageInternalError("while writing") from OSError("no space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(optuna.Study, "tell", full)
+        with pytest.raises(OSError, match=r"search.db cannot be used \(no space left on device\); the same"):
+            go_on(small_search(), tmp_path, 2)
+    assert [trial.state for trial in go_on(small_search(), tmp_path, 2).standing.trials] == ["complete"] * 2
 
 
 def test_a_search_that_only_fails_ends(tmp_path: Path) -> None:
     workers = Actors(**{f"trial_{number:04}": Outcome(error="why") for number in range(50)})
-    result = searching.run_search(small_search(), tmp_path, workers=workers, progress=False)
+    result = go_on(small_search(), tmp_path, None, workers=workers)
     assert len(result.failed) == 5
     assert result.best is None
 
 
 def test_no_trial_begins_when_the_time_is_up(tmp_path: Path) -> None:
-    result = searching.run_search(small_search(), tmp_path, minutes=1e-9, workers=Here(), progress=False)
+    result = go_on(small_search(), tmp_path, None, minutes=1e-9)
     assert result.standing.trials == []
     with pytest.raises(ValueError, match="minutes must be above 0, got 0"):
-        searching.run_search(small_search(), tmp_path, minutes=0, workers=Here())
+        go_on(small_search(), tmp_path, None, minutes=0)
     with pytest.raises(ValueError, match="trials must be at least 1, got 0"):
-        searching.run_search(small_search(), tmp_path, trials=0, workers=Here())
+        go_on(small_search(), tmp_path, 0)
 
 
 def test_what_is_no_database_is_named(tmp_path: Path) -> None:
