@@ -6,7 +6,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import build
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.config.imports import permit_task
+from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.best import BestPolicy
 from torchrl_her_recipes.runs.callbacks import Callback, Callbacks, RunView, Stopped
@@ -93,11 +94,12 @@ def run(
         (True, [320, 640])
     """
     home, trainer = None if folder is None else RunFolder(folder), components.trainer()
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), ExitStack() as stack:
         # Losses and policies of TorchRL draw from torch's own generator.
         torch.manual_seed(components.recipe.run.seed)
         if home is not None:
             home.create()
+            stack.enter_context(home.at_work())
             # Before config.yaml: a folder that has one can be resumed.
             _save(components, trainer, home, BestPolicy())
             home.describe(components.recipe)
@@ -137,9 +139,25 @@ def resume(
             options and components are given, or the components differ from those of the run.
     """
     home = RunFolder(folder)
-    recipe = home.recipe()
+    home.recipe()  # before a lock is left in a folder that is none of a run
     if options and components is not None:
         raise ValueError("give resume() options, or components that were made with them, not both")
+    with home.at_work():
+        return _resume(
+            home, components, options or {}, callbacks, progress=progress, allow_import=allow_import
+        )
+
+
+def _resume(
+    home: RunFolder,
+    components: Components | None,
+    options: Mapping[str, Any],
+    callbacks: Sequence[Callback],
+    *,
+    progress: bool,
+    allow_import: bool,
+) -> RunResult:
+    recipe = home.recipe()
     state = _newest_state(home, keep=recipe.run.keep_checkpoints)
     if allow_import:
         permit_task(recipe.task.name)
@@ -150,11 +168,12 @@ def resume(
     components = components or build(wanted)
     trainer = components.trainer()
     with torch.random.fork_rng(devices=[]):
-        load_run_state(components, trainer, state)
+        with naming(home.checkpoint, "is not of this run"):
+            load_run_state(components, trainer, state)
         if options:
             if trainer.epochs > components.recipe.run.epochs:
                 raise ValueError(
-                    f"epochs must be at least {trainer.epochs}, as many as the run in {folder} has done, "
+                    f"epochs must be at least {trainer.epochs}, as many as the run in {home.path} has done, "
                     f"got {components.recipe.run.epochs}"
                 )
             home.describe(components.recipe)
