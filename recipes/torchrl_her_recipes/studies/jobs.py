@@ -123,7 +123,7 @@ def run_job(job: Job) -> Outcome:
     except KeyboardInterrupt:
         return Outcome(interrupted=True)
     except Exception as error:
-        if job.folder.is_dir():
+        with suppress(OSError):  # there may be no folder, or no room
             story.write_text(traceback.format_exc())
         return Outcome(error=" ".join(f"{type(error).__name__}: {error}".split()))
 

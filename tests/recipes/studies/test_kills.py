@@ -1,16 +1,20 @@
-"""A study whose processes are killed at any moment ends bit for bit as one that was left alone."""
+"""A study that is killed, or has no room, at any moment ends bit for bit as one that was left alone."""
 
 from __future__ import annotations
 
 import random
+import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from filelock import FileLock
 
+from torchrl_her import load_checkpoint
 from torchrl_her_recipes.config.study import Study
 
 from ..runs.killed import server
@@ -85,3 +89,52 @@ def test_a_study_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_n
     count: int, alone: tuple[Path, float], tmp_path: Path
 ) -> None:
     assert len(list(kills(count, alone, tmp_path, random.Random(0)))) == count
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A small disk."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=32m", "tmpfs", str(place)]
+    try:
+        subprocess.run(command, check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"no disk can be mounted here: {error}")
+    yield place
+    subprocess.run(["umount", "--lazy", str(place)], check=True)
+
+
+def fill(disk: Path) -> Path:
+    """Takes up all the room that is left."""
+    path = disk / "ballast"
+    with suppress(OSError), open(path, "wb", buffering=0) as file:
+        while file.write(bytes(4096)):
+            pass
+    with pytest.raises(OSError, match="No space left on device"):
+        (disk / "more").write_bytes(bytes(4096))
+    (disk / "more").unlink()
+    return path
+
+
+@pytest.mark.parametrize("count", [1, pytest.param(10, marks=pytest.mark.full)])
+def test_a_study_whose_disk_is_full_goes_on_when_there_is_room(
+    count: int, alone: tuple[Path, float], disk: Path
+) -> None:
+    whole, seconds = alone
+    draw, said = random.Random(1), []
+    for study in range(count):
+        folder = disk / str(study)
+        attempt = Attempt(STUDY, folder)
+        time.sleep(draw.uniform(0.0, 0.9 * seconds))
+        ballast = fill(disk)
+        if not attempt.wait() and attempt.result is not None:
+            said += attempt.result.failed.values()
+        for path in folder.rglob("checkpoint.pt"):
+            load_checkpoint(path)
+        ballast.unlink()
+        again = Attempt(STUDY, folder)
+        assert again.wait(), again.result
+        assert_same_studies(whole, folder)
+        shutil.rmtree(folder)
+    assert all("No space left on device" in line and len(line.splitlines()) == 1 for line in said), said
