@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import platform
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -195,7 +196,10 @@ def _write_whole(path: Path, text: str) -> None:
     """Writes a file that is never seen in part."""
     part = path.with_name(path.name + ".part")
     try:
-        part.write_text(text, newline="")
+        with open(part, "w", newline="", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())  # or a loss of power may leave an empty file under the name
         part.replace(path)
     except OSError:
         part.unlink(missing_ok=True)  # what there is of it takes up room
