@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_her import load_checkpoint
 from torchrl_her_recipes import Components, Recipe, make_recipe
 from torchrl_her_recipes.runs.interrupt import Interrupted
 
@@ -60,3 +63,11 @@ def assert_same(first: Any, second: Any, *, path: str = "") -> None:
         assert torch.equal(first, second), path
     else:
         assert first == second, path
+
+
+def assert_same_runs(first: Path, second: Path) -> None:
+    """Two folders: all weights, buffers and generators, and the tables but for the time."""
+    for name in ("checkpoint.pt", "policy.pt", "best.pt"):
+        assert_same(load_checkpoint(first / name), load_checkpoint(second / name))
+    tables = [pd.read_csv(folder / "metrics.csv").drop(columns="seconds") for folder in (first, second)]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)

@@ -247,8 +247,8 @@ class Demonstrations:
             rows = TensorDict.from_dict(state["rows"], batch_size=[int(lengths.sum())])
             facts = {name: state[name] for name in ("states", "task", "made_by", "achieved_reward")}
             return cls(rows, lengths, **facts)
-        except (KeyError, RuntimeError, AttributeError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
+        except (LookupError, RuntimeError, AttributeError, TypeError, ValueError, ArithmeticError) as error:
+            reason = " ".join(ascii(str(error))[1:300].split())
             raise ValueError(f"the demonstrations in {path} do not fit together: {reason}") from error
 
 

@@ -6,11 +6,10 @@ from collections.abc import Iterator, Sequence
 from itertools import product
 from typing import Any
 
-import yaml
-
 from torchrl_her_envs.registry import task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.learners import LEARNERS
+from torchrl_her_recipes.config.plain_files import parse_yaml
 from torchrl_her_recipes.config.shipped import preset_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, locate
 
@@ -101,10 +100,9 @@ def parse_value(text: str) -> Any:
     if text == "None":
         return None
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        why = getattr(error, "problem", None) or error
-        raise ValueError(f"{text} cannot be read as a value of YAML: {' '.join(str(why).split())}") from error
+        return parse_yaml(text)
+    except ValueError as error:
+        raise ValueError(f"{text} cannot be read as a value of YAML: {error}") from error
 
 
 def split_sweep(text: str) -> list[str]:

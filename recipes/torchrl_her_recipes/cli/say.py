@@ -35,7 +35,11 @@ def say_line(message: str) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an error."""
+    """The message of an error, without letters that a terminal would act on."""
+    return "".join(letter if letter.isprintable() else "?" for letter in _message(error))
+
+
+def _message(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror is not None:
         return f"cannot use {error.filename}: {error.strerror.lower()}"
     if isinstance(error, MemoryError):

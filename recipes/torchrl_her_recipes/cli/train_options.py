@@ -17,6 +17,7 @@ from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
 from torchrl_her_recipes.config.learners import LEARNERS, options_of
 from torchrl_her_recipes.config.options import default_of
+from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe, check_extending, make_recipe
 from torchrl_her_recipes.config.shipped import load_preset, preset_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, option_names
@@ -103,7 +104,11 @@ def _check_single(name: str, text: str) -> None:
 def _recipe(values: Mapping[str, Any]) -> Recipe:
     own = dict(values)
     preset = own.pop("preset", None)
-    return make_recipe(load_preset(preset) if preset else None, **own)
+    base = load_preset(preset) if preset else None
+    if not str(preset).endswith((".yaml", ".yml")):
+        return make_recipe(base, **own)
+    with naming(Path(str(preset)), "and the options beside it do not work"):
+        return make_recipe(base, **own)
 
 
 def _label(recipe: Recipe) -> str:

@@ -13,7 +13,7 @@ from torchrl_her_envs.registry import check_task, get_task_spec
 from torchrl_her_recipes.config.algorithms import check_goal_sources, check_strategy, get_algorithm
 from torchrl_her_recipes.config.loggers import check_loggers
 from torchrl_her_recipes.config.options import check_options, option
-from torchrl_her_recipes.config.values import read_yaml
+from torchrl_her_recipes.config.plain_files import read_yaml
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_her_recipes.config.options import what_there_is
-from torchrl_her_recipes.config.shortcuts import merge
-from torchrl_her_recipes.config.values import read_mapping
+from torchrl_her_recipes.config.plain_files import naming, read_mapping, shown
+from torchrl_her_recipes.config.shortcuts import merge, place
 
 CONF = Path(__file__).parent.parent / "conf"
 TRAINED = Path(__file__).parent.parent / "trained"
@@ -38,6 +38,8 @@ def _load(name: str, above: tuple[Path, ...]) -> dict[str, Any]:
         raise ValueError(f"the preset {name!r} begins with itself")
     values = read_mapping(path)
     first = values.pop("preset", None)
+    with naming(path):
+        place(values)  # names that there are not
     return values if first is None else merge(_load(first, (*above, path)), values)
 
 
@@ -49,8 +51,8 @@ def preset_summary(name: str) -> str:
 
 def _path(name: str) -> Path:
     path = Path(name) if str(name).endswith((".yaml", ".yml")) else CONF / "preset" / f"{name}.yaml"
-    if not path.is_file():
-        raise ValueError(f"there is no preset {name!r}{what_there_is(name, preset_names(), 'presets')}")
+    if "\0" in str(name) or not path.is_file():
+        raise ValueError(f"there is no preset {shown(name)}{what_there_is(name, preset_names(), 'presets')}")
     return path
 
 

@@ -13,17 +13,17 @@ from typing import Any, Literal, get_args
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.learners import AUTO
 from torchrl_her_recipes.config.options import what_there_is
+from torchrl_her_recipes.config.plain_files import read_yaml
 from torchrl_her_recipes.config.recipe import Recipe, compose
 from torchrl_her_recipes.config.shipped import CONF
 from torchrl_her_recipes.config.shortcuts import locate, merge
-from torchrl_her_recipes.config.values import as_kind, read_yaml
+from torchrl_her_recipes.config.values import as_kind
 from torchrl_her_recipes.config.without_effect import without_effect
 
 Kind = Literal["float", "log_float", "int", "log_int", "choice"]
 
 _KINDS = get_args(Kind)
 _SPACES = CONF / "space"
-_LARGEST = 65_536  # bytes of a file
 _MOST = 100  # values of a choice
 # Trials must be of the same length and start, or they could not be compared; files are the search's own.
 _SAME_FOR_ALL = ("task", "seed", "num_runs", "epochs", "epoch_frames", "checkpoint_interval", "keep_buffer")
@@ -263,13 +263,7 @@ def load_space(name: str) -> Space:
     path = Path(name) if name.endswith((".yaml", ".yml")) else _SPACES / f"{name}.yaml"
     if not path.is_file():
         raise ValueError(f"there is no space {name!r}{what_there_is(name, space_names(), 'spaces')}")
-    if path.stat().st_size > _LARGEST:
-        raise ValueError(f"{path} cannot be read: a space has at most {_LARGEST:,} bytes")
-    try:
-        values = read_yaml(path)
-    except RecursionError:
-        raise ValueError(f"{path} cannot be read: its brackets are nested too deeply") from None
-    return make_space(str(path) if path.parent != _SPACES else name, values)
+    return make_space(str(path) if path.parent != _SPACES else name, read_yaml(path))
 
 
 def make_space(name: str, values: Any) -> Space:

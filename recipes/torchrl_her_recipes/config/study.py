@@ -11,10 +11,10 @@ from typing import Any
 
 from torchrl_her_recipes.config.metrics import metric_names
 from torchrl_her_recipes.config.options import what_there_is
+from torchrl_her_recipes.config.plain_files import naming, read_mapping
 from torchrl_her_recipes.config.recipe import Recipe, compose
 from torchrl_her_recipes.config.shipped import CONF, load_preset
 from torchrl_her_recipes.config.shortcuts import locate, merge, place
-from torchrl_her_recipes.config.values import read_mapping
 
 _STUDIES = CONF / "study"
 _LENGTHS = ("num_runs", "epochs", "epoch_frames")
@@ -175,7 +175,25 @@ def load_study(
     known = [field.name for field in fields(Study) if field.name != "name"]
     if unknown := [key for key in values if key not in known]:
         raise ValueError(f"{path}: a study has no {', '.join(unknown)}; it has preset, {', '.join(known)}")
+    with naming(path):
+        study = _shortened(path, values, preset, seeds=seeds, frames=frames, quick=quick)
+        list(study.cells())  # whether all of its recipes can work
+        return study
+
+
+def _shortened(
+    path: Path,
+    values: Mapping[str, Any],
+    preset: str | None,
+    *,
+    seeds: int | None,
+    frames: int | None,
+    quick: bool,
+) -> Study:
+    """The study that a file describes, at the size that is asked for."""
     study = Study(name=path.stem, **values)
+    if not study.name.strip("."):
+        raise ValueError("a study is called as its file, which needs a name before the suffix")
     recipe = merge(load_preset(preset) if preset else {}, study.recipe)
     asked = merge(_QUICK if quick else {}, {} if seeds is None else {"num_runs": seeds})
 

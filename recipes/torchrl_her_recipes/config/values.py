@@ -1,40 +1,11 @@
-"""Plain values: reading YAML files, and turning values into the types of options."""
+"""Plain values: turning them into the types of options."""
 
 from __future__ import annotations
 
 from contextlib import suppress
 from importlib import import_module
 from numbers import Integral, Real
-from pathlib import Path
 from typing import Any
-
-import yaml
-
-
-def read_yaml(path: Path) -> Any:
-    """The content of a YAML file.
-
-    Raises:
-        ValueError: it is not YAML.
-        OSError: it cannot be read.
-    """
-    try:
-        return yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-
-
-def read_mapping(path: Path) -> dict[str, Any]:
-    """The names and values that a YAML file holds.
-
-    Raises:
-        ValueError: it is not YAML, or holds something else.
-        OSError: it cannot be read.
-    """
-    values = read_yaml(path)
-    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
-        raise ValueError(f"{path} cannot be read: it must hold names and values, got {values!r}")
-    return values
 
 
 def as_kind(name: str, value: object, kind: type) -> Any:

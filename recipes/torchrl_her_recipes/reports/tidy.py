@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import csv
 import gzip
-import json
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import yaml
 
+from torchrl_her_recipes.config.plain_files import LARGEST_TABLE, naming, read_json, read_mapping, reason
 from torchrl_her_recipes.config.study import Study
-from torchrl_her_recipes.config.values import read_mapping
 from torchrl_her_recipes.reports.results import Combination, read_combinations
+from torchrl_her_recipes.runs.arrays import read_arrays
 from torchrl_her_recipes.runs.goal_map import GoalMap
 
 _ABOUT, _RUNS, _GOALS = "about.yaml", "runs.csv", "goals.npz"
+_DAMAGE = (AttributeError, EOFError, LookupError, OSError, TypeError, ValueError, csv.Error, zlib.error)
 _LARGE = 1_000_000  # bytes, from which on a table is compressed
 _KEYS = ("seed", "epoch", "frames")  # of a row, beside its combination
 _KEPT = ("task", "algorithm", "options", "done", "epochs", "planned", "seconds", "differs")
@@ -189,10 +190,13 @@ def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
     path, packed = folder / _RUNS, folder / f"{_RUNS}.gz"
     if not path.is_file() and not packed.is_file():
         raise ValueError(f"{folder} has no {_RUNS}")
-    read = path.read_bytes if path.is_file() else lambda: gzip.decompress(packed.read_bytes())
     tables: dict[str, list[dict[str, float]]] = {}
     try:
-        lines = csv.DictReader(read().decode().splitlines())
+        with open(path, "rb") if path.is_file() else gzip.open(packed) as file:
+            text = file.read(LARGEST_TABLE + 1)
+        if len(text) > LARGEST_TABLE:
+            raise ValueError(f"it has more than {LARGEST_TABLE:,} bytes")
+        lines = csv.DictReader(text.decode().splitlines())
         names = lines.fieldnames or []
         if not {"label", *_KEYS} <= set(names):
             raise ValueError(f"its columns are {', '.join(names)}")
@@ -201,8 +205,8 @@ def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
             row = {name: _parse(line[name]) for name in names[numbers:] if line[name] != ""}
             tables.setdefault(line["label"], []).append(row)
         return {label: _count(rows) for label, rows in tables.items()}
-    except (AttributeError, EOFError, KeyError, OSError, TypeError, ValueError) as error:
-        raise ValueError(f"the table of runs in {folder} is damaged: {error}") from error
+    except _DAMAGE as error:
+        raise ValueError(f"the table of runs in {folder} is damaged: {reason(error)}") from error
 
 
 def _parse(text: str) -> float:
@@ -233,12 +237,11 @@ def _write_goals(cells: Sequence[Combination], path: Path) -> None:
 def _read_goals(path: Path) -> dict[str, GoalMap]:
     if not path.is_file():
         return {}
-    try:
-        with open(path, "rb") as file, np.load(file) as arrays:
-            labels = [name.removesuffix(".counts") for name in arrays.files if name.endswith(".counts")]
-            return {label: GoalMap(arrays[f"{label}.counts"], arrays[f"{label}.target"]) for label in labels}
-    except (BadZipFile, EOFError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+    arrays = read_arrays(path)
+    labels = [name.removesuffix(".counts") for name in arrays if name.endswith(".counts")]
+    return {
+        label: GoalMap.of(path, arrays[f"{label}.counts"], arrays.get(f"{label}.target")) for label in labels
+    }
 
 
 def _origin(folders: Sequence[Path]) -> dict[str, Any]:
@@ -247,8 +250,9 @@ def _origin(folders: Sequence[Path]) -> dict[str, Any]:
     versions: dict[str, set[str]] = {}
     for path in (home / "run.json" for home in homes):
         if path.is_file():
-            for name, version in json.loads(path.read_text()).get("versions", {}).items():
-                versions.setdefault(name, set()).add(version)
+            with naming(path):
+                for name, version in read_json(path).get("versions", {}).items():
+                    versions.setdefault(name, set()).add(str(version))
     times = [path.stat().st_mtime for home in homes if (path := home / "metrics.csv").is_file()]
     return {
         "date": datetime.fromtimestamp(max(times), UTC).date().isoformat(),

@@ -5,16 +5,20 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
 import yaml
+from filelock import FileLock, Timeout
 
+from torchrl_her_recipes.config.plain_files import naming, read_json, read_mapping, read_table
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.values import read_mapping
 
+_COUNTED = ("run", "seed", "epoch", "frames")  # columns of the table
 _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict", "gymnasium", "pymunk", "numpy")
 
 
@@ -53,6 +57,28 @@ class RunFolder:
         policy_in_it = path in (home.policy, home.best) and path.is_file() and home.config.is_file()
         return home if path.is_dir() or policy_in_it else None
 
+    @contextmanager
+    def at_work(self, *, wait: float = 0.0) -> Iterator[None]:
+        """Keeps other processes from training into the folder, which must exist.
+
+        The end of a process ends this, however it comes. The same process may do so more than once.
+
+        Args:
+            wait: seconds for another process to end: one that nobody looks after any more saves what it has.
+
+        Raises:
+            ValueError: another process is at work in it.
+        """
+        lock = FileLock(self.path / ".lock", is_singleton=True)
+        try:
+            lock.acquire(timeout=wait)
+        except Timeout:
+            raise ValueError(f"another process is training in {self.path}") from None
+        try:
+            yield
+        finally:
+            lock.release()
+
     def create(self) -> None:
         """Makes the folder.
 
@@ -84,24 +110,29 @@ class RunFolder:
             epoch: of the evaluation.
             success: in it, the median of the runs.
         """
-        about = json.loads(self.about.read_text()) | {"best": {"epoch": epoch, "success": success}}
+        about = read_json(self.about) | {"best": {"epoch": epoch, "success": success}}
         _write_whole(self.about, json.dumps(about, indent=2) + "\n")
 
     def recipe(self) -> Recipe:
         """The recipe of the run.
 
         Raises:
-            ValueError: this is no folder of a run, or its configuration cannot be read.
+            ValueError: this is no folder of a run, its configuration cannot be read, or a link in it leads
+                out of it, so that what is written would go elsewhere.
         """
         if not self.config.is_file():
             inside = sorted(config.parent.name for config in self.path.glob("*/config.yaml"))
             hint = f"; choose one of {', '.join(inside)} in it" if inside else ""
             raise ValueError(f"{self.path} is no folder of a run: it has no config.yaml{hint}")
+        home = self.path.resolve()
+        for path in self.path.rglob("*"):
+            if path.is_symlink() and not path.resolve().is_relative_to(home):
+                raise ValueError(
+                    f"{path} is a link that leads out of the run's folder: put there what it is of"
+                )
         values = read_mapping(self.config)
-        try:
+        with naming(self.config):
             return Recipe.from_dict(values)
-        except ValueError as error:
-            raise ValueError(f"{self.config} cannot be read: {error}") from error
 
     @property
     def is_done(self) -> bool:
@@ -143,23 +174,18 @@ class RunFolder:
         """
         if not self.metrics.exists():
             return []
-        with open(self.metrics, newline="") as file:
-            try:
-                return [{name: _number(text) for name, text in row.items()} for row in csv.DictReader(file)]
-            except (AttributeError, TypeError, ValueError) as error:  # a line is cut short, or no numbers
-                raise ValueError(f"{self.metrics} is damaged: a line is no row of the table") from error
+        return read_table(self.metrics, counts=_COUNTED)
 
 
 def _write_whole(path: Path, text: str) -> None:
     """Writes a file that is never seen in part."""
     part = path.with_name(path.name + ".part")
     try:
-        part.write_text(text, newline="")
+        with open(part, "w", newline="", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())  # or a loss of power may leave an empty file under the name
         part.replace(path)
     except OSError:
         part.unlink(missing_ok=True)  # what there is of it takes up room
         raise
-
-
-def _number(text: str) -> float:
-    return int(text) if text.isdigit() else float(text)

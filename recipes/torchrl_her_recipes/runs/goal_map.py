@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_her_recipes.components.goal_space import histograms
+from torchrl_her_recipes.runs.arrays import read_arrays
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,22 @@ class GoalMap:
         """
         if not path.is_file():
             raise ValueError(f"{path.parent} has no {path.name}: the run has written no virtual goals")
-        try:
-            with open(path, "rb") as file, np.load(file) as arrays:
-                return cls(arrays["counts"], arrays["target"])
-        except (BadZipFile, EOFError, KeyError, ValueError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
+        arrays = read_arrays(path)
+        return cls.of(path, arrays.get("counts"), arrays.get("target"))
+
+    @classmethod
+    def of(cls, path: Path, counts: np.ndarray | None, target: np.ndarray | None) -> GoalMap:
+        """One of arrays that a file holds.
+
+        Raises:
+            ValueError: there are none, or they are not those of a map; the message names the file.
+        """
+        if counts is None or target is None or counts.ndim < 2 or counts.shape[1:] != target.shape:
+            got = [None if own is None else list(own.shape) for own in (counts, target)]
+            raise ValueError(
+                f"{path} is damaged: it must hold counts of the shape [runs, *target], got {got}"
+            )
+        return cls(counts, target)
 
 
 def goal_map(buffer: TensorDictReplayBuffer, target: torch.Tensor | None) -> GoalMap | None:

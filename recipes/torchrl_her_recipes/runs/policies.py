@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_her.trainers.checkpoint import load_checkpoint
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.learners import AUTO
+from torchrl_her_recipes.config.plain_files import reason
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.shipped import TRAINED, policy_names
 from torchrl_her_recipes.runs.exported.card import KEYS, PolicyCard
@@ -185,7 +186,7 @@ def _named(path: Path, make: Callable[..., _Made], value: object) -> _Made:
     try:
         return make(value)
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise ValueError(f"{path} is no exported policy: {' '.join(str(error).split())}") from error
+        raise ValueError(f"{path} is no exported policy: {reason(error)}") from error
 
 
 def _policy_of(state: dict[str, Any]) -> TrainedPolicy:

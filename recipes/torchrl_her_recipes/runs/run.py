@@ -20,6 +20,7 @@ from torchrl_her_recipes.components.assembly import build
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.loggers import check_installed
+from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.best import BestPolicy
 from torchrl_her_recipes.runs.callbacks import Callback, Callbacks, RunView, Stopped
@@ -98,11 +99,12 @@ def run(
     home, trainer = None if folder is None else RunFolder(folder), components.trainer()
     if home is not None:
         check_installed(components.recipe.run.log)
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), ExitStack() as stack:
         # Losses and policies of TorchRL draw from torch's own generator.
         torch.manual_seed(components.recipe.run.seed)
         if home is not None:
             home.create()
+            stack.enter_context(home.at_work())
             # Before config.yaml: a folder that has one can be resumed.
             _save(components, trainer, home, BestPolicy())
             home.describe(components.recipe)
@@ -142,9 +144,25 @@ def resume(
             options and components are given, or the components differ from those of the run.
     """
     home = RunFolder(folder)
-    recipe = home.recipe()
+    home.recipe()  # before a lock is left in a folder that is none of a run
     if options and components is not None:
         raise ValueError("give resume() options, or components that were made with them, not both")
+    with home.at_work():
+        return _resume(
+            home, components, options or {}, callbacks, progress=progress, allow_import=allow_import
+        )
+
+
+def _resume(
+    home: RunFolder,
+    components: Components | None,
+    options: Mapping[str, Any],
+    callbacks: Sequence[Callback],
+    *,
+    progress: bool,
+    allow_import: bool,
+) -> RunResult:
+    recipe = home.recipe()
     state = _newest_state(home, keep=recipe.run.keep_checkpoints)
     if allow_import:
         permit_task(recipe.task.name)
@@ -156,11 +174,12 @@ def resume(
     components = components or build(wanted)
     trainer = components.trainer()
     with torch.random.fork_rng(devices=[]):
-        load_run_state(components, trainer, state)
+        with naming(home.checkpoint, "is not of this run"):
+            load_run_state(components, trainer, state)
         if options:
             if trainer.epochs > components.recipe.run.epochs:
                 raise ValueError(
-                    f"epochs must be at least {trainer.epochs}, as many as the run in {folder} has done, "
+                    f"epochs must be at least {trainer.epochs}, as many as the run in {home.path} has done, "
                     f"got {components.recipe.run.epochs}"
                 )
             home.describe(components.recipe)

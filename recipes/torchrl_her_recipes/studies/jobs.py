@@ -11,12 +11,14 @@ from typing import Any, NamedTuple
 
 from torchrl_her_recipes.components.assembly import build
 from torchrl_her_recipes.config.imports import import_modules, imported_modules, permit_task
+from torchrl_her_recipes.config.plain_files import LARGEST_TABLE, read_text
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.run import RunResult, resume, run
 
 _CHECKPOINTS = "checkpoint*.pt"
+_ORPHAN = 300.0  # seconds that a worker whose study was killed has to save its run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,8 +98,8 @@ def read_progress(folder: Path) -> Progress:
         Progress(epochs=0, seconds=0.0)
     """
     try:
-        lines = RunFolder(folder).metrics.read_text().splitlines()
-    except OSError:  # there is none yet
+        lines = read_text(RunFolder(folder).metrics, largest=LARGEST_TABLE).splitlines()
+    except (OSError, ValueError):  # there is none yet, or it is damaged
         return Progress()
     with suppress(IndexError, ValueError, KeyError):  # of a table that lost its end when the power went
         last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
@@ -125,11 +127,13 @@ def run_job(job: Job) -> Outcome:
     story = job.folder / "error.txt"
     try:
         story.unlink(missing_ok=True)
-        return Outcome(interrupted=_train(job).interrupted)
+        job.folder.mkdir(parents=True, exist_ok=True)
+        with RunFolder(job.folder).at_work(wait=_ORPHAN):
+            return Outcome(interrupted=_train(job).interrupted)
     except KeyboardInterrupt:
         return Outcome(interrupted=True)
     except Exception as error:
-        if job.folder.is_dir():
+        with suppress(OSError):  # there may be no folder, or no room
             story.write_text(traceback.format_exc())
         return Outcome(error=" ".join(f"{type(error).__name__}: {error}".split()))
 
@@ -163,7 +167,7 @@ def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:
         {'config.yaml': b'...'}
     """
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    kept = [path for path in paths if checkpoints or not path.match(_CHECKPOINTS)]
+    kept = [path for path in paths if path.name != ".lock" and (checkpoints or not path.match(_CHECKPOINTS))]
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in kept}
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import yaml
 
+from torchrl_her_recipes.config.plain_files import read_mapping
 from torchrl_her_recipes.config.search import Search
-from torchrl_her_recipes.config.values import read_mapping
 
 
 class SearchFolder:

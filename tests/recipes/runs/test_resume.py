@@ -21,7 +21,7 @@ from torchrl_her_recipes import Callback, Components, Recipe, RunView, build, cl
 from torchrl_her_recipes.runs import state as run_state
 from torchrl_her_recipes.runs.folder import RunFolder
 
-from ..small import assert_same, small
+from ..small import assert_same, assert_same_runs, small
 from .killed import is_killed, no_pictures, server
 
 KILLS = 20
@@ -56,14 +56,6 @@ def press_ctrl_c(components: Components, batch: int) -> Components:
 
     components.collector.next = next_batch  # type: ignore[method-assign]
     return components
-
-
-def assert_same_runs(first: Path, second: Path) -> None:
-    """Two folders: all weights, buffers and generators, and the tables but for the time."""
-    for name in ("checkpoint.pt", "policy.pt", "best.pt"):
-        assert_same(load_checkpoint(first / name), load_checkpoint(second / name))
-    tables = [pd.read_csv(folder / "metrics.csv").drop(columns="seconds") for folder in (first, second)]
-    pd.testing.assert_frame_equal(*tables, check_exact=True)
 
 
 def damage(path: Path) -> None:

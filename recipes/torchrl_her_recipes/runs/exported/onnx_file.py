@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from torchrl_her_recipes.config.plain_files import reason
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.exported.card import KEYS, PolicyCard
 
@@ -93,7 +94,7 @@ def read_onnx(path: str | Path) -> OnnxFile:
     try:
         return check_onnx(model)
     except ValueError as error:
-        raise ValueError(f"{path} {error}") from error
+        raise ValueError(f"{path} {reason(error)}") from error
 
 
 def check_onnx(model: bytes) -> OnnxFile:
@@ -112,6 +113,8 @@ def check_onnx(model: bytes) -> OnnxFile:
     except (DecodeError, ValueError) as error:
         raise ValueError("is damaged, or is no ONNX file") from error
     metadata = {entry.key: entry.value for entry in proto.metadata_props}
+    if not all(isinstance(own, str) for pair in metadata.items() for own in pair):
+        raise ValueError("is damaged: its description is no text")
     if not {CARD, RECIPE, DIGEST} <= set(metadata):
         raise ValueError(
             "is damaged, or is no exported policy: `torchrl-her export RUN --format onnx` writes one"

@@ -1,0 +1,209 @@
+"""Reading files that may come from anybody: text, YAML, JSON and tables, none of which can be a trap.
+
+Nothing of them is executed, they may not be larger than such files are, and whatever is wrong with one is a
+ValueError of one line that names it.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+_LARGEST = 1 << 20  # bytes of a configuration
+LARGEST_TABLE = 1 << 28
+_DEPTH = 30
+_VALUES = 50_000  # in all, with those that are repeated by name
+# What damaged content may lead to, whatever reads it. A RuntimeError is torch's, or a RecursionError.
+_DAMAGE = (ArithmeticError, AttributeError, AssertionError, LookupError, RuntimeError, TypeError, ValueError)
+_SHOWN = 300  # letters of a reason
+
+
+def shown(value: object, most: int = 80) -> str:
+    """A value in a message: in one line, of printable letters, and not endless.
+
+    Example:
+        >>> shown({"a": "\\x1b[2J"}), shown("x" * 100, 10)
+        ("{'a': '\\\\x1b[2J'}", "'xxxxxx...")
+    """
+    text = repr(value)
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def reason(error: BaseException | str) -> str:
+    """The message of an error as the end of a line."""
+    text = "".join(letter if letter.isprintable() else " " for letter in str(error)[: 10 * _SHOWN])
+    text = " ".join(text.split()) or type(error).__name__
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
+
+
+@contextmanager
+def naming(path: Path, what: str = "cannot be read") -> Iterator[None]:
+    """Turns whatever is wrong with the content of a file into a ValueError that names the file.
+
+    Raises:
+        ValueError: something was.
+    """
+    try:
+        yield
+    except _DAMAGE as error:
+        if type(error).__name__ == "OutOfMemoryError":  # a RuntimeError of torch's, and no damage
+            raise
+        said = reason(error) if isinstance(error, ValueError) else f"it is damaged ({type(error).__name__})"
+        raise ValueError(f"{path} {what}: {said}") from error
+
+
+def read_text(path: Path, *, largest: int = _LARGEST) -> str:
+    """The text of a file.
+
+    Raises:
+        ValueError: it has more than ``largest`` bytes, or is no text in UTF-8.
+        OSError: it cannot be read.
+    """
+    with open(path, "rb") as file:
+        data = file.read(largest + 1)
+    if len(data) > largest:
+        raise ValueError(f"{path} cannot be read: it has more than {largest:,} bytes")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} cannot be read: it is no text in UTF-8") from error
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads plain values, as many and as deep as configurations have."""
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self._depth += 1
+        if self._depth > _DEPTH:
+            raise ValueError(f"it is nested more than {_DEPTH} levels deep")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def get_single_node(self) -> Any:
+        node = super().get_single_node()
+        if node is not None:
+            _count(node, {})
+        return node
+
+
+def _count(node: Any, known: dict[int, int]) -> int:
+    """How many values a part of a document has, with each part that is repeated by name (``*name``).
+
+    Raises:
+        ValueError: there are too many, or it holds itself.
+    """
+    place = id(node)
+    if known.get(place) == 0:
+        raise ValueError("it holds itself")
+    if place not in known:
+        known[place] = 0
+        parts = node.value if isinstance(node, yaml.CollectionNode) else []
+        pairs = [each for pair in parts for each in pair] if isinstance(node, yaml.MappingNode) else parts
+        known[place] = 1 + sum(_count(each, known) for each in pairs)
+        if known[place] > _VALUES:
+            raise ValueError(f"it has more than {_VALUES:,} values")
+    return known[place]
+
+
+def parse_yaml(text: str) -> Any:
+    """The plain values that a text spells in YAML.
+
+    Raises:
+        ValueError: it is not YAML, or has too many values for a configuration.
+
+    Example:
+        >>> parse_yaml("{a: [1, b]}")
+        {'a': [1, 'b']}
+        >>> parse_yaml("a: &a [1, *a]")
+        Traceback (most recent call last):
+        ValueError: it holds itself
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise ValueError(reason(error)) from error
+    except _DAMAGE as error:
+        said = reason(error) if isinstance(error, ValueError) else f"no value ({type(error).__name__})"
+        raise ValueError(said) from error
+
+
+def read_yaml(path: Path) -> Any:
+    """The content of a YAML file.
+
+    Raises:
+        ValueError: it is not YAML, or too large for a configuration.
+        OSError: it cannot be read.
+    """
+    text = read_text(path)
+    with naming(path):
+        return parse_yaml(text)
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """The names and values that a YAML file holds.
+
+    Raises:
+        ValueError: it is not YAML, too large, or holds something else.
+        OSError: it cannot be read.
+    """
+    values = read_yaml(path)
+    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
+        raise ValueError(f"{path} cannot be read: it must hold names and values, got {shown(values)}")
+    return values
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The names and values that a JSON file holds.
+
+    Raises:
+        ValueError: it is not JSON, too large, or holds something else.
+        OSError: it cannot be read.
+    """
+    text = read_text(path)
+    with naming(path):
+        values = json.loads(text)
+    if not isinstance(values, dict):
+        raise ValueError(f"{path} cannot be read: it must hold names and values, got {shown(values)}")
+    return values
+
+
+def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, float]]:
+    """The rows of a file of comma-separated numbers, by the names in its first line.
+
+    Args:
+        path: the file.
+
+    Keyword Args:
+        counts: columns that each row must have, of whole numbers of at least 0.
+
+    Raises:
+        ValueError: a line is no row of the table.
+        OSError: it cannot be read.
+    """
+    text = read_text(path, largest=LARGEST_TABLE)
+    try:
+        rows = [
+            {name: _number(each) for name, each in row.items()}
+            for row in csv.DictReader(text.splitlines(), strict=True)
+        ]
+    except (AttributeError, TypeError, ValueError, csv.Error) as error:  # cut short, or no numbers
+        raise ValueError(f"{path} is damaged: a line is no row of the table") from error
+    for name in counts:
+        if odd := [row.get(name) for row in rows if not isinstance(row.get(name), int)]:
+            raise ValueError(f"{path} is damaged: {name} must be a whole number, got {shown(odd[0])}")
+    return rows
+
+
+def _number(text: str) -> float:
+    return int(text) if text.isdigit() else float(text)
