@@ -80,7 +80,7 @@ def draw(width: int, on: Callable[[Sheet], None]) -> Tensor:
 
 
 def draw_bits(sheet: Sheet, bits: list[int], wanted: list[int]) -> None:
-    """Bits, dark where they are set; a green edge where they are as they should be, and a red one where not."""
+    """Bits, dark where they are set; a green edge where they are right, and a red one where not."""
     for box, bit, goal in zip(_cells(len(bits)), bits, wanted, strict=True):
         width = (box[2] - box[0]) / 8
         sheet.box(box, INK if bit else _LIGHT, outline=SUCCESS if bit == goal else FAILURE, line=width)

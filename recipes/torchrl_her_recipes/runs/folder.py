@@ -136,7 +136,8 @@ class RunFolder:
         """The files that there are only while others are written: a killed run leaves them behind."""
         whole = (self.config, self.about, self.metrics, self.checkpoint, self.policy, self.best)
         return [path.with_name(path.name + ".part") for path in whole] + [
-            self.goal_map.with_suffix(".part.npz")
+            self.goal_map.with_suffix(".part.npz"),
+            self.video.with_suffix(".part.gif"),
         ]
 
     @property
@@ -144,19 +145,28 @@ class RunFolder:
         """The checkpoints before the newest one."""
         return sorted(self.path.glob(f"{self.checkpoint.stem}.*{self.checkpoint.suffix}"))
 
-    def rows(self) -> list[dict[str, float]]:
+    def rows(self, *, going_on: bool = False) -> list[dict[str, float]]:
         """The table so far.
+
+        Args:
+            going_on: whether somebody may be writing it: then a line without an end is left out, and with it
+                the other rows of its epoch.
 
         Raises:
             ValueError: it is damaged.
         """
-        if not self.metrics.exists():
+        try:
+            text = self.metrics.read_text()
+        except FileNotFoundError:
             return []
-        with open(self.metrics, newline="") as file:
-            try:
-                return [{name: _number(text) for name, text in row.items()} for row in csv.DictReader(file)]
-            except (AttributeError, TypeError, ValueError) as error:  # a line is cut short, or no numbers
-                raise ValueError(f"{self.metrics} is damaged: a line is no row of the table") from error
+        if going_on:
+            text = text[: text.rfind("\n") + 1]
+        try:
+            table = csv.DictReader(io.StringIO(text))
+            rows = [{name: _number(own) for name, own in row.items()} for row in table]
+        except (AttributeError, TypeError, ValueError) as error:  # a line is cut short, or no numbers
+            raise ValueError(f"{self.metrics} is damaged: a line is no row of the table") from error
+        return _whole_epochs(rows) if going_on else rows
 
     def close(self) -> None:
         """Writes out what is still in memory."""
@@ -174,6 +184,14 @@ def _write_whole(path: Path, text: str) -> None:
     except OSError:
         part.unlink(missing_ok=True)  # what there is of it takes up room
         raise
+
+
+def _whole_epochs(rows: list[dict[str, float]]) -> list[dict[str, float]]:
+    """The rows without those of the last epoch, if it has fewer than the first."""
+    if not rows:
+        return rows
+    first, last = (sum(row["epoch"] == end["epoch"] for row in rows) for end in (rows[0], rows[-1]))
+    return rows if last == first else rows[:-last]
 
 
 def _number(text: str) -> float:
