@@ -23,7 +23,10 @@ from .config.spaces import space_for as space_for
 from .config.study import Study as Study
 from .config.study import load_study as load_study
 from .config.study import study_names as study_names
+from .reports.follow import Followed as Followed
+from .reports.follow import follow as follow
 from .reports.page import write_report as write_report
+from .reports.runs import write_runs_report as write_runs_report
 from .reports.tidy import write_results as write_results
 from .runs.callbacks import Callback as Callback
 from .runs.callbacks import EarlyStopping as EarlyStopping

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import math
+import statistics
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from torchrl_her_recipes.config.study import Study
 from torchrl_her_recipes.reports.bootstrap import REPETITIONS
 from torchrl_her_recipes.reports.compare import ALL_TASKS, Difference, Final, Judged, Verdict, compare, judge
 from torchrl_her_recipes.reports.formatting import MEASURES, SIGNS, show, show_gap, show_interval, show_range
-from torchrl_her_recipes.reports.pictures import draw_pictures
+from torchrl_her_recipes.reports.pictures import Film, draw_pictures
 from torchrl_her_recipes.reports.results import LAST, Combination
 from torchrl_her_recipes.reports.thesis import load_thesis
 from torchrl_her_recipes.reports.tidy import Results, read_study
@@ -45,11 +47,26 @@ def write_report(study: Study, folder: Path, out: Path) -> Path:
     return write_page(read_study(study, folder), out)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Live:
+    """What a page knows that is written again and again.
+
+    Args:
+        version: of the page.
+        every: seconds between two looks for a newer one.
+        going: whether there may be a newer one.
+    """
+
+    version: int
+    every: float
+    going: bool
+
+
 def write_page(results: Results, out: Path) -> Path:
     """Writes a page about results that were read before.
 
     Args:
-        results: of a study.
+        results: of a study, or of runs.
         out: where the page goes, its tables, and its pictures into `figures`.
 
     Returns:
@@ -58,7 +75,29 @@ def write_page(results: Results, out: Path) -> Path:
     Raises:
         OSError: the page cannot be written.
     """
-    cells, thesis = results.cells, load_thesis(results.name)
+    return write_text(describe(results, out), out)
+
+
+def write_text(described: dict[str, Any], out: Path, *, live: Live | None = None) -> Path:
+    """Writes the page itself, which is replaced as a whole.
+
+    Args:
+        described: what is on it, from :func:`describe`.
+        out: where it goes.
+        live: for a page that renews itself; None for one that stays as it is.
+    """
+    page = _template().render(described, live=live, written=f"{datetime.now():%Y-%m-%d %H:%M}")
+    return write_whole(out / "index.html", page)
+
+
+def describe(results: Results, out: Path) -> dict[str, Any]:
+    """All that is on a page, by the names that its template has for it; writes the tables and pictures.
+
+    Args:
+        results: of a study, or of runs.
+        out: where the tables go, and the pictures into `figures`.
+    """
+    cells, thesis = results.cells, load_thesis(results.name if results.kind == "study" else "")
     measures = list(dict.fromkeys([*_AT_THE_END, *(order.measure for order in thesis.orders)]))
     compared = [compare(cells, measure, thesis) for measure in measures]
     finals = [row for rows, _ in compared for row in rows]
@@ -66,21 +105,30 @@ def write_page(results: Results, out: Path) -> Path:
     judged = judge(cells, thesis.orders, differences)
     (out / "figures").mkdir(parents=True, exist_ok=True)
     _write_tables(out, cells, finals, differences, judged)
-    page = _template().render(
-        study=results,
-        thesis=thesis,
-        cells=cells,
-        tasks=list(dict.fromkeys(cell.task for cell in cells)),
-        finals={measure: rows for measure, (rows, _) in zip(measures, compared, strict=True)},
-        differences=[row for row in differences if row.measure == "success"],
-        shares=_shares([row for row in finals if row.measure == "kl"]),
-        orders=_by_order(judged),
-        verdicts=Counter(row.verdict for row in judged),
-        failing=[row for row in judged if row.verdict is not Verdict.APART],
-        pictures=draw_pictures(cells, finals, out / "figures"),
-    )
-    path = out / "index.html"
-    path.write_text(page, encoding="utf-8")
+    return {
+        "study": results,
+        "thesis": thesis,
+        "cells": cells,
+        "tasks": list(dict.fromkeys(cell.task for cell in cells)),
+        "finals": {measure: rows for measure, (rows, _) in zip(measures, compared, strict=True)},
+        "differences": [row for row in differences if row.measure == "success"],
+        "shares": _shares([row for row in finals if row.measure == "kl"]),
+        "orders": _by_order(judged),
+        "verdicts": Counter(row.verdict for row in judged),
+        "failing": [row for row in judged if row.verdict is not Verdict.APART],
+        "pictures": draw_pictures(cells, finals, out / "figures"),
+        "film": None if results.film is None else Film.of(*results.film),
+    }
+
+
+def write_whole(path: Path, text: str) -> Path:
+    """Writes a file that is never seen in part."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
     return path
 
 
@@ -93,7 +141,7 @@ def _template() -> Any:
         lstrip_blocks=True,
     )
     environment.filters |= {"show": show, "show_interval": show_interval, "show_gap": show_gap}
-    environment.filters["duration"] = _duration
+    environment.filters |= {"duration": _duration, "success_now": _success_now}
     environment.globals["show_range"] = show_range
     environment.globals |= {"ALL_TASKS": ALL_TASKS, "LAST": LAST, "MEASURES": MEASURES}
     environment.globals |= {"REPETITIONS": REPETITIONS, "SIGNS": SIGNS}
@@ -102,6 +150,12 @@ def _template() -> Any:
 
 def _duration(seconds: float) -> str:
     return "—" if math.isnan(seconds) else duration(seconds)
+
+
+def _success_now(cell: Combination) -> str:
+    """The success of its last evaluation, the median of its runs."""
+    last = [row["success"] for row in cell.rows if row["epoch"] == cell.epoch]
+    return show(statistics.median(last), "success")
 
 
 def _shares(rows: Sequence[Final]) -> dict[tuple[str, str], tuple[float, float | None]]:

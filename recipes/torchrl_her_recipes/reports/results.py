@@ -87,42 +87,74 @@ class Combination:
         return bool(self.rows) and all(name in row for row in self.rows)
 
 
-def read_combinations(study: Study, folder: Path) -> list[Combination]:
+def read_combinations(study: Study, folder: Path, *, nothing_yet: bool = False) -> list[Combination]:
     """All combinations of a study, with what a folder holds of them.
 
     Args:
         study: what was to be run.
         folder: with a folder of each combination.
+        nothing_yet: whether there may be no run, and no folder.
 
     Raises:
         ValueError: there is no such folder, it has none of the study's runs, or one cannot be read.
     """
-    if not folder.is_dir():
+    if not folder.is_dir() and not nothing_yet:
         raise ValueError(f"there is no folder {folder}; `torchrl-her study {study.name}` makes its runs")
     cells = [
         _read(label, recipe, options, Batches(folder / label))
         for options, (label, recipe) in zip(study.combinations(), study.cells(), strict=True)
     ]
-    if all(cell.missing for cell in cells):
+    if all(cell.missing for cell in cells) and not nothing_yet:
         labels = ", ".join(cell.label for cell in cells)
         raise ValueError(f"{folder} has no run of the study {study.name}; its runs are {labels}")
     return cells
 
 
 def _read(label: str, planned: Recipe, options: Mapping[str, Any], batches: Batches) -> Combination:
-    """The only place of reports that reads a recipe."""
     made = batches.recipe or planned
-    ours, study_s = dict(_flat(asdict(made))), dict(_flat(asdict(planned)))
-    differs = [
-        f"{name}={value} (the study: {study_s.get(name)})"
-        for name, value in ours.items()
-        if value != study_s.get(name)
-    ]
+    differs = [f"{name}={value} (the study: {usual})" for name, value, usual in _differences(made, planned)]
+    return _combination(
+        label, planned, made, batches, options=options, algorithm=curve_label(label, planned), differs=differs
+    )
+
+
+def read_single(label: str, batches: Batches) -> Combination:
+    """A run of no study; what differs are the options that are not the usual ones.
+
+    Args:
+        label: its name.
+        batches: of its seeds; one, as a rule.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    recipes = [home.recipe() for home in batches.homes]
+    made = recipes[0].replace(num_runs=sum(own.run.num_runs for own in recipes))
+    differs = [f"{name}={value}" for name, value, _ in _differences(made, Recipe())]
+    return _combination(label, made, made, batches, options={}, algorithm=label, differs=differs)
+
+
+def _differences(made: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
+    """The options of a recipe that are not those of another one, and their values in both."""
+    ours, theirs = dict(_flat(asdict(made))), dict(_flat(asdict(usual)))
+    return [(name, value, theirs.get(name)) for name, value in ours.items() if value != theirs.get(name)]
+
+
+def _combination(
+    label: str,
+    planned: Recipe,
+    made: Recipe,
+    batches: Batches,
+    *,
+    options: Mapping[str, Any],
+    algorithm: str,
+    differs: Sequence[str],
+) -> Combination:
     rows = batches.rows()
     return Combination(
         label=label,
         task=planned.task.name,
-        algorithm=curve_label(label, planned),
+        algorithm=algorithm,
         options=dict(_flat(options)),
         rows=rows,
         done=batches.is_done,

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -35,11 +35,17 @@ class Results:
         name: of the study.
         summary: one line for people.
         cells: its combinations.
+        kind: what they are: of a ``"study"``, or single ``"runs"``.
+        over: whether nothing more is to come of it.
+        film: the newest film of its policies and what it shows, if there is one.
     """
 
     name: str
     summary: str
     cells: list[Combination]
+    kind: Literal["study", "runs"] = "study"
+    over: bool = True
+    film: tuple[Path, str] | None = None
 
 
 def is_results(folder: Path) -> bool:
@@ -47,18 +53,20 @@ def is_results(folder: Path) -> bool:
     return (folder / _ABOUT).is_file()
 
 
-def read_study(study: Study, folder: Path) -> Results:
+def read_study(study: Study, folder: Path, *, nothing_yet: bool = False) -> Results:
     """What there is of a study, from the folders of its runs or from the files made of them.
 
     Args:
         study: which one.
         folder: with a folder of each combination, or with the files of :func:`write_results`.
+        nothing_yet: whether there may be no run, and no folder.
 
     Raises:
         ValueError: the folder has none of the study's runs, or one cannot be read.
     """
     if not is_results(folder):
-        return Results(name=study.name, summary=study.summary, cells=read_combinations(study, folder))
+        cells = read_combinations(study, folder, nothing_yet=nothing_yet)
+        return Results(name=study.name, summary=study.summary, cells=cells)
     results = read_results(folder)
     if results.name != study.name:
         raise ValueError(f"{folder} holds results of the study {results.name}, not of {study.name}")

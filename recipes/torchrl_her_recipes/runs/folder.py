@@ -158,7 +158,8 @@ class RunFolder:
         """The files that there are only while others are written: a killed run leaves them behind."""
         whole = (self.config, self.about, self.metrics, self.checkpoint, self.policy, self.best)
         return [path.with_name(path.name + ".part") for path in whole] + [
-            self.goal_map.with_suffix(".part.npz")
+            self.goal_map.with_suffix(".part.npz"),
+            self.video.with_suffix(".part.gif"),
         ]
 
     @property
@@ -166,15 +167,21 @@ class RunFolder:
         """The checkpoints before the newest one."""
         return sorted(self.path.glob(f"{self.checkpoint.stem}.*{self.checkpoint.suffix}"))
 
-    def rows(self) -> list[dict[str, float]]:
+    def rows(self, *, going_on: bool = False) -> list[dict[str, float]]:
         """The table so far.
+
+        Args:
+            going_on: whether somebody may be writing it: then a line without an end is left out, and with it
+                the other rows of its epoch.
 
         Raises:
             ValueError: it is damaged.
         """
-        if not self.metrics.exists():
+        try:
+            rows = read_table(self.metrics, counts=_COUNTED, going_on=going_on)
+        except FileNotFoundError:
             return []
-        return read_table(self.metrics, counts=_COUNTED)
+        return _whole_epochs(rows) if going_on else rows
 
 
 def _write_whole(path: Path, text: str) -> None:
@@ -189,3 +196,11 @@ def _write_whole(path: Path, text: str) -> None:
     except OSError:
         part.unlink(missing_ok=True)  # what there is of it takes up room
         raise
+
+
+def _whole_epochs(rows: list[dict[str, float]]) -> list[dict[str, float]]:
+    """The rows without those of the last epoch, if it has fewer than the first."""
+    if not rows:
+        return rows
+    first, last = (sum(row["epoch"] == end["epoch"] for row in rows) for end in (rows[0], rows[-1]))
+    return rows if last == first else rows[:-last]

@@ -130,7 +130,7 @@ def draw_curve(
 ) -> None:
     """One metric over environment steps, on given axes: median, and 33rd to 67th percentile."""
     frames, low, middle, high = band(rows, name)
-    axes.plot(frames, middle, color=color, label=label)
+    axes.plot(frames, middle, color=color, label=label, marker="o" if len(frames) == 1 else None)
     axes.fill_between(frames, low, high, color=color, alpha=0.25, linewidth=0)
 
 

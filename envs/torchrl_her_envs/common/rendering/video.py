@@ -60,7 +60,12 @@ def write_video(frames: Sequence[Tensor], path: str | Path, *, fps: float = 25) 
     if fps <= 0:
         raise ValueError(f"fps must be above 0, got {fps}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    _WRITERS[suffix](frames, path, fps)
+    part = path.with_stem(f"{path.stem}.part")  # so that nobody sees a film of which the end is missing
+    try:
+        _WRITERS[suffix](frames, part, fps)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
     return path
 
 
