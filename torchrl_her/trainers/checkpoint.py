@@ -20,6 +20,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.storages import Storage
 
 from torchrl_her.files.reading import MoreThanDataError, load_tensors
+from torchrl_her.files.writing import written
 from torchrl_her.replay_buffers.runs.buffer import bounds_of_run, runs_of, sizes_of
 from torchrl_her.replay_buffers.runs.storage import Field, PackedStorage, unpack
 from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_state_dict
@@ -78,19 +79,12 @@ def save_checkpoint(state: dict[str, Any], path: str | Path, *, keep: int = 1) -
     """
     _check_plain(state, "the state")
     path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
+    with written(path) as part:
         with open(part, "wb") as file:
             _write(state, file)
         for newer, older in reversed(list(pairwise(_generations(path, keep)))):
             if newer.exists():
                 os.replace(newer, older)
-        os.replace(part, path)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    finally:
-        part.unlink(missing_ok=True)  # missing if all went well; otherwise it would waste a full disk
-    _sync_folder(path.parent)
 
 
 def _check_plain(value: Any, name: str) -> None:
@@ -125,16 +119,6 @@ def _write(state: dict[str, Any], file: BinaryIO) -> None:
 def _generations(path: Path, keep: int) -> list[Path]:
     """The paths of a checkpoint and of those before it, the newest first."""
     return [path, *(path.with_name(f"{path.stem}.{age}{path.suffix}") for age in range(1, keep))]
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes the renaming of files survive a loss of power."""
-    if os.name == "posix":  # elsewhere a folder cannot be opened
-        number = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
 
 
 def load_checkpoint(path: str | Path, *, map_location: torch.device | str = "cpu") -> dict[str, Any]:

@@ -117,8 +117,11 @@ class Recipe:
         return self.replace(**values)
 
     def to_dict(self) -> Nested:
-        """All values, by group and name."""
-        return asdict(self)
+        """All values, by group and name, as a YAML file has them: lists and no tuples."""
+        return {
+            group: {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
+            for group, own in asdict(self).items()
+        }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:

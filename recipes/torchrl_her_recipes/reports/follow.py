@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.config.study import Study
 from torchrl_her_recipes.reports.best_film import film_best
-from torchrl_her_recipes.reports.page import Live, describe, write_text, write_whole
+from torchrl_her_recipes.reports.page import Live, describe, render
 from torchrl_her_recipes.reports.runs import read_runs, read_study_so_far, runs_in, signature
 from torchrl_her_recipes.reports.tidy import Results
 
@@ -110,11 +111,11 @@ def follow(
 
 def _write(described: dict[str, Any], out: Path, live: Live) -> None:
     """Writes the page, and then says that it is there to those who look at an older one."""
-    write_text(described, out, live=live)
+    render(described, out, live=live)
     _tell(out, live.version)
 
 
 def _tell(out: Path, version: int) -> None:
     """Says beside the page which version is the newest, and that somebody still looks."""
     newest = json.dumps({"version": version, "looked": int(time.time())})
-    write_whole(out / "live.js", f"window.torchrlHer({newest});\n")
+    write_text(out / "live.js", f"window.torchrlHer({newest});\n")

@@ -14,6 +14,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.config.study import Study
 from torchrl_her_recipes.reports.bootstrap import REPETITIONS
 from torchrl_her_recipes.reports.compare import ALL_TASKS, Difference, Final, Judged, Verdict, compare, judge
@@ -75,10 +76,10 @@ def write_page(results: Results, out: Path) -> Path:
     Raises:
         OSError: the page cannot be written.
     """
-    return write_text(describe(results, out), out)
+    return render(describe(results, out), out)
 
 
-def write_text(described: dict[str, Any], out: Path, *, live: Live | None = None) -> Path:
+def render(described: dict[str, Any], out: Path, *, live: Live | None = None) -> Path:
     """Writes the page itself, which is replaced as a whole.
 
     Args:
@@ -87,7 +88,9 @@ def write_text(described: dict[str, Any], out: Path, *, live: Live | None = None
         live: for a page that renews itself; None for one that stays as it is.
     """
     page = _template().render(described, live=live, written=f"{datetime.now():%Y-%m-%d %H:%M}")
-    return write_whole(out / "index.html", page)
+    path = out / "index.html"
+    write_text(path, page)
+    return path
 
 
 def describe(results: Results, out: Path) -> dict[str, Any]:
@@ -119,17 +122,6 @@ def describe(results: Results, out: Path) -> dict[str, Any]:
         "pictures": draw_pictures(cells, finals, out / "figures"),
         "film": None if results.film is None else Film.of(*results.film),
     }
-
-
-def write_whole(path: Path, text: str) -> Path:
-    """Writes a file that is never seen in part."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-    return path
 
 
 def _template() -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import platform
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from pathlib import Path
 import yaml
 from filelock import FileLock, Timeout
 
+from torchrl_her.files.writing import part_of, write_text
 from torchrl_her_recipes.config.plain_files import naming, read_json, read_mapping, read_table
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -100,8 +100,8 @@ class RunFolder:
             "platform": platform.platform(),
             "versions": {name: version(name) for name in _PACKAGES},
         }
-        _write_whole(self.about, json.dumps(about, indent=2) + "\n")
-        _write_whole(self.config, yaml.safe_dump(recipe.to_dict(), sort_keys=False))
+        write_text(self.about, json.dumps(about, indent=2) + "\n")
+        write_text(self.config, yaml.safe_dump(recipe.to_dict(), sort_keys=False))
 
     def describe_best(self, epoch: int, success: float) -> None:
         """Adds to what :meth:`describe` wrote which evaluation the best policy is of.
@@ -111,7 +111,7 @@ class RunFolder:
             success: in it, the median of the runs.
         """
         about = read_json(self.about) | {"best": {"epoch": epoch, "success": success}}
-        _write_whole(self.about, json.dumps(about, indent=2) + "\n")
+        write_text(self.about, json.dumps(about, indent=2) + "\n")
 
     def recipe(self) -> Recipe:
         """The recipe of the run.
@@ -151,21 +151,25 @@ class RunFolder:
         writer = csv.DictWriter(table, columns, restval="nan")
         writer.writeheader()
         writer.writerows(rows)
-        _write_whole(self.metrics, table.getvalue())
+        write_text(self.metrics, table.getvalue())
 
     @property
     def parts(self) -> list[Path]:
         """The files that there are only while others are written: a killed run leaves them behind."""
-        whole = (self.config, self.about, self.metrics, self.checkpoint, self.policy, self.best)
-        return [path.with_name(path.name + ".part") for path in whole] + [
-            self.goal_map.with_suffix(".part.npz"),
-            self.video.with_suffix(".part.gif"),
-        ]
+        texts = (self.config, self.about, self.metrics)
+        binary = (self.checkpoint, self.policy, self.best, self.curves, self.goals, self.goal_map, self.video)
+        return [part_of(path) for path in (*texts, *binary)]
+
+    @property
+    def checkpoints(self) -> list[Path]:
+        """The checkpoints that there are, the newest first."""
+        newest = [self.checkpoint] if self.checkpoint.exists() else []
+        return newest + self.older_checkpoints
 
     @property
     def older_checkpoints(self) -> list[Path]:
         """The checkpoints before the newest one."""
-        return sorted(self.path.glob(f"{self.checkpoint.stem}.*{self.checkpoint.suffix}"))
+        return sorted(self.path.glob(f"{self.checkpoint.stem}.[0-9]*{self.checkpoint.suffix}"))
 
     def rows(self, *, going_on: bool = False) -> list[dict[str, float]]:
         """The table so far.
@@ -182,20 +186,6 @@ class RunFolder:
         except FileNotFoundError:
             return []
         return _whole_epochs(rows) if going_on else rows
-
-
-def _write_whole(path: Path, text: str) -> None:
-    """Writes a file that is never seen in part."""
-    part = path.with_name(path.name + ".part")
-    try:
-        with open(part, "w", newline="", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())  # or a loss of power may leave an empty file under the name
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)  # what there is of it takes up room
-        raise
 
 
 def _whole_epochs(rows: list[dict[str, float]]) -> list[dict[str, float]]:

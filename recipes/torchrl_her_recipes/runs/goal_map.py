@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torchrl.data import TensorDictReplayBuffer
 
+from torchrl_her.files.writing import written
 from torchrl_her_recipes.components.goal_space import histograms
 from torchrl_her_recipes.runs.arrays import read_arrays
 
@@ -34,9 +35,8 @@ class GoalMap:
 
     def save(self, path: Path) -> None:
         """Writes it as a file of numpy arrays."""
-        part = path.with_suffix(".part.npz")
-        np.savez_compressed(part, counts=self.counts, target=self.target)
-        part.replace(path)  # whole or not at all
+        with written(path) as part:
+            np.savez_compressed(part, counts=self.counts, target=self.target)
 
     @classmethod
     def load(cls, path: Path) -> GoalMap:

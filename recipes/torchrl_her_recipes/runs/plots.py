@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
+from torchrl_her.files.writing import written
 from torchrl_her_envs.common.goal_env import Box, GoalEnv
 from torchrl_her_recipes.config.metrics import AXES, PANELS
 from torchrl_her_recipes.runs.goal_map import GoalMap
@@ -54,7 +55,17 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
         axes.grid(alpha=0.3)
         if limits is not None:
             axes.set_ylim(*limits)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Writes a picture, whole or not at all.
+
+    Raises:
+        OSError: it cannot be written; the one before is untouched.
+    """
+    with written(path) as part:
+        figure.savefig(part, dpi=110)
 
 
 def plot_comparison(
@@ -77,7 +88,7 @@ def plot_comparison(
         if axes is not grid[0] and len(metrics) == 1:
             axes.set_ylabel("")
     grid[0].set_ylabel(f"{grid[0].get_ylabel()} (median, 33rd to 67th percentile)")
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def colors(labels: Sequence[str]) -> dict[str, str]:
@@ -170,7 +181,7 @@ def plot_goals(goals: GoalMap, env: GoalEnv, path: Path, *, title: str = "") -> 
         draw_goals(axes, share, env, limit=limit)
         axes.set_title(name)
     figure.colorbar(panels[0].images[-1], ax=panels, label="share of virtual goals in a cell", extend="max")
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> None:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.runs.plots import COLORS, Rows
+from torchrl_her_recipes.runs.plots import COLORS, Rows, save_figure
 
 _RANDOM = 0.5  # p of the thesis: one of two actions goes forward
 _SOLVED = 0.9  # success of the greedy policy
@@ -120,7 +120,7 @@ def plot_times(runs: Sequence[tuple[Recipe, Rows]], path: Path) -> None:
     )
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def _option(recipe: Recipe, name: str, default: int) -> int:

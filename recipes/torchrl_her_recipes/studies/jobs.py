@@ -87,7 +87,8 @@ class Outcome:
 
 def can_resume(folder: Path) -> bool:
     """Whether a run's folder has a checkpoint to go on from, and says of which run."""
-    return RunFolder(folder).config.exists() and any(folder.glob(_CHECKPOINTS))
+    home = RunFolder(folder)
+    return home.config.exists() and bool(home.checkpoints)
 
 
 def read_progress(folder: Path) -> Progress:

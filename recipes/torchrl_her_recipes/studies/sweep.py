@@ -11,6 +11,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.run import last_success
@@ -74,7 +75,7 @@ def run_sweep(
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(folder / ".lock", timeout=0):
             plan = plan_sweep(runs, folder)
-            (folder / _NOTE).write_text(json.dumps(_plain(runs)))
+            write_text(folder / _NOTE, json.dumps(_plain(runs)))
             outcomes = run_jobs(plan, workers, progress=progress)
     except Timeout as error:
         raise ValueError(f"another process is running a sweep in {folder}") from error

@@ -16,6 +16,7 @@ from torchrl_her_envs.toy.bit_flip import BitFlip
 from torchrl_her_envs.toy.treasure_hunt import TreasureHunt
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.runs.play import load_actor
+from torchrl_her_recipes.runs.plots import save_figure
 from torchrl_her_recipes.runs.toy_values import true_values, values_by_wrong_bits, values_on_the_line
 from torchrl_her_recipes.studies.seed_batches import Batches
 
@@ -44,7 +45,7 @@ def plot_values(runs: Sequence[Batches], path: Path) -> None:
         ]
         _draw(goal_env(make_task_envs(recipe, 1, [0])), axes, actors, recipe.learner.gamma)
         axes.set_title(own.path.name)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 @singledispatch

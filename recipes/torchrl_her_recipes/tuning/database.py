@@ -20,7 +20,7 @@ from optuna.storages import RDBStorage
 from optuna.study import Study
 from sqlalchemy.exc import SQLAlchemyError
 
-from torchrl_her_recipes.tuning.folder import part_of
+from torchrl_her.files.writing import written
 
 _NAME = "search"
 _PATIENCE = 60  # seconds that a process waits for others to write
@@ -35,15 +35,14 @@ def create_database(path: Path, first: dict[str, Any] | None) -> None:
     """
     if path.exists():
         return
-    part = part_of(path)
-    part.unlink(missing_ok=True)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = _storage(part)
-    study = optuna.create_study(storage=storage, study_name=_NAME, direction="maximize")
-    if first is not None:
-        study.enqueue_trial(first)
-    storage.engine.dispose()
-    part.replace(path)
+    with written(path) as part:
+        part.unlink(missing_ok=True)
+        storage = _storage(part)
+        study = optuna.create_study(storage=storage, study_name=_NAME, direction="maximize")
+        if first is not None:
+            study.enqueue_trial(first)
+        storage.engine.dispose()
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import yaml
 
+from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.config.plain_files import read_mapping
 from torchrl_her_recipes.config.search import Search
 
@@ -60,15 +61,3 @@ class SearchFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         if not self.settings.exists():
             write_text(self.settings, yaml.safe_dump(search.to_plain(), sort_keys=False))
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a file that is never seen in part."""
-    part = part_of(path)
-    part.write_text(text, newline="")
-    part.replace(path)
-
-
-def part_of(path: Path) -> Path:
-    """Where a file is written before it takes its place; its ending stays, which says how to write it."""
-    return path.with_name(f".part_{path.name}")

@@ -12,12 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, PercentFormatter, StrMethodFormatter
 
 from torchrl_her_recipes.config.spaces import Entry, Space
-from torchrl_her_recipes.runs.plots import COLORS
-from torchrl_her_recipes.tuning.folder import part_of
+from torchrl_her_recipes.runs.plots import COLORS, save_figure
 from torchrl_her_recipes.tuning.standing import TrialRow
 
 _COLOR, _PALE = COLORS["filtered_her_ibs"], COLORS["her_ibs_sequential"]
-_DPI = 110
 
 
 def plot_history(trials: Sequence[TrialRow], path: Path) -> None:
@@ -38,7 +36,7 @@ def plot_history(trials: Sequence[TrialRow], path: Path) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     _percent(axes)
     axes.legend(fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_importance(importance: Mapping[str, float], path: Path) -> None:
@@ -57,7 +55,7 @@ def plot_importance(importance: Mapping[str, float], path: Path) -> None:
     axes.set(xlim=(0, max(importance.values()) * 1.12 or 1), xlabel="importance (PED-ANOVA)")
     axes.xaxis.set_major_formatter(PercentFormatter(1.0))
     axes.grid(axis="x", alpha=0.3)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_options(trials: Sequence[TrialRow], space: Space, path: Path) -> None:
@@ -87,7 +85,7 @@ def plot_options(trials: Sequence[TrialRow], space: Space, path: Path) -> None:
         axes.set_visible(False)
     for axes in grid[:, 0]:
         axes.set_ylabel("score")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _of(trials: Sequence[TrialRow], state: str) -> list[TrialRow]:
@@ -140,10 +138,3 @@ def _scatter(
 
 def _percent(axes: Axes) -> None:
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-
-
-def _save(figure: Figure, path: Path) -> None:
-    """Writes a picture that is never seen in part."""
-    part = part_of(path)
-    figure.savefig(part, dpi=_DPI)
-    part.replace(path)

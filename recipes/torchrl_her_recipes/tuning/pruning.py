@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from filelock import FileLock
 from optuna.exceptions import OptunaError
 from optuna.pruners import BasePruner, MedianPruner, NopPruner
 from optuna.study import Study
@@ -20,7 +19,6 @@ from torchrl_her_recipes.runs.score import score
 from torchrl_her_recipes.tuning.database import load_study
 
 PRUNED = "pruned"  # attribute of a trial: after which epoch
-_LOCK = ".lock"
 
 
 class HalvingPruner(BasePruner):
@@ -117,26 +115,14 @@ class Reporter(Callback):
 
 
 @contextmanager
-def reporting(
-    *, folder: str, database: str, pruner: str, epochs: int, number: int
-) -> Iterator[list[Callback]]:
+def reporting(*, database: str, pruner: str, epochs: int, number: int) -> Iterator[list[Callback]]:
     """What surrounds the run of a trial where it is done; gives the run's callbacks.
 
-    If a process that was at work on the trial is left over by a search that was killed, it is waited for.
-
     Args:
-        folder: of the trial.
         database: of the search.
         pruner: by its name.
         epochs: of a trial.
         number: of the trial.
     """
-    lock = Path(folder) / _LOCK
-    lock.parent.mkdir(exist_ok=True)
-    with FileLock(lock), load_study(Path(database), pruner=make_pruner(pruner, epochs)) as study:
+    with load_study(Path(database), pruner=make_pruner(pruner, epochs)) as study:
         yield [Reporter(study, number)]
-
-
-def give_back_lock(folder: Path) -> None:
-    """Removes the lock of a trial that nobody is at work on any more."""
-    (folder / _LOCK).unlink(missing_ok=True)

@@ -11,12 +11,13 @@ from dataclasses import fields
 import yaml
 from optuna.study import Study
 
+from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.config.learners import options_of
 from torchrl_her_recipes.config.options import default_of
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.search import Search
 from torchrl_her_recipes.config.shortcuts import GROUPS, Nested
-from torchrl_her_recipes.tuning.folder import SearchFolder, write_text
+from torchrl_her_recipes.tuning.folder import SearchFolder
 from torchrl_her_recipes.tuning.plots import plot_history, plot_importance, plot_options
 from torchrl_her_recipes.tuning.standing import Standing, TrialRow, standing_of
 

@@ -24,7 +24,7 @@ from torchrl_her_recipes.studies.jobs import Job, Outcome, kept_progress, read_p
 from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
 from torchrl_her_recipes.tuning.database import create_database, load_study
 from torchrl_her_recipes.tuning.folder import SearchFolder
-from torchrl_her_recipes.tuning.pruning import PRUNED, give_back_lock, reporting
+from torchrl_her_recipes.tuning.pruning import PRUNED, reporting
 from torchrl_her_recipes.tuning.results import write_standing
 from torchrl_her_recipes.tuning.samplers import make_sampler
 from torchrl_her_recipes.tuning.standing import Standing
@@ -242,7 +242,6 @@ class _Rounds:
             return None
         folder = self.home.trial(number)
         around = {
-            "folder": str(folder),
             "database": str(self.home.database),
             "pruner": self.search.pruner,
             "epochs": recipe.run.epochs,
@@ -278,7 +277,6 @@ class _Rounds:
         self.study.set_user_attr(_SECONDS, self.seconds)
         if state != TrialState.COMPLETE:
             self._drop_checkpoints(number)
-        give_back_lock(home.path)
         self.say(self._line(number, error))
         if time.monotonic() - self._drawn > _DRAW:
             self.write()
@@ -295,8 +293,7 @@ class _Rounds:
 
     def _drop_checkpoints(self, number: int) -> None:
         """Removes what a trial could go on from, which is large, and of no use to one that never does."""
-        home = RunFolder(self.home.trial(number))
-        for path in (home.checkpoint, *home.older_checkpoints):
+        for path in RunFolder(self.home.trial(number)).checkpoints:
             path.unlink(missing_ok=True)
 
     def _line(self, number: int, error: str) -> str:

@@ -90,7 +90,7 @@ def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not
             folder = tmp_path / str(kills)
     assert not is_killed(recipe, folder, after=300.0)
     assert_same_runs(tmp_path / "whole", folder)
-    assert not list(folder.glob("*.part"))
+    assert not list(folder.glob("*.part.*"))
     events = EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
     assert [event.step for event in events.Scalars("success/run_0")] == [480, 960, 1_440, 1_920, 2_400]
@@ -389,7 +389,7 @@ def test_a_run_before_its_first_epoch_can_be_resumed(no_pictures: None, tmp_path
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no disk that is always full")
 def test_a_full_disk_does_not_end_a_run(no_pictures: None, tmp_path: Path) -> None:
-    (tmp_path / "checkpoint.pt.part").symlink_to("/dev/full")
+    (tmp_path / "checkpoint.part.pt").symlink_to("/dev/full")
     said = "no checkpoint after 0 frames, the run goes on: .*No space left on device"
     with pytest.warns(UserWarning, match=said):
         run(build(small(epochs=2)), tmp_path, progress=False)
@@ -399,7 +399,7 @@ def test_a_full_disk_does_not_end_a_run(no_pictures: None, tmp_path: Path) -> No
 def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(
     no_pictures: None, tmp_path: Path
 ) -> None:
-    (tmp_path / "metrics.csv.part").symlink_to("/dev/full")
+    (tmp_path / "metrics.part.csv").symlink_to("/dev/full")
     with pytest.warns(UserWarning, match=r"no table after 800 frames, the run goes on: .*No space left"):
         result = run(build(small(epochs=2, epoch_frames=800)), tmp_path, progress=False)
     assert len(result.rows) == len(RunFolder(tmp_path).rows()) == 2

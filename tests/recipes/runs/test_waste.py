@@ -45,11 +45,11 @@ def age(path: Path) -> None:
 def test_what_is_found_is_what_the_list_says_and_is_removed(
     runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    killed, busy = runs / "unfinished" / "checkpoint.pt.part", runs / "unfinished" / "metrics.csv.part"
+    killed, busy = runs / "unfinished" / "checkpoint.part.pt", runs / "unfinished" / "metrics.part.csv"
     killed.write_bytes(bytes(2_500))
     age(killed)
     busy.touch()
-    stranger = runs / "unfinished" / "film.mp4.part"
+    stranger = runs / "unfinished" / "film.part.mp4"
     stranger.touch()
     age(stranger)
     before = {path: path.read_bytes() for path in runs.rglob("*") if path.is_file()}

@@ -181,7 +181,7 @@ def test_a_failing_write_leaves_the_old_checkpoint(
 def test_a_full_disk_leaves_the_old_checkpoint(tmp_path: Path, numbers: int) -> None:
     path = tmp_path / "checkpoint.pt"
     save_checkpoint({"epoch": 1}, path)
-    (tmp_path / "checkpoint.pt.part").symlink_to("/dev/full")
+    (tmp_path / "checkpoint.part.pt").symlink_to("/dev/full")
     with pytest.raises(OSError, match=r"No space left on device: '.*checkpoint\.pt'"):
         save_checkpoint({"epoch": 2, "weights": torch.zeros(numbers)}, path, keep=2)
     assert load_checkpoint(path) == {"epoch": 1}

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 from jinja2 import Environment, StrictUndefined
 
+from torchrl_her.files.writing import write_text
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.options import default_of
 from torchrl_her_recipes.config.recipe import Recipe
@@ -68,7 +69,7 @@ def write_model_card(path: Path, file: str, card: PolicyCard, recipe: Recipe) ->
         summary=get_task_spec(card.task).summary,
         is_onnx=file.endswith(SUFFIX),
     )
-    path.write_text(text.rstrip() + "\n")
+    write_text(path, text.rstrip() + "\n")
 
 
 def training_command(recipe: Recipe) -> str:

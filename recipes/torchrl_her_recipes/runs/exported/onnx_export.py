@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
+from torchrl_her.files.writing import written
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.exported.card import KEYS, PolicyCard
 from torchrl_her_recipes.runs.exported.network import TensorPolicy
@@ -70,17 +70,13 @@ def write_onnx(
     described[DIGEST] = digest(proto, described[CARD], described[RECIPE])
     for name, text in described.items():
         proto.metadata_props.add(key=name, value=text)
-    part = path.with_name(path.name + ".part")
-    try:
+    with written(path) as part:
         part.write_bytes(proto.SerializeToString())
         try:
-            written = OnnxPolicy(check_onnx(part.read_bytes()))
+            read_again = OnnxPolicy(check_onnx(part.read_bytes()))
         except ValueError as error:
             raise ValueError(f"this policy cannot be written as an ONNX file: the file {error}") from error
-        check_actions(own, written, card, states)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)  # missing if all went well
+        check_actions(own, read_again, card, states)
 
 
 def check_actions(

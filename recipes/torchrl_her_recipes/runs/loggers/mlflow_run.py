@@ -15,6 +15,7 @@ from mlflow.exceptions import MlflowException
 from torchrl.record.loggers import MLFlowLogger
 from torchrl.record.loggers.common import Logger
 
+from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.runs.callbacks import RunView
 
 _EXPERIMENT = "torchrl-her"
@@ -104,7 +105,7 @@ def _own_run(client: MlflowClient, address: str, name: str, home: Path) -> Run:
             return client.get_run(own_id)
     artifacts = None if address else (home / "artifacts").resolve().as_uri()
     own = client.create_run(_experiment(client, artifacts), run_name=name)
-    note.write_text(f"{own.info.run_id} {address}")
+    write_text(note, f"{own.info.run_id} {address}")
     return own
 
 

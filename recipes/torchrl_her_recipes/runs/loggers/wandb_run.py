@@ -12,6 +12,7 @@ from typing import Any
 import wandb
 from torchrl.record.loggers import WandbLogger
 
+from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.runs.callbacks import RunView
 
 _PROJECT = "torchrl-her"
@@ -73,5 +74,5 @@ def remembered(path: Path) -> str:
         return own
     own = uuid.uuid4().hex[:12]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(own)
+    write_text(path, own)
     return own
