@@ -124,15 +124,22 @@ class RunFolder:
             inside = sorted(config.parent.name for config in self.path.glob("*/config.yaml"))
             hint = f"; choose one of {', '.join(inside)} in it" if inside else ""
             raise ValueError(f"{self.path} is no folder of a run: it has no config.yaml{hint}")
+        self._check_links()
+        values = read_mapping(self.config)
+        with naming(self.config):
+            return Recipe.from_dict(values)
+
+    def _check_links(self) -> None:
+        """Raises a ValueError if something would be written through a link to a place elsewhere."""
         home = self.path.resolve()
         for path in self.path.rglob("*"):
+            top, *below = path.relative_to(self.path).parts
+            if top == "wandb" and below and not below[0].startswith("run_id"):
+                continue  # wandb's own links to logs, which it replaces and never writes through
             if path.is_symlink() and not path.resolve().is_relative_to(home):
                 raise ValueError(
                     f"{path} is a link that leads out of the run's folder: put there what it is of"
                 )
-        values = read_mapping(self.config)
-        with naming(self.config):
-            return Recipe.from_dict(values)
 
     @property
     def is_done(self) -> bool:

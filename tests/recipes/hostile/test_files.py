@@ -269,7 +269,7 @@ def test_a_study_has_no_folder_outside_its_own(value: str, tmp_path: Path) -> No
         list(load_study(str(path)).cells())
 
 
-@pytest.mark.parametrize("name", ["policy.gif", "checkpoint.part.pt", "tensorboard"])
+@pytest.mark.parametrize("name", ["policy.gif", "checkpoint.part.pt", "tensorboard", "wandb"])
 @pytest.mark.parametrize("command", [("train", "--resume"), ("play",), ("export",)], ids=" ".join)
 def test_nothing_is_written_through_a_link_out_of_a_run_s_folder(
     command: tuple[str, ...], name: str, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
