@@ -127,9 +127,9 @@ def _wide(state: dict[str, Any]) -> None:
 
 
 def _claims_much(state: dict[str, Any]) -> None:
-    state["recipe"]["learner"]["hidden"] = 100_000
+    state["recipe"]["learner"]["hidden"] = 2_000
     state["actor"] = {
-        name: torch.zeros(()).expand([100_000 if side == 64 else side for side in value.shape])
+        name: torch.zeros(()).expand([2_000 if side == 64 else side for side in value.shape])
         for name, value in state["actor"].items()
     }
 
@@ -178,9 +178,9 @@ def test_files_that_somebody_made_give_one_line(
 def test_a_policy_that_no_longer_fits_its_task_is_not_played(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    play = sys.modules["torchrl_her_recipes.runs.play"]
+    players = sys.modules["torchrl_her_recipes.runs.players"]
 
     robot = make_env("robot_v0", num_envs=2)
-    monkeypatch.setattr(play, "make_task_envs", lambda *_args, **_options: robot)
+    monkeypatch.setattr(players, "make_task_envs", lambda *_args, **_options: robot)
     assert main(["play", "hand_reach", "--out", str(tmp_path / "a.gif")]) == 2
     assert "a policy of hand_reach cannot play hand_reach: it has other widths" in capsys.readouterr().err

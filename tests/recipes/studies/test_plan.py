@@ -21,7 +21,8 @@ def jobs(folder: Path) -> list[Job]:
 
 def write(folder: Path, *, epochs: int, seconds: float, checkpoint: bool) -> None:
     folder.mkdir()
-    (folder / "metrics.csv").write_text(f"run,epoch,seconds\n0,{epochs},{seconds}\n1,{epochs},{seconds}\n")
+    rows = "".join(f"{run},{run},{epochs},{100 * epochs},{seconds}\n" for run in range(2))
+    (folder / "metrics.csv").write_text(f"run,seed,epoch,frames,seconds\n{rows}")
     if checkpoint:
         (folder / "checkpoint.pt").touch()
 
