@@ -286,13 +286,13 @@ def test_pictures() -> None:
         env.render(size=0)
 
 
-@pytest.mark.long
 def test_environments_made_without_pictures_give_none() -> None:
     assert not walk().can_render
     with pytest.raises(ValueError, match='pictures need render_mode="rgb_array", got None'):
         walk().render()
 
 
+@pytest.mark.full
 def test_pictures_of_other_processes() -> None:
     env, same = (walk(3, render_mode="rgb_array", parallel=parallel) for parallel in (True, False))
     env.reset()

@@ -61,7 +61,8 @@ def _ran(components: Components) -> dict[str, Any]:
     return shown(components, run(components, progress=False))
 
 
-@pytest.mark.parametrize("sync", [False, pytest.param(True, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("sync", [False, True])
 def test_a_node_that_dies_costs_its_open_episodes_alone(
     cluster: Cluster, nodes: list[Node], sync: bool
 ) -> None:

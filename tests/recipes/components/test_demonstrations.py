@@ -209,7 +209,7 @@ def test_discrete_actions_are_learned_from_without_cloning(tmp_path: Path) -> No
     assert shown.starts.walk.back == [6]  # all the way
 
 
-@pytest.mark.long
+@pytest.mark.full
 def test_rows_are_learned_from_while_other_processes_collect(file: str) -> None:
     components = build(small(**asked(file), processes=2))
     trainer = components.trainer()

@@ -84,6 +84,13 @@ def test_dqn(name: str, options: dict[str, Any]) -> None:
     assert places(components)[0] == {name}
 
 
+# On the CPU the tests of resumption show the same.
+ELSEWHERE = pytest.mark.parametrize(
+    "device", ["emulated", "cuda", pytest.param("cpu", marks=pytest.mark.full)], indirect=True
+)
+
+
+@ELSEWHERE
 def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> None:
     options = {**CURRICULUM, **SHORT, "learner.device": name, "num_runs": 2, "checkpoint_interval": 1}
     whole = run(build(small(epochs=3, **options)), tmp_path / "whole", progress=False)
@@ -96,6 +103,7 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> No
     assert_same(*ends)
 
 
+@ELSEWHERE
 def test_a_run_goes_on_in_the_middle_of_an_epoch(name: str, tmp_path: Path) -> None:
     recipe = small(**CURRICULUM, **SHORT, num_runs=2, **{"learner.device": name})
     whole = run(build(recipe), tmp_path / "whole", progress=False)

@@ -33,9 +33,9 @@ from .exported.tiny import needs_onnx
     "options",
     [
         {"algo": "cher", "normalize": True, "num_runs": 2},
-        {"algo": "her", "learner": "td3"},
+        pytest.param({"algo": "her", "learner": "td3"}, marks=pytest.mark.full),
         {"algo": "filtered_her", "learner": "sac", "normalize": True},
-        {"algo": "cher", "learner": "tqc"},
+        pytest.param({"algo": "cher", "learner": "tqc"}, marks=pytest.mark.full),
         {"algo": "her", "task": "bit_flip"},
     ],
     ids=lambda options: f"{options['algo']}_{options.get('learner', options.get('task', 'ddpg'))}",

@@ -172,7 +172,12 @@ def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
 
 
 @pytest.mark.parametrize(
-    "options", [{"task": "hand_wall_v2"}, {"task": "robot_v2", "num_runs": 2}, {"sampler": "uniform"}]
+    "options",
+    [
+        {"task": "robot_v2", "num_runs": 2},
+        pytest.param({"task": "hand_wall_v2"}, marks=pytest.mark.full),
+        pytest.param({"sampler": "uniform"}, marks=pytest.mark.full),
+    ],
 )
 def test_a_finished_run_that_is_given_more_epochs(
     options: dict[str, Any], no_pictures: None, tmp_path: Path
