@@ -117,11 +117,21 @@ class Recipe:
         return self.replace(**values)
 
     def to_dict(self) -> Nested:
-        """All values, by group and name, as a YAML file has them: lists and no tuples."""
-        return {
-            group: {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
-            for group, own in asdict(self).items()
-        }
+        """All values, by group and name."""
+        return asdict(self)
+
+    def changed(self) -> Nested:
+        """The values that are not the defaults, by group and name.
+
+        Example:
+            >>> Recipe().replace(seed=3, gamma=0.9).changed()
+            {'learner': {'gamma': 0.9}, 'run': {'seed': 3}}
+        """
+        kept: Nested = {}
+        for group, own in self.to_dict().items():
+            defaults = {each.name: default_of(each) for each in fields(getattr(self, group))}
+            kept[group] = {name: value for name, value in own.items() if value != defaults[name]}
+        return {group: own for group, own in kept.items() if own}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:

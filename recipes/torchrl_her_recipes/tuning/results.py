@@ -6,17 +6,12 @@ import csv
 import io
 import warnings
 from collections.abc import Sequence
-from dataclasses import fields
 
 import yaml
 from optuna.study import Study
 
 from torchrl_her.files.writing import write_text
-from torchrl_her_recipes.config.learners import options_of
-from torchrl_her_recipes.config.options import default_of
-from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.search import Search
-from torchrl_her_recipes.config.shortcuts import GROUPS, Nested
 from torchrl_her_recipes.tuning.folder import SearchFolder
 from torchrl_her_recipes.tuning.plots import plot_history, plot_importance, plot_options
 from torchrl_her_recipes.tuning.standing import Standing, TrialRow, standing_of
@@ -61,22 +56,4 @@ def best_preset(search: Search, best: TrialRow, home: SearchFolder) -> str:
     """A trial as a preset: training with it repeats the trial, with its seeds."""
     recipe = search.space.recipe(search.recipe, best.values)
     about = f"# trial {best.number} of the search in {home.path.name}: score {best.score:.3f}\n"
-    return about + yaml.safe_dump(changed(recipe), sort_keys=False)
-
-
-def changed(recipe: Recipe) -> Nested:
-    """The values of a recipe that are not the defaults.
-
-    Example:
-        >>> changed(Recipe().replace(seed=3, gamma=0.9))
-        {'learner': {'gamma': 0.9}, 'run': {'seed': 3}}
-    """
-    values: Nested = {}
-    for group, own in recipe.to_dict().items():
-        kind = options_of(recipe.learner.name) if group == "learner" else GROUPS[group]
-        defaults = {each.name: default_of(each) for each in fields(kind)}
-        # The name says which options there are.
-        kept = {name: value for name, value in own.items() if value != defaults[name]}
-        if kept:
-            values[group] = kept
-    return values
+    return about + yaml.safe_dump(recipe.changed(), sort_keys=False)

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from filelock import FileLock
 from PIL import Image
 
-from torchrl_her_recipes import load_preset, make_recipe, run_score
+from torchrl_her_recipes import RunFolder, load_preset, make_recipe, run_score
 from torchrl_her_recipes.studies.jobs import Job, Outcome
 
 from ..studies.here import Here
@@ -46,7 +45,7 @@ def test_a_search_leaves_the_best_as_a_preset_and_more_trials_can_be_added(tmp_p
     assert table(tmp_path)[0]["learning_rate"] == str(own.learner.learning_rate)
     # Training with the preset repeats the best trial.
     recipe = make_recipe(load_preset(str(tmp_path / "best.yaml")))
-    assert yaml.safe_load((tmp_path / f"trial_{best.number:04}/config.yaml").read_text()) == recipe.to_dict()
+    assert RunFolder(tmp_path / f"trial_{best.number:04}").recipe() == recipe
     assert run_score(recipe) == best.score
     for name in ("history", "importance", "options"):
         with Image.open(tmp_path / f"{name}.png") as picture:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from jinja2 import Environment, StrictUndefined
 
 from torchrl_her.files.writing import write_text
 from torchrl_her_envs.registry import get_task_spec
-from torchrl_her_recipes.config.options import default_of
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.shortcuts import GROUPS, locate
 from torchrl_her_recipes.runs.exported.card import PolicyCard
@@ -80,13 +78,12 @@ def training_command(recipe: Recipe) -> str:
         >>> training_command(make_recipe(task="hand_v1", algo="cher", seed=3))
         'torchrl-her train task=hand_v1 algo=cher seed=3'
     """
-    words = []
+    words, changed = [], recipe.changed()
     for group, own in recipe.to_dict().items():
-        options = {each.name: each for each in fields(getattr(recipe, group))}
         for name, value in own.items():
             named = name == "name" and group in GROUPS
             always = (group, name) in (("task", "name"), ("hindsight", "algo"), ("run", "seed"))
-            if always or value != default_of(options[name]):
+            if always or name in changed.get(group, {}):
                 words.append(shlex.quote(f"{group if named else _short(group, name)}={_text(value)}"))
     return " ".join(["torchrl-her train", *words])
 
