@@ -1,7 +1,7 @@
 """Reading what ``torch.save`` wrote, without its unpickler: tensors and plain data, and nothing else.
 
 ``torch.load(weights_only=True)`` executes nothing either, but a small file can make it take any amount of
-memory (torch 2.14.1: it unpacks compressed records, so that 0.2 MB become 200 MB, and makes a ``bytearray`` as
+memory (torch 2.14.1: it unpacks compressed records, so that 0.2 MB become 200 MB, and a ``bytearray`` as
 long as a file says, 2 GB for one of a kilobyte). Here every size is compared with what is there before memory
 is taken for it.
 """
