@@ -64,6 +64,7 @@ nitpick_ignore_regex = [
     ("py:class", r"torchrl_her_envs\.throwing\.rendering\.render\.Scene"),
     ("py:class", r"torchrl_her_recipes\.components\.curricula\.CurriculumState"),
     ("py:class", r"torchrl_her_recipes\.config\.spaces\.Entry"),
+    ("py:class", r"torchrl_her_recipes\.reports\.tidy\.Results"),
     ("py:class", r"torchrl_her_recipes\.components\.demonstrations\.RunDemonstrations"),
     ("py:class", r"torchrl_her_recipes\.studies\.(workers_local\.Workers|study\.StudyResult|plan\.Plan)"),
 ]
