@@ -163,9 +163,9 @@ class RunFolder:
     @property
     def parts(self) -> list[Path]:
         """The files that there are only while others are written: a killed run leaves them behind."""
-        texts = (self.config, self.about, self.metrics)
-        binary = (self.checkpoint, self.policy, self.best, self.curves, self.goals, self.goal_map, self.video)
-        return [part_of(path) for path in (*texts, *binary)]
+        whole = (self.config, self.about, self.metrics, self.checkpoint, self.policy, self.best)
+        pictures = (self.curves, self.goals, self.goal_map, self.video)
+        return [part_of(path) for path in (*whole, *pictures)]
 
     @property
     def checkpoints(self) -> list[Path]:

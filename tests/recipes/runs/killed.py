@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from multiprocessing import get_context
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import pytest
@@ -31,12 +32,17 @@ def no_pictures() -> Iterator[None]:
 
 
 def is_killed(recipe: Recipe, folder: Path, *, after: float) -> bool:
-    """Lets a process go on with a run; returns whether it was killed before it came to the end.
+    """Lets a process go on with a run; returns whether it was killed before it came to the end."""
+    return was_killed(_go_on, recipe, folder, after=after)
+
+
+def was_killed(target: Callable[..., Any], *args: Any, after: float) -> bool:
+    """Lets a process do something for some seconds; returns whether it was killed before it came to the end.
 
     Not a fork of the tests' process: it would be born with the locks that other threads there hold (Ray's,
     progress bars'), and share some with all other forks, which a killed one never gives back.
     """
-    process = server().Process(target=_go_on, args=(recipe, folder))
+    process = server().Process(target=target, args=args)
     process.start()
     process.join(after)
     process.kill()

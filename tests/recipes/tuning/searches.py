@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -14,7 +13,7 @@ from torchrl_her_recipes.config.spaces import make_space
 from torchrl_her_recipes.tuning import results
 from torchrl_her_recipes.tuning.search import SearchResult, run_search
 
-from ..runs.killed import no_pictures, server
+from ..runs.killed import no_pictures, was_killed
 from ..studies.here import Here
 
 SPACE = {
@@ -62,10 +61,4 @@ def go_on(
 
 def is_killed(search: Search, folder: Path, trials: int, *, after: float) -> bool:
     """Lets a process go on with a search; returns whether it was killed before it came to the end."""
-    process = server().Process(target=go_on, args=(search, folder, trials))
-    process.start()
-    process.join(after)
-    process.kill()
-    process.join()
-    assert process.exitcode in (0, -signal.SIGKILL)
-    return process.exitcode != 0
+    return was_killed(go_on, search, folder, trials, after=after)
