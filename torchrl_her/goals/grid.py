@@ -8,14 +8,13 @@ from __future__ import annotations
 import math
 import operator
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import reduce
 
 import torch
 from torch import Tensor
 
 _MAX_CELLS = 1 << 24  # a table of float64 is then 128 MiB, and five are kept
-_ROUNDING = 1e-5  # of the box: goals outside of it by less than this are rounding errors
 _CHUNK = 1 << 21  # kernel values held at once when summing over samples
 _THIN = 1e-4  # of sigma: differences over thinner boxes would lose digits
 
@@ -34,7 +33,7 @@ class GoalGrid:
         shape: d numbers of cells.
 
     Keyword Args:
-        warn: whether to warn, once, when a goal lies outside of the box.
+        warn: whether to warn, once, when a goal lies farther outside of the box than a cell is wide.
 
     Raises:
         ValueError: the box has no volume, the lengths differ, or there are no cells or too many.
@@ -80,27 +79,30 @@ class GoalGrid:
     def cell(self, goals: Tensor) -> Tensor:
         """The cell [...] of int64 of each goal [..., d]; the last dimension varies fastest.
 
-        Goals outside are counted in the cell at the edge, NaN in the first one of its dimension.
-        The first time that this happens, a warning names the first such goal (unless ``warn`` is False).
+        Goals outside are counted in the cell at the edge, NaN in the first one of its dimension. The first
+        time that a goal is NaN, or farther outside than a cell is wide, a warning names it (unless ``warn``
+        is False).
         """
         if goals.shape[-1] != len(self.shape):
             raise ValueError(f"the grid has {len(self.shape)} dimensions, got goals of {goals.shape[-1]}")
         index = torch.zeros(goals.shape[:-1], dtype=torch.int64, device=goals.device)
-        for i, (low, size, n) in enumerate(zip(self.low, self.cell_size, self.shape, strict=True)):
-            x = (goals[..., i] - low) / size
+        for x, n in self._along(goals):
             if not self._warned and x.numel() > 0:
                 least, most = x.aminmax()  # NaN if there is one, and then no comparison holds
-                if not ((least >= -_ROUNDING * n) & (most <= n + _ROUNDING * n)):
-                    self._warn(goals.detach().reshape(-1, len(self.shape)).double())
+                if not ((least >= -1) & (most <= n + 1)):
+                    self._warn(goals.detach().reshape(-1, len(self.shape)))
             index.mul_(n).add_(x.nan_to_num_(0.0).clamp_(0, n - 1).long())
         return index
 
+    def _along(self, goals: Tensor) -> Iterator[tuple[Tensor, int]]:
+        """For each dimension, where goals [..., d] lie [...] in cells from the corner, and its cells."""
+        for i, (low, size, n) in enumerate(zip(self.low, self.cell_size, self.shape, strict=True)):
+            yield (goals[..., i] - low) / size, n
+
     def _warn(self, goals: Tensor) -> None:
         self._warned = True
-        low, high = goals.new_tensor(self.low), goals.new_tensor(self.high)
-        slack = (high - low) * _ROUNDING / 2
-        outside = ~((goals >= low - slack) & (goals <= high + slack)).all(-1)
-        goal = goals[outside.int().argmax()].tolist()
+        near = torch.stack([(x >= -1) & (x <= n + 1) for x, n in self._along(goals)]).all(0)
+        goal = goals[near.int().argmin()].tolist()
         warnings.warn(
             f"goal {goal} lies outside the grid's box, low={self.low}, high={self.high}; "
             "such goals are counted in the cells at its edge (this is said once)",

@@ -37,7 +37,14 @@ def test_every_center_lies_in_its_own_cell(dtype: torch.dtype) -> None:
 
 def test_the_edges_of_the_box_belong_to_the_cells_at_the_edge() -> None:
     corners = torch.tensor([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0], [1.0 + 1e-6, -1e-6]])
-    assert SCREEN.cell(corners).tolist() == [0, 19, 380, 399, 380]  # no warning for what was rounded
+    assert SCREEN.cell(corners).tolist() == [0, 19, 380, 399, 380]
+
+
+def test_goals_less_than_a_cell_outside_count_at_the_edge_without_a_word() -> None:
+    grid = GoalGrid((0.0, 0.0), (1.0, 1.0), (2, 4))
+    assert grid.cell(torch.tensor([[-0.49, 1.24], [1.49, -0.24]])).tolist() == [3, 4]
+    with pytest.warns(UserWarning, match=r"goal \[0.5, 1.375\] lies outside"):
+        grid.cell(torch.tensor([[-0.49, 1.24], [0.5, 1.375]]))
 
 
 def test_goals_outside_count_at_the_edge_and_are_named_once() -> None:
