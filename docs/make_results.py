@@ -35,6 +35,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "draws": str(HERE / "studies" / "draws.yaml"),
     "learners": str(HERE / "studies" / "learners.yaml"),
     "n_steps": "n_steps",
+    "search": str(HERE / "studies" / "search.yaml"),
     "fetch": "fetch",
     "window": "window",
     "initialisation": "initialisation",

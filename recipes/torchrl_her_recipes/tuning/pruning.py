@@ -65,8 +65,8 @@ def make_pruner(name: str, epochs: int) -> BasePruner:
         name: of the pruner.
         epochs: of a trial.
     """
-    if name == "median":  # no earlier than a fifth of the way: success comes late
-        return MedianPruner(n_startup_trials=5, n_warmup_steps=epochs // 5)
+    if name == "median":  # no earlier than two fifths of the way: success comes late
+        return MedianPruner(n_startup_trials=5, n_warmup_steps=2 * epochs // 5)
     return HalvingPruner(epochs) if name == "halving" else NopPruner()
 
 

@@ -38,9 +38,9 @@ def ends_after(study: optuna.Study, *successes: float) -> int | None:
 
 
 def test_median_ends_what_is_below_it_when_there_are_enough_trials() -> None:
-    # Means of the last evaluations so far; from the second epoch of ten on (a fifth of the way).
+    # Means of the last evaluations so far; from the fourth epoch of ten on (two fifths of the way).
     trials = [[success] * 10 for success in (0.1, 0.2, 0.3, 0.4, 0.5)]
-    assert ends_after(study_of("median", 10, *trials), *[0.25] * 10) == 2
+    assert ends_after(study_of("median", 10, *trials), *[0.25] * 10) == 4
     assert ends_after(study_of("median", 10, *trials), *[0.35] * 10) is None
     assert ends_after(study_of("median", 10, *trials), *[0.3] * 10) is None  # as good as the median
     assert ends_after(study_of("median", 10, *trials[:4]), *[0.0] * 10) is None  # too few
