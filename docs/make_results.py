@@ -37,6 +37,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "n_steps": "n_steps",
     "search": str(HERE / "studies" / "search.yaml"),
     "fetch": "fetch",
+    "hand_reach": str(HERE / "studies" / "hand_reach.yaml"),
     "window": "window",
     "initialisation": "initialisation",
 }
@@ -131,7 +132,7 @@ def main() -> None:
     for name in STUDIES:
         if is_results(RESULTS / name):
             every = read_results(RESULTS / name).cells
-            cells = [cell for cell in every if cell.done]
+            cells = [cell for cell in every if cell.done] or every
             print(f"\n### {name}\n")
             print_table(cells)
             if name == "fetch" and any(not cell.missing for cell in every):
