@@ -82,7 +82,10 @@ def test_cases_alone_are_enough() -> None:
 
 @pytest.mark.parametrize("path", (ROOT / "docs" / "studies").glob("*.yaml"), ids=lambda path: path.stem)
 def test_the_studies_of_the_results_are_made_of_recipes_that_work(path: Path) -> None:
-    assert len(dict(load_study(str(path)).cells())) > 1
+    study = load_study(str(path))
+    recipes = list(dict(study.cells()).values())
+    assert len(recipes) == len(list(study.combinations())) > 0
+    assert all(recipe not in recipes[:index] for index, recipe in enumerate(recipes))
 
 
 def test_mappings_are_named_by_what_differs() -> None:
