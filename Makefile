@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 WORKERS ?= logical
 BIN := $(VENV)/bin
-# Each worker computes in one thread: more of them only wait for each other.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal --durations=15
+# Each worker computes in one thread: more of them only wait for each other. Without bytecode, as containers like
+# to have it, each process that a test starts would compile all of torch, which takes six seconds.
+PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal --durations=15
 
 .PHONY: demo test test-full test-versions lint bench bench-gpu docs clean
 

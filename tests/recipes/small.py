@@ -22,6 +22,7 @@ SMALL: dict[str, Any] = {
     "buffer_size": 20_000,
     "episodes": 4,
     "checkpoint_interval": 1,
+    "pictures": False,  # they take longer than the training
     "keep_buffer": True,  # so that tests can compare it, and give finished runs more epochs
 }
 

@@ -63,7 +63,7 @@ def test_an_environment_of_one_s_own_end_to_end(
     stranger: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Trained because it was typed; everything that reads the folder afterwards asks."""
-    assert main(["train", *overrides(task=stranger, folder="run", **TINY)]) == 0
+    assert main(["train", *overrides(task=stranger, folder="run", pictures=True, **TINY)]) == 0
     assert "has no compute_terminated" in capsys.readouterr().err
     assert Path("run/policy.gif").stat().st_size > 500
     module, refused = module_of(stranger), REFUSED.format(module_of(stranger))
@@ -130,7 +130,7 @@ def test_import_on_the_command_line_permits_a_module_and_what_is_in_it(
 
 def test_a_torchrl_environment_of_one_s_own_trains_by_its_name(tmp_path: Path) -> None:
     task = "tests.envs.common.own_point:Point"
-    recipe = small(task=task, algo="filtered_her", **TINY)
+    recipe = small(task=task, algo="filtered_her", pictures=True, **TINY)
     result = run(build(recipe), tmp_path / "run", progress=False)
     assert result.rows[-1]["rows_virtual"] > 0
     assert (tmp_path / "run" / "policy.gif").exists()

@@ -357,6 +357,9 @@ class RunConfig(Group):
     keep_buffer: bool = option(
         False, "whether the checkpoint of a finished run keeps the replay buffer, for more epochs later"
     )
+    pictures: bool = option(
+        True, "whether curves, map of goals and film of the policy are made at the end; it takes some seconds"
+    )
     log: Any = option(
         ("tensorboard",),
         "loggers, as [csv,wandb]: csv, tensorboard, wandb, mlflow, or registered ones; [] for none besides "

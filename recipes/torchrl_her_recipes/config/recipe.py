@@ -29,7 +29,7 @@ from torchrl_her_recipes.config.without_effect import without_effect
 
 # Compiling takes 15 s the first time and saves half a millisecond a step: from this many steps on it pays.
 # They leave what was trained as it is.
-EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints", "keep_buffer", "log")
+EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints", "keep_buffer", "pictures", "log")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ class Recipe:
 
         Raises:
             ValueError: another option than ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``,
-                ``keep_buffer`` and ``log``.
+                ``keep_buffer``, ``pictures`` and ``log``.
 
         Example:
             >>> Recipe().extended(epochs=80).run.epochs
@@ -154,7 +154,7 @@ def check_extending(values: Mapping[str, Any]) -> None:
         >>> check_extending({"gamma": 0.9})
         Traceback (most recent call last):
         ValueError: a run that goes on takes epochs, checkpoint_interval, keep_checkpoints, keep_buffer,
-        log only; gamma=0.9 would change what it has trained: start a new run
+        pictures, log only; gamma=0.9 would change what it has trained: start a new run
     """
     for name, value in values.items():
         if name.removeprefix("run.") not in EXTENDING:

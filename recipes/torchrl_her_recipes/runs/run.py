@@ -132,8 +132,8 @@ def resume(
     Args:
         folder: of the run.
         components: newly made ones, if those of the run were not the ones of its recipe.
-        options: other values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``, ``keep_buffer`` or
-            ``log``, which are written into the folder's configuration.
+        options: other values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``, ``keep_buffer``,
+            ``pictures`` or ``log``, which are written into the folder's configuration.
         callbacks: called on the way; they may stop the run. Those of its beginning are not remembered.
         progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
         allow_import: whether the module that the run's task may name may be imported.
@@ -377,21 +377,24 @@ def _finish(
     components: Components, trainer: Trainer, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool
 ) -> None:
     """Draws the pictures and then writes the policy, whose file tells that the run has ended."""
-    _draw(components, rows, home, has_buffer)
+    goals = _save_goals(components, home) if has_buffer else _saved_goals(home)
+    if components.recipe.run.pictures:
+        _draw(components, rows, goals, home)
     save_checkpoint({"actor": dict(components.greedy.state_dict())}, home.policy)
     if _has_ended(components, trainer):
         for path in home.older_checkpoints:
             path.unlink(missing_ok=True)
 
 
-def _draw(components: Components, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool) -> None:
+def _draw(
+    components: Components, rows: list[dict[str, float]], goals: GoalMap | None, home: RunFolder
+) -> None:
     recipe = components.recipe
     title = f"{recipe.task.name}, {recipe.hindsight.algo}, " + (
         f"seed {recipe.run.seed}" if recipe.run.num_runs == 1 else f"{recipe.run.num_runs} runs"
     )
     if rows:
         plot_curves(rows, home.curves, title=title)
-    goals = _save_goals(components, home) if has_buffer else _saved_goals(home)
     task = goal_env(components.env)
     if goals is not None and goals.target.ndim == 2 and task.goal_box() is not None:
         plot_goals(goals, task, home.goals, title=f"virtual goals: {title}")

@@ -18,7 +18,6 @@ from torchrl_her_recipes import build, resume, run
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.goal_space import KernelSpace, goal_space
 
-from ..runs.killed import no_pictures
 from ..small import assert_same, small, stop_after
 
 CASES: dict[str, dict[str, Any]] = {
@@ -58,12 +57,11 @@ def test_runs_side_by_side_are_the_runs_that_they_would_be_alone(case: str) -> N
 @pytest.mark.parametrize("case", CASES)
 def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(case: str, tmp_path: Path) -> None:
     recipe = small(**{**CASES[case], "epoch_frames": 480, "frames_per_update": 60.0, "num_runs": 2})
-    with no_pictures():
-        run(build(recipe), tmp_path / "whole", progress=False)
-        stopped = build(recipe)
-        stop_after(stopped, 8)
-        run(stopped, tmp_path / "stopped", progress=False)
-        resume(tmp_path / "stopped", progress=False)
+    run(build(recipe), tmp_path / "whole", progress=False)
+    stopped = build(recipe)
+    stop_after(stopped, 8)
+    run(stopped, tmp_path / "stopped", progress=False)
+    resume(tmp_path / "stopped", progress=False)
     first, second = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("whole", "stopped"))
     assert_same(first, second)
     tables = [pd.read_csv(tmp_path / name / "metrics.csv") for name in ("whole", "stopped")]
@@ -73,8 +71,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(case: str, tmp_pat
 def test_only_runs_with_ibs_tell_a_divergence(tmp_path: Path) -> None:
     for algo, told in (("filtered_her_rare", False), ("filtered_her_ibs", True)):
         estimator = {"estimator": "kernel"} if told else {}
-        with no_pictures():
-            rows = run(build(small(algo=algo, **estimator)), tmp_path / algo, progress=False).rows
+        rows = run(build(small(algo=algo, **estimator)), tmp_path / algo, progress=False).rows
         assert all(("kl" in row) == told for row in rows)
         assert not told or all(0.0 < row["kl"] < 100.0 for row in rows)
         assert not (tmp_path / algo / "goal_map.npz").exists()

@@ -53,7 +53,7 @@ def test_the_command_line_imports_before_it_reads_the_command(
     assert cli.main(train) == 2
     assert "no option 'patience'" in capsys.readouterr().err
     assert cli.main(["--import", own, *train]) == 0
-    assert "policy.gif" in capsys.readouterr().out
+    assert "(metrics.csv, checkpoint.pt)" in capsys.readouterr().out
     assert cli.main(["--import", own, "list"]) == 0
     assert "TD3 again" in capsys.readouterr().out
 

@@ -32,7 +32,6 @@ from torchrl_her_recipes.runs.policies import load_trained
 from torchrl_her_recipes.runs.run import resume, run
 
 from ..runs.exported.tiny import needs_onnx, states, tiny_policy
-from ..runs.killed import no_pictures
 from ..small import small
 from . import damage
 from .damage import Damage
@@ -108,8 +107,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a file of each kind."""
     folder = tmp_path_factory.mktemp("whole")
     recipe = small(task="hand_v0", algo="her_ibs", epochs=1, epoch_frames=480, hidden=8, keep_buffer=False)
-    with no_pictures():
-        run(build(recipe), folder / "run", progress=False)
+    run(build(recipe), folder / "run", progress=False)
     shutil.rmtree(folder / "run" / "tensorboard")
     policy = tiny_policy()
     card = {name: list(own) if isinstance(own, tuple) else own for name, own in policy.card.to_dict().items()}
@@ -240,13 +238,12 @@ def test_a_checkpoint_of_another_make_is_not_gone_on_from(whole: Path, tmp_path:
     shutil.copytree(whole / "run", tmp_path / "run")
     path = tmp_path / "run" / "checkpoint.pt"
     state, said = load_checkpoint(path), []
-    with no_pictures():
-        for case in range(10):
-            save_checkpoint(damage.entries(state, random.Random(case), tmp_path / "trap"), path)
-            try:
-                resume(tmp_path / "run", progress=False)
-            except ValueError as error:
-                said.append(str(error))
+    for case in range(10):
+        save_checkpoint(damage.entries(state, random.Random(case), tmp_path / "trap"), path)
+        try:
+            resume(tmp_path / "run", progress=False)
+        except ValueError as error:
+            said.append(str(error))
     assert len(said) > 1
     assert all("checkpoint" in line and len(line.splitlines()) == 1 for line in said)
 

@@ -4,31 +4,19 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache
 from multiprocessing import get_context
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
 
 from torchrl_her_recipes import Recipe, build, cli
 from torchrl_her_recipes.runs import run as running
 
-_PICTURES = ("plot_curves", "plot_goals", "film_policy")
 _ROOT = Path(__file__).parents[3]
-
-
-@contextmanager
-def no_pictures() -> Iterator[None]:
-    """Most of the time of such short runs."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name in _PICTURES:
-            patch.setattr(running, name, mock.Mock())
-        yield
 
 
 def is_killed(recipe: Recipe, folder: Path, *, after: float) -> bool:
@@ -70,7 +58,6 @@ def _nothing() -> None:
 
 
 def _go_on(recipe: Recipe, folder: Path) -> None:
-    with no_pictures():
-        if (folder / "config.yaml").exists():
-            sys.exit(cli.main(["train", "--resume", str(folder)]))
-        running.run(build(recipe), folder, progress=False)
+    if (folder / "config.yaml").exists():
+        sys.exit(cli.main(["train", "--resume", str(folder)]))
+    running.run(build(recipe), folder, progress=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +27,8 @@ from torchrl_her_recipes.runs import run as running
 from torchrl_her_recipes.runs.best import BestPolicy
 
 from ..small import assert_same, small
-from .killed import no_pictures
 
 SHORT: dict[str, Any] = {"epoch_frames": 480, "seed": 3}
-
-
-@pytest.fixture(name="no_pictures")
-def _no_pictures() -> Iterator[None]:
-    with no_pictures():
-        yield
 
 
 @pytest.fixture
@@ -70,7 +62,7 @@ class Weights(Callback):
 
 
 def test_the_best_evaluation_is_kept_and_the_later_of_two_equal_ones(
-    no_pictures: None, says: dict[int, list[float]], tmp_path: Path
+    says: dict[int, list[float]], tmp_path: Path
 ) -> None:
     says |= {1: [0.25], 2: [0.75], 3: [0.75], 4: [0.5]}
     weights = Weights()
@@ -84,7 +76,7 @@ def test_the_best_evaluation_is_kept_and_the_later_of_two_equal_ones(
 
 
 def test_runs_side_by_side_are_kept_as_of_the_evaluation_with_the_best_median(
-    no_pictures: None, says: dict[int, list[float]], tmp_path: Path
+    says: dict[int, list[float]], tmp_path: Path
 ) -> None:
     says |= {1: [0.5, 0.5, 0.5], 2: [1.0, 0.25, 0.25], 3: [0.25, 0.25, 0.25]}
     weights = Weights()
@@ -107,9 +99,7 @@ def test_further_training_leaves_the_best_policy_alone() -> None:
     assert_same(best.state["actor"], before)
 
 
-def test_a_run_that_goes_on_remembers_its_best_policy(
-    no_pictures: None, says: dict[int, list[float]], tmp_path: Path
-) -> None:
+def test_a_run_that_goes_on_remembers_its_best_policy(says: dict[int, list[float]], tmp_path: Path) -> None:
     class Stop(Callback):
         def on_epoch(self, run: RunView) -> bool:
             return run.trainer.epochs == 2
@@ -126,7 +116,7 @@ def test_a_run_that_goes_on_remembers_its_best_policy(
 
 
 def test_a_best_policy_that_is_newer_than_the_checkpoint_does_not_survive_it(
-    no_pictures: None, says: dict[int, list[float]], tmp_path: Path
+    says: dict[int, list[float]], tmp_path: Path
 ) -> None:
     class Fail(Callback):
         def on_batch(self, run: RunView) -> None:
@@ -148,8 +138,7 @@ def two(says: dict[int, list[float]], tmp_path: Path) -> Path:
     """The folder of a run whose first epoch was better than its second one."""
     says |= {1: [0.75, 0.5, 1.0], 2: [0.5, 0.25, 0.75]}
     folder = tmp_path / "two"
-    with no_pictures():
-        run(build(small(num_runs=3, task="hand_v0", **SHORT)), folder, progress=False)
+    run(build(small(num_runs=3, task="hand_v0", **SHORT)), folder, progress=False)
     return folder
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
@@ -14,13 +13,6 @@ from torchrl_her_recipes import Callback, EarlyStopping, RunView, build, resume,
 from torchrl_her_recipes.runs.folder import RunFolder
 
 from ..small import assert_same, small
-from .killed import no_pictures
-
-
-@pytest.fixture(name="no_pictures")
-def _no_pictures() -> Iterator[None]:
-    with no_pictures():
-        yield
 
 
 class Diary(Callback):
@@ -71,9 +63,7 @@ def test_all_callbacks_are_called_although_the_first_one_stops_the_run() -> None
 
 
 @pytest.mark.parametrize("when", [{"batches": 3}, {"batches": 4}, {"epochs": 1}, {"epochs": 2}])
-def test_a_run_that_is_stopped_goes_on_bit_for_bit(
-    when: dict[str, int], no_pictures: None, tmp_path: Path
-) -> None:
+def test_a_run_that_is_stopped_goes_on_bit_for_bit(when: dict[str, int], tmp_path: Path) -> None:
     recipe = small(epochs=3, epoch_frames=480, checkpoint_interval=2, seed=3)
     run(build(recipe), tmp_path / "whole", progress=False)
     diary = Diary(**when)
@@ -96,7 +86,7 @@ def test_a_stop_at_the_last_epoch_is_none() -> None:
     assert not result.stopped
 
 
-def test_a_number_that_a_callback_adds_is_in_the_table(no_pictures: None, tmp_path: Path) -> None:
+def test_a_number_that_a_callback_adds_is_in_the_table(tmp_path: Path) -> None:
     class Halves(Callback):
         def on_epoch(self, run: RunView) -> None:
             run.rows[-1]["half"] = run.rows[-1]["frames"] / 2

@@ -18,7 +18,7 @@ from torchrl_her_recipes.runs.callbacks import RunView
 from torchrl_her_recipes.runs.folder import RunFolder
 
 from ..small import small
-from .killed import no_pictures, server
+from .killed import server
 from .test_log_to import SHORT, STEPS, DiesAt
 
 wandb = pytest.importorskip("wandb", reason="needs the extra wandb")
@@ -40,9 +40,8 @@ def _alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def _die(folder: Path) -> None:
     os.environ.update(ALONE)
-    with no_pictures():
-        recipe = small(**SHORT, log=["wandb", "mlflow"])
-        run(build(recipe), folder, callbacks=[DiesAt(3)], progress=False)
+    recipe = small(**SHORT, log=["wandb", "mlflow"])
+    run(build(recipe), folder, callbacks=[DiesAt(3)], progress=False)
 
 
 def wandb_records(folder: Path) -> list[Any]:
@@ -98,7 +97,7 @@ def test_after_a_kill_and_a_resumption_each_step_is_there_once(tmp_path: Path) -
     assert [metric.step for metric in told] == STEPS[:3]  # behind the last checkpoint, too
     wandb_id = (tmp_path / "wandb" / "run_id.txt").read_text()
 
-    rows = resume(tmp_path, options={"keep_checkpoints": 1}, progress=False).rows
+    rows = resume(tmp_path, options={"keep_checkpoints": 1, "pictures": True}, progress=False).rows
     success = {step: row["success"] for step, row in zip(STEPS, rows, strict=True)}
 
     told = client.get_metric_history(own.info.run_id, "success/run_0")
@@ -135,10 +134,9 @@ def test_the_service_of_the_environment_is_told(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/shared.db")
     monkeypatch.setenv("MLFLOW_EXPERIMENT_NAME", "throwing")
     monkeypatch.chdir(tmp_path)
-    with no_pictures():
-        for name in ("one", "two"):
-            recipe = small(epochs=1, epoch_frames=480, log="mlflow")
-            run(build(recipe), tmp_path / name, progress=False)
+    for name in ("one", "two"):
+        recipe = small(epochs=1, epoch_frames=480, log="mlflow")
+        run(build(recipe), tmp_path / name, progress=False)
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/shared.db")
     experiment = client.get_experiment_by_name("throwing")
     assert sorted(own.info.run_name for own in client.search_runs([experiment.experiment_id])) == [

@@ -22,7 +22,7 @@ from torchrl_her_recipes.runs import log_to
 from torchrl_her_recipes.runs.show import read_film
 
 from ..small import small
-from .killed import no_pictures, server
+from .killed import server
 
 SHORT: dict[str, Any] = {"epoch_frames": 480, "epochs": 5, "checkpoint_interval": 2}
 STEPS = [480, 960, 1_440, 1_920, 2_400]
@@ -40,8 +40,7 @@ class DiesAt(Callback):
 
 
 def _die(log: list[str], folder: Path, epochs: int) -> None:
-    with no_pictures():
-        run(build(small(**SHORT, log=log)), folder, callbacks=[DiesAt(epochs)], progress=False)
+    run(build(small(**SHORT, log=log)), folder, callbacks=[DiesAt(epochs)], progress=False)
 
 
 def killed_run(folder: Path, log: list[str], *, after: int = 3) -> None:
@@ -64,7 +63,7 @@ def csv_steps(path: Path) -> list[int]:
 def _finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with two loggers."""
     folder = tmp_path_factory.mktemp("finished")
-    recipe = small(epochs=2, epoch_frames=480, num_runs=2, log=["csv", "tensorboard"])
+    recipe = small(epochs=2, epoch_frames=480, num_runs=2, log=["csv", "tensorboard"], pictures=True)
     run(build(recipe), folder, progress=False)
     return folder
 
@@ -102,8 +101,7 @@ def test_after_a_kill_and_a_resumption_each_step_is_there_once(after: int, tmp_p
     killed_run(tmp_path, ["csv", "tensorboard"], after=after)
     before = csv_steps(tmp_path / "csv" / "scalars" / "success" / "run_0.csv")
     assert before == STEPS[:after]  # behind the last checkpoint, too
-    with no_pictures():
-        rows = resume(tmp_path, progress=False).rows
+    rows = resume(tmp_path, progress=False).rows
     own, success = events(tmp_path / "tensorboard"), [row["success"] for row in rows]
     assert [(event.step, event.value) for event in own.Scalars("success/run_0")] == [
         (step, pytest.approx(value)) for step, value in zip(STEPS, success, strict=True)
@@ -112,17 +110,16 @@ def test_after_a_kill_and_a_resumption_each_step_is_there_once(after: int, tmp_p
 
 
 def test_a_logger_that_joins_later_is_told_the_whole_table(tmp_path: Path) -> None:
-    with no_pictures():
-        run(build(small(epochs=2, epoch_frames=480, log=[])), tmp_path, progress=False)
-        assert not (tmp_path / "tensorboard").exists()
-        resume(tmp_path, options={"epochs": 3, "log": ["tensorboard"]}, progress=False)
+    run(build(small(epochs=2, epoch_frames=480, log=[])), tmp_path, progress=False)
+    assert not (tmp_path / "tensorboard").exists()
+    resume(tmp_path, options={"epochs": 3, "log": ["tensorboard"]}, progress=False)
     steps = [event.step for event in events(tmp_path / "tensorboard").Scalars("epoch/run_0")]
     assert steps == [480, 960, 1_440]
 
 
 def test_any_logger_of_torchrl_can_be_given(tmp_path: Path) -> None:
     loggers = [CSVLogger("mine", str(tmp_path)), TensorboardLogger("events", str(tmp_path))]
-    recipe = small(epochs=2, epoch_frames=480, log=[])
+    recipe = small(epochs=2, epoch_frames=480, log=[], pictures=True)
     run(build(recipe), tmp_path / "run", callbacks=[LogTo(own) for own in loggers], progress=False)
     assert csv_steps(tmp_path / "mine" / "scalars" / "success" / "run_0.csv") == [480, 960]
     own = events(tmp_path / "events")
@@ -169,7 +166,7 @@ def _flaky(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_logger_that_fails_is_opened_anew_and_told_what_it_missed(tmp_path: Path) -> None:
     recipe = small(epochs=3, epoch_frames=480, log="flaky")
     said = "^log=flaky fails after 960 frames, the run goes on: OSError: no network$"
-    with no_pictures(), pytest.warns(UserWarning, match=said):
+    with pytest.warns(UserWarning, match=said):
         result = run(build(recipe), tmp_path, progress=False)
     assert len(result.rows) == 3
     assert csv_steps(tmp_path / "from_0" / "scalars" / "success" / "run_0.csv") == [480]

@@ -114,7 +114,7 @@ def test_what_export_wrote_is_played(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    run(build(small(task="hand_v0", epochs=1)), "run", progress=False)
+    run(build(small(task="hand_v0", epochs=1, pictures=True)), "run", progress=False)
     assert main(["export", "run", "--out", "mine.pt"]) == 0
     assert main(["play", "mine.pt", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
     alone = capsys.readouterr().out.splitlines()[-1]

@@ -7,7 +7,6 @@ import random
 import signal
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from torchrl_her_recipes.runs import state as run_state
 from torchrl_her_recipes.runs.folder import RunFolder
 
 from ..small import assert_same, assert_same_runs, small
-from .killed import is_killed, no_pictures, server
+from .killed import is_killed, server
 
 KILLS = 20
 # Everything there is to save: a curriculum whose layer changes on the way, q, priorities, held-back episodes.
@@ -37,12 +36,6 @@ ALL: dict[str, Any] = {
     "success_threshold": 0.01,
     "guided_share": 0.5,
 }
-
-
-@pytest.fixture(name="no_pictures")
-def _no_pictures() -> Iterator[None]:
-    with no_pictures():
-        yield
 
 
 def press_ctrl_c(components: Components, batch: int) -> Components:
@@ -71,7 +64,7 @@ def damage(path: Path) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="a fork server that shares torch is for Linux")
 @pytest.mark.parametrize("most", [2, pytest.param(KILLS, marks=pytest.mark.full)])
 def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not(
-    most: int, no_pictures: None, tmp_path: Path
+    most: int, tmp_path: Path
 ) -> None:
     recipe, draw = small(**ALL), random.Random(0)
     run(build(recipe), tmp_path / "whole", progress=False)
@@ -126,9 +119,7 @@ def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not
         ),
     ],
 )
-def test_ctrl_c_at_any_batch_changes_nothing(
-    options: dict[str, Any], no_pictures: None, tmp_path: Path
-) -> None:
+def test_ctrl_c_at_any_batch_changes_nothing(options: dict[str, Any], tmp_path: Path) -> None:
     recipe, draw = small(**{**options, "epochs": 3}), random.Random(1)
     run(build(recipe), tmp_path / "whole", progress=False)
     left = recipe.total_frames // (recipe.collection.num_envs * recipe.collection.steps_per_batch)
@@ -144,7 +135,7 @@ def test_ctrl_c_at_any_batch_changes_nothing(
 
 
 def test_ctrl_c_saves_what_there_is(tmp_path: Path) -> None:
-    components = press_ctrl_c(build(small(epochs=3)), 50)  # in the middle of the third epoch
+    components = press_ctrl_c(build(small(epochs=3, pictures=True)), 50)  # in the middle of the third epoch
     result = run(components, tmp_path / "run", progress=False)
     assert result.interrupted
     assert [row["frames"] for row in result.rows] == [1_600, 3_200]
@@ -155,7 +146,7 @@ def test_ctrl_c_saves_what_there_is(tmp_path: Path) -> None:
 
 
 def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
-    no_pictures: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_state, "_worlds", lambda components: None)
     recipe = small(epochs=2)
@@ -179,9 +170,7 @@ def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
         pytest.param({"sampler": "uniform"}, marks=pytest.mark.full),
     ],
 )
-def test_a_finished_run_that_is_given_more_epochs(
-    options: dict[str, Any], no_pictures: None, tmp_path: Path
-) -> None:
+def test_a_finished_run_that_is_given_more_epochs(options: dict[str, Any], tmp_path: Path) -> None:
     recipe = small(epochs=4, checkpoint_interval=2, **options)
     run(build(recipe), tmp_path / "whole", progress=False)
     run(build(recipe.replace(epochs=2)), tmp_path / "part", progress=False)
@@ -191,7 +180,7 @@ def test_a_finished_run_that_is_given_more_epochs(
 
 
 def test_epochs_extend_a_finished_run_and_an_interrupted_one(
-    no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recipe, whole = small(epochs=2, epoch_frames=800), tmp_path / "whole"
     run(build(recipe.replace(epochs=4)), whole, progress=False)
@@ -209,15 +198,15 @@ def test_epochs_extend_a_finished_run_and_an_interrupted_one(
     [
         (
             ["seed=3"],
-            "keep_buffer, log only; seed=3 would change what it has trained: start a new run",
+            "keep_buffer, pictures, log only; seed=3 would change what it has trained: start a new run",
         ),
         (
             ["epochs=4", "learner.gamma=0.9"],
-            "keep_checkpoints, keep_buffer, log only; learner.gamma=0.9 would change what",
+            "keep_checkpoints, keep_buffer, pictures, log only; learner.gamma=0.9 would change what",
         ),
         (
             ["preset=demo"],
-            "keep_buffer, log only; preset=demo would change what it has trained",
+            "keep_buffer, pictures, log only; preset=demo would change what it has trained",
         ),
         (["epoch=4"], "no option 'epoch'; did you mean epochs?"),
         (["epochs=4", "run.epochs=5"], "epochs=4 and run.epochs=5 set the same option"),
@@ -251,7 +240,7 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(
-    no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recipe = small(epochs=2, epoch_frames=480, keep_buffer=False)
     run(build(recipe), tmp_path, progress=False)
@@ -271,7 +260,7 @@ def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(
 
 
 def test_a_finished_run_draws_its_pictures_again_without_its_buffer(tmp_path: Path) -> None:
-    recipe = small(epochs=2, epoch_frames=480, keep_buffer=False, algo="filtered_her_ibs")
+    recipe = small(epochs=2, epoch_frames=480, keep_buffer=False, algo="filtered_her_ibs", pictures=True)
     run(build(recipe), tmp_path, progress=False)
     names = ("curves.png", "virtual_goals.png", "policy.gif", "policy.pt")
     same = (
@@ -290,9 +279,7 @@ def test_a_finished_run_draws_its_pictures_again_without_its_buffer(tmp_path: Pa
     assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is None
 
 
-def test_a_buffer_that_was_kept_goes_when_it_is_not_wanted_any_more(
-    no_pictures: None, tmp_path: Path
-) -> None:
+def test_a_buffer_that_was_kept_goes_when_it_is_not_wanted_any_more(tmp_path: Path) -> None:
     run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
     assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is not None
     resume(tmp_path, options={"epochs": 2, "keep_buffer": False}, progress=False)
@@ -300,7 +287,7 @@ def test_a_buffer_that_was_kept_goes_when_it_is_not_wanted_any_more(
 
 
 def test_a_default_run_is_small_when_it_has_finished_and_ends_as_one_that_keeps_its_buffer(
-    no_pictures: None, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     options: dict[str, Any] = {"epochs": 2, "epoch_frames": 480, "task": "hand_v1", "algo": "cher_ibs"}
     for name, keep in (("kept", True), ("small", False)):
@@ -314,9 +301,7 @@ def test_a_default_run_is_small_when_it_has_finished_and_ends_as_one_that_keeps_
     assert (tmp_path / "small" / "checkpoint.pt").stat().st_size < 2_000_000
 
 
-def test_without_a_checkpoint_a_run_cannot_go_on(
-    no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_checkpoint_a_run_cannot_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
     (tmp_path / "checkpoint.pt").unlink()
     assert cli.main(["train", "--resume", str(tmp_path), "epochs=3"]) == 2
@@ -339,7 +324,7 @@ class Stop(Callback):
         return run.trainer.epochs == self.epochs
 
 
-def test_the_last_checkpoints_are_kept_until_the_run_has_finished(no_pictures: None, tmp_path: Path) -> None:
+def test_the_last_checkpoints_are_kept_until_the_run_has_finished(tmp_path: Path) -> None:
     recipe = small(epochs=5, epoch_frames=400, keep_checkpoints=3)
     run(build(recipe), tmp_path, callbacks=[Stop(4)], progress=False)
     epochs = {path.name: load_checkpoint(path)["trainer"]["epochs"] for path in tmp_path.glob("checkpoint*")}
@@ -351,7 +336,7 @@ def test_the_last_checkpoints_are_kept_until_the_run_has_finished(no_pictures: N
 
 @pytest.mark.filterwarnings("always")
 def test_on_the_command_line_a_warning_is_one_line(
-    no_pictures: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(build(small(epochs=3, epoch_frames=800)), tmp_path, callbacks=[Stop(2)], progress=False)
     damage(tmp_path / "checkpoint.pt")
@@ -360,7 +345,7 @@ def test_on_the_command_line_a_warning_is_one_line(
     assert line.strip().startswith(f"torchrl-her: warning: {tmp_path / 'checkpoint.pt'} is damaged: ")
 
 
-def test_the_one_before_a_damaged_checkpoint_is_used(no_pictures: None, tmp_path: Path) -> None:
+def test_the_one_before_a_damaged_checkpoint_is_used(tmp_path: Path) -> None:
     recipe = small(epochs=3, epoch_frames=800)
     for name, callbacks in (("whole", []), ("part", [Stop(2)])):
         run(build(recipe), tmp_path / name, callbacks=callbacks, progress=False)
@@ -373,7 +358,7 @@ def test_the_one_before_a_damaged_checkpoint_is_used(no_pictures: None, tmp_path
     assert_same_runs(tmp_path / "whole", tmp_path / "part")
 
 
-def test_damaged_checkpoints_alone_are_refused(no_pictures: None, tmp_path: Path) -> None:
+def test_damaged_checkpoints_alone_are_refused(tmp_path: Path) -> None:
     run(build(small(epochs=2)), tmp_path, callbacks=[Stop(1)], progress=False)
     for path in tmp_path.glob("checkpoint*.pt"):
         damage(path)
@@ -383,7 +368,7 @@ def test_damaged_checkpoints_alone_are_refused(no_pictures: None, tmp_path: Path
         resume(tmp_path, progress=False)
 
 
-def test_a_run_before_its_first_epoch_can_be_resumed(no_pictures: None, tmp_path: Path) -> None:
+def test_a_run_before_its_first_epoch_can_be_resumed(tmp_path: Path) -> None:
     recipe = small(epochs=1)
     run(build(recipe), tmp_path / "whole", progress=False)
     assert run(press_ctrl_c(build(recipe), 0), tmp_path / "part", progress=False).interrupted
@@ -393,7 +378,7 @@ def test_a_run_before_its_first_epoch_can_be_resumed(no_pictures: None, tmp_path
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no disk that is always full")
-def test_a_full_disk_does_not_end_a_run(no_pictures: None, tmp_path: Path) -> None:
+def test_a_full_disk_does_not_end_a_run(tmp_path: Path) -> None:
     (tmp_path / "checkpoint.part.pt").symlink_to("/dev/full")
     said = "no checkpoint after 0 frames, the run goes on: .*No space left on device"
     with pytest.warns(UserWarning, match=said):
@@ -401,9 +386,7 @@ def test_a_full_disk_does_not_end_a_run(no_pictures: None, tmp_path: Path) -> No
     assert load_checkpoint(tmp_path / "checkpoint.pt")["trainer"]["epochs"] == 2
 
 
-def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(
-    no_pictures: None, tmp_path: Path
-) -> None:
+def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "metrics.part.csv").symlink_to("/dev/full")
     with pytest.warns(UserWarning, match=r"no table after 800 frames, the run goes on: .*No space left"):
         result = run(build(small(epochs=2, epoch_frames=800)), tmp_path, progress=False)
@@ -412,7 +395,7 @@ def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(
     assert [event.step for event in events.Scalars("success/run_0")] == [800, 1600]
 
 
-def test_parts_that_were_swapped_must_be_given_to_resume(no_pictures: None, tmp_path: Path) -> None:
+def test_parts_that_were_swapped_must_be_given_to_resume(tmp_path: Path) -> None:
     def swapped(recipe: Recipe) -> Components:
         components = build(recipe)
         components.optimizer = torch.optim.AdamW(components.loss.parameters(), lr=1e-3)

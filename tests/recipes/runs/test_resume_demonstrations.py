@@ -11,7 +11,6 @@ from torchrl_her import load_checkpoint
 from torchrl_her_recipes import build, record_demonstrations, resume, run
 
 from ..small import assert_same, small, stop_after
-from .killed import no_pictures
 
 ALL: dict[str, Any] = {"task": "hand_v1", "epochs": 3, "epoch_frames": 480, "episodes": 10, "seed": 5}
 
@@ -45,15 +44,14 @@ def asked(file: str, **options: Any) -> dict[str, Any]:
 )
 def test_a_stop_changes_nothing(options: dict[str, Any], file: str, tmp_path: Path) -> None:
     recipe = small(**asked(file, **options))
-    with no_pictures():
-        run(build(recipe), tmp_path / "whole", progress=False)
-        stopped = build(recipe)
-        stop_after(stopped, 4)
-        assert run(stopped, tmp_path / "part", progress=False).interrupted
-        stopped = build(recipe)
-        stop_after(stopped, 5)
-        assert resume(tmp_path / "part", components=stopped, progress=False).interrupted
-        assert not resume(tmp_path / "part", progress=False).interrupted
+    run(build(recipe), tmp_path / "whole", progress=False)
+    stopped = build(recipe)
+    stop_after(stopped, 4)
+    assert run(stopped, tmp_path / "part", progress=False).interrupted
+    stopped = build(recipe)
+    stop_after(stopped, 5)
+    assert resume(tmp_path / "part", components=stopped, progress=False).interrupted
+    assert not resume(tmp_path / "part", progress=False).interrupted
     whole, part = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("whole", "part"))
     assert whole["demonstrations"]["buffer"]["rows"][0] is not None
     if "demonstrations.starts_share" in options:
@@ -72,8 +70,7 @@ def test_a_file_that_was_changed_meanwhile_is_refused(file: str, tmp_path: Path)
     recipe = small(**asked(str(path)))
     components = build(recipe)
     stop_after(components, 3)
-    with no_pictures():
-        run(components, tmp_path / "part", progress=False)
+    run(components, tmp_path / "part", progress=False)
     record_demonstrations("hand_v1", path, episodes=6, seed=1, force=True)
     with pytest.raises(ValueError, match="the run's demonstrations was 4, .*: give resume"):
         resume(tmp_path / "part", progress=False)

@@ -18,16 +18,18 @@ from torchrl_her_recipes import Components, Recipe, build, load_actor, play, res
 
 from ..small import assert_same, small
 
+RECIPE = small(seed=3, pictures=True)
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
-    run(build(small(seed=3)), folder, progress=False)
+    run(build(RECIPE), folder, progress=False)
     return folder
 
 
 def test_configuration_versions_and_seed(finished: Path) -> None:
-    assert Recipe.from_dict(yaml.safe_load((finished / "config.yaml").read_text())) == small(seed=3)
+    assert Recipe.from_dict(yaml.safe_load((finished / "config.yaml").read_text())) == RECIPE
     about = json.loads((finished / "run.json").read_text())
     assert about["seed"] == 3
     assert about["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
@@ -54,6 +56,14 @@ def test_pictures_open(finished: Path) -> None:
         with Image.open(finished / name) as picture:
             assert min(picture.size) > 100, name
             assert picture.convert("L").getextrema()[0] < picture.convert("L").getextrema()[1], name
+
+
+def test_pictures_that_are_not_wanted_are_not_made_until_they_are(tmp_path: Path) -> None:
+    run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
+    assert not list(tmp_path.glob("*.png")) + list(tmp_path.glob("*.gif"))
+    resume(tmp_path, options={"pictures": True}, progress=False)
+    pictures = sorted(path.name for path in (*tmp_path.glob("*.png"), *tmp_path.glob("*.gif")))
+    assert pictures == ["curves.png", "policy.gif", "virtual_goals.png"]
 
 
 def test_play_shows_the_policy_that_the_run_ended_with(finished: Path, tmp_path: Path) -> None:
@@ -101,7 +111,7 @@ def test_the_same_seed_gives_the_same_run() -> None:
 
 
 def test_epochs_without_an_update_leave_a_table_that_fits(tmp_path: Path) -> None:
-    recipe = small(epochs=3, epoch_frames=400, warmup_frames=900, checkpoint_interval=1)
+    recipe = small(epochs=3, epoch_frames=400, warmup_frames=900, checkpoint_interval=1, pictures=True)
     run(build(recipe), tmp_path / "run", progress=False)
     table = pd.read_csv(tmp_path / "run" / "metrics.csv")
     assert table["loss_value"].isna().tolist() == [True, True, False]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,24 +15,22 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.state import without_buffer
 
 from ..small import assert_same, small, stop_after
-from .killed import no_pictures
 
 
 @pytest.fixture
-def runs(tmp_path: Path) -> Iterator[Path]:
+def runs(tmp_path: Path) -> Path:
     """A folder with a run of an older version, one that keeps its buffer, and an unfinished one."""
     folder = tmp_path / "runs"
     recipe = small(epoch_frames=480)
-    with no_pictures():
-        run(build(recipe), folder / "study" / "kept", progress=False)
-        run(build(recipe), folder / "old", progress=False)
-        config = folder / "old" / "config.yaml"
-        config.write_text(config.read_text().replace("  keep_buffer: true\n", ""))
-        (folder / "old" / "checkpoint.1.pt").write_bytes(bytes(1_000))
-        stopped = build(recipe)
-        stop_after(stopped, 8)
-        assert run(stopped, folder / "unfinished", progress=False).interrupted
-        yield folder
+    run(build(recipe), folder / "study" / "kept", progress=False)
+    run(build(recipe), folder / "old", progress=False)
+    config = folder / "old" / "config.yaml"
+    config.write_text(config.read_text().replace("  keep_buffer: true\n", ""))
+    (folder / "old" / "checkpoint.1.pt").write_bytes(bytes(1_000))
+    stopped = build(recipe)
+    stop_after(stopped, 8)
+    assert run(stopped, folder / "unfinished", progress=False).interrupted
+    return folder
 
 
 def age(path: Path) -> None:

@@ -21,7 +21,7 @@ from torchrl_her_recipes.studies import worker_main, workers_local
 from torchrl_her_recipes.studies.study import StudyResult, run_study
 from torchrl_her_recipes.studies.workers_local import LocalWorkers
 
-from ..runs.killed import no_pictures, server
+from ..runs.killed import server
 
 Whom = Literal["parent", "worker", "both"]
 WHOM: tuple[Whom, ...] = ("parent", "worker", "both")
@@ -84,17 +84,16 @@ class Attempt:
 def _run(study: Study, folder: Path, writer: Connection) -> None:
     """The process of the study. Its workers are forks of it: new ones would take seconds to import torch."""
     os.setsid()
-    with no_pictures():
-        spare = [_Fork(others) for others in _growing(_AT_ONCE + 2)]  # before there are threads here
+    spare = [_Fork(others) for others in _growing(_AT_ONCE + 2)]  # before there are threads here
 
-        def next_fork(*_arguments: Any, **_options: Any) -> _Fork:
-            own = spare.pop(0)
-            writer.send(own.pid)
-            return own
+    def next_fork(*_arguments: Any, **_options: Any) -> _Fork:
+        own = spare.pop(0)
+        writer.send(own.pid)
+        return own
 
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(workers_local.subprocess, "Popen", next_fork)
-            result = run_study(study, folder, workers=LocalWorkers(_AT_ONCE), progress=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workers_local.subprocess, "Popen", next_fork)
+        result = run_study(study, folder, workers=LocalWorkers(_AT_ONCE), progress=False)
     writer.send(result)
 
 

@@ -30,7 +30,7 @@ HEAD = "run,epoch,seconds"
 
 @pytest.fixture
 def job(tmp_path: Path) -> Job:
-    return Job(label="her", recipe=small(task="hand_v0", algo="her"), folder=tmp_path / "her")
+    return Job(label="her", recipe=small(task="hand_v0", algo="her", pictures=True), folder=tmp_path / "her")
 
 
 def test_a_job_without_a_checkpoint_begins_again(job: Job) -> None:

@@ -13,7 +13,7 @@ from torchrl_her_recipes.config.spaces import make_space
 from torchrl_her_recipes.tuning import results
 from torchrl_her_recipes.tuning.search import SearchResult, run_search
 
-from ..runs.killed import no_pictures, was_killed
+from ..runs.killed import was_killed
 from ..studies.here import Here
 
 SPACE = {
@@ -35,6 +35,7 @@ RECIPE: dict[str, Any] = {
     "episodes": 20,
     "compile": "never",
     "checkpoint_interval": 1,
+    "pictures": False,
     "hidden": 16,
     "depth": 2,
 }
@@ -50,8 +51,8 @@ def small_search(space: dict[str, Any] | None = None, *, sampler: Any = "tpe", *
 def go_on(
     search: Search, folder: Path, trials: int | None, *, pictures: bool = False, **options: Any
 ) -> SearchResult:
-    """Searches in this process, without the pictures of runs, and perhaps without its own."""
-    with no_pictures(), pytest.MonkeyPatch.context() as patch:
+    """Searches in this process, perhaps without the pictures of it."""
+    with pytest.MonkeyPatch.context() as patch:
         if not pictures:
             for name in ("plot_history", "plot_importance", "plot_options"):
                 patch.setattr(results, name, mock.Mock())
