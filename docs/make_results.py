@@ -36,6 +36,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "learners": str(HERE / "studies" / "learners.yaml"),
     "n_steps": "n_steps",
     "search": str(HERE / "studies" / "search.yaml"),
+    "divergence": "divergence",
     "fetch": "fetch",
     "hand_reach": str(HERE / "studies" / "hand_reach.yaml"),
     "window": "window",
@@ -84,6 +85,20 @@ def draw_success(cells: Sequence[Combination], path: Path) -> None:
     for cell in cells:
         panels.setdefault(cell.task, {})[cell.algorithm] = cell.rows
     plot_comparison(panels, path)
+
+
+def draw_the_ends(cells: Sequence[Combination], measure: str, label: str, path: Path) -> None:
+    """A line for each combination: median and 33rd to 67th percentile of its runs at the end."""
+    ends = [at_the_end(cell.rows, measure, evaluations=1) for cell in cells]
+    low, middle, high = np.percentile(ends, [33, 50, 67], axis=1)
+    figure = Figure(figsize=(7.0, 0.8 + 0.27 * len(cells)), layout="constrained")
+    axes, lines = figure.subplots(), range(len(cells))
+    axes.errorbar(middle, lines, xerr=(middle - low, high - middle), fmt="o", color="#2b6cb0", capsize=3)
+    axes.set_yticks(lines, [cell.algorithm for cell in cells])
+    axes.invert_yaxis()
+    axes.grid(alpha=0.3)
+    axes.set(xlabel=label, xlim=(0.0, None))
+    figure.savefig(path, dpi=110)
 
 
 def draw_beside_published(cells: Sequence[Combination], path: Path) -> None:
@@ -140,7 +155,10 @@ def main() -> None:
                     [cell for cell in every if not cell.missing], options.images / "fetch.png"
                 )
                 continue
-            draw_success(cells, options.images / f"{name}.png")
+            if name == "divergence":
+                draw_the_ends(cells, "kl", "KL(q, q*)", options.images / f"{name}.png")
+            else:
+                draw_success(cells, options.images / f"{name}.png")
             if name in MAPS and any(cell.goals is not None for cell in cells):
                 draw_maps(cells, options.images / f"{name}_goals.png")
 
