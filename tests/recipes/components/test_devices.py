@@ -30,7 +30,7 @@ CURRICULUM = {
     "window": 4,
     "success_threshold": 0.01,
 }
-SHORT = {"epoch_frames": 640, "warmup_frames": 160, "compile": "never"}
+SHORT = {"epoch_frames": 640, "warmup_frames": 160}
 
 
 @pytest.fixture
@@ -56,9 +56,8 @@ def test_each_part_is_where_it_should_be(
     options: dict[str, Any], learner: str, replay: str, name: str
 ) -> None:
     at = {"here": "cpu", "there": name}
-    recipe = small(
-        num_runs=2, epochs=2, **options, **{"learner.device": at[learner], "replay.device": at[replay]}
-    )
+    devices = {"learner.device": at[learner], "replay.device": at[replay]}
+    recipe = small(num_runs=2, **options, **SHORT, **devices)
     components = build(recipe)
     result = run(components, progress=False)
     assert places(components) == ({at[learner]}, {at[replay]})
@@ -68,7 +67,7 @@ def test_each_part_is_where_it_should_be(
 
 @pytest.mark.parametrize("learner", ["td3", "sac", "redq", "tqc"])
 def test_every_learner(learner: str, name: str) -> None:
-    components = build(small(learner=learner, epochs=1, **{"learner.device": name}))
+    components = build(small(learner=learner, epochs=1, **SHORT, **{"learner.device": name}))
     run(components, progress=False)
     assert places(components) == ({name}, {name})
 
@@ -79,10 +78,12 @@ def test_every_learner(learner: str, name: str) -> None:
     ids=["bit_flip", "treasure_hunt"],
 )
 def test_dqn(name: str, options: dict[str, Any]) -> None:
-    components = build(small(epochs=1, **options, **{"learner.device": name}))
+    components = build(small(epochs=1, **options, **SHORT, **{"learner.device": name}))
     run(components, progress=False)
     assert places(components)[0] == {name}
 
+
+TWO = {"num_runs": 2, "compile": "never"}
 
 # On the CPU the tests of resumption show the same.
 ELSEWHERE = pytest.mark.parametrize(
@@ -92,7 +93,7 @@ ELSEWHERE = pytest.mark.parametrize(
 
 @ELSEWHERE
 def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> None:
-    options = {**CURRICULUM, **SHORT, "learner.device": name, "num_runs": 2, "checkpoint_interval": 1}
+    options = {**CURRICULUM, **SHORT, **TWO, "learner.device": name, "checkpoint_interval": 1}
     whole = run(build(small(epochs=3, **options)), tmp_path / "whole", progress=False)
     run(build(small(epochs=2, **options)), tmp_path / "parts", progress=False)
     layers = load_checkpoint(tmp_path / "parts" / "checkpoint.pt")["guide"]["layer"]
@@ -105,7 +106,7 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> No
 
 @ELSEWHERE
 def test_a_run_goes_on_in_the_middle_of_an_epoch(name: str, tmp_path: Path) -> None:
-    recipe = small(**CURRICULUM, **SHORT, num_runs=2, **{"learner.device": name})
+    recipe = small(**CURRICULUM, **SHORT, **TWO, **{"learner.device": name})
     whole = run(build(recipe), tmp_path / "whole", progress=False)
     components = build(recipe)
     stop_after(components, 5)
