@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchrl_her_envs import make_env
-from torchrl_her_recipes.config.study import load_study
+from torchrl_her_recipes.config.study import Study, load_study
 from torchrl_her_recipes.reports.results import Combination, at_the_end
 from torchrl_her_recipes.reports.tidy import is_results, read_results, write_results
 from torchrl_her_recipes.runs.plots import draw_curves, draw_goals, plot_comparison
@@ -80,11 +80,12 @@ def print_table(cells: Sequence[Combination]) -> None:
         )
 
 
-def draw_success(cells: Sequence[Combination], path: Path) -> None:
+def draw_study(cells: Sequence[Combination], study: Study, path: Path) -> None:
+    """The metrics of the study's figure over environment steps."""
     panels: dict[str, dict[str, Rows]] = {}
     for cell in cells:
         panels.setdefault(cell.task, {})[cell.algorithm] = cell.rows
-    plot_comparison(panels, path)
+    plot_comparison(panels, path, metrics=study.figure)
 
 
 def draw_the_ends(cells: Sequence[Combination], measure: str, label: str, path: Path) -> None:
@@ -158,7 +159,7 @@ def main() -> None:
             if name == "divergence":
                 draw_the_ends(cells, "kl", "KL(q, q*)", options.images / f"{name}.png")
             else:
-                draw_success(cells, options.images / f"{name}.png")
+                draw_study(cells, load_study(STUDIES[name]), options.images / f"{name}.png")
             if name in MAPS and any(cell.goals is not None for cell in cells):
                 draw_maps(cells, options.images / f"{name}_goals.png")
 
