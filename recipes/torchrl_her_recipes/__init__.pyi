@@ -63,4 +63,4 @@ from .studies.sweep import plan_sweep as plan_sweep
 from .studies.sweep import run_sweep as run_sweep
 from .studies.sweep import unfinished_sweep as unfinished_sweep
 from .studies.workers import make_workers as make_workers
-from .tuning.tune import tune as tune
+from .tuning.search import tune as tune

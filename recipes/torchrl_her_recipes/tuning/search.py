@@ -60,7 +60,7 @@ class SearchResult:
         return None if first is None else first.score
 
 
-def run_search(
+def tune(
     search: Search,
     folder: str | Path,
     *,
@@ -70,7 +70,7 @@ def run_search(
     say: Callable[[str], None] = lambda _line: None,
     progress: bool = True,
 ) -> SearchResult:
-    """Tries options, or goes on with it.
+    """Searches for good options, or goes on with it: each trial is a batched run in a worker process.
 
     Trials that were under way when a search was stopped or killed go on first. With one worker the result is
     the same, bit for bit, as that of a search that was never stopped.
@@ -84,10 +84,13 @@ def run_search(
         say: called with a line when a trial ends.
         progress: whether to show a progress bar.
 
+    Returns:
+        The trials, the best first, and the folder with the best as a preset.
+
     Raises:
         ValueError: the folder holds another search, somebody is at work in it, a limit is not positive, or
             the task names a module that must not be imported.
-        ImportError: the sampler needs a package that is not installed.
+        ImportError: Optuna is not installed, or the sampler needs a package that is not installed.
         OSError: the database cannot be used any more, for instance because the disk is full.
         KeyboardInterrupt: by a second Ctrl-C.
     """

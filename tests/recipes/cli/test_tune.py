@@ -85,6 +85,9 @@ def test_bad_input_is_one_line_and_exit_code_2(
 def test_without_optuna_the_remedy_is_given(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "torchrl_her_recipes.tuning.search", None)
+    for name in [name for name in sys.modules if name.startswith("torchrl_her_recipes.tuning")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(vars(torchrl_her_recipes), "tune", raising=False)  # kept once it was loaded
+    monkeypatch.setitem(sys.modules, "optuna", None)
     assert main(["tune", *_small()]) == 2
     assert capsys.readouterr().err == "torchrl-her: a search needs Optuna: pip install '.[tune]'\n"

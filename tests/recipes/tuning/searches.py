@@ -11,7 +11,7 @@ import pytest
 from torchrl_her_recipes import Search, make_recipe
 from torchrl_her_recipes.config.spaces import make_space
 from torchrl_her_recipes.tuning import results
-from torchrl_her_recipes.tuning.search import SearchResult, run_search
+from torchrl_her_recipes.tuning.search import SearchResult, tune
 
 from ..runs.killed import was_killed
 from ..studies.here import Here
@@ -57,7 +57,7 @@ def go_on(
             for name in ("plot_history", "plot_importance", "plot_options"):
                 patch.setattr(results, name, mock.Mock())
         workers = options.pop("workers", None) or Here()
-        return run_search(search, folder, trials=trials, workers=workers, progress=False, **options)
+        return tune(search, folder, trials=trials, workers=workers, progress=False, **options)
 
 
 def is_killed(search: Search, folder: Path, trials: int, *, after: float) -> bool:
