@@ -38,6 +38,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "search": str(HERE / "studies" / "search.yaml"),
     "divergence": "divergence",
     "fetch": "fetch",
+    "lift_ablation": str(HERE / "studies" / "lift_ablation.yaml"),
     "hand_reach": str(HERE / "studies" / "hand_reach.yaml"),
     "window": "window",
     "initialisation": "initialisation",
