@@ -37,6 +37,8 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "n_steps": "n_steps",
     "search": str(HERE / "studies" / "search.yaml"),
     "divergence": "divergence",
+    "wall": "wall",
+    "demonstrations": str(HERE / "studies" / "demonstrations.yaml"),
     "fetch": "fetch",
     "lift_ablation": str(HERE / "studies" / "lift_ablation.yaml"),
     "hand_reach": str(HERE / "studies" / "hand_reach.yaml"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,18 @@ COLORS = {  # of algorithms, the same in every picture
     "unfiltered_cher": "#d53f8c",
     "unfiltered_cher_ibs": "#975a16",
 }
-_COLORS = ("#dd6b20", "#805ad5", "#2b6cb0", "#38a169", "#d53f8c", "#718096")
+_COLORS = (  # of all others, in their order
+    "#dd6b20",
+    "#805ad5",
+    "#2b6cb0",
+    "#38a169",
+    "#d53f8c",
+    "#718096",
+    "#1a202c",
+    "#0bc5ea",
+    "#975a16",
+    "#c53030",
+)
 _REGIONS = {"goals": "#63b3ed", "reach": "#fc8181"}
 _SCREEN = 300  # pixels of the picture behind a heat map
 
@@ -92,13 +104,15 @@ def plot_comparison(
 
 
 def colors(labels: Sequence[str]) -> dict[str, str]:
-    """A color for each label: algorithms have their own, others take their turn.
+    """A color for each label: algorithms have their own, others take turns at those that are left.
 
     Example:
         >>> colors(["her", "window=20"])
         {'her': '#dd6b20', 'window=20': '#805ad5'}
     """
-    return {label: COLORS.get(label, _COLORS[index % len(_COLORS)]) for index, label in enumerate(labels)}
+    own = {label: COLORS[label] for label in labels if label in COLORS}
+    left = cycle([color for color in _COLORS if color not in own.values()] or _COLORS)
+    return {label: own.get(label) or next(left) for label in labels}
 
 
 def draw_curves(axes: Axes, curves: Mapping[str, Rows], name: str, palette: Mapping[str, str]) -> None:

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from torchrl_her_envs import TASKS, ThrowingEnv, make_env
-from torchrl_her_recipes.runs.plots import draw_goals
+from torchrl_her_recipes.runs.plots import COLORS, colors, draw_goals
 
 GOALS = [(0.627, 0.021), (-0.35, 0.4), (0.9, -0.7), (0.1, 0.85)]  # the first is the one of the bug report
 
@@ -103,3 +103,13 @@ def test_the_edges_of_a_picture_are_those_that_the_environment_states(task: str)
     dark = (picture[:, 3].int().sum(-1) < 400).nonzero().flatten().tolist()
     assert all(b - a == 1 for a, b in pairwise(dark))
     assert top - (top - bottom) * dark[0] / 216 == pytest.approx(-1.0, abs=0.01)
+
+
+def test_no_two_lines_of_a_picture_have_one_color() -> None:
+    """Up to as many lines as there are colors, with and without algorithms that have their own."""
+    others = [f"case {number}" for number in range(6)]
+    for labels in ([f"case {number}" for number in range(10)], [*others, "her_ibs"], ["cher", *others]):
+        palette = colors(labels)
+        assert list(palette) == labels
+        assert len(set(palette.values())) == len(labels)
+    assert colors([*COLORS, "case"])["case"] in COLORS.values()  # none is left: they begin again
