@@ -86,7 +86,7 @@ def make_ddpg_loss(
     critic: TensorDictModule,
     *,
     gamma: float = 0.98,
-    reward_range: tuple[float, float] = (-1.0, 0.0),
+    reward_range: tuple[float, float] | None = (-1.0, 0.0),
     action_penalty: float = 0.0,
     reduction: Literal["mean", "none"] = "mean",
     cloning: Cloning | None = None,
@@ -97,7 +97,8 @@ def make_ddpg_loss(
         actor: from :func:`~torchrl_her.make_actor`.
         critic: from :func:`~torchrl_her.make_critic`.
         gamma: discount, in [0, 1).
-        reward_range: least and greatest reward; targets are clamped to the returns that these allow.
+        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
+            leave them as they are.
         action_penalty: weight of the action L2 penalty, see
             :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.

@@ -14,7 +14,7 @@ def make_dqn_loss(
     actor: QValueActor,
     *,
     gamma: float = 0.98,
-    reward_range: tuple[float, float] = (-1.0, 0.0),
+    reward_range: tuple[float, float] | None = (-1.0, 0.0),
     double: bool = True,
     reduction: Literal["mean", "none"] = "mean",
 ) -> DQNLoss:
@@ -23,7 +23,8 @@ def make_dqn_loss(
     Args:
         actor: from :func:`~torchrl_her.make_q_actor`.
         gamma: discount, in [0, 1).
-        reward_range: least and greatest reward; targets are clamped to the returns that these allow.
+        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
+            leave them as they are.
         double: whether the online network chooses the next action (van Hasselt et al., 2016).
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -222,7 +221,7 @@ def set_soft_targets(loss: SACLoss, gamma: float, reward_range: tuple[float, flo
     Raises:
         ValueError: ``gamma`` is outside of [0, 1).
     """
-    clamped = clamped_td0(gamma, reward_range or (-math.inf, math.inf))
+    clamped = clamped_td0(gamma, reward_range)
     if reward_range is None:
         loss.make_value_estimator(gamma=gamma)
     else:

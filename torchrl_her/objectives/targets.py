@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -39,13 +40,13 @@ class ClampedTD0(TD0Estimator):
 
 
 def clamped_td0(
-    gamma: float, reward_range: tuple[float, float], value_network: TensorDictModule | None = None
+    gamma: float, reward_range: tuple[float, float] | None, value_network: TensorDictModule | None = None
 ) -> ClampedTD0:
     """Targets for ``loss.make_value_estimator``, clamped to the returns that are possible.
 
     Args:
         gamma: discount, in [0, 1).
-        reward_range: least and greatest reward.
+        reward_range: least and greatest reward; None to leave targets as they are.
         value_network: gives the value of the next state; None if the loss passes it.
 
     Raises:
@@ -53,7 +54,7 @@ def clamped_td0(
     """
     if not 0.0 <= gamma < 1.0:
         raise ValueError(f"gamma must be in [0, 1), got {gamma}")
-    least, greatest = reward_range
+    least, greatest = reward_range or (-math.inf, math.inf)
     return ClampedTD0(
         low=min(least, least / (1.0 - gamma)),  # paid once, if the episode ends there, or forever
         high=max(greatest, greatest / (1.0 - gamma)),

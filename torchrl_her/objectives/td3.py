@@ -127,7 +127,7 @@ def make_td3_loss(
     critics: int = 2,
     target_critics: int = 0,
     gamma: float = 0.98,
-    reward_range: tuple[float, float] = (-1.0, 0.0),
+    reward_range: tuple[float, float] | None = (-1.0, 0.0),
     action_penalty: float = 0.0,
     generators: Sequence[torch.Generator] | None = None,
     reduction: Literal["mean", "none"] = "mean",
@@ -147,7 +147,8 @@ def make_td3_loss(
         target_critics: as many critics are drawn at random in each gradient step, and targets have the least
             of their values alone; 0 for all. Chen et al., Randomized ensembled double Q-learning, 2021.
         gamma: discount, in [0, 1).
-        reward_range: least and greatest reward; targets are clamped to the returns that these allow.
+        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
+            leave them as they are.
         action_penalty: weight of the action L2 penalty, see
             :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
         generators: of the random numbers of each run; None for torch's own.

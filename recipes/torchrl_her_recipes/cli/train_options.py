@@ -138,12 +138,12 @@ class OptionsCommand(click.Command):
 
 
 def _of_other_learners() -> Iterator[tuple[str, str]]:
-    """The options that the default learner does not have, and which have them."""
-    known = {own.name for own in fields(options_of("ddpg"))}
+    """The options that the default learner does not have, or by another default, and which have them."""
+    known = {(own.name, default_of(own)) for own in fields(options_of("ddpg"))}
     learners: dict[tuple[str, str], list[str]] = {}  # of an option as it is written, with its default
     for spec in LEARNERS.values():
         for own in fields(spec.options):
-            if own.name not in known:
+            if (own.name, default_of(own)) not in known:
                 shown = _written("learner", own.name, default_of(own)), own.metadata["help"]
                 learners.setdefault(shown, []).append(spec.name)
     for (written, help), names in learners.items():

@@ -83,6 +83,10 @@ class LearnerBuilder(ABC):
         """The actions of one environment."""
         return self.env.action_spec_unbatched.to(self.device)
 
+    def bounds(self, rewards: tuple[float, float]) -> tuple[float, float] | None:
+        """The rewards whose returns targets are clamped to; None if they are not clamped."""
+        return rewards if self.options.clamp_targets else None
+
     @abstractmethod
     def networks(self, runs: int) -> Networks:
         """The actor and the critics of some runs side by side."""

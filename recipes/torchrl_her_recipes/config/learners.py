@@ -15,6 +15,7 @@ from torchrl_her_recipes.config.options import option, what_there_is
 Actions = Literal["continuous", "discrete"]
 
 _CRITICS = "how many critics there are; targets have the least of their values"
+_CLAMPED = "whether targets are clamped to the returns that rewards allow, where rewards have bounds"
 _TARGET_CRITICS = "so many critics, drawn at random, are asked for each step's targets; 0: all"
 
 
@@ -111,6 +112,8 @@ class EpsilonConfig(LearnerConfig):
 class DQNConfig(EpsilonConfig):
     """DQN."""
 
+    clamp_targets: bool = option(True, _CLAMPED)
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.norm == "batch":
@@ -143,6 +146,7 @@ class DDPGConfig(NoiseConfig):
     action_penalty: float = option(
         0.3, "action L2 penalty, which keeps actions off the ends of tanh", at_least=0
     )
+    clamp_targets: bool = option(True, _CLAMPED)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -115,7 +115,8 @@ class Study:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
             labels.add(label)
             for_task = self.for_task.get(_task_of(own.get("task")), {})
-            recipe = compose(merge(self.recipe, for_task, self.cases.get(case, {})), own)
+            asked = merge(self.cases.get(case, {}), own)  # unlike the study's own, none is left out silently
+            recipe = compose(merge(self.recipe, for_task), asked)
             if self.figure == "times" and recipe.task.name != "chain":
                 task = recipe.task.name
                 raise ValueError(f"the figure times of {self.name} is for the task chain, not {task}")

@@ -98,6 +98,14 @@ def test_options_reach_the_loss_and_the_exploration() -> None:
     assert not hasattr(tqc.loss.value_estimator, "low")
 
 
+@pytest.mark.parametrize(("task", "learner"), [("hand_v0", "ddpg"), ("hand_v0", "td3"), ("bit_flip", "dqn")])
+def test_targets_are_clamped_unless_they_shall_not(task: str, learner: str) -> None:
+    made = [build(small(task=task, learner=learner, **own)) for own in ({}, {"clamp_targets": False})]
+    clamped, free = (own.loss.value_estimator for own in made)
+    assert [clamped.low, clamped.high] == pytest.approx([-50.0, 0.0])
+    assert [free.low, free.high] == [-math.inf, math.inf]
+
+
 def test_by_default_exploration_is_that_of_the_thesis() -> None:
     exploration = build(small(task="hand_v0")).exploration
     assert (exploration.noise, exploration.uniform_share) == (0.05, 0.2)

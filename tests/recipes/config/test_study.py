@@ -80,9 +80,20 @@ def test_cases_alone_are_enough() -> None:
     assert {label: own.hindsight.k for label, own in cells.items()} == {"few": 1, "many": 8}
 
 
-@pytest.mark.parametrize("path", (ROOT / "docs" / "studies").glob("*.yaml"), ids=lambda path: path.stem)
-def test_the_studies_of_the_results_are_made_of_recipes_that_work(path: Path) -> None:
-    study = load_study(str(path))
+def test_cases_may_not_set_what_has_no_effect() -> None:
+    """The same run twice, under two names, would be taken for a comparison."""
+    study = Study(name="own", cases={"plain": {}, "more": {"critics": 5}})
+    with pytest.raises(ValueError, match="has no option critics"):
+        list(study.cells())
+
+
+@pytest.mark.parametrize(
+    "name",
+    [*study_names(), *map(str, sorted((ROOT / "docs" / "studies").glob("*.yaml")))],
+    ids=lambda name: Path(name).stem,
+)
+def test_no_two_combinations_of_a_study_are_the_same(name: str) -> None:
+    study = load_study(name)
     recipes = list(dict(study.cells()).values())
     assert len(recipes) == len(list(study.combinations())) > 0
     assert all(recipe not in recipes[:index] for index, recipe in enumerate(recipes))

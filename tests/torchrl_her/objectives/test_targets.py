@@ -45,6 +45,12 @@ def test_targets_are_clamped_to_what_is_possible() -> None:
     assert constant_loss(-49.0)(rows([-1.0]))["target_value"].item() == pytest.approx(-49.02)
 
 
+@pytest.mark.parametrize("value", [-200.0, -49.0, 100.0])
+def test_targets_may_be_left_as_they_are(value: float) -> None:
+    loss = constant_loss(value, reward_range=None)
+    assert loss(rows([-1.0]))["target_value"].item() == pytest.approx(-1.0 + 0.98 * value)
+
+
 @pytest.mark.parametrize(
     ("reward_range", "low", "high"),
     [((-1.0, 0.0), -2.0, 0.0), ((0.0, 1.0), 0.0, 2.0), ((-2.0, 3.0), -4.0, 6.0), ((1.0, 2.0), 1.0, 4.0)],

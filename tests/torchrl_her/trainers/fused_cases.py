@@ -36,32 +36,39 @@ def make_loss(
     critics: int = 2,
     target_critics: int = 0,
     penalty: float = 0.3,
-    bounded: bool = False,
+    bounded: bool | None = None,
     dtype: torch.dtype = torch.float64,
     **network: Any,
 ) -> LossModule:
     """A loss with small networks and random numbers of its own; actions have three different ranges.
 
-    ``bounded`` clamps targets of SAC and TQC as well; ``redq`` is SAC with targets of two critics at random.
+    ``bounded`` says whether targets are clamped, in place of what is usual for the algorithm; ``redq`` is SAC
+    with targets of two critics at random.
     """
+    usual = algorithm in ("ddpg", "td3", "dqn")
+    clamped: dict[str, Any] = {
+        "reward_range": (-0.02, 0.0) if (usual if bounded is None else bounded) else None
+    }
     if algorithm == "redq":
         critics, target_critics = critics + 1, 2
     low, high = (torch.tensor(own, dtype=dtype) for own in ((-1.0, -2.0, 0.0), (1.0, 2.0, 3.0)))
     spec = Bounded(low, high, dtype=dtype)
     options: dict[str, Any] = {"hidden": 16, "runs": runs, **network}
     if algorithm == "dqn":
-        return make_dqn_loss(make_q_actor(WIDTHS, ACTIONS, **options)[0].to(dtype), reduction="none")
+        actor = make_q_actor(WIDTHS, ACTIONS, **options)[0].to(dtype)
+        return make_dqn_loss(actor, reduction="none", **clamped)
     outputs = QUANTILES if algorithm == "tqc" else 1
     critic = make_critic(WIDTHS, ACTIONS, outputs=outputs, **options).to(dtype)
     if algorithm == "ddpg":
         actor = make_actor(WIDTHS, ACTIONS, **options).to(dtype)
-        return make_ddpg_loss(actor, critic, action_penalty=penalty, reduction="none")
+        return make_ddpg_loss(actor, critic, action_penalty=penalty, reduction="none", **clamped)
     generators = [torch.Generator().manual_seed(run) for run in range(runs)]
     shared: dict[str, Any] = {
         "critics": critics,
         "action_penalty": penalty,
         "generators": generators,
         "reduction": "none",
+        **clamped,
     }
     if algorithm == "td3":
         actor = make_actor(WIDTHS, ACTIONS, **options).to(dtype)
@@ -69,7 +76,7 @@ def make_loss(
             dtype
         )
     actor = make_stochastic_actor(WIDTHS, spec, **options).to(dtype)
-    shared |= {"action_spec": spec, "runs": runs, "reward_range": (-0.02, 0.0) if bounded else None}
+    shared |= {"action_spec": spec, "runs": runs}
     if algorithm == "tqc":
         return make_tqc_loss(actor, critic, dropped_quantiles=1, **shared).to(dtype)
     return make_sac_loss(actor, critic, target_critics=target_critics, **shared).to(dtype)

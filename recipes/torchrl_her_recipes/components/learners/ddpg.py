@@ -61,7 +61,7 @@ class DDPGBuilder(LearnerBuilder):
             actor,
             critics[0],
             gamma=self.options.gamma,
-            reward_range=rewards,
+            reward_range=self.bounds(rewards),
             action_penalty=self.options.action_penalty,
             reduction="none",
             cloning=self.cloning,

@@ -41,7 +41,10 @@ class DQNBuilder(LearnerBuilder):
         generators: Sequence[torch.Generator],
     ) -> LossModule:
         return make_dqn_loss(
-            cast(QValueActor, actor), gamma=self.options.gamma, reward_range=rewards, reduction="none"
+            cast(QValueActor, actor),
+            gamma=self.options.gamma,
+            reward_range=self.bounds(rewards),
+            reduction="none",
         )
 
     def exploration(self, generators: Sequence[torch.Generator]) -> Exploration:

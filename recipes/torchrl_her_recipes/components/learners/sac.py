@@ -63,19 +63,17 @@ class SACBuilder(DDPGBuilder):
         }
 
     def bounds(self, rewards: tuple[float, float]) -> tuple[float, float] | None:
-        """The rewards whose returns targets are clamped to; None if they are not clamped.
+        """As for other learners.
 
         Raises:
-            ValueError: they are to be clamped, but rewards have no bounds.
+            ValueError: targets are to be clamped, but rewards have no bounds.
         """
-        if not self.options.clamp_targets:
-            return None
-        if not all(map(math.isfinite, rewards)):
+        if self.options.clamp_targets and not all(map(math.isfinite, rewards)):
             raise ValueError(
                 f"clamp_targets=true has no effect on {self.recipe.task.name}, whose rewards have no bounds: "
                 "leave it out"
             )
-        return rewards
+        return super().bounds(rewards)
 
     def epsilon(self) -> dict[str, float]:
         """None: the policy explores by itself."""

@@ -29,7 +29,7 @@ class TD3Builder(DDPGBuilder):
             critics=self.options.critics,
             target_critics=self.options.target_critics,
             gamma=self.options.gamma,
-            reward_range=rewards,
+            reward_range=self.bounds(rewards),
             action_penalty=self.options.action_penalty,
             generators=generators,
             reduction="none",
