@@ -36,6 +36,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "learners": str(HERE / "studies" / "learners.yaml"),
     "n_steps": "n_steps",
     "search": str(HERE / "studies" / "search.yaml"),
+    "filter_bias": "filter_bias",
     "divergence": "divergence",
     "wall": "wall",
     "demonstrations": str(HERE / "studies" / "demonstrations.yaml"),

@@ -88,18 +88,21 @@ def plot_comparison(
     Args:
         panels: title of each panel to the curves in it, label to table of metrics.
         path: of the picture.
-        metrics: what is drawn, one panel each.
+        metrics: what is drawn, one panel each; those of several titles have a row each.
     """
-    columns = [(title, curves, name) for title, curves in panels.items() for name in metrics]
-    figure = Figure(figsize=(1.0 + 4.2 * len(columns), 3.8), layout="constrained")
-    grid = figure.subplots(1, len(columns), sharey=len(metrics) == 1, squeeze=False)[0]
-    for axes, (title, curves, name) in zip(grid, columns, strict=True):
+    columns = [(title, curves, name) for name in metrics for title, curves in panels.items()]
+    rows = len(metrics) if len(panels) > 1 else 1
+    width = len(columns) // rows
+    figure = Figure(figsize=(1.0 + 4.2 * width, 3.8 * rows), layout="constrained")
+    grid = figure.subplots(rows, width, sharey="row" if width == len(panels) else False, squeeze=False)
+    for axes, (title, curves, name) in zip(grid.flat, columns, strict=True):
         draw_curves(axes, curves, name, colors(list(curves)))
         axes.set(title=title, xlabel="environment steps of each run")
         axes.legend(fontsize=8)
-        if axes is not grid[0] and len(metrics) == 1:
+        if axes not in grid[:, 0] and width == len(panels):
             axes.set_ylabel("")
-    grid[0].set_ylabel(f"{grid[0].get_ylabel()} (median, 33rd to 67th percentile)")
+    gap = " " if rows == 1 else "\n"
+    grid[0, 0].set_ylabel(f"{grid[0, 0].get_ylabel()}{gap}(median, 33rd to 67th percentile)")
     save_figure(figure, path)
 
 
