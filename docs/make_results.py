@@ -106,6 +106,27 @@ def draw_the_ends(cells: Sequence[Combination], measure: str, label: str, path: 
     figure.savefig(path, dpi=110)
 
 
+def draw_demonstrations(cells: Sequence[Combination], path: Path) -> None:
+    """Success at the end over the number of demonstrations, and the curriculum in their place."""
+    ends = {cell.algorithm: np.percentile(at_the_end(cell.rows, "success"), [33, 50, 67]) for cell in cells}
+    numbers = ["0", "1", "10", "100"]
+    figure = Figure(figsize=(5.2, 3.8), layout="constrained")
+    axes, places = figure.subplots(), range(len(numbers))
+    for how, label, color in (("rows", "rows", "#2b6cb0"), ("cloned", "rows and cloning", "#38a169")):
+        low, middle, high = np.stack([ends.get(f"{number}_{how}", ends["none"]) for number in numbers], 1)
+        axes.errorbar(
+            places, middle, (middle - low, high - middle), marker="o", capsize=3, color=color, label=label
+        )
+    low, middle, high = ends["curriculum"]
+    axes.axhline(middle, color="#dd6b20", label="a curriculum in their place")
+    axes.axhspan(low, high, color="#dd6b20", alpha=0.2, linewidth=0)
+    axes.set_xticks(places, numbers)
+    axes.set(xlabel="demonstrations", ylabel="success rate at the end", ylim=(0.0, 1.0))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
 def draw_beside_published(cells: Sequence[Combination], path: Path) -> None:
     """A panel for each task: our curve, and what others have published."""
     figure = Figure(figsize=(1.0 + 4.2 * len(cells), 3.8), layout="constrained")
@@ -162,6 +183,8 @@ def main() -> None:
                 continue
             if name == "divergence":
                 draw_the_ends(cells, "kl", "KL(q, q*)", options.images / f"{name}.png")
+            elif name == "demonstrations":
+                draw_demonstrations(cells, options.images / f"{name}.png")
             else:
                 draw_study(cells, load_study(STUDIES[name]), options.images / f"{name}.png")
             if name in MAPS and any(cell.goals is not None for cell in cells):
