@@ -27,8 +27,7 @@ from torchrl_her_recipes.config.options import default_of, what_there_is
 from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, Nested, over, place
 from torchrl_her_recipes.config.without_effect import without_effect
 
-# Compiling takes 15 s the first time and saves half a millisecond a step: from this many steps on it pays.
-# They leave what was trained as it is.
+# What a run that goes on may set anew, since it leaves what was trained as it is.
 EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints", "keep_buffer", "pictures", "log")
 
 
