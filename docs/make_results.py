@@ -113,7 +113,8 @@ def draw_demonstrations(cells: Sequence[Combination], path: Path) -> None:
     figure = Figure(figsize=(5.2, 3.8), layout="constrained")
     axes, places = figure.subplots(), range(len(numbers))
     for how, label, color in (("rows", "rows", "#2b6cb0"), ("cloned", "rows and cloning", "#38a169")):
-        low, middle, high = np.stack([ends.get(f"{number}_{how}", ends["none"]) for number in numbers], 1)
+        own = [ends["none"] if number == "0" else ends[f"{number}_{how}"] for number in numbers]
+        low, middle, high = np.stack(own, 1)
         axes.errorbar(
             places, middle, (middle - low, high - middle), marker="o", capsize=3, color=color, label=label
         )

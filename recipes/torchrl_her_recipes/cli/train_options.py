@@ -138,7 +138,7 @@ class OptionsCommand(click.Command):
 
 
 def _of_other_learners() -> Iterator[tuple[str, str]]:
-    """The options that the default learner does not have, or by another default, and which have them."""
+    """The options that the default learner does not have, or has with another default; and who has them."""
     known = {(own.name, default_of(own)) for own in fields(options_of("ddpg"))}
     learners: dict[tuple[str, str], list[str]] = {}  # of an option as it is written, with its default
     for spec in LEARNERS.values():

@@ -98,8 +98,7 @@ def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:
     for own in fields(recipe.learner):  # "auto" has the options of DDPG
         value = getattr(recipe.learner, own.name)
         if own.name not in known and value != default_of(own):
-            hint = f" or write learner={name}" if recipe.learner.name == "auto" else ""
-            raise ValueError(f"{own.name}={value} has no effect with learner={name}: leave it out{hint}")
+            raise ValueError(f"{own.name}={value} has no effect with learner={name}: leave it out")
     return spec
 
 

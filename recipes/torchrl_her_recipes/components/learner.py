@@ -85,7 +85,7 @@ class LearnerBuilder(ABC):
 
     def bounds(self, rewards: tuple[float, float]) -> tuple[float, float] | None:
         """The rewards whose returns targets are clamped to; None if they are not clamped."""
-        return rewards if self.options.clamp_targets else None
+        return rewards if getattr(self.options, "clamp_targets", True) else None
 
     @abstractmethod
     def networks(self, runs: int) -> Networks:
@@ -125,7 +125,8 @@ class LearnerBuilder(ABC):
         Args:
             actor: from :meth:`networks`.
             critics: likewise.
-            rewards: the least and the greatest that there can be; infinite if the task's is dense.
+            rewards: the least and the greatest that there can be; infinite if the task's is dense. See
+                :meth:`bounds` for learners with the option ``clamp_targets``.
             generators: of each run's random numbers.
         """
 

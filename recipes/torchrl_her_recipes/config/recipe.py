@@ -22,7 +22,7 @@ from torchrl_her_recipes.config.groups import (
     TaskConfig,
 )
 from torchrl_her_recipes.config.imports import permit_task
-from torchrl_her_recipes.config.learners import AUTO, DDPGConfig, LearnerConfig, options_of
+from torchrl_her_recipes.config.learners import AUTO, LEARNERS, DDPGConfig, LearnerConfig, options_of
 from torchrl_her_recipes.config.options import default_of, what_there_is
 from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, Nested, over, place
 from torchrl_her_recipes.config.without_effect import without_effect
@@ -194,12 +194,7 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     """The same recipe as :func:`make_recipe`, where no value was named by the user."""
     given = place(values)
     below = place(base or {})
-    name = given.get("learner", {}).get("name") or below.get("learner", {}).get("name") or "auto"
-    if name == "auto":
-        task = given.get("task", {}).get("name") or below.get("task", {}).get("name") or TaskConfig.name
-        name = _learner_for(task)
-    known = {own.name for own in fields(options_of(name))}
-    below["learner"] = {key: value for key, value in below.get("learner", {}).items() if key in known}
+    _drop_options_of_another_learner(below, given)
     _drop_options_of_another_task(below, given)
     _drop_another_curriculum(below, given)
     _drop_other_goal_sources(below, given)
@@ -209,10 +204,40 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     return _assemble(over(below, given))
 
 
-def _learner_for(task: object) -> str:
-    """What ``learner=auto`` stands for, as far as the name of the task tells."""
-    actions = get_task_spec(task).actions if isinstance(task, str) else None
-    return "auto" if actions is None else AUTO[actions]
+def _named(group: str, default: str, *values: Nested) -> str:
+    """The name that the first of some values has for a group."""
+    return next((own[group]["name"] for own in values if own.get(group, {}).get("name")), default)
+
+
+def _learner_of(*values: Nested) -> str:
+    """The learner that is named in the first of some values, or that ``auto`` stands for on their task."""
+    name, task = _named("learner", "auto", *values), _named("task", TaskConfig.name, *values)
+    actions = get_task_spec(task).actions if isinstance(task, str) and name == "auto" else None
+    return name if actions is None else AUTO[actions]
+
+
+def _drop_options_of_another_learner(below: Nested, given: Nested) -> None:
+    """Leaves those options of the base's learner that the one that is asked for takes as well.
+
+    What is merely a default of the base's learner is left out, too: the other one may have its own.
+
+    Raises:
+        ValueError: an option is asked for that ``auto`` does not have on this task.
+    """
+    name, before = _learner_of(given, below), _learner_of(below)
+    kind, former = options_of(name), LEARNERS[before].options if before in LEARNERS else None
+    known = {own.name for own in fields(kind)}
+    if _named("learner", "auto", given, below) == "auto":
+        without = {own.name for own in fields(options_of("auto"))} - known
+        for key, value in given.get("learner", {}).items():
+            if key in without:
+                raise ValueError(f"{key}={value} has no effect with learner={name}: leave it out")
+    defaults = {} if former in (None, kind) else {own.name: default_of(own) for own in fields(former)}
+    below["learner"] = {
+        key: value
+        for key, value in below.get("learner", {}).items()
+        if key in known and (key not in defaults or value != defaults[key])
+    }
 
 
 def _drop_options_of_another_task(below: Nested, given: Nested) -> None:

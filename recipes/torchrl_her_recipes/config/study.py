@@ -39,7 +39,8 @@ class Study:
             figure has a panel for each task, and in it a curve for each combination of the others.
         cases: other options that are compared, by a name of one's own: each case has some of them, and none
             is crossed with another case, only with what varies. An ablation has a case for each part that
-            it takes away. They may not set how many runs there are, or how long they are.
+            it takes away. They may not set how many runs there are, or how long they are, and each of their
+            options must have an effect with all that varies.
         for_task: options of the runs on some of the tasks alone, by the task's name.
         figure: the metrics that are drawn over environment steps, or "times" for the steps until the
             task ``chain`` is solved.
@@ -104,19 +105,25 @@ class Study:
         """The names and recipes of all combinations; the runs of a recipe are its seeds.
 
         Raises:
-            ValueError: a recipe cannot work, or two combinations have the same name.
+            ValueError: a recipe cannot work, two combinations have the same name or the same recipe, or
+                a case sets an option that has no effect with what varies.
         """
-        labels = set()
+        before: dict[str, Recipe] = {}
         for own in self.combinations():
             case = own.pop("case", "")
             words = [_word(name, value, self.vary[name]) for name, value in own.items()]
             label = "_".join(word for word in (*words, case) if word).replace("/", "_") or self.name
-            if label in labels:
+            if label in before:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
-            labels.add(label)
             for_task = self.for_task.get(_task_of(own.get("task")), {})
             asked = merge(self.cases.get(case, {}), own)  # unlike the study's own, none is left out silently
-            recipe = compose(merge(self.recipe, for_task), asked)
+            try:
+                recipe = compose(merge(self.recipe, for_task), asked)
+            except ValueError as error:
+                raise ValueError(f"{label}: {error}") from error
+            if twin := next((other for other, same in before.items() if same == recipe), None):
+                raise ValueError(f"the study {self.name} has the same run twice: {twin} and {label}")
+            before[label] = recipe
             if self.figure == "times" and recipe.task.name != "chain":
                 task = recipe.task.name
                 raise ValueError(f"the figure times of {self.name} is for the task chain, not {task}")

@@ -31,18 +31,8 @@ COLORS = {  # of algorithms, the same in every picture
     "unfiltered_cher": "#d53f8c",
     "unfiltered_cher_ibs": "#975a16",
 }
-_COLORS = (  # of all others, in their order
-    "#dd6b20",
-    "#805ad5",
-    "#2b6cb0",
-    "#38a169",
-    "#d53f8c",
-    "#718096",
-    "#1a202c",
-    "#0bc5ea",
-    "#975a16",
-    "#c53030",
-)
+_ORDER = ("her", "filtered_her", "filtered_her_ibs", "her_ibs", "unfiltered_cher", "her_ibs_sequential")
+_COLORS = tuple(dict.fromkeys([*(COLORS[name] for name in _ORDER), *COLORS.values()]))  # of all others
 _REGIONS = {"goals": "#63b3ed", "reach": "#fc8181"}
 _SCREEN = 300  # pixels of the picture behind a heat map
 

@@ -101,8 +101,9 @@ def unfinished_sweep(runs: Mapping[str, Recipe], folders: Path) -> Path | None:
     """
     wanted = _plain(runs)
     for note in sorted(folders.glob(f"*/{_NOTE}"), reverse=True):
-        with suppress(ValueError):  # of what was torn when the power failed
-            if json.loads(note.read_text()) == wanted and not _are_done(note.parent, runs):
+        with suppress(ValueError, AttributeError):  # of what was torn when the power failed
+            noted = {label: Recipe.from_dict(own) for label, own in json.loads(note.read_text()).items()}
+            if _plain(noted) == wanted and not _are_done(note.parent, runs):
                 return note.parent
     return None
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from torchrl_her_recipes import build, run
+from torchrl_her_recipes import Recipe, build, run
 from torchrl_her_recipes.components.agents import find_learner, make_agent, make_player
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.learners import LEARNERS
@@ -41,15 +41,18 @@ def test_auto_follows_the_actions(options: dict[str, Any], name: str) -> None:
             {"task": "hand_v0", "learner": "dqn"},
             "continuous actions: choose ddpg or td3 or sac or redq or tqc",
         ),
-        (
-            {"task": "bit_flip", "action_penalty": 0.5},
-            "with learner=dqn: leave it out or write learner=dqn",
-        ),
     ],
 )
 def test_what_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:
     recipe = small(**options)
     with pytest.raises(ValueError, match=message):
+        find_learner(recipe, make_task_envs(recipe, 1, [0]))
+
+
+def test_an_option_of_ddpg_is_refused_where_auto_turns_out_to_be_dqn() -> None:
+    """Where the name of the task does not tell its actions, this is known when the environment is made."""
+    recipe = Recipe.from_dict({"task": {"name": "bit_flip"}, "learner": {"action_penalty": 0.5}})
+    with pytest.raises(ValueError, match="action_penalty=0.5 has no effect with learner=dqn: leave it out$"):
         find_learner(recipe, make_task_envs(recipe, 1, [0]))
 
 

@@ -57,6 +57,16 @@ def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
         make_recipe(**options)
 
 
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_another_learner_has_its_own_defaults(learner: str) -> None:
+    """And what was changed on purpose goes over to it."""
+    for former in LEARNERS:
+        task = "bit_flip" if "dqn" in (learner, former) else "hand_v0"
+        full = make_recipe(task=task, learner=former, gamma=0.9).to_dict()
+        assert make_recipe(full, learner=learner) == make_recipe(task=task, learner=learner, gamma=0.9)
+    assert Recipe().replace(learner="sac", gamma=0.9) == make_recipe(learner="sac", gamma=0.9)
+
+
 def test_an_unknown_learner_gets_a_hint() -> None:
     with pytest.raises(ValueError, match="unknown learner 'ddgp'; did you mean ddpg. The learners are auto"):
         make_recipe(learner="ddgp")

@@ -63,7 +63,7 @@ class SACBuilder(DDPGBuilder):
         }
 
     def bounds(self, rewards: tuple[float, float]) -> tuple[float, float] | None:
-        """As for other learners.
+        """The same, but asked for where there are no bounds it is an error, since it is off by default.
 
         Raises:
             ValueError: targets are to be clamped, but rewards have no bounds.
