@@ -18,12 +18,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchrl_her_recipes.reports.tidy import read_results
+from torchrl_her_recipes.runs.plots import COLORS
 
 HERE = Path(__file__).parent
-FIRST = 4  # the epoch from which on the means are taken: before it, hardly a goal is achieved
+FIRST = 4  # the epoch from which on the means are taken: before it, Q is still on its way from 0
 GOALS = {"real": ("success", "q_bias"), "virtual": ("virtual_success", "virtual_q_bias")}
 CASES = {"as_it_is": "o", "no_penalty": "s", "neither": "^"}
-COLORS = {"her": "#dd6b20", "filtered_her": "#805ad5"}
 
 Means = dict[str, np.ndarray]  # of each run, by metric
 Statistic = Callable[[Means, Means], float]
@@ -64,7 +64,9 @@ def with_interval(statistic: Statistic, without: Means, filtered: Means, *, scal
 
     low, high = np.percentile([statistic(again(without), again(filtered)) for _ in range(2000)], [2.5, 97.5])
     form = ".0f" if scale > 1 else ".1f"
-    return f"{scale * statistic(without, filtered):+{form}} ({scale * low:+{form}} to {scale * high:+{form}})"
+    middle = f"{scale * statistic(without, filtered):+{form}}"
+    shown = f"**{middle}**" if low * high > 0 else middle  # 0 is outside
+    return f"{shown} ({scale * low:+{form}} to {scale * high:+{form}})"
 
 
 def main() -> None:
@@ -88,11 +90,13 @@ def main() -> None:
     figure = Figure(figsize=(3.6 * len(tasks), 6.6), layout="constrained")
     for line, (kind, (success, bias)) in zip(figure.subplots(2, len(tasks)), GOALS.items(), strict=True):
         for axes, task in zip(line, tasks, strict=True):
-            for algorithm, color in COLORS.items():
+            for algorithm in ("her", "filtered_her"):
                 for case, marker in CASES.items():
                     own = found[task, algorithm, case]
                     label = f"{algorithm}, {case}"
-                    axes.scatter(own[success], own[bias], s=16, marker=marker, color=color, label=label)
+                    axes.scatter(
+                        own[success], own[bias], s=16, marker=marker, color=COLORS[algorithm], label=label
+                    )
             axes.set(title=f"{task}, {kind} goals", xlabel="success", ylabel="bias of Q")
             axes.grid(alpha=0.3)
     axes.legend(fontsize=7)

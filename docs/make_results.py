@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from torchrl_her_envs import make_env
 from torchrl_her_recipes.config.study import Study, load_study
-from torchrl_her_recipes.reports.results import Combination, at_the_end
+from torchrl_her_recipes.reports.results import LAST, Combination, at_the_end
 from torchrl_her_recipes.reports.tidy import is_results, read_results, write_results
 from torchrl_her_recipes.runs.plots import draw_curves, draw_goals, plot_comparison
 
@@ -82,6 +82,29 @@ def print_table(cells: Sequence[Combination]) -> None:
             f"| `{cell.task}` | `{cell.algorithm}` | {cell.runs} | {cell.frames:,} "
             f"| {spread(success, '.0%')} | {min(success):.0%} | {kl} |"
         )
+
+
+def frames_until(rows: Rows, success: float) -> list[float]:
+    """Frames of each run until the mean of its last evaluations has come to a success; inf if it has not."""
+    frames = []
+    for run in sorted({row["run"] for row in rows}):
+        own = [row for row in rows if row["run"] == run]
+        means = [
+            np.mean([row["success"] for row in own[end - LAST : end]]) for end in range(LAST, len(own) + 1)
+        ]
+        there = np.flatnonzero(np.array(means) >= success - 1e-6)
+        frames.append(own[there[0] + LAST - 1]["frames"] if len(there) else np.inf)
+    return frames
+
+
+def print_speed(cells: Sequence[Combination], success: float) -> None:
+    print(f"\n| combination | frames until {success:.0%} | runs that never are |")
+    print("| --- | --- | --- |")
+    for cell in cells:
+        frames = frames_until(cell.rows, success)
+        low, middle, high = np.percentile(np.minimum(frames, cell.frames), [33, 50, 67])  # at the end at most
+        never = int(np.isinf(frames).sum())
+        print(f"| `{cell.algorithm}` | **{middle:,.0f}** ({low:,.0f} to {high:,.0f}) | {never} |")
 
 
 def draw_study(cells: Sequence[Combination], study: Study, path: Path) -> None:
@@ -177,6 +200,8 @@ def main() -> None:
             cells = [cell for cell in every if cell.done] or every
             print(f"\n### {name}\n")
             print_table(cells)
+            if name == "wall":
+                print_speed(cells, 0.8)
             if name == "fetch" and any(not cell.missing for cell in every):
                 draw_beside_published(
                     [cell for cell in every if not cell.missing], options.images / "fetch.png"
