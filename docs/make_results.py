@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,9 +40,11 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "filter_bias": "filter_bias",
     "divergence": "divergence",
     "wall": "wall",
+    "proposals": "proposals",
     "demonstrations": str(HERE / "studies" / "demonstrations.yaml"),
     "fetch": "fetch",
     "lift_ablation": str(HERE / "studies" / "lift_ablation.yaml"),
+    "fetch_ibs": "fetch_ibs",
     "hand_reach": str(HERE / "studies" / "hand_reach.yaml"),
     "window": "window",
     "initialisation": "initialisation",
@@ -105,6 +108,13 @@ def print_speed(cells: Sequence[Combination], success: float) -> None:
         low, middle, high = np.percentile(np.minimum(frames, cell.frames), [33, 50, 67])  # at the end at most
         never = int(np.isinf(frames).sum())
         print(f"| `{cell.algorithm}` | **{middle:,.0f}** ({low:,.0f} to {high:,.0f}) | {never} |")
+
+
+def beginning_of_fetch(other: Combination) -> Combination:
+    """As many steps of the study ``fetch`` as another combination has: the same without weights of goals."""
+    (cell,) = [cell for cell in read_results(RESULTS / "fetch").cells if cell.task == other.task]
+    rows = [row for row in cell.rows if row["frames"] <= other.frames]
+    return replace(cell, algorithm="uniform", rows=rows)
 
 
 def draw_study(cells: Sequence[Combination], study: Study, path: Path) -> None:
@@ -207,6 +217,8 @@ def main() -> None:
                     [cell for cell in every if not cell.missing], options.images / "fetch.png"
                 )
                 continue
+            if name == "fetch_ibs":
+                cells = [beginning_of_fetch(cells[0]), *cells]
             if name == "divergence":
                 draw_the_ends(cells, "kl", "KL(q, q*)", options.images / f"{name}.png")
             elif name == "demonstrations":
