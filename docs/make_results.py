@@ -42,6 +42,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "wall": "wall",
     "proposals": "proposals",
     "demonstrations": str(HERE / "studies" / "demonstrations.yaml"),
+    "demonstrations_preset": str(HERE / "studies" / "demonstrations_preset.yaml"),
     "fetch": "fetch",
     "lift_ablation": str(HERE / "studies" / "lift_ablation.yaml"),
     "fetch_ibs": "fetch_ibs",
