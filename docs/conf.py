@@ -58,6 +58,7 @@ nitpick_ignore_regex = [
     ("py:class", r"ctypes\..*"),
     # Types that appear in signatures and that nobody has to name.
     ("py:class", r"torchrl_her\.replay_buffers\.keys\.TransitionKeys"),
+    ("py:class", r"torchrl_her_recipes\.tuning\.search\.SearchResult"),
     ("py:class", r"torchrl_her\.replay_buffers\.runs\.storage\.Field"),
     ("py:class", r"torchrl_her\.native\.job\.Structures"),
     ("py:class", r"torchrl_her_envs\.throwing\.arrays\.Array"),
