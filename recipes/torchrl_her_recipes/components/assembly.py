@@ -27,7 +27,7 @@ from torchrl_her_recipes.components.curricula import (
 )
 from torchrl_her_recipes.components.demonstrations import load_demonstrations, rows_needed
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
-from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
+from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs, resolved
 from torchrl_her_recipes.components.goal_space import goal_space
 from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.imports import permit_task
@@ -47,6 +47,7 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     """
     if allow_import:
         permit_task(recipe.task.name)
+    recipe = resolved(recipe)
     processes = recipe.collection.processes > 0  # then those here only tell what the others are like
     task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
     curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import closing
 from typing import Any
 
 import torch
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded
+from torchrl.envs import ActionScaling, EnvBase, TransformedEnv
 
+from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_envs.registry import GYM, get_task_spec, make_env
 from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.resolve import EnvFacts, auto_options, resolve
 
 _AT_ONCE = 20  # environments of gymnasium's in an evaluation: each is a simulation of 10 MB and more
 
@@ -35,7 +39,7 @@ def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictu
     """Environments of the recipe's task: ``num_envs`` for each seed.
 
     All environments of recipes are made here, so this is also where modules that recipes name are imported,
-    or refused.
+    or refused. Continuous actions are from -1 to 1, whatever the task's own bounds are.
 
     Args:
         recipe: of a run.
@@ -59,4 +63,21 @@ def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictu
         options["dtype"] = getattr(torch, recipe.run.dtype)
     if pictures:
         options = {**get_task_spec(task.name).for_pictures, **options}
-    return make_env(task.name, num_envs=num_envs * len(seeds), seed=seeds, **options)
+    env = make_env(task.name, num_envs=num_envs * len(seeds), seed=seeds, **options)
+    actions = env.action_spec
+    if isinstance(actions, Bounded) and not (actions.low.eq(-1).all() and actions.high.eq(1).all()):
+        return TransformedEnv(env, ActionScaling())
+    return env
+
+
+def resolved(recipe: Recipe) -> Recipe:
+    """The recipe with a value for each option that is ``auto``, from what its environment is.
+
+    Raises:
+        ValueError: see :func:`make_task_envs`.
+    """
+    if not auto_options(recipe):
+        return recipe
+    with closing(make_task_envs(recipe, 1, [0])) as env:
+        task = goal_env(env)
+        return resolve(recipe, EnvFacts(max_steps=task.max_steps, batched=task.batched))

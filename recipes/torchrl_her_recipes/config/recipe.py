@@ -22,8 +22,8 @@ from torchrl_her_recipes.config.groups import (
     TaskConfig,
 )
 from torchrl_her_recipes.config.imports import permit_task
-from torchrl_her_recipes.config.learners import AUTO, LEARNERS, DDPGConfig, LearnerConfig, options_of
-from torchrl_her_recipes.config.options import default_of, what_there_is
+from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, DDPGConfig, LearnerConfig, options_of
+from torchrl_her_recipes.config.options import AUTO, default_of, what_there_is
 from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, Nested, over, place
 from torchrl_her_recipes.config.without_effect import without_effect
 
@@ -35,6 +35,9 @@ EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints", "keep_buffer",
 class Recipe:
     """Every choice of a training run, as groups of options with plain values.
 
+    Options that are ``auto`` get their values from the task's environment when the run is built, see
+    :func:`~torchrl_her_recipes.config.resolve.resolve`.
+
     :func:`make_recipe` makes one from the short names of options. Lengths are environment steps ("frames").
 
     Raises:
@@ -42,8 +45,8 @@ class Recipe:
 
     Example:
         >>> recipe = Recipe(hindsight=HindsightConfig(algo="her"), run=RunConfig(seed=3))
-        >>> recipe.learner.gamma, recipe.total_frames
-        (0.98, 614400)
+        >>> recipe.learner.learning_rate, recipe.learner.gamma
+        (0.001, 'auto')
     """
 
     task: TaskConfig = field(default_factory=TaskConfig)
@@ -69,7 +72,7 @@ class Recipe:
             )
         for (group, name), why in without_effect(self).items():
             value = getattr(getattr(self, group), name)
-            if value != _default(getattr(self, group), name):
+            if value not in (None, _default(getattr(self, group), name)):
                 shown = f"{group}.{name}" if group in LONG_ONLY else name
                 raise ValueError(f"{shown}={value} has no effect {why}: leave it out")
 
@@ -213,7 +216,7 @@ def _learner_of(*values: Nested) -> str:
     """The learner that is named in the first of some values, or that ``auto`` stands for on their task."""
     name, task = _named("learner", "auto", *values), _named("task", TaskConfig.name, *values)
     actions = get_task_spec(task).actions if isinstance(task, str) and name == "auto" else None
-    return name if actions is None else AUTO[actions]
+    return name if actions is None else BY_ACTIONS[actions]
 
 
 def _drop_options_of_another_learner(below: Nested, given: Nested) -> None:
@@ -264,10 +267,10 @@ def _drop_other_goal_sources(below: Nested, given: Nested) -> None:
     short = {name: asked[name] for name in ("k", "strategy") if name in asked}
     if not short:
         return
-    if asked.get("goal_sources") is not None:
+    if asked.get("goal_sources", AUTO) not in (None, AUTO):
         shown = " and ".join(f"{name}={value}" for name, value in short.items())
         raise ValueError(f"{shown} and goal_sources={asked['goal_sources']} say the same: give one of them")
-    below.get("hindsight", {}).pop("goal_sources", None)
+    asked["goal_sources"] = None
 
 
 def _assemble(values: Nested) -> Recipe:

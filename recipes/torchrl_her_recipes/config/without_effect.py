@@ -7,6 +7,7 @@ from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.algorithms import get_algorithm
+from torchrl_her_recipes.config.options import AUTO
 
 WEIGHTS = ("ibs", "novelty")  # the groups of options of weights of goals
 
@@ -55,7 +56,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
             idle["ibs", "cells"] = idle["ibs", "recent"] = "with estimator=kernel"
         if algorithm.instructive == "sequential":
             idle["ibs", "floor"] = with_algo
-    if algorithm.hindsight and groups.hindsight.goal_sources is not None:
+    if algorithm.hindsight and groups.hindsight.goal_sources not in (None, AUTO):
         idle["hindsight", "k"] = idle["hindsight", "strategy"] = "with goal_sources"
     if not algorithm.curriculum:
         all_of("curriculum", with_algo)
@@ -114,7 +115,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         idle["learner", "products"] = "with dtype=float64"
     elif groups.learner.norm == "batch":
         idle["learner", "products"] = "with norm=batch"
-    elif groups.learner.hidden < 32:
+    elif groups.learner.hidden != AUTO and groups.learner.hidden < 32:
         idle["learner", "products"] = "with hidden below 32"
     if getattr(groups.learner, "uniform_share", None) == 1.0:
         idle["learner", "action_noise"] = "with uniform_share=1"

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_her.trainers.checkpoint import load_checkpoint
 from torchrl_her_recipes.config.imports import permit_task
-from torchrl_her_recipes.config.learners import AUTO
+from torchrl_her_recipes.config.learners import BY_ACTIONS
 from torchrl_her_recipes.config.plain_files import reason
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.shipped import TRAINED, policy_names
@@ -209,7 +209,7 @@ def _card_of(state: dict[str, Any]) -> PolicyCard:
         high=(1.0,) * actions,
         normalize_clip=recipe.learner.normalize_clip if recipe.learner.normalize else None,
         algorithm=recipe.hindsight.algo,
-        learner=AUTO["continuous"] if recipe.learner.name == "auto" else recipe.learner.name,
+        learner=BY_ACTIONS["continuous"] if recipe.learner.name == "auto" else recipe.learner.name,
         seed=recipe.run.seed,
         frames=state["frames"],
         success=state["success"],
