@@ -17,6 +17,7 @@ from torchrl_her_recipes.config.imports import check_permitted, foreign_module, 
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.resolve import EnvFacts, auto_options, resolve
 
+_FACTS: dict[str, EnvFacts] = {}  # of tasks whose environments were made before
 _AT_ONCE = 20  # environments of gymnasium's in an evaluation: each is a simulation of 10 MB and more
 
 
@@ -78,6 +79,8 @@ def resolved(recipe: Recipe) -> Recipe:
     """
     if not auto_options(recipe):
         return recipe
-    with closing(make_task_envs(recipe, 1, [0])) as env:
-        task = goal_env(env)
-        return resolve(recipe, EnvFacts(max_steps=task.max_steps, batched=task.batched))
+    if (facts := _FACTS.get(repr(recipe.task))) is None:
+        with closing(make_task_envs(recipe, 1, [0])) as env:
+            task = goal_env(env)
+            facts = _FACTS[repr(recipe.task)] = EnvFacts(max_steps=task.max_steps, batched=task.batched)
+    return resolve(recipe, facts)

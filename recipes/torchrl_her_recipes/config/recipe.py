@@ -63,6 +63,9 @@ class Recipe:
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self) -> None:
+        if self.run.frames is not None and self.collection.epoch_frames != AUTO:
+            epochs = -(-self.run.frames // self.collection.epoch_frames)
+            object.__setattr__(self, "run", replace(self.run, frames=None, epochs=epochs))
         wanted = options_of(self.learner.name)
         if type(self.learner) is not wanted:
             got = type(self.learner).__name__
@@ -201,6 +204,8 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     _drop_options_of_another_task(below, given)
     _drop_another_curriculum(below, given)
     _drop_other_goal_sources(below, given)
+    if "epochs" in given.get("run", {}):
+        below.get("run", {}).pop("frames", None)
     for group, own in without_effect(_groups(over(below, given))):
         if own not in given.get(group, {}) and own in below.get(group, {}):
             del below[group][own]

@@ -106,7 +106,8 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         for name in ("priority_alpha", "priority_beta"):
             idle["replay", name] = f"with sampler={groups.replay.sampler}"
     if not groups.learner.normalize:
-        idle["learner", "normalize_clip"] = "with normalize=false"
+        for name in ("normalize_clip", "normalize_least_std"):
+            idle["learner", name] = "with normalize=false"
     if groups.learner.compile == "never":
         idle["learner", "products"] = "with compile=never"
     elif not groups.learner.device.startswith(("cpu", "auto")):

@@ -151,7 +151,7 @@ class TensorPolicy(nn.Module):
 
 def _constants(norm: RunningNorm, key: str) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, deviation and limit of an entry, as :meth:`RunningNorm.normalize` uses them."""
-    n, mean, var = norm.moments_of(key)
-    std = var.sqrt().clamp(min=norm.least_std)
+    n, mean, _ = norm.moments_of(key)
+    std = norm.std[0, norm.columns_of(key)]
     limit = torch.where(n > 0, norm.clip, torch.inf)
     return mean.float(), std.float(), limit.float()
