@@ -17,7 +17,6 @@ from torch import Tensor, nn
 
 from torchrl_her.modules.networks import by_run
 
-
 _RELATIVE_STD = 1e-4  # of the mean: smaller deviations are hardly more than what float32 rounds
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 FREE_ARGUMENT = 2.0  # arguments of tanh up to this cost nothing: tanh(2) is 0.964, and its slope 0.07
@@ -12,10 +11,10 @@ LARGEST_ACTION = 1 - 1e-6  # beyond it float32 hardly tells arguments of tanh ap
 def action_cost(action: Tensor, *, l2: float = 0.0, saturation: float = 0.0) -> Tensor:
     """Cost of actions in an actor's loss: their mean square, and how far they are saturated.
 
-    An actor that ends in tanh gets no gradient where its actions are at their bounds. The action L2 penalty of
-    OpenAI's HER prevents that by pulling all actions towards 0, and an actor whose critic cannot tell actions
-    apart yet learns to stand still. The saturation penalty acts on ``atanh(action)`` beyond 2 alone, where its
-    slope is not flattened by tanh, and leaves all other actions free.
+    An actor that ends in tanh gets no gradient where its actions are at their bounds. The action L2 penalty
+    of OpenAI's HER prevents that by pulling all actions towards 0, and an actor whose critic cannot tell
+    actions apart yet learns to stand still. The saturation penalty acts on ``atanh(action)`` beyond 2 alone,
+    where its slope is not flattened by tanh, and leaves all other actions free.
 
     Args:
         action: [..., a], from -1 to 1.

@@ -63,13 +63,15 @@ class CollectionConfig(Group):
     steps_per_batch: int = option(10, "steps of each environment between two rounds of updates", at_least=1)
     frames_per_update: float = option(
         AUTO,
-        "environment steps for each gradient step; 0.5: two gradient steps for each environment step; auto: 2, "
-        "or 5 with this package's tasks",
+        "environment steps for each gradient step; 0.5: two gradient steps for each environment step; "
+        "auto: 2, or 5 with this package's tasks",
         above=0,
         below=math.inf,
     )
     warmup_frames: int = option(
-        AUTO, "environment steps before the first gradient step; auto: an episode of each environment", at_least=0
+        AUTO,
+        "environment steps before the first gradient step; auto: an episode of each environment",
+        at_least=0,
     )
     processes: int = option(
         0,
@@ -143,8 +145,8 @@ class HindsightConfig(Group):
     goal_sources: Any = option(
         AUTO,
         "in place of k and strategy, how many virtual goals come from where, as in '{future: 2, actual: 2}': "
-        "any strategy, actual (goals wanted in recent episodes), achieved (goals achieved in them); auto: three "
-        "future ones and an actual one, or none if k or strategy is given",
+        "any strategy, actual (goals wanted in recent episodes), achieved (goals achieved in them); auto: "
+        "three future ones and an actual one, or none if k or strategy is given",
     )
     n_steps: int = option(1, "steps that a transition spans, at most (n-step returns)", at_least=1)
 

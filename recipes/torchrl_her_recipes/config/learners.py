@@ -62,7 +62,9 @@ class LearnerConfig(Group):
     )
     normalize_clip: float = option(5.0, "normalized values are clipped to plus and minus this", above=0)
     normalize_least_std: float | None = option(
-        None, "least deviation that values are divided by; 1/10,000 of each entry's mean if not given", above=0
+        None,
+        "least deviation that values are divided by; 1/10,000 of each entry's mean if not given",
+        above=0,
     )
     tau: float = option(0.05, "rate of the soft target update", at_least=0, at_most=1)
     average_decay: float = option(

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
-from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.without_effect import without_effect
 
 _GAMMA = (0.9, 0.99)  # least and greatest
 _WARMUP = 1_000  # environment steps, at least
@@ -27,10 +27,6 @@ class EnvFacts:
 
     max_steps: int
     batched: bool = False
-
-
-def _has_hindsight(recipe: Recipe) -> bool:
-    return get_algorithm(recipe.hindsight.algo).hindsight
 
 
 def _gamma(_recipe: Recipe, facts: EnvFacts) -> float:
@@ -57,7 +53,7 @@ def _warmup_frames(recipe: Recipe, facts: EnvFacts) -> int:
 
 # In this order: later ones depend on earlier ones.
 _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
-    "goal_sources": lambda recipe, _facts: recipe.hindsight.sources if _has_hindsight(recipe) else None,
+    "goal_sources": lambda recipe, _facts: recipe.hindsight.sources,
     "gamma": _gamma,
     "hidden": lambda _recipe, facts: 64 if facts.batched else 256,
     "num_envs": _num_envs,
@@ -68,7 +64,7 @@ _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
 
 
 def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
-    """Group and name of each option that is ``auto`` and depends on the environment.
+    """Group and name of each option that is ``auto``, depends on the environment, and has an effect.
 
     Example:
         >>> auto_options(Recipe().replace(gamma=0.95))[:2]
@@ -76,7 +72,8 @@ def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
     """
     homes = {own.name: group.name for group in fields(recipe) for own in fields(getattr(recipe, group.name))}
     names = [(homes[name], name) for name in _VALUES]
-    return [(group, name) for group, name in names if getattr(getattr(recipe, group), name) == AUTO]
+    idle = without_effect(recipe)
+    return [own for own in names if getattr(getattr(recipe, own[0]), own[1]) == AUTO and own not in idle]
 
 
 def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:

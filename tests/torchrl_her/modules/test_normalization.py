@@ -110,7 +110,9 @@ def test_the_unit_of_values_makes_no_difference(unit: float) -> None:
     plain.update(rows(3.0, 3.002, 2.998))
     norm.update(rows(3.0 * unit, 3.002 * unit, 2.998 * unit))
     wanted = plain(rows(3.001, 50.0))["observation"]
-    torch.testing.assert_close(norm(rows(3.001 * unit, 50.0 * unit))["observation"], wanted, rtol=1e-2, atol=0)
+    torch.testing.assert_close(
+        norm(rows(3.001 * unit, 50.0 * unit))["observation"], wanted, rtol=1e-2, atol=0
+    )
     assert wanted[1].item() == norm.clip
 
 

@@ -20,7 +20,13 @@ def test_both_costs_by_hand() -> None:
 def test_free_actions_are_not_pulled_and_saturated_ones_get_a_full_gradient() -> None:
     argument = torch.tensor([0.0, 1.5, -1.99, 5.0, -6.0], dtype=torch.float64, requires_grad=True)
     action_cost(argument.tanh(), saturation=1.0).backward()
-    expected = [0.0, 0.0, 0.0, 2 * 3 / 5, -2 * 4 / 5]  # of the square of what is above 2, whatever tanh's slope
+    expected = [
+        0.0,
+        0.0,
+        0.0,
+        2 * 3 / 5,
+        -2 * 4 / 5,
+    ]  # of the square of what is above 2, whatever tanh's slope
     assert argument.grad is not None
     assert argument.grad.tolist() == pytest.approx(expected, rel=1e-6)
 
@@ -29,4 +35,6 @@ def test_actions_at_their_bounds_give_finite_numbers() -> None:
     action = torch.tensor([1.0, -1.0], requires_grad=True)
     cost = action_cost(action, saturation=1.0)
     cost.backward()
-    assert cost.isfinite() and action.grad is not None and action.grad.isfinite().all()
+    assert cost.isfinite()
+    assert action.grad is not None
+    assert action.grad.isfinite().all()
