@@ -152,5 +152,6 @@ def keep_weights(loss: LossModule, critic: TensorDictModule | Sequence[TensorDic
     if isinstance(critic, TensorDictModule) or len(critic) > 1:
         return
     weights = TensorDict.from_module(critic[0]).data.unsqueeze(0)
-    for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
-        params.data.update_(weights)
+    for name, params in loss.named_children():  # TorchRL warns of asking for targets before they are updated
+        if name in ("qvalue_network_params", "target_qvalue_network_params"):
+            params.data.update_(weights)

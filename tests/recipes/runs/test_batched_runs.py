@@ -116,7 +116,9 @@ class Emptying(Callback):
     def on_batch(self, run: RunView) -> None:
         recipe = run.components.recipe
         for index, seed in enumerate(recipe.seeds):
-            if run.trainer.frames == recipe.collection.num_envs * recipe.collection.steps_per_batch * (6 + seed % 3):
+            if run.trainer.frames == recipe.collection.num_envs * recipe.collection.steps_per_batch * (
+                6 + seed % 3
+            ):
                 empty_run(run.components.buffer, index)
         self.idle.append([size == 0 for size in sizes_of(run.components.buffer)])
 
