@@ -155,22 +155,23 @@ class FusedLearner:
         job.critic, job.critic_layers = self._critic, len(self._critic)
         job.critics, job.critic_tensors = weights.critics, weights.critic_tensors
         job.tensors = weights.table()
-        job.counts = len(weights.counts)
         job.max_norm, job.tau, job.bfloat16 = self.max_grad_norm, self.tau, self._products == "bfloat16"
         return call
 
     def _run(self, call: FusedCall, first: int, steps: int) -> Tensor:
         """Makes some of the steps; returns what was measured, [3, steps, R]."""
         losses = torch.zeros(3, steps, self.runs, dtype=self._kinds.dtype)
-        noise, adam = call.draw_noise(steps), self._adam(steps)  # memory that the job points to
+        counts = self._weights.counts
+        noise, adam = call.draw_noise(steps), self._adam(steps, counts)  # memory that the job points to
         job = call.job
+        job.counts = len(counts)
         job.first_step, job.steps, job.losses, job.adam = first, steps, losses.data_ptr(), adam
         self._steps(ctypes.addressof(job))
         del noise
         return losses
 
-    def _adam(self, steps: int) -> Any:
-        """Adam's numbers for each step of each run, [R, S]."""
+    def _adam(self, steps: int, counts: Sequence[float]) -> Any:
+        """Adam's numbers for each step of each run, [R, S], which has made so many before."""
         (group,) = self.optimizer.param_groups
         rate, (beta1, beta2), kind = float(group["lr"]), group["betas"], self._kinds.adam
 
@@ -189,7 +190,6 @@ class FusedLearner:
 
         # As its step() would: schedulers of learning rates ask for it.
         self.optimizer._opt_called = True  # type: ignore[attr-defined]
-        counts = self._weights.counts
         return (kind * (steps * self.runs))(
             *(own for run in range(self.runs) for own in numbers(counts[run % len(counts)]))
         )
