@@ -9,7 +9,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer
 from torchrl_her.curriculum.transforms import take_columns
@@ -162,7 +162,10 @@ class GuidedExploration(TensorDictModuleBase):
         rows = TensorDict({self.input_key: seen}, tensordict.batch_size)
         own = tensordict.get(action_key)
         acts = guided >= 0 if own.ndim == guided.ndim else (guided >= 0).squeeze(-1)
-        return tensordict.set(action_key, torch.where(acts, self.guide(rows).get(action_key), own))
+        # Greedy: whether it is asked at all depends on the other runs, so it must not draw for this one.
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            action = self.guide(rows).get(action_key)
+        return tensordict.set(action_key, torch.where(acts, action, own))
 
     def _begin(self, begun: Tensor, top: Tensor | None) -> Tensor:
         """Draws which of the episodes that begin are guided; the others are as they were."""

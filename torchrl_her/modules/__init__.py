@@ -18,10 +18,11 @@ from torchrl_her.modules.networks import (
     stack_runs,
     take_run,
 )
+from torchrl_her.modules.noise import RunNoise
 from torchrl_her.modules.normalization import Moments, RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch, NormalizedPolicy
 from torchrl_her.modules.q_actor import QNet, make_q_actor
-from torchrl_her.modules.stochastic_actor import StochasticActorNet, make_stochastic_actor
+from torchrl_her.modules.stochastic_actor import StochasticActor, StochasticActorNet, make_stochastic_actor
 
 __all__ = [
     "ActorNet",
@@ -34,9 +35,11 @@ __all__ = [
     "NormalizedPolicy",
     "PolicyAverage",
     "QNet",
+    "RunNoise",
     "RunningNorm",
     "StackedLayerNorm",
     "StackedLinear",
+    "StochasticActor",
     "StochasticActorNet",
     "explore",
     "explore_actions",

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_her.modules.networks import ActivationName, Norm, StackedLinear, by_run, hidden_layers
+from torchrl_her.modules.noise import RunNoise
 
 _LEAST_SCALE, _GREATEST_SCALE = -10.0, 2.0  # of the logarithm: Haarnoja et al., 2018
 
@@ -55,6 +58,44 @@ class StochasticActorNet(nn.Module):
         return location, scale.clamp(_LEAST_SCALE, _GREATEST_SCALE).exp()
 
 
+class StochasticActor(ProbabilisticActor):
+    """TorchRL's actor of SAC, whose draws come from a generator for each of R runs.
+
+    What a run draws then does not depend on which other runs play beside it. Copies share the generators, as
+    they play for the same runs.
+
+    Args:
+        *args: of :class:`torchrl.modules.ProbabilisticActor`.
+        generators: R of them; None for torch's own generator, which all runs share.
+        **kwargs: of the same.
+    """
+
+    def __init__(
+        self, *args: Any, generators: Sequence[torch.Generator | None] | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.noise = RunNoise(generators)
+
+    @property
+    def generators(self) -> list[torch.Generator | None] | None:
+        """Sources of the draws of each run."""
+        return self.noise.generators
+
+    @generators.setter
+    def generators(self, generators: Sequence[torch.Generator | None] | None) -> None:
+        self.noise = RunNoise(generators)
+
+    def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
+        """Writes the action of each row [R * E, ...]: drawn, or greedy if exploration is switched off."""
+        if self.noise.generators is None or exploration_type() is not ExplorationType.RANDOM:
+            return super().forward(tensordict, *args, **kwargs)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            tensordict = super().forward(tensordict, *args, **kwargs)
+        dist = self.build_dist_from_params(tensordict)
+        drawn = dist.transforms[0](dist.loc + dist.scale * self.noise(dist.loc))
+        return tensordict.set(self.out_keys[-1], drawn)
+
+
 class SquashedLocation(nn.Module):
     """The greedy action of a stochastic actor: the location of its normal distribution, squashed and scaled.
 
@@ -94,6 +135,7 @@ def make_stochastic_actor(
     norm: Norm = "none",
     runs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
+    generators: Sequence[torch.Generator] | None = None,
 ) -> ProbabilisticActor:
     """SAC's actor: draws from a squashed normal distribution; its greedy action is the squashed location.
 
@@ -103,6 +145,7 @@ def make_stochastic_actor(
         hidden, depth, activation, norm: as for :class:`~torchrl_her.modules.ActorNet`.
         runs: R, how many independent actors.
         in_keys: what it sees; the goal must be among them.
+        generators: of the actions that each run draws; None for torch's own.
 
     Example:
         >>> from tensordict import TensorDict
@@ -120,10 +163,11 @@ def make_stochastic_actor(
         norm=norm,
         runs=runs,
     )
-    return ProbabilisticActor(
+    return StochasticActor(
         TensorDictModule(net, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": action_spec.space.low, "high": action_spec.space.high},
         spec=action_spec,
+        generators=generators,
     )

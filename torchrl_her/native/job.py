@@ -75,7 +75,7 @@ def structures(dtype: torch.dtype) -> Structures:
         "Job",
         ("algorithm runs critics batch first_step steps rows actions threads", ctypes.c_int),
         ("actor_layers critic_layers actor_tensors critic_tensors bfloat16", ctypes.c_int),
-        ("target_critics dropped", ctypes.c_int),
+        ("target_critics dropped counts", ctypes.c_int),
         ("actor critic", ctypes.POINTER(Layer)),
         ("tensors", ctypes.POINTER(tensors)),
         ("entries", ctypes.c_int),

@@ -17,7 +17,7 @@ enum Algorithm { kDdpg, kTd3, kSac, kDqn, kTqc };
 struct Tensors {
     int rows, columns;
     real *value, *target, *first_moment, *second_moment;  // of all runs; target may be null
-    float* steps;  // Adam's count, or null
+    float* steps;  // Adam's counts [counts], or null
 };
 
 struct Entry {
@@ -30,6 +30,7 @@ struct Job {
     int actor_layers, critic_layers, actor_tensors, critic_tensors, bfloat16;
     int target_critics;  // how many critics are drawn for targets, and the actor follows the mean of all; 0: all
     int dropped;         // how many of the greatest quantiles of all critics TQC's targets leave out
+    int counts;          // of Adam's steps: one for each run, or one for all
     const Layer *actor, *critic;
     const Tensors* tensors;  // of the actor, of each critic, and SAC's logarithm of the temperature
     int entries;
@@ -46,7 +47,7 @@ struct Job {
     const uint8_t* idle;     // [runs]
     const int32_t* drawn;    // [steps, runs, target_critics], critics
     real gamma, least, greatest, penalty, saturation, max_norm, tau, policy_noise, noise_limit, target_entropy;
-    const Adam* adam;  // [steps]
+    const Adam* adam;  // [runs, steps]
     real* priorities;  // [runs, rows]
     real* losses;      // [3, steps, runs]
 };
@@ -455,7 +456,7 @@ class Learner {
     void update() {
         double critics = 0;
         for (int n = 1; n <= job_.critics; ++n) critics += networks_[n].gradient_square();
-        const Adam& adam = job_.adam[step_ - job_.first_step];
+        const Adam& adam = job_.adam[long(run_) * job_.steps + step_ - job_.first_step];
         for (int n = 0; n <= job_.critics; ++n) {
             const real clip = clipping(n == 0 ? networks_[0].gradient_square() : critics);
             for (Parameter& parameter : networks_[n].parameters) adam_step(parameter, adam, clip, job_.tau);
@@ -479,7 +480,8 @@ class Learner {
 extern "C" void her_steps(const her::Job* job) {
     const int tensors = job->actor_tensors + job->critics * job->critic_tensors + her::is_stochastic(*job);
     for (int i = 0; i < tensors; ++i)
-        if (job->tensors[i].steps) *job->tensors[i].steps += job->steps;
+        for (int n = 0; job->tensors[i].steps && n < job->counts; ++n)
+            if (job->counts == 1 || !job->idle[n]) job->tensors[i].steps[n] += job->steps;
 #pragma omp parallel for schedule(dynamic) num_threads(job->threads) if (job->threads > 1)
     for (int run = 0; run < job->runs; ++run) {
         if (job->idle[run]) continue;

@@ -5,9 +5,8 @@ from torchrl_her.objectives.cloning import DEMONSTRATION, ClonesDemonstrations, 
 from torchrl_her.objectives.critics import critic_value, critic_values
 from torchrl_her.objectives.ddpg import CloningDDPGLoss, PenalizedDDPGLoss, make_ddpg_loss
 from torchrl_her.objectives.dqn import make_dqn_loss
-from torchrl_her.objectives.noise import RunNoise
 from torchrl_her.objectives.sac import CloningSACLoss, PenalizedSACLoss, make_sac_loss
-from torchrl_her.objectives.targets import ClampedTD0, clamped_td0, make_target_updater
+from torchrl_her.objectives.targets import ClampedTD0, RunsHardUpdate, clamped_td0, make_target_updater
 from torchrl_her.objectives.td3 import CloningTD3Loss, PenalizedTD3Loss, make_td3_loss
 from torchrl_her.objectives.tqc import CloningTQCLoss, PenalizedTQCLoss, make_tqc_loss
 
@@ -24,7 +23,7 @@ __all__ = [
     "PenalizedSACLoss",
     "PenalizedTD3Loss",
     "PenalizedTQCLoss",
-    "RunNoise",
+    "RunsHardUpdate",
     "action_cost",
     "clamped_td0",
     "cloning_terms",

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, TQCLoss
 
-from torchrl_her.objectives.noise import RunNoise
+from torchrl_her.modules.noise import RunNoise
 
 
 @torch.no_grad()
@@ -125,7 +125,10 @@ def checked_subset(target_critics: int, critics: int) -> int:
 def as_critics(
     critic: TensorDictModule | Sequence[TensorDictModule], critics: int
 ) -> TensorDictModule | list[TensorDictModule]:
-    """One critic that others are made like, or all of them in a list.
+    """One critic that others are made like, or all of them in a list, as TorchRL's losses take them.
+
+    TorchRL registers the weights of a list of one critic as buffers, which are not trained. So a single one
+    is handed over by itself; TorchRL then draws weights anew, which :func:`keep_weights` puts back.
 
     Raises:
         ValueError: the list has another length than ``critics``, or that is below 1.
@@ -136,4 +139,19 @@ def as_critics(
         return critic
     if len(critic) != critics:
         raise ValueError(f"there must be {critics} critics, got {len(critic)}")
-    return list(critic)
+    return list(critic) if critics > 1 else critic[0]
+
+
+def keep_weights(loss: LossModule, critic: TensorDictModule | Sequence[TensorDictModule]) -> None:
+    """Gives the only critic of a loss the weights that it came with, if it came in a list.
+
+    Args:
+        loss: made with what :func:`as_critics` gave.
+        critic: what that was given.
+    """
+    if isinstance(critic, TensorDictModule) or len(critic) > 1:
+        return
+    weights = TensorDict.from_module(critic[0]).data.unsqueeze(0)
+    for name, params in loss.named_children():  # TorchRL warns of asking for targets before they are updated
+        if name in ("qvalue_network_params", "target_qvalue_network_params"):
+            params.data.update_(weights)

@@ -14,9 +14,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SACLoss
 
+from torchrl_her.modules.noise import RunNoise
 from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
-from torchrl_her.objectives.critics import as_critics, checked_subset, least_of_some
-from torchrl_her.objectives.noise import RunNoise
+from torchrl_her.objectives.critics import as_critics, checked_subset, keep_weights, least_of_some
 from torchrl_her.objectives.targets import clamped_td0
 
 
@@ -199,6 +199,7 @@ def make_sac_loss(
         scalar_output_mode="exclude" if reduction == "none" else None,
         **options,
     )
+    keep_weights(loss, critic)
     loss.set_keys(state_action_value=(own[0] if isinstance(own, list) else own).out_keys[0])
     set_soft_targets(loss, gamma, reward_range)
     return loss

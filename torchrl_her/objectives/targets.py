@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -63,7 +64,55 @@ def clamped_td0(
     )
 
 
-def make_target_updater(loss: LossModule, *, tau: float, hard_interval: int) -> TargetNetUpdater:
+class RunsHardUpdate(HardUpdate):
+    """Copies the online weights of each of R runs to its target networks, by the run's own count of steps.
+
+    Args:
+        loss: with stacked networks.
+
+    Keyword Args:
+        interval: gradient steps between two copies.
+        runs: R.
+
+    Attributes:
+        counts: gradient steps of each run.
+        idle: runs that make no gradient step at present.
+    """
+
+    def __init__(self, loss: LossModule, *, interval: int, runs: int) -> None:
+        super().__init__(loss, value_network_update_interval=interval - 1)
+        self.interval, self.counts = interval, [0] * runs
+        self.idle: Sequence[int] = ()
+        self._due: list[int] = []
+
+    def step(self) -> None:
+        """Counts a gradient step of each run that is not idle, and copies the weights where it is time."""
+        learning = [run for run in range(len(self.counts)) if run not in self.idle]
+        for run in learning:
+            self.counts[run] += 1
+        self._due = [run for run in learning if self.counts[run] % self.interval == 0]
+        if self._due:
+            TargetNetUpdater.step(self)
+
+    def _step(self, p_source: TensorDictBase, p_target: TensorDictBase) -> None:
+        dim, runs = p_target.ndim, len(self.counts)  # a stack of N critics is [N, R, ...]
+        for key, target in p_target.items(True, True):
+            source, own = (
+                each.data.unflatten(dim, (runs, -1)).movedim(dim, 0) for each in (p_source.get(key), target)
+            )
+            own[self._due] = source[self._due]
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "counts": list(self.counts)}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self.counts = list(state_dict["counts"])
+
+
+def make_target_updater(
+    loss: LossModule, *, tau: float, hard_interval: int, runs: int = 1
+) -> TargetNetUpdater:
     """What moves the target networks of a loss, one step at a time.
 
     Args:
@@ -72,6 +121,7 @@ def make_target_updater(loss: LossModule, *, tau: float, hard_interval: int) -> 
     Keyword Args:
         tau: share of the online weights in a soft update, which follows each step if ``hard_interval`` is 0.
         hard_interval: copies the online weights every so many steps; 0 for soft updates.
+        runs: how many independent runs the loss has; each has its own count of steps.
 
     Example:
         >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss
@@ -79,6 +129,8 @@ def make_target_updater(loss: LossModule, *, tau: float, hard_interval: int) -> 
         >>> type(make_target_updater(loss, tau=0.01, hard_interval=0)).__name__
         'SoftUpdate'
     """
+    if hard_interval > 0 and runs > 1:
+        return RunsHardUpdate(loss, interval=hard_interval, runs=runs)
     if hard_interval > 0:
         # TorchRL counts that many steps without a copy before each step with one
         return HardUpdate(loss, value_network_update_interval=hard_interval - 1)

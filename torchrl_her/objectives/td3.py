@@ -13,10 +13,10 @@ from torchrl.data import Bounded
 from torchrl.objectives import TD3Loss
 from torchrl.objectives.utils import distance_loss
 
+from torchrl_her.modules.noise import RunNoise
 from torchrl_her.objectives.action_cost import action_cost
 from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
-from torchrl_her.objectives.critics import as_critics, checked_subset, least_of_some
-from torchrl_her.objectives.noise import RunNoise
+from torchrl_her.objectives.critics import as_critics, checked_subset, keep_weights, least_of_some
 from torchrl_her.objectives.targets import clamped_td0
 
 
@@ -186,6 +186,7 @@ def make_td3_loss(
         reduction=reduction,
         **options,
     )
+    keep_weights(loss, critic)
     key = (own[0] if isinstance(own, list) else own).out_keys[0]
     estimator = clamped_td0(gamma, reward_range)
     loss.set_keys(state_action_value=key)

@@ -13,9 +13,9 @@ from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import TQCLoss
 
+from torchrl_her.modules.noise import RunNoise
 from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
-from torchrl_her.objectives.critics import as_critics
-from torchrl_her.objectives.noise import RunNoise
+from torchrl_her.objectives.critics import as_critics, keep_weights
 from torchrl_her.objectives.sac import PenalizedSACLoss, positive_temperature, set_soft_targets
 
 
@@ -161,6 +161,7 @@ def make_tqc_loss(
         **options,
         **cloned,
     )
+    keep_weights(loss, critic)
     loss.set_keys(state_action_value=first.out_keys[0])
     set_soft_targets(loss, gamma, reward_range)
     return loss

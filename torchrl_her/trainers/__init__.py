@@ -1,5 +1,6 @@
 """The training loop: learners, evaluation metrics, checkpoints."""
 
+from torchrl_her.trainers.adam import RunsAdam
 from torchrl_her.trainers.checkpoint import (
     CheckpointError,
     buffer_state_dict,
@@ -27,6 +28,7 @@ __all__ = [
     "Learner",
     "LossLearner",
     "Replay",
+    "RunsAdam",
     "Schedule",
     "Trainer",
     "buffer_state_dict",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, Literal, get_args
 
 import torch
@@ -24,7 +25,7 @@ from torchrl_her.trainers.fused_call import FusedCall
 from torchrl_her.trainers.fused_layers import layers_of
 from torchrl_her.trainers.fused_weights import FusedWeights
 from torchrl_her.trainers.fusing import FUSED, action_key, is_plain_adam, network_of, why_not_fused
-from torchrl_her.trainers.learner import check_rows
+from torchrl_her.trainers.learner import check_idle, check_rows, idle_runs
 
 Products = Literal["float32", "bfloat16"]
 
@@ -120,15 +121,17 @@ class FusedLearner:
         """
         check_rows(rows, steps, self.runs)
         self._check(rows)
+        check_idle(self.optimizer, self.target, idle)
         call = self._call(rows, steps)
         call.set_idle(idle)
-        if isinstance(self.target, HardUpdate):  # copies the weights after some of the steps
-            losses = []
-            for step in range(steps):
-                losses.append(self._run(call, step, 1))
-                self.target.step()
-        else:
-            losses = [self._run(call, 0, steps)]
+        with idle_runs(self.loss, self.target, idle):
+            if isinstance(self.target, HardUpdate):  # copies the weights after some of the steps
+                losses = []
+                for step in range(steps):
+                    losses.append(self._run(call, step, 1))
+                    self.target.step()
+            else:
+                losses = [self._run(call, 0, steps)]
         rows.set(self.loss.tensor_keys.priority, call.priorities.view(rows.batch_size))
         return dict(zip(self._fused.losses, torch.cat(losses, 1), strict=False))
 
@@ -158,31 +161,38 @@ class FusedLearner:
     def _run(self, call: FusedCall, first: int, steps: int) -> Tensor:
         """Makes some of the steps; returns what was measured, [3, steps, R]."""
         losses = torch.zeros(3, steps, self.runs, dtype=self._kinds.dtype)
-        noise, adam = call.draw_noise(steps), self._adam(steps)  # memory that the job points to
+        counts = self._weights.counts
+        noise, adam = call.draw_noise(steps), self._adam(steps, counts)  # memory that the job points to
         job = call.job
+        job.counts = len(counts)
         job.first_step, job.steps, job.losses, job.adam = first, steps, losses.data_ptr(), adam
         self._steps(ctypes.addressof(job))
         del noise
         return losses
 
-    def _adam(self, steps: int) -> Any:
-        """Adam's numbers for each step."""
+    def _adam(self, steps: int, counts: Sequence[float]) -> Any:
+        """Adam's numbers for each step of each run, [R, S], which has made so many before."""
         (group,) = self.optimizer.param_groups
-        count, rate, (beta1, beta2) = self._weights.steps, float(group["lr"]), group["betas"]
-        kind = self._kinds.adam
-        numbers = [
-            kind(
-                *bias_corrections(count + step, rate, (beta1, beta2)),
-                beta2,
-                1 - beta1,
-                1 - beta2,
-                group["eps"],
-            )
-            for step in range(1, steps + 1)
-        ]
+        rate, (beta1, beta2), kind = float(group["lr"]), group["betas"], self._kinds.adam
+
+        @cache  # most runs have made as many steps as the others
+        def numbers(count: float) -> list[Any]:
+            return [
+                kind(
+                    *bias_corrections(count + step, rate, (beta1, beta2)),
+                    beta2,
+                    1 - beta1,
+                    1 - beta2,
+                    group["eps"],
+                )
+                for step in range(1, steps + 1)
+            ]
+
         # As its step() would: schedulers of learning rates ask for it.
         self.optimizer._opt_called = True  # type: ignore[attr-defined]
-        return (kind * steps)(*numbers)
+        return (kind * (steps * self.runs))(
+            *(own for run in range(self.runs) for own in numbers(counts[run % len(counts)]))
+        )
 
     def _layers(self, name: str | None) -> Any:
         layers = [] if name is None else layers_of(network_of(getattr(self.loss, name)))

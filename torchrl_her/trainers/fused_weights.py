@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from torchrl_her.native.job import STOCHASTIC, Structures
+from torchrl_her.trainers.adam import RunsAdam
 from torchrl_her.trainers.fusing import FUSED
 
 State = dict[str, Tensor]
@@ -97,17 +98,19 @@ class FusedWeights:
                         f"{list(tensor.shape)} on {tensor.device}: make the learner after moving the loss, "
                         "and load states of the same networks"
                     )
-        counts = {float(state["step"]) for state in states}
+        counts = {tuple(state["step"].flatten().tolist()) for state in states}
         if len(counts) > 1:
             raise ValueError(f"Adam must have made as many steps for each parameter, got {sorted(counts)}")
 
     @property
-    def steps(self) -> float:
-        """How many steps Adam has made."""
-        return float(self._optimizer.state[self.parameters[0]]["step"])
+    def counts(self) -> list[float]:
+        """How many steps Adam has made: of each run, or of all together."""
+        return self._optimizer.state[self.parameters[0]]["step"].flatten().tolist()
 
     def _start(self, parameter: nn.Parameter) -> State:
         """The first state of a parameter, as Adam itself makes it at its first step."""
+        if isinstance(self._optimizer, RunsAdam):
+            return self._optimizer.start(parameter)
         state: State = self._optimizer.state[parameter]
         state["step"] = torch.zeros((), dtype=torch.float32)
         state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter.data) for _ in range(2))

@@ -21,9 +21,10 @@ from torchrl_her.native.job import STOCHASTIC, Algorithm
 from torchrl_her.objectives.cloning import ClonesDemonstrations
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss
 from torchrl_her.objectives.sac import PenalizedSACLoss
-from torchrl_her.objectives.targets import ClampedTD0
+from torchrl_her.objectives.targets import ClampedTD0, RunsHardUpdate
 from torchrl_her.objectives.td3 import PenalizedTD3Loss
 from torchrl_her.objectives.tqc import PenalizedTQCLoss
+from torchrl_her.trainers.adam import RunsAdam
 from torchrl_her.trainers.fused_layers import layers_of, parameter_shapes
 
 
@@ -130,7 +131,11 @@ def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | Non
         return "behavior cloning of demonstrations, which the C++ steps do not have"
     if type(loss) not in FUSED:
         return f"a {type(loss).__name__}, which is not a loss that this library makes"
-    if type(target) not in (SoftUpdate, HardUpdate) or target is None or target.loss_module is not loss:
+    if (
+        type(target) not in (SoftUpdate, HardUpdate, RunsHardUpdate)
+        or target is None
+        or target.loss_module is not loss
+    ):
         return "targets that do not follow this loss by a SoftUpdate or HardUpdate"
     return next(_obstacles(loss, FUSED[type(loss)]), None)
 
@@ -142,7 +147,7 @@ def is_plain_adam(optimizer: torch.optim.Optimizer, loss: LossModule | None = No
         optimizer: any optimizer.
         loss: the optimizer must hold exactly its parameters; None if that does not matter.
     """
-    if type(optimizer) is not torch.optim.Adam or len(optimizer.param_groups) != 1:
+    if type(optimizer) not in (torch.optim.Adam, RunsAdam) or len(optimizer.param_groups) != 1:
         return False
     (group,) = optimizer.param_groups
     extras = ("weight_decay", "amsgrad", "maximize", "differentiable")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.objectives import LossModule
+from torchrl.objectives import HardUpdate, LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
 from torchrl_her.trainers.runs import clip_by_run, keep_runs, run_dims
@@ -41,6 +42,39 @@ def check_rows(rows: TensorDictBase, steps: int, runs: int) -> None:
         raise ValueError(f"{rows.shape[-1]} rows cannot be shared out among {steps} gradient steps")
 
 
+def check_idle(
+    optimizer: torch.optim.Optimizer, target: TargetNetUpdater | None, idle: Sequence[int]
+) -> None:
+    """Refuses idle runs where gradient steps of all runs are counted together, which changes later ones.
+
+    Raises:
+        ValueError: the optimizer is a plain Adam, or the target update a plain HardUpdate.
+    """
+    remedies = {
+        torch.optim.Adam: "trainers.RunsAdam(loss, lr=..., runs=R)",
+        HardUpdate: "make_target_updater(loss, tau=0, hard_interval=..., runs=R)",
+    }
+    for own in (optimizer, target):
+        if idle and type(own) in remedies:
+            raise ValueError(
+                f"runs {list(idle)} are idle, but {type(own).__name__} counts the steps of all runs "
+                f"together: take torchrl_her.{remedies[type(own)]}"
+            )
+
+
+@contextmanager
+def idle_runs(loss: LossModule, target: TargetNetUpdater | None, idle: Sequence[int]) -> Iterator[None]:
+    """Lets a loss and its target update know, in the ``with`` block, which runs do not learn."""
+    parts: list[Any] = [own for own in (getattr(loss, "noise", None), target) if hasattr(own, "idle")]
+    for own in parts:
+        own.idle = tuple(idle)
+    try:
+        yield
+    finally:
+        for own in parts:
+            own.idle = ()
+
+
 class LossLearner:
     """Gradient steps on any TorchRL loss module: backward, clipping, optimizer, target update.
 
@@ -52,7 +86,7 @@ class LossLearner:
         loss: the outputs whose names begin with ``loss`` are summed; no two of them may train the same
             network.
         optimizer: over the loss module's parameters; must be elementwise, as Adam is, if there are several
-            runs.
+            runs, and a :class:`~torchrl_her.trainers.RunsAdam` if some of them may be idle.
         target: moves the target networks; None for a loss without them.
         max_grad_norm: to which the gradients of each network of each run are clipped separately.
         runs: R.
@@ -87,7 +121,9 @@ class LossLearner:
         check_rows(rows, steps, self.runs)
         last = rows.ndim - 1
         parts = rows.split(rows.shape[last] // steps, last)
-        with keep_runs(self.loss, self.optimizer, idle, runs=self.runs):
+        check_idle(self.optimizer, self.target, idle)
+        kept = keep_runs(self.loss, self.optimizer, idle, runs=self.runs)
+        with kept, idle_runs(self.loss, self.target, idle):
             measured = [self._update(part) for part in parts]
         key = getattr(self.loss.tensor_keys, "priority", None)
         priorities = [] if key is None else [part.get(key, None) for part in parts]

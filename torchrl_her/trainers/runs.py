@@ -32,8 +32,6 @@ def keep_runs(
 ) -> Iterator[None]:
     """Leaves some runs of a stacked loss and its optimizer unchanged by what happens in the ``with`` block.
 
-    What all runs share, such as Adam's count of steps, does change.
-
     Args:
         loss: its tensors have a dimension of R equal blocks, in the order of the runs (see ``run_dims``).
         optimizer: over its parameters.

@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import nn
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
 
 from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import Curriculum, zero_unused_inputs
@@ -17,6 +18,7 @@ from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.networks import StackedLinear, stack_runs
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.objectives.targets import make_target_updater
+from torchrl_her.trainers.adam import RunsAdam
 from torchrl_her_recipes.components.curricula import is_guided
 from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.learner import Agent, LearnerBuilder, Networks
@@ -50,6 +52,7 @@ def make_agent(
         ValueError: the learner cannot choose such actions, or cannot train several runs.
     """
     builder = _builder(recipe, env, curriculum)
+    builder.generators = generators
     actor, critics = _networks(builder, recipe, curriculum)  # the same on all devices
     builder.device, actor = device, actor.to(device)
     critics = [critic.to(device) for critic in critics]
@@ -65,12 +68,20 @@ def make_agent(
         exploration=exploration,
         policy=TensorDictSequential(player, *([] if guide is None else [guide]), exploration),
         loss=loss,
-        optimizer=torch.optim.Adam(loss.parameters(), lr=options.learning_rate, fused=True),
-        target=make_target_updater(loss, tau=options.tau, hard_interval=options.hard_update_interval),
+        optimizer=_make_adam(loss, options.learning_rate, recipe.run.num_runs),
+        target=make_target_updater(
+            loss, tau=options.tau, hard_interval=options.hard_update_interval, runs=recipe.run.num_runs
+        ),
         norm=norm,
         average=_average_of(player, recipe),
         guide=guide,
     )
+
+
+def _make_adam(loss: LossModule, learning_rate: float, runs: int) -> torch.optim.Adam:
+    if runs > 1:
+        return RunsAdam(loss, lr=learning_rate, runs=runs)
+    return torch.optim.Adam(loss.parameters(), lr=learning_rate, fused=True)
 
 
 def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:

@@ -24,14 +24,13 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
-from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import CurriculumProgress
-from torchrl_her.modules.exploration import Exploration
 from torchrl_her_recipes.components.collection_worker import (
     Beginning,
     WorkerCollector,
     begin_process,
     derive_seed,
+    drawing_modules,
     make_worker_env,
     share_of_envs,
 )
@@ -332,9 +331,8 @@ def _to_send(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     together.
     """
     copy = deepcopy(policy).to(CPU)
-    for module in copy.modules():
-        if isinstance(module, Exploration | GuidedExploration):
-            module.generators = [None] * len(module.generators)
+    for module in drawing_modules(copy):
+        module.generators = [None] * len(module.generators)
     return copy
 
 

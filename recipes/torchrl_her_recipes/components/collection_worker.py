@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, TransformedEnv
 
@@ -18,6 +19,7 @@ from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import CurriculumProgress
 from torchrl_her.curriculum.transforms import StateToObs
 from torchrl_her.modules.exploration import Exploration
+from torchrl_her.modules.stochastic_actor import StochasticActor
 from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import in_layers, is_guided, make_curriculum
@@ -86,6 +88,12 @@ class Beginning:
         )
 
 
+def drawing_modules(policy: nn.Module) -> list[Any]:
+    """The parts of a policy that draw random numbers, each from a generator for each run."""
+    kinds = Exploration | GuidedExploration | StochasticActor
+    return [module for module in policy.modules() if isinstance(module, kinds)]
+
+
 def derive_seed(*numbers: int) -> int:
     """A seed that differs for different numbers, which are not negative."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))
@@ -98,12 +106,11 @@ class WorkerCollector(Collector):
         """Begins new episodes everywhere."""
         goal_env(self.env).set_seeds(beginning.env_seeds)
         first = beginning.seeds[0]
-        torch.manual_seed(first)  # policies such as SAC's draw from torch's own generator
+        torch.manual_seed(first)  # a policy of one's own may draw from torch's own generator
         np.random.seed(first % (1 << 32))
         random.seed(first)
-        for exploration in self.policy.modules():
-            if isinstance(exploration, Exploration | GuidedExploration):
-                exploration.generators = [torch.Generator().manual_seed(seed) for seed in beginning.seeds]
+        for module in drawing_modules(self.policy):
+            module.generators = [torch.Generator().manual_seed(seed) for seed in beginning.seeds]
         if beginning.progress is not None:
             _progress_of(self.env).load_state_dict(beginning.progress)
         self.reset()

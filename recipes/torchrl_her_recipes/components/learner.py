@@ -64,9 +64,11 @@ class LearnerBuilder(ABC):
     Attributes:
         options: the recipe's group of the learner's own options.
         device: where networks and losses are.
+        generators: of each run's random numbers, for policies that draw their actions; None for torch's own.
     """
 
     device = torch.device("cpu")
+    generators: Sequence[torch.Generator] | None = None
 
     def __init__(self, recipe: Recipe, env: EnvBase, in_keys: Sequence[str]) -> None:
         self.recipe, self.env, self.in_keys = recipe, env, in_keys

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -126,3 +127,30 @@ def test_a_learner_may_be_for_one_run_only(monkeypatch: pytest.MonkeyPatch) -> N
     recipe = small(task="hand_v0", learner="sac", num_runs=2)
     with pytest.raises(ValueError, match="num_runs must be 1 with learner=sac"):
         find_learner(recipe, make_task_envs(recipe, 2, [0, 1]))
+
+
+@pytest.mark.parametrize("compile", ["always", "never"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"learner": "td3"},
+        {"learner": "sac"},
+        {"learner": "tqc", "quantiles": 5},
+        {"learner": "redq", "target_critics": 0},
+    ],
+    ids=lambda own: own["learner"],
+)
+def test_one_critic_learns_and_begins_with_the_weights_of_its_seed(
+    options: dict[str, Any], compile: str, tmp_path: Path
+) -> None:
+    recipe = small(critics=1, hidden=8, epochs=1, compile=compile, **options)
+    first, second = build(recipe), build(recipe.replace(seed=1, num_runs=2))
+    before = {name: value.clone() for name, value in first.loss.state_dict().items() if "qvalue" in name}
+    other = build(recipe.replace(seed=1)).loss.state_dict()
+    for name, value in before.items():
+        weights = second.loss.state_dict()[name][:, :1]
+        assert torch.equal(weights, other[name][:, :1])  # of the first run, which has the seed 1
+        assert "norm" in name or not torch.equal(weights, value[:, :1]) or not value.any()
+    run(first, tmp_path / "run", progress=False)
+    after = first.loss.state_dict()
+    assert not any(torch.equal(value, after[name]) for name, value in before.items())

@@ -17,7 +17,8 @@ from torchrl_her import (
     make_stochastic_actor,
     make_td3_loss,
 )
-from torchrl_her.objectives import RunNoise, critic_value
+from torchrl_her.modules import RunNoise
+from torchrl_her.objectives import critic_value
 from torchrl_her.objectives.critics import least_of_some
 
 from ..lost_game import SPEC, rows, say

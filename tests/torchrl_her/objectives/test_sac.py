@@ -9,6 +9,7 @@ import torch
 from torchrl.objectives import LossModule, SACLoss, SoftUpdate
 
 from torchrl_her import LossLearner, make_critic, make_sac_loss, make_stochastic_actor
+from torchrl_her.trainers import RunsAdam
 
 from ..lost_game import SPEC, rows, say
 
@@ -140,9 +141,7 @@ def test_each_run_has_a_temperature_of_its_own() -> None:
         temperature=0.2,
         reduction="none",
     )
-    learner = LossLearner(
-        loss, torch.optim.Adam(loss.parameters(), lr=0.1), SoftUpdate(loss, tau=0.1), runs=3
-    )
+    learner = LossLearner(loss, RunsAdam(loss, lr=0.1, runs=3), SoftUpdate(loss, tau=0.1), runs=3)
     assert loss.log_alpha.exp().tolist() == pytest.approx([0.2] * 3)
     learner.update(rows(8, action=torch.rand(1, 8, 3)).expand(3, 8).clone(), idle=[1])
     changed = (loss.log_alpha.exp() - 0.2).abs() > 1e-3

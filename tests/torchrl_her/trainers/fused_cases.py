@@ -22,7 +22,7 @@ from torchrl_her import (
     make_td3_loss,
     make_tqc_loss,
 )
-from torchrl_her.objectives import RunNoise
+from torchrl_her.modules import RunNoise
 
 WIDTHS, ACTIONS = (4, 2), 3
 ALGORITHMS = ("ddpg", "td3", "sac", "redq", "tqc", "dqn")

@@ -16,8 +16,15 @@ from tensordict import TensorDict
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
 from tests.torchrl_her.trainers.fused_cases import ALGORITHMS, make_loss, make_rows, twin
-from torchrl_her import FusedLearner, LossLearner, make_actor, make_critic, make_ddpg_loss
-from torchrl_her.trainers import Learner
+from torchrl_her import (
+    FusedLearner,
+    LossLearner,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    make_target_updater,
+)
+from torchrl_her.trainers import Learner, RunsAdam
 from torchrl_her.trainers.runs import run_dims
 
 
@@ -194,7 +201,8 @@ def test_a_run_is_the_same_beside_others(algorithm: str) -> None:
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_idle_runs_stay_as_they_are_from_the_first_step_on(algorithm: str) -> None:
     loss = make_loss(algorithm, runs=3)
-    learner = make_learner(FusedLearner, loss)
+    optimizer = RunsAdam(loss, lr=1e-2, runs=3)
+    learner = FusedLearner(loss, optimizer, SoftUpdate(loss, tau=0.1))
     before = {name: value.clone() for name, value in loss.state_dict().items()}
     learner.update(make_rows(algorithm, (3, 8)), idle=[1])
     for name, value in loss.state_dict().items():
@@ -206,6 +214,37 @@ def test_idle_runs_stay_as_they_are_from_the_first_step_on(algorithm: str) -> No
     for parameter, state in learner.optimizer.state.items():
         dim = 1 if parameter.ndim == 4 else 0
         assert (state["exp_avg"].select(dim, 1) == 0).all()
+        assert state["step"].flatten().tolist() == [1, 0, 1]
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("hard", [0, 2])
+def test_a_run_that_was_idle_learns_as_with_torchrl_s_loss(algorithm: str, hard: int) -> None:
+    losses = [loss := make_loss(algorithm, runs=3), twin(loss)]
+    measured = []
+    for kind, own in zip((LossLearner, FusedLearner), losses, strict=True):
+        target = make_target_updater(own, tau=0.1, hard_interval=hard, runs=3)
+        options = {"runs": 3} if kind is LossLearner else {}
+        learner = kind(own, RunsAdam(own, lr=1e-2, runs=3), target, max_grad_norm=0.5, **options)
+        for number, idle in enumerate([[1], [], [0, 2], []]):
+            rows = make_rows(algorithm, (3, 24), number)
+            learning = [run for run in range(3) if run not in idle]
+            measured.append([values[:, learning] for values in learner.update(rows, 3, idle=idle).values()])
+    torch.testing.assert_close(measured[:4], measured[4:], atol=1e-12, rtol=0)
+    for name, value in losses[0].state_dict().items():
+        torch.testing.assert_close(value, losses[1].state_dict()[name], atol=1e-12, rtol=0)
+
+
+def test_idle_runs_need_counts_of_their_own() -> None:
+    rows = make_rows("ddpg", (2, 8))
+    learner = make_learner(FusedLearner, make_loss("ddpg", runs=2))
+    with pytest.raises(ValueError, match=r"runs \[1\] are idle, but Adam counts .* take .*RunsAdam"):
+        learner.update(rows, idle=[1])
+    loss = make_loss("ddpg", runs=2)
+    target = HardUpdate(loss, value_network_update_interval=3)
+    learner = LossLearner(loss, RunsAdam(loss, runs=2), target, runs=2)
+    with pytest.raises(ValueError, match=r"HardUpdate counts .* take .*make_target_updater"):
+        learner.update(rows, idle=[1])
 
 
 def test_a_checkpoint_in_between_changes_nothing() -> None:
@@ -366,7 +405,7 @@ def test_counts_of_steps_that_differ_are_refused() -> None:
     learner = make_learner(FusedLearner, make_loss("ddpg"))
     learner.update(make_rows("ddpg", (1, 8)))
     list(learner.optimizer.state.values())[-1]["step"] = torch.tensor(1000.0)
-    with pytest.raises(ValueError, match=r"as many steps for each parameter, got \[1.0, 1000.0\]"):
+    with pytest.raises(ValueError, match=r"as many steps for each parameter, got \[\(1.0,\), \(1000.0,\)\]"):
         learner.update(make_rows("ddpg", (1, 8)))
 
 

@@ -22,7 +22,7 @@ from torchrl_her import (
     make_td3_loss,
     make_tqc_loss,
 )
-from torchrl_her.trainers import GraphLearner, LossLearner, why_not_recorded
+from torchrl_her.trainers import GraphLearner, LossLearner, RunsAdam, why_not_recorded
 
 from ...emulated import DEVICE, emulated_device
 from ...emulated_graphs import CapturingError, Graph, emulated_graphs
@@ -81,11 +81,17 @@ def parts(
     return {"loss": loss, "optimizer": optimizer, "target": target, "runs": runs}
 
 
-def pair(runs: int = RUNS, **options: Any) -> tuple[LossLearner, GraphLearner]:
+def pair(
+    runs: int = RUNS, *, optimizer: type[torch.optim.Adam] = torch.optim.Adam, **options: Any
+) -> tuple[LossLearner, GraphLearner]:
     """A learner without graphs and one with, from the same parts."""
-    plain = LossLearner(**parts(runs))
+    own, other = parts(runs), parts(runs)
+    if optimizer is RunsAdam:
+        for each in (own, other):
+            each["optimizer"] = RunsAdam(each["loss"], lr=1e-2, runs=runs)
+    plain = LossLearner(**own)
     plain.optimizer.param_groups[0]["capturable"] = True  # which rounds otherwise
-    return plain, GraphLearner(**parts(runs), compile=False, **options)
+    return plain, GraphLearner(**other, compile=False, **options)
 
 
 def rows(seed: int, steps: int, runs: int = RUNS, device: Any = DEVICE) -> TensorDictBase:
@@ -125,7 +131,7 @@ def test_launched_steps_are_those_without_a_graph(graphs: type[Graph], runs: int
 
 
 def test_runs_that_are_idle_stay_as_they_are(graphs: type[Graph]) -> None:
-    here, there = pair()
+    here, there = pair(optimizer=RunsAdam)
     for number, idle in enumerate([[1], [], [], [], [0, 2], []]):
         here.update(rows(number, 2), 2, idle=idle)
         there.update(rows(number, 2), 2, idle=idle)

@@ -31,6 +31,7 @@ from torchrl_her import (
 )
 from torchrl_her.objectives import PenalizedDDPGLoss
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, empty_run
+from torchrl_her.trainers import RunsAdam
 
 N, STEPS = 8, 10
 
@@ -245,7 +246,7 @@ def test_a_run_whose_buffer_is_empty_waits_and_holds_no_other_back() -> None:
             make_critic((1, 1), 1, hidden=8, runs=runs),
             reduction="none",
         )
-        optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+        optimizer = RunsAdam(loss, lr=1e-2, runs=runs)
         learner = FusedLearner(loss, optimizer, make_target_updater(loss, tau=0.1, hard_interval=0))
         generators = [torch.Generator().manual_seed(run) for run in range(runs)]
         buffer = TensorDictReplayBuffer(

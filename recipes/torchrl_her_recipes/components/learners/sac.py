@@ -25,7 +25,12 @@ class SACBuilder(DDPGBuilder):
 
     def actor(self, runs: int) -> TensorDictModule:
         return make_stochastic_actor(
-            self.widths, self.action_spec, runs=runs, in_keys=self.in_keys, **self.options.actor_shape
+            self.widths,
+            self.action_spec,
+            runs=runs,
+            in_keys=self.in_keys,
+            generators=self.generators,
+            **self.options.actor_shape,
         )
 
     def greedy(self, actor: TensorDictModule) -> nn.Module:

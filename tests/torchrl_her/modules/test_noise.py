@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_her.objectives import RunNoise
+from torchrl_her.modules import RunNoise
 
 
 def test_a_run_draws_the_same_beside_others() -> None:

@@ -1,8 +1,9 @@
-"""The random numbers of losses: each of several runs has its own."""
+"""Random numbers of actors and losses: each of several runs has its own."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +17,10 @@ class RunNoise:
     Args:
         generators: R of them; None for torch's own generator, which all runs share.
 
+    Attributes:
+        generators: as given. Copies of this object share them.
+        idle: runs that draw nothing; their numbers are 0.
+
     Example:
         >>> alone, beside = torch.Generator().manual_seed(1), torch.Generator().manual_seed(1)
         >>> one = RunNoise([alone])(torch.zeros(3, 2))
@@ -24,16 +29,24 @@ class RunNoise:
         True
     """
 
-    def __init__(self, generators: Sequence[torch.Generator] | None = None) -> None:
+    def __init__(self, generators: Sequence[torch.Generator | None] | None = None) -> None:
         self.generators = None if generators is None else list(generators)
+        self.idle: Sequence[int] = ()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RunNoise:
+        return RunNoise(self.generators)
 
     def __call__(self, like: Tensor) -> Tensor:
         """Numbers of the shape, type and device of a tensor whose first dimension is R equal blocks."""
         if self.generators is None:
             return torch.randn_like(like)
         out = torch.empty_like(like, memory_format=torch.contiguous_format)
-        for block, generator in zip(out.view(len(self.generators), -1), self.generators, strict=True):
-            block.normal_(generator=generator)
+        blocks = out.view(len(self.generators), -1)
+        for run, (block, generator) in enumerate(zip(blocks, self.generators, strict=True)):
+            if run in self.idle:
+                block.zero_()
+            else:
+                block.normal_(generator=generator)
         return out
 
     def subsets(self, count: int, of: int) -> Tensor:
@@ -48,7 +61,9 @@ class RunNoise:
         sources: Sequence[torch.Generator | None] = self.generators or [None]
         devices = [None if own is None else own.device for own in sources]  # draws elsewhere are refused
         drawn = [
-            torch.randperm(of, generator=own, device=device)[:count]
-            for own, device in zip(sources, devices, strict=True)
+            torch.arange(count, device=device)
+            if run in self.idle
+            else torch.randperm(of, generator=own, device=device)[:count]
+            for run, (own, device) in enumerate(zip(sources, devices, strict=True))
         ]
         return torch.stack(drawn).sort(-1).values
