@@ -517,22 +517,25 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         What is not ours is asked first: if it raises an error, nothing of the batch is stored or counted.
         """
         exclude = [*self._exclude, *in_root_and_next([self._keys.env_ids])]
-        written: Iterable[TensorDictBase] = (
-            join_copies(rows, own.virtual, own.real, exclude=exclude, virtual_key=self.options.virtual_key)
-            for own in drafts
-        )
+
+        def join(draft: _Draft) -> TensorDictBase:
+            copies = draft.virtual, draft.real
+            return join_copies(rows, *copies, exclude=exclude, virtual_key=self.options.virtual_key)
+
+        shown: list[TensorDictBase] = []
         undo: list[Callable[[], None] | None] = []
         try:
             if self.on_write is not None:
-                written = list(written)  # all have to be shown before the first one is stored
-                for out, draft in zip(written, drafts, strict=True):
+                shown = [join(draft) for draft in drafts]
+                for out, draft in zip(shown, drafts, strict=True):
                     undo.append(self.on_write(out, draft.runs, draft.counts))
             for draft in drafts:
                 if draft.virtual is not None and self.goal_weights and draft.weighted:
                     goals = draft.virtual.copies.changes[self._keys.goals[0]]
                     self._weights_of_runs().update(goals, draft.runs, draft.virtual.counts)
-            for out, draft in zip(written, drafts, strict=True):
-                self._store(out, draft.runs, draft.counts)
+            for place, draft in enumerate(drafts):
+                # Not all at once if nobody has to see them: that would touch fresh memory.
+                self._store(shown[place] if shown else join(draft), draft.runs, draft.counts)
                 self._counts.add(draft.runs, **draft.numbers)
                 places.note(draft.runs, draft.real.copies.root.split(draft.real.counts), draft.counts)
         except Exception:
