@@ -100,8 +100,8 @@ class Successes:
     """
 
     def __init__(self, runs: int, *, memory: float = 100.0, start: float = 0.5) -> None:
-        if not memory > 0:
-            raise ValueError(f"memory must be positive, got {memory}")
+        if not 0 < memory < math.inf:
+            raise ValueError(f"memory must be positive and finite, got {memory}")
         self.memory = memory
         self.rate = torch.full((runs,), start, dtype=torch.float64)
 

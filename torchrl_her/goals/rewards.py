@@ -63,7 +63,7 @@ class GoalReward:
         threshold: goals nearer than this count as achieved; in the unit of the goals.
 
     Raises:
-        ValueError: ``threshold`` is not positive.
+        ValueError: ``threshold`` is not positive, or not finite.
 
     Example:
         >>> reward, terminated = GoalReward(0.1)(torch.zeros(2, 2), torch.tensor([[0.05, 0.0], [0.2, 0.0]]))
@@ -72,8 +72,8 @@ class GoalReward:
     """
 
     def __init__(self, threshold: float) -> None:
-        if not threshold > 0:
-            raise ValueError(f"threshold must be positive, got {threshold}")
+        if not 0 < threshold < torch.inf:
+            raise ValueError(f"threshold must be positive and finite, got {threshold}")
         self.threshold = threshold
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
