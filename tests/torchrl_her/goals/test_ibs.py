@@ -434,5 +434,5 @@ def test_only_the_newest_goals_count(together: bool) -> None:
 
 
 def test_recent_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="recent must be at least 1, or None, got 0"):
+    with pytest.raises(ValueError, match="recent must be at least 1, got 0"):
         GoalHistogram(GoalGrid(0.0, 3.0, [3]), recent=0)
