@@ -49,7 +49,7 @@ def check_buffer_size(
 
 def memory_of(device: torch.device) -> float:
     """Bytes of memory of a device; infinity where nobody tells."""
-    if device.type == "cuda":
+    if device.type == "cuda" and torch.cuda.device_count():
         return float(torch.cuda.get_device_properties(device).total_memory)
     if device.type != "cpu" or not hasattr(os, "sysconf"):
         return torch.inf
