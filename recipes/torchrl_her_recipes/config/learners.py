@@ -44,7 +44,9 @@ class LearnerConfig(Group):
     device: str = option("cpu", "where the networks are: cpu, cuda, cuda:1, ..., or auto")
     gamma: float = option(0.98, "discount factor", above=0, below=1)
     learning_rate: float = option(1e-3, "learning rate of Adam", above=0)
-    max_grad_norm: float = option(3.0, "gradients of each network are clipped to this norm", above=0)
+    max_grad_norm: float = option(
+        3.0, "gradients of each network are clipped to this norm", above=0, infinite=True
+    )
     hidden: int = option(64, "width of the hidden layers", at_least=1)
     depth: int = option(3, "how many hidden layers the networks have", at_least=2)
     activation: str = option("relu", "behind each hidden layer", choices=("relu", "tanh", "elu"))
@@ -56,7 +58,9 @@ class LearnerConfig(Group):
     normalize: bool = option(
         False, "whether observations and goals are normalized, by mean and deviation of all that was written"
     )
-    normalize_clip: float = option(5.0, "normalized values are clipped to plus and minus this", above=0)
+    normalize_clip: float = option(
+        5.0, "normalized values are clipped to plus and minus this", above=0, infinite=True
+    )
     tau: float = option(0.02, "rate of the soft target update", at_least=0, at_most=1)
     average_decay: float = option(
         0.9995,
