@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_her.checks import check_whole
 from torchrl_her.goals.density import goal_scale, log_kernel_density, log_neighbor_density
 
 _KERNEL_DIMENSIONS = 3
@@ -99,8 +100,8 @@ class Successes:
     """
 
     def __init__(self, runs: int, *, memory: float = 100.0, start: float = 0.5) -> None:
-        if not memory > 0:
-            raise ValueError(f"memory must be positive, got {memory}")
+        if not 0 < memory < math.inf:
+            raise ValueError(f"memory must be positive and finite, got {memory}")
         self.memory = memory
         self.rate = torch.full((runs,), start, dtype=torch.float64)
 
@@ -138,8 +139,9 @@ class Rare(GoalFactor):
 
     def __init__(self, *, samples: int = 250, sigma: float = 0.2, k: int = 10) -> None:
         for name, number in (("samples", samples), ("sigma", sigma), ("k", k)):
-            if not number > 0:
-                raise ValueError(f"{name} must be positive, got {number}")
+            if not 0 < number < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {number}")
+        check_whole(samples=samples, k=k)
         self.samples, self.sigma, self.k = samples, sigma, k
 
     def __call__(self, offers: Offers) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_her.checks import check_whole
 from torchrl_her.replay_buffers.runs.streams import Generators, uniform
 
 
@@ -37,9 +38,7 @@ class AchievedGoals:
     """
 
     def __init__(self, capacity: int = 50_000, *, runs: int = 1) -> None:
-        for name, number in (("capacity", capacity), ("runs", runs)):
-            if number < 1:
-                raise ValueError(f"{name} must be at least 1, got {number}")
+        check_whole(capacity=capacity, runs=runs)
         self.capacity, self.runs = capacity, runs
         self._written = torch.zeros(runs, dtype=torch.int64)
         self._rows: tuple[Tensor, Tensor] | None = None  # goals and observations, [R * capacity, ...]

@@ -13,6 +13,7 @@ from torchrl.envs import Transform
 
 from torchrl_her.behavior.factors import GoalFactor, Offers
 from torchrl_her.behavior.memory import AchievedGoals
+from torchrl_her.checks import check_whole
 from torchrl_her.goals.factors import draw
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.rewards import RewardFunction
@@ -129,8 +130,7 @@ class BehaviorGoals(Transform):
     ) -> None:
         if not 0.0 <= real_share <= 1.0:
             raise ValueError(f"real_share must be in [0, 1], got {real_share}")
-        if candidates < 1:
-            raise ValueError(f"candidates must be at least 1, got {candidates}")
+        check_whole(candidates=candidates)
         if told not in get_args(Told):
             raise ValueError(f"told must be one of {', '.join(get_args(Told))}, got {told!r}")
         own = weights_by_run(weights, runs)
@@ -345,7 +345,7 @@ class BehaviorGoals(Transform):
         likelihood = offers.goals.new_ones(offers.goals.shape[:-1])
         if self.weights and not self.weights[0].alike:
             own = self._weights_of_runs()(offers.goals, range(self.runs), offers.counts)
-            likelihood = checked_weights(own)
+            likelihood = checked_weights(own, offers.goals)
         for factor in self.factors:
             likelihood = likelihood * factor(offers)
         return likelihood

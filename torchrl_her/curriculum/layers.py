@@ -16,6 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_her.checks import check_whole
+
 Indices = str | Sequence[int | str]
 _LISTS = ("observation", "achieved_goal", "desired_goal")
 
@@ -249,10 +251,7 @@ class CurriculumProgress:
         window: int = 20,
         success_threshold: float = 0.9,
     ) -> None:
-        if runs < 1:
-            raise ValueError(f"runs must be at least 1, got {runs}")
-        if window < 1:
-            raise ValueError(f"window must be at least 1, got {window}")
+        check_whole(runs=runs, window=window)
         if not 0.0 < success_threshold <= 1.0:
             raise ValueError(f"success_threshold must be in (0, 1], got {success_threshold}")
         self.curriculum, self.runs = curriculum, runs

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import zip_longest
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 
+from torchrl_her.checks import check_finite
 from torchrl_her.curriculum.layers import CurriculumLayer, CurriculumProgress
 from torchrl_her.modules.normalization import RunningNorm
 
@@ -23,7 +24,7 @@ def count_inputs(
     desired_goal_key: NestedKey = "desired_goal",
     input_key: NestedKey = "input",
     layer_key: NestedKey = "layer",
-) -> None:
+) -> Callable[[], None]:
     """Counts the networks' input of transitions that are written, as :class:`~torchrl_her.ZeroPad` makes it.
 
     Hand it to the writer as ``HERWriter(on_write=functools.partial(count_inputs, norm, progress))``. Inputs
@@ -41,8 +42,15 @@ def count_inputs(
         observation_key, desired_goal_key: read.
         input_key: of the input, in ``norm``.
         layer_key: of the layer that each row carries, if episodes have layers of their own.
+
+    Returns:
+        What undoes it.
+
+    Raises:
+        ValueError: an input is not finite; then nothing is counted.
     """
-    layers = progress.curriculum.layers
+    check_finite({f"{key!r}": rows.get(key) for key in (observation_key, desired_goal_key)})
+    undo, layers = norm.snapshot(), progress.curriculum.layers
     for run, own in zip(runs, rows.split(list(counts)), strict=True):
         parts = [(progress.layer_of(run), own)]
         if progress.by_episode:
@@ -53,6 +61,7 @@ def count_inputs(
             seen = (part.get(observation_key)[..., :shown], part.get(desired_goal_key))
             if len(part) > 0:
                 norm.count(input_key, torch.cat(seen, -1), run=run)
+    return undo
 
 
 def restart_inputs(

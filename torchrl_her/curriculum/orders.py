@@ -152,13 +152,13 @@ class TeacherStudent(EpisodeLayers):
         uniform_share: float = 0.2,
         still: float = 0.02,
     ) -> None:
-        if not memory > 0:
-            raise ValueError(f"memory must be positive, got {memory}")
+        if not 0 < memory < torch.inf:
+            raise ValueError(f"memory must be positive and finite, got {memory}")
         if not 0 < uniform_share <= 1:
             raise ValueError(f"uniform_share must be in (0, 1], got {uniform_share}")
         super().__init__(curriculum, runs=runs, generators=generators)
-        if not still > 0:
-            raise ValueError(f"still must be positive, got {still}")
+        if not 0 < still < torch.inf:
+            raise ValueError(f"still must be positive and finite, got {still}")
         self.memory, self.uniform_share, self.still = memory, uniform_share, still
         self.long = torch.zeros(runs, len(curriculum), dtype=torch.float64)
         self.short = torch.zeros_like(self.long)

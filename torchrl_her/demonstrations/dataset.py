@@ -12,6 +12,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_her.checks import check_finite
 from torchrl_her.trainers.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from torchrl_her.trainers.cut import cut_episodes
 
@@ -73,6 +74,7 @@ class Demonstrations:
             raise ValueError(
                 f"episodes of {n} transitions in all cannot have rows {list(self.rows.batch_size)}"
             )
+        check_finite({f"{key!r} of demonstrations": own for key, own in self.rows.items(True, True)})
         ends = self.lengths.cumsum(0) - 1
         if self.rows["next", "done"].flatten().nonzero().flatten().tolist() != ends.tolist():
             raise ValueError("the last transition of each demonstration must be done, and no other one")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from torchrl_her.checks import check_whole
+
 
 def step_back(
     back: int, outcomes: Sequence[bool], *, stride: int, threshold: float, samples: int, longest: int
@@ -77,9 +79,7 @@ class WalkBack:
         threshold: float = 0.5,
         samples: int = 50,
     ) -> None:
-        for name, value in (("width", width), ("stride", stride), ("samples", samples)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+        check_whole(width=width, stride=stride, samples=samples)
         if not 0.0 < threshold <= 1.0:
             raise ValueError(f"threshold must be in (0, 1], got {threshold}")
         self.width, self.stride, self.threshold, self.samples = width, stride, threshold, samples

@@ -105,7 +105,7 @@ def choose_goals(
     width = table.shape[1]
     valid = torch.ones_like(line, dtype=torch.bool)
     lines = None if weights is None else goals[table]
-    weight = None if weights is None or lines is None else checked_weights(weights(lines))
+    weight = None if weights is None or lines is None else checked_weights(weights(lines), lines)
     index = _propose(candidates, k, weight, draws)
     useless = weight is not None and not bool((weight > 0).all())
     begin = line * width  # of the lines in the flat table

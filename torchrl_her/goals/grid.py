@@ -14,6 +14,8 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from torchrl_her.checks import check_finite
+
 _MAX_CELLS = 1 << 24  # a table of float64 is then 128 MiB, and five are kept
 _CHUNK = 1 << 21  # kernel values held at once when summing over samples
 _THIN = 1e-4  # of sigma: differences over thinner boxes would lose digits
@@ -79,19 +81,22 @@ class GoalGrid:
     def cell(self, goals: Tensor) -> Tensor:
         """The cell [...] of int64 of each goal [..., d]; the last dimension varies fastest.
 
-        Goals outside are counted in the cell at the edge, NaN in the first one of its dimension. The first
-        time that a goal is NaN, or farther outside than a cell is wide, a warning names it (unless ``warn``
-        is False).
+        Goals outside are counted in the cell at the edge. The first time that a goal is farther outside than
+        a cell is wide, a warning names it (unless ``warn`` is False).
+
+        Raises:
+            ValueError: goals have another width, or are not finite.
         """
         if goals.shape[-1] != len(self.shape):
             raise ValueError(f"the grid has {len(self.shape)} dimensions, got goals of {goals.shape[-1]}")
+        check_finite({"goals": goals})
         index = torch.zeros(goals.shape[:-1], dtype=torch.int64, device=goals.device)
         for x, n in self._along(goals):
             if not self._warned and x.numel() > 0:
-                least, most = x.aminmax()  # NaN if there is one, and then no comparison holds
+                least, most = x.aminmax()
                 if not ((least >= -1) & (most <= n + 1)):
                     self._warn(goals.detach().reshape(-1, len(self.shape)))
-            index.mul_(n).add_(x.nan_to_num_(0.0).clamp_(0, n - 1).long())
+            index.mul_(n).add_(x.clamp_(0, n - 1).long())
         return index
 
     def _along(self, goals: Tensor) -> Iterator[tuple[Tensor, int]]:

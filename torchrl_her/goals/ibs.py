@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_her.checks import check_whole
 from torchrl_her.goals.grid import GoalGrid, kl_divergence
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
@@ -42,8 +43,8 @@ class GoalHistogram(GoalWeights):
     alike = True
 
     def __init__(self, grid: GoalGrid, *, recent: int | None = None) -> None:
-        if recent is not None and recent < 1:
-            raise ValueError(f"recent must be at least 1, or None, got {recent}")
+        if recent is not None:
+            check_whole(recent=recent)
         self.grid, self.recent = grid, recent
         self.counts = torch.zeros(grid.num_cells, dtype=torch.int64)
         self._newest = torch.zeros(0, dtype=torch.int32)  # cells of the goals that count, if not all do

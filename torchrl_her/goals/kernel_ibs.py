@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_her.checks import check_whole
 from torchrl_her.goals.density import log_kernel_density
 from torchrl_her.goals.grid import Numbers
 from torchrl_her.goals.instructive import InstructiveWeights
@@ -84,8 +85,7 @@ class KernelInstructiveness(InstructiveWeights):
     ) -> None:
         if goals.ndim != 2 or len(goals) == 0 or not goals.isfinite().all():
             raise ValueError(f"goals must be finite, [n, g] with n > 0, got a shape of {list(goals.shape)}")
-        if samples < 1:
-            raise ValueError(f"samples must be at least 1, got {samples}")
+        check_whole(samples=samples)
         g = goals.shape[1]
         factor = torch.as_tensor(scale, dtype=torch.float64).reshape(-1)
         if len(factor) not in (1, g) or not bool(((factor > 0) & factor.isfinite()).all()):

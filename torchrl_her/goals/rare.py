@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
+from torchrl_her.checks import check_whole
 from torchrl_her.goals.density import goal_scale, log_kernel_density, log_neighbor_density
 from torchrl_her.goals.grid import Numbers
 from torchrl_her.goals.weights import GoalWeights, normalized_weights, spread_evenly
@@ -74,9 +75,7 @@ class RareGoals(GoalWeights):
             raise ValueError(f"sharpness must be positive and finite, or None, got {sharpness}")
         if not 1 < limit < math.inf:
             raise ValueError(f"limit must be above 1 and finite, got {limit}")
-        for name, value in (("k", k), ("memory", memory), ("samples", samples)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+        check_whole(k=k, memory=memory, samples=samples)
         self.estimator, self.sigma, self.k, self.sharpness, self.limit = estimator, sigma, k, sharpness, limit
         self.memory, self.samples = memory, samples
         self.goals: Tensor | None = None

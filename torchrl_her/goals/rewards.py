@@ -9,6 +9,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchrl_her.checks import check_finite
+
 
 class RewardFunction(Protocol):
     """Maps achieved and desired goals [..., g] to (reward, terminated), each [..., 1].
@@ -61,7 +63,7 @@ class GoalReward:
         threshold: goals nearer than this count as achieved; in the unit of the goals.
 
     Raises:
-        ValueError: ``threshold`` is not positive.
+        ValueError: ``threshold`` is not positive, or not finite.
 
     Example:
         >>> reward, terminated = GoalReward(0.1)(torch.zeros(2, 2), torch.tensor([[0.05, 0.0], [0.2, 0.0]]))
@@ -70,8 +72,8 @@ class GoalReward:
     """
 
     def __init__(self, threshold: float) -> None:
-        if not threshold > 0:
-            raise ValueError(f"threshold must be positive, got {threshold}")
+        if not 0 < threshold < torch.inf:
+            raise ValueError(f"threshold must be positive and finite, got {threshold}")
         self.threshold = threshold
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
@@ -109,6 +111,47 @@ class EnvReward:
         )
 
 
+def ask_reward(
+    reward_fn: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor
+) -> tuple[Tensor, Tensor]:
+    """What a reward function says of goals [..., g]: (reward, terminated), each [..., 1], checked.
+
+    Raises:
+        ValueError: it does not give one finite reward and one bool for each pair of goals.
+
+    Example:
+        >>> ask_reward(GoalReward(0.1), torch.zeros(2, 1), torch.ones(2, 1))[0].tolist()
+        [[-1.0], [-1.0]]
+        >>> ask_reward(lambda achieved, desired: (achieved / 0, achieved > 0), torch.ones(1), torch.ones(1))
+        Traceback (most recent call last):
+        ValueError: rewards of the reward function must be finite, got inf in it
+    """
+    reward, terminated = reward_fn(achieved_goal, desired_goal)
+    shape = _pairs(achieved_goal, desired_goal)
+    if terminated.dtype != torch.bool or terminated.numel() != shape.numel():
+        raise ValueError(
+            f"the reward function must give one bool for each of {shape.numel()} pairs of goals, got "
+            f"{terminated.dtype} of shape {list(terminated.shape)}"
+        )
+    return _checked(reward, shape).unsqueeze(-1), terminated.reshape(*shape, 1)
+
+
+def _pairs(achieved_goal: Tensor, desired_goal: Tensor) -> torch.Size:
+    """The shape [...] of goals [..., g] that are broadcast against each other."""
+    return torch.broadcast_shapes(achieved_goal.shape, desired_goal.shape)[:-1]
+
+
+def _checked(reward: Tensor, shape: torch.Size) -> Tensor:
+    """Rewards of a reward function in the shape of the pairs of goals that it was given."""
+    if reward.numel() != shape.numel():
+        raise ValueError(
+            f"the reward function must give one reward for each of {shape.numel()} pairs of goals, got a "
+            f"shape of {list(reward.shape)}"
+        )
+    check_finite({"rewards of the reward function": reward})
+    return reward.reshape(shape)
+
+
 def missed(
     reward_fn: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor, achieved_reward: float
 ) -> Tensor:
@@ -121,9 +164,12 @@ def missed(
         achieved_goal: [..., g].
         desired_goal: [..., g], broadcast against ``achieved_goal``.
         achieved_reward: the reward of an achieved goal.
+
+    Raises:
+        ValueError: there is not one finite reward for each pair of goals.
     """
     if isinstance(reward_fn, EnvReward):
         value = reward_fn.compute_reward(achieved_goal, desired_goal)
     else:
         value = reward_fn(achieved_goal, desired_goal)[0]
-    return value.squeeze(-1) < achieved_reward
+    return _checked(value, _pairs(achieved_goal, desired_goal)) < achieved_reward

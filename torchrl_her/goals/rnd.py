@@ -15,6 +15,7 @@ from torch.nn.utils import skip_init
 from torchrl.envs.transforms.rnd import RunningMeanStd
 from torchrl.objectives import RNDLoss
 
+from torchrl_her.checks import check_whole
 from torchrl_her.goals.weights import GoalWeights, normalized_weights, spread_evenly
 
 _GOAL = "goal"
@@ -73,14 +74,7 @@ class NetworkNovelty(GoalWeights):
         for name, value in (("sharpness", sharpness), ("lr", lr)):
             if not 0 < value < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value}")
-        for name, count in (
-            ("hidden", hidden),
-            ("features", features),
-            ("steps", steps),
-            ("batch_size", batch_size),
-        ):
-            if count < 1:
-                raise ValueError(f"{name} must be at least 1, got {count}")
+        check_whole(hidden=hidden, features=features, steps=steps, batch_size=batch_size)
         self.seed, self.sharpness, self.hidden, self.features = seed, sharpness, hidden, features
         self.lr, self.steps, self.batch_size = lr, steps, batch_size
         self._learned: _Learned | None = None

@@ -103,12 +103,17 @@ def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: in
     return own
 
 
-def checked_weights(weight: Tensor) -> Tensor:
-    """Weights as floating-point numbers.
+def checked_weights(weight: Tensor, goals: Tensor) -> Tensor:
+    """Weights [...] of goals [..., g] as floating-point numbers.
 
     Raises:
-        ValueError: some are negative or not finite.
+        ValueError: there is not one for each goal, or some are negative or not finite.
     """
+    if weight.shape != goals.shape[:-1]:
+        raise ValueError(
+            f"weights of goals must be {list(goals.shape[:-1])} for goals {list(goals.shape)}, got "
+            f"{list(weight.shape)}"
+        )
     weight = weight if weight.is_floating_point() else weight.float()
     if weight.numel() > 0:
         least, most = weight.aminmax()

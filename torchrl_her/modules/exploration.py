@@ -12,6 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from torchrl_her.checks import check_whole
+
 
 def explore(
     greedy: Tensor,
@@ -181,8 +183,8 @@ class DecayingEpsilon(Exploration):
     def __init__(
         self, low: Tensor, high: Tensor, *, noise: float = 0.05, uniform_share: float = 0.2, **options: Any
     ) -> None:
-        if not noise >= 0.0:
-            raise ValueError(f"noise must be at least 0, got {noise}")
+        if not 0.0 <= noise < torch.inf:
+            raise ValueError(f"noise must be at least 0 and finite, got {noise}")
         if not 0.0 <= uniform_share <= 1.0:
             raise ValueError(f"uniform_share must be in [0, 1], got {uniform_share}")
         super().__init__(**options)
@@ -222,8 +224,7 @@ class DecayingEpsilonGreedy(Exploration):
     """
 
     def __init__(self, actions: int, **options: Any) -> None:
-        if actions < 1:
-            raise ValueError(f"actions must be at least 1, got {actions}")
+        check_whole(actions=actions)
         super().__init__(**options)
         self.actions = actions
 

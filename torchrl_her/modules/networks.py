@@ -16,6 +16,8 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
+from torchrl_her.checks import check_whole
+
 ActivationName = Literal["relu", "tanh", "elu"]
 Norm = Literal["none", "layer", "batch"]
 
@@ -132,10 +134,8 @@ def hidden_layers(
         >>> len(hidden_layers(4, 64, 3))
         3
     """
-    if hidden < 1:
-        raise ValueError(f"hidden must be at least 1, got {hidden}")
-    if depth < _LEAST_DEPTH:
-        raise ValueError(f"depth must be at least {_LEAST_DEPTH}, got {depth}")
+    check_whole(hidden=hidden)
+    check_whole(depth=depth, least=_LEAST_DEPTH)
     for name, word, known in (("norm", norm, get_args(Norm)), ("activation", activation, tuple(ACTIVATIONS))):
         if word not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {word!r}")
@@ -225,8 +225,7 @@ class CriticNet(nn.Module):
         outputs: int = 1,
     ) -> None:
         super().__init__()
-        if outputs < 1:
-            raise ValueError(f"outputs must be at least 1, got {outputs}")
+        check_whole(outputs=outputs)
         self.runs, self.outputs = runs, outputs
         first, *rest = hidden_layers(
             inputs, hidden, depth, joined=actions, runs=runs, norm=norm, activation=activation

@@ -7,7 +7,7 @@ Hindsight experience replay, 2017, appendix A.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
+from torchrl_her.checks import check_whole
 from torchrl_her.modules.networks import by_run
 
 _RELATIVE_STD = 1e-4  # of the mean: smaller deviations are hardly more than what float32 rounds
@@ -115,7 +116,7 @@ class RunningNorm(nn.Module):
         >>> norm = RunningNorm({"observation": 1, "desired_goal": 1}, clip=5.0)
         >>> seen, goals = torch.tensor([[1.0], [5.0]]), torch.tensor([[0.0], [0.2]])
         >>> rows = TensorDict({"observation": seen, "desired_goal": goals}, [2])
-        >>> norm.update(rows)  # means 3 and 0.1, standard deviations 2 and 0.1
+        >>> _ = norm.update(rows)  # means 3 and 0.1, standard deviations 2 and 0.1
         >>> norm(rows)["observation"].tolist()
         [[-1.0], [1.0]]
         >>> norm.normalize("desired_goal", torch.tensor([[0.15], [7.0]]))
@@ -138,9 +139,7 @@ class RunningNorm(nn.Module):
         super().__init__()
         if not widths:
             raise ValueError("widths must name at least one entry to normalize, got none")
-        for name, value in [("runs", runs), *((f"the width of {key!r}", own) for key, own in widths.items())]:
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+        check_whole(runs=runs, **{f"the width of {key!r}": own for key, own in widths.items()})
         for name, number in (("clip", clip), ("least_std", least_std)):
             if number is not None and not number > 0:
                 raise ValueError(f"{name} must be above 0, got {number}")
@@ -190,7 +189,7 @@ class RunningNorm(nn.Module):
     @torch.no_grad()
     def update(
         self, rows: TensorDictBase, runs: Sequence[int] | None = None, counts: Sequence[int] | None = None
-    ) -> None:
+    ) -> Callable[[], None]:
         """Counts transitions, by what is in their root; nothing of them if an entry cannot be counted.
 
         Args:
@@ -198,12 +197,16 @@ class RunningNorm(nn.Module):
             runs: which runs they are of; None for all R of them.
             counts: how many each of these runs has; None for equally many.
 
+        Returns:
+            What undoes it, see :meth:`snapshot`.
+
         Raises:
             KeyError: an entry is missing.
             ValueError: it has another width or is not finite, or rows cannot be divided among the runs.
         """
+        undo = self.snapshot()
         if self.frozen:
-            return
+            return undo
         if runs is None:
             self._check_blocks(rows.shape)
             runs = range(self.runs)
@@ -219,6 +222,26 @@ class RunningNorm(nn.Module):
         ]
         for own, moments_of_part in new:
             _add(own, moments_of_part)
+        return undo
+
+    def snapshot(self) -> Callable[[], None]:
+        """A function that makes the statistics what they are now.
+
+        Example:
+            >>> norm = RunningNorm({"observation": 1})
+            >>> put_back = norm.snapshot()
+            >>> norm.count("observation", torch.ones(3, 1))
+            >>> put_back()
+            >>> norm.n.tolist()
+            [[0.0]]
+        """
+        before = [(own, own.clone()) for own in (self.n, self.mean, self.var)]
+
+        def put_back() -> None:
+            for own, value in before:
+                own.copy_(value)
+
+        return put_back
 
     @torch.no_grad()
     def count(self, key: NestedKey, values: Tensor, *, run: int = 0, weight: float = 1.0) -> None:

@@ -47,7 +47,7 @@ class NormalizeBatch(Transform):
         >>> _ = buffer.append_transform(NormalizeBatch(norm))
         >>> rows = TensorDict({"observation": torch.tensor([[1.0], [5.0]])}, [2])
         >>> _ = buffer.extend(rows)
-        >>> norm.update(rows)
+        >>> _ = norm.update(rows)
         >>> buffer.sample()["observation"].abs().unique().tolist()
         [1.0]
         >>> buffer.storage[:]["observation"].tolist()

@@ -34,8 +34,10 @@ class Cloning:
     key: str = DEMONSTRATION
 
     def __post_init__(self) -> None:
-        if not self.weight >= 0:
-            raise ValueError(f"the weight of behavior cloning must be at least 0, got {self.weight}")
+        if not 0 <= self.weight < torch.inf:
+            raise ValueError(
+                f"the weight of behavior cloning must be at least 0 and finite, got {self.weight}"
+            )
 
 
 def cloning_terms(

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, TQCLoss
 
+from torchrl_her.checks import check_whole
 from torchrl_her.modules.noise import RunNoise
 
 
@@ -133,8 +134,7 @@ def as_critics(
     Raises:
         ValueError: the list has another length than ``critics``, or that is below 1.
     """
-    if critics < 1:
-        raise ValueError(f"critics must be at least 1, got {critics}")
+    check_whole(critics=critics)
     if isinstance(critic, TensorDictModule):
         return critic
     if len(critic) != critics:

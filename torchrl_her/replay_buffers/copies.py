@@ -8,9 +8,9 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torchrl_her.goals.rewards import RewardFunction
+from torchrl_her.goals.rewards import RewardFunction, ask_reward
 from torchrl_her.replay_buffers.episodes import Episodes
-from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of, failed
+from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of, failed, stored_as
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, n_step_return, windows
 
 
@@ -36,12 +36,21 @@ class Copies:
         if key not in self.changes:
             order = self.last if isinstance(key, tuple) and key[0] == "next" else self.root
             return entry_of(rows, key).index_select(0, order)
-        value, entry = self.changes[key], rows.get(key, None)
-        if entry is None:
-            return value
-        # The discounted sum of whole numbers is none.
-        dtype = value.dtype if STEPS_KEY in self.changes and value.is_floating_point() else entry.dtype
-        return value.to(dtype).view(-1, *entry.shape[1:])
+        return self.changes[key]
+
+    def like(self, rows: TensorDictBase) -> Copies:
+        """The same; what differs has the types and shapes that it has in the collected transitions.
+
+        Raises:
+            ValueError: an entry cannot hold a value.
+        """
+        changes = dict(self.changes)
+        for key, value in self.changes.items():
+            if (entry := rows.get(key, None)) is not None:
+                # The discounted sum of whole numbers is none.
+                summed = STEPS_KEY in changes and value.is_floating_point()
+                changes[key] = value.view(-1, *entry.shape[1:]) if summed else stored_as(value, entry, key)
+        return replace(self, changes=changes)
 
 
 def real_copies(
@@ -94,13 +103,14 @@ def virtual_copies(
     """
     achieved, fallen = entry_of(rows, keys.next_achieved), failed(rows, keys, reward_fn, achieved_reward)
     if n_steps == 1 or gamma is None:
-        reward, terminated = reward_fn(achieved.index_select(0, source), goals)
-        terminated = terminated.view(-1, 1) | fallen.index_select(0, source)
+        reward, terminated = ask_reward(reward_fn, achieved.index_select(0, source), goals)
+        terminated = terminated | fallen.index_select(0, source)
         truncated = entry_of(rows, keys.truncated).index_select(0, source)
         return Copies(source, source, keys.changes(goals, reward, terminated, truncated), reward.flatten())
     window, inside = _windows(rows, episodes, source, n_steps)
-    reward, terminated = reward_fn(achieved[window], goals.unsqueeze(1).expand(-1, n_steps, -1))
-    reward, terminated = reward.view(*window.shape, 1), terminated.view(*window.shape, 1)
+    reward, terminated = ask_reward(
+        reward_fn, achieved[window], goals.unsqueeze(1).expand(-1, window.shape[1], -1)
+    )
     out = n_step_return(reward, terminated | fallen[window], inside, gamma)
     last = _at(window, out.last)
     truncated = entry_of(rows, keys.truncated).index_select(0, last)
@@ -134,8 +144,7 @@ def virtual_episodes(
     number = _episode_of(rows, episodes)[source]
     table, inside = episodes.rows[number], episodes.inside[number]
     wanted = goals.unsqueeze(1).expand(-1, table.shape[1], -1)
-    reward, terminated = reward_fn(entry_of(rows, keys.next_achieved)[table], wanted)
-    reward, terminated = reward.view(*table.shape, 1), terminated.view(*table.shape, 1)
+    reward, terminated = ask_reward(reward_fn, entry_of(rows, keys.next_achieved)[table], wanted)
     terminated = terminated | failed(rows, keys, reward_fn, achieved_reward)[table]
     ended = terminated.squeeze(-1).cumsum(-1) - terminated.squeeze(-1).to(torch.int64)
     used = inside & (ended == 0)
@@ -174,7 +183,7 @@ def _episode_of(rows: TensorDictBase, episodes: Episodes) -> Tensor:
 
 
 def _windows(rows: TensorDictBase, episodes: Episodes, source: Tensor, n_steps: int) -> tuple[Tensor, Tensor]:
-    """For transitions [V], the positions [V, n] of n steps from them on, and which are in the episode."""
+    """For transitions [V], the positions [V, m] of up to n steps from them on; which are in the episode."""
     real = episodes.rows[episodes.inside]  # one episode after the other: a place is a position in here
     place = real.new_zeros(len(rows)).index_copy_(0, real, torch.arange(len(real), device=real.device))
     end = episodes.lengths.cumsum(0)[episode_numbers(episodes)]

@@ -9,7 +9,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-from torchrl_her.goals.rewards import RewardFunction
+from torchrl_her.checks import check_finite
+from torchrl_her.goals.rewards import RewardFunction, ask_reward
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,28 @@ class TransitionKeys:
         """The goals [..., g] that the task itself has asked for."""
         real = rows.get(self.real_goal, None)
         return entry_of(rows, self.goals[0]) if real is None else real
+
+    def check(self, rows: TensorDictBase, what: str, *, k: int) -> None:
+        """Refuses transitions with goals or rewards that cannot be stored, or that cannot be relabeled.
+
+        Args:
+            rows: [...], transitions.
+            what: what messages call them.
+            k: how many virtual goals a transition gets; without any, goals may be of any shape, or missing.
+
+        Raises:
+            ValueError: there is NaN or infinity, or goals are no vectors of one width.
+        """
+        goals = (self.achieved, self.next_achieved, *self.goals, self.real_goal)
+        entries = {key: entry for key in (*goals, self.reward) if (entry := rows.get(key, None)) is not None}
+        check_finite({f"the {what} {key!r}": entry for key, entry in entries.items()})
+        entries.pop(self.reward, None)
+        shapes = {key: list(entry.shape) for key, entry in entries.items()}
+        widths = {shape[-1] for shape in shapes.values() if len(shape) == rows.ndim + 1}
+        if k > 0 and (len(widths) > 1 or any(len(shape) != rows.ndim + 1 for shape in shapes.values())):
+            raise ValueError(
+                f"goals must be vectors of one width, {[*rows.shape, 'g']}, got {shapes}: flatten images"
+            )
 
     def changes(
         self, goals: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor
@@ -88,7 +111,7 @@ def failed(
     at = out.nonzero().squeeze(-1)
     if len(at) > 0:  # what the reward function terminates was a success, though with another reward
         goals = (entry_of(transitions, key)[at] for key in (keys.next_achieved, keys.goals[1]))
-        out[at] = ~reward_fn(*goals)[1].reshape(-1)
+        out[at] = ~ask_reward(reward_fn, *goals)[1].flatten()
     return out.unsqueeze(-1)
 
 
@@ -128,6 +151,30 @@ def device_of(transitions: TensorDictBase) -> torch.device:
     if transitions.device is not None:
         return transitions.device
     return next((entry.device for entry in transitions.values(True, True)), torch.device("cpu"))
+
+
+def stored_as(value: Tensor, entry: Tensor, key: NestedKey) -> Tensor:
+    """Values [n, ...] in the type and shape of an entry [m, ...] of the collected transitions.
+
+    Raises:
+        ValueError: the entry is of whole numbers that cannot hold a value.
+
+    Example:
+        >>> import torch
+        >>> stored_as(torch.tensor([4.0]), torch.zeros(3, 1, dtype=torch.int64), "desired_goal")
+        tensor([[4]])
+        >>> stored_as(torch.tensor([4.4]), torch.zeros(3, 1, dtype=torch.int64), "desired_goal")
+        Traceback (most recent call last):
+        ValueError: 'desired_goal' is of torch.int64, which cannot hold 4.4...: collect torch.float32
+    """
+    out = value.to(entry.dtype)
+    if out.dtype != value.dtype and not out.is_floating_point():
+        lost = value[out.to(value.dtype) != value]
+        if len(lost) > 0:
+            raise ValueError(
+                f"{key!r} is of {entry.dtype}, which cannot hold {lost[0].item()}: collect {value.dtype}"
+            )
+    return out.view(-1, *entry.shape[1:])
 
 
 def entry_of(transitions: TensorDictBase, key: NestedKey) -> Tensor:

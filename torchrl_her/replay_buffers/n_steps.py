@@ -66,13 +66,15 @@ def windows(start: Tensor, end: Tensor, n_steps: int) -> tuple[Tensor, Tensor]:
         n_steps: n.
 
     Returns:
-        ``(places, inside)``, [..., n] each; places beyond the episode repeat its last one.
+        ``(places, inside)``, [..., m] each; m is n, or the longest way to an end, if that is shorter. Places
+        beyond the episode repeat its last one.
 
     Example:
-        >>> places, inside = windows(torch.tensor([4]), torch.tensor([6]), 3)
+        >>> places, inside = windows(torch.tensor([4, 7]), torch.tensor([6, 10]), 100)
         >>> places.tolist(), inside.tolist()
-        ([[4, 5, 5]], [[True, True, False]])
+        ([[4, 5, 5], [7, 8, 9]], [[True, True, False], [True, True, True]])
     """
-    places = start.unsqueeze(-1) + torch.arange(n_steps, device=start.device)
+    longest = int((end - start).max()) if start.numel() else 1
+    places = start.unsqueeze(-1) + torch.arange(min(n_steps, longest), device=start.device)
     behind = end.unsqueeze(-1)
     return places.minimum(behind - 1), places < behind

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
@@ -10,6 +12,7 @@ from typing import Any, Generic, Literal, TypeVar, get_args, overload
 from tensordict import NestedKey, unravel_key
 from torch import Tensor
 
+from torchrl_her.checks import check_whole
 from torchrl_her.goals.rewards import RewardFunction, missed
 from torchrl_her.goals.sources import GoalSources, check_goal_sources, sources_name
 from torchrl_her.goals.strategies import RECENT, Strategy, get_strategy
@@ -18,6 +21,7 @@ from torchrl_her.replay_buffers.keys import TransitionKeys, in_root_and_next, un
 
 T = TypeVar("T")
 Per = Literal["transition", "episode"]
+_SUSPICIOUS = 10  # so many episodes, all of one step, hardly come by chance
 
 
 class _NotGiven(int):
@@ -71,9 +75,9 @@ class HindsightOptions:
         virtual_key: where a bool [..., 1] marks virtual transitions; None for no mark.
 
     Raises:
-        ValueError: ``k`` is negative, there is no such strategy or source, ``goal_sources`` and another ``k``
-            or ``strategy`` are given, ``n_steps`` is below 1 or above 1 without ``gamma`` or with whole
-            episodes, ``per`` is neither of the two.
+        ValueError: a number is not whole, not finite or too small, there is no such strategy or source,
+            ``goal_sources`` and another ``k`` or ``strategy`` are given, ``n_steps`` is above 1 without
+            ``gamma`` or with whole episodes, ``per`` is neither of the two.
         TypeError: ``exclude`` is a single key, or ``goal_sources`` no mapping.
 
     Example:
@@ -109,12 +113,11 @@ class HindsightOptions:
     virtual_key: NestedKey | None = "virtual"
 
     def __post_init__(self) -> None:
-        if self.k < 0:
-            raise ValueError(f"k must be at least 0, got {self.k}")
+        check_whole(k=self.k, least=0)
+        recent = {f"recent_{source}": getattr(self, f"recent_{source}") for source in RECENT}
+        check_whole(n_steps=self.n_steps, **recent)
         if self.per not in get_args(Per):
             raise ValueError(f"per must be one of {', '.join(get_args(Per))}, got {self.per!r}")
-        if self.n_steps < 1:
-            raise ValueError(f"n_steps must be at least 1, got {self.n_steps}")
         if self.n_steps > 1 and self.per == "episode":
             raise ValueError(
                 f"n_steps={self.n_steps} makes single transitions, which cannot be sampled as sequences: use "
@@ -122,9 +125,8 @@ class HindsightOptions:
             )
         if self.n_steps > 1 and (self.gamma is None or not 0 < self.gamma <= 1):
             raise ValueError(f"n_steps={self.n_steps} needs 0 < gamma <= 1, the loss's; got {self.gamma}")
-        for name in RECENT:
-            if getattr(self, f"recent_{name}") < 1:
-                raise ValueError(f"recent_{name} must be at least 1, got {getattr(self, f'recent_{name}')}")
+        if not math.isfinite(self.achieved_reward):
+            raise ValueError(f"achieved_reward must be finite, got {self.achieved_reward}")
         get_strategy(self.strategy)
         in_root_and_next(self.exclude)
         if self.goal_sources is not None:
@@ -260,6 +262,7 @@ class HindsightBase:
             raise TypeError(f"options must be HindsightOptions or None, got {options!r}")
         self.reward_fn, self.weights = reward_fn, weights
         self.options = (options or HindsightOptions()).changed(changes)
+        self._time_seen = False  # whether an episode had several steps, or their absence was said
 
     @property
     def options(self) -> HindsightOptions:
@@ -271,6 +274,21 @@ class HindsightBase:
         self._options = options
         self._keys = options.transition_keys()
         self._exclude = in_root_and_next([*options.exclude, options.real_goal_key])
+
+    def _look_at_time(self, lengths: Tensor) -> None:
+        """Warns, once, if all of the first episodes [E] have a single step: time may be another dimension."""
+        if self._time_seen or self.k == 0:
+            return
+        several = bool((lengths > 1).any())
+        suspicious = not several and len(lengths) >= _SUSPICIOUS
+        if suspicious:
+            warnings.warn(
+                f"all {len(lengths)} episodes have one step: does time run along the last dimension of "
+                "batches [N, T]? For storages of two dimensions TorchRL itself transposes them "
+                "(this is said once)",
+                stacklevel=5,
+            )
+        self._time_seen = several or suspicious
 
     def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
         """The filter, [...]: False where a goal [..., g] was already achieved before the action."""

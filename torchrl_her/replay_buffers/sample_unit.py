@@ -28,11 +28,11 @@ from torchrl.data.replay_buffers.storages import StorageEnsemble
 
 from torchrl_her.goals.choose import LIKELIHOODS, TRIES, Candidates, Index, choose_goals
 from torchrl_her.goals.factors import combine, draw, draw_alike
-from torchrl_her.goals.rewards import RewardFunction
+from torchrl_her.goals.rewards import RewardFunction, ask_reward
 from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
-from torchrl_her.replay_buffers.keys import device_of, entry_of, failed
+from torchrl_her.replay_buffers.keys import device_of, entry_of, failed, stored_as
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_return, windows
 from torchrl_her.replay_buffers.neighbors import (
     MASK,
@@ -57,7 +57,7 @@ class _Stored(NamedTuple):
     rows: TensorDictBase  # [n], a view
     before: Tensor  # [n, g], goals achieved before the action
     after: Tensor  # [n, g], those that the action achieved: the candidates
-    wanted: Tensor  # [n, g], those that were really wanted, of the type of achieved ones
+    wanted: Tensor  # [n, g], those that were really wanted; of their type, if goals are drawn from them
     episodes: EpisodeIndex
     recent: dict[tuple[str, int], Tensor]  # rows of the newest episodes, as far as they were asked for
 
@@ -253,13 +253,13 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         if chosen.ahead is not None:
             reward, terminated = chosen.ahead.returns.reward[rows], chosen.ahead.returns.terminated[rows]
         else:
-            reward, terminated = self.reward_fn(entry_of(data, self._keys.next_achieved)[rows], chosen.goals)
-            fallen = failed(data, self._keys, self.reward_fn, self.achieved_reward)
-            terminated = terminated.view(-1, 1) | fallen[rows]
+            achieved = entry_of(data, self._keys.next_achieved)[rows]
+            reward, terminated = ask_reward(self.reward_fn, achieved, chosen.goals)
+            terminated = terminated | failed(data, self._keys, self.reward_fn, self.achieved_reward)[rows]
         truncated = entry_of(out, self._keys.truncated)[rows]
         for key, value in self._keys.changes(chosen.goals, reward, terminated, truncated).items():
             entry = entry_of(out, key)
-            value = value.to(entry.dtype).view(len(rows), *entry.shape[1:])
+            value = stored_as(value, entry, key)
             out.set(key, entry.index_copy(0, rows, value))  # a copy: what was read might be the storage
         return out
 
@@ -331,11 +331,11 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         reward = entry_of(stored.rows, self._keys.reward).reshape(-1, 1)[window]
         end = entry_of(stored.rows, self._keys.done).reshape(-1, 1)[window]
         if len(virtual) > 0:
-            wanted = goals.unsqueeze(1).expand(-1, self.options.n_steps, -1)
-            own_reward, own_end = self.reward_fn(stored.after[window[virtual]], wanted)
+            wanted = goals.unsqueeze(1).expand(-1, window.shape[1], -1)
+            own_reward, own_end = ask_reward(self.reward_fn, stored.after[window[virtual]], wanted)
             fallen = failed(stored.rows, self._keys, self.reward_fn, self.achieved_reward)[window[virtual]]
-            reward[virtual] = own_reward.to(reward.dtype).view(*fallen.shape)
-            end[virtual] = own_end.view(*fallen.shape) | fallen
+            reward[virtual] = stored_as(own_reward, reward[0], self._keys.reward).view_as(own_reward)
+            end[virtual] = own_end | fallen
         returns = n_step_return(reward, end, inside, gamma)
         last = window.gather(-1, returns.last.unsqueeze(-1)).squeeze(-1)
         return _Ahead(stored.rows.get("next")[last], returns)
@@ -372,8 +372,10 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                     f"holds {done.numel() // grid.numel()}: extend with batch.reshape(-1), or give the "
                     "storage ndim=2"
                 )
+            rows = rows if dims == 1 else rows.flatten(0, dims - 1)
+            self._keys.check(rows, "stored", k=1)
             before, after, wanted, next_wanted = (
-                entry_of(rows, key).flatten(0, dims - 1)
+                entry_of(rows, key)
                 for key in (self._keys.achieved, self._keys.next_achieved, *self._keys.goals)
             )
             episodes = index_episodes(
@@ -382,8 +384,9 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                 oldest=state[1],
                 seams=((after, before), (next_wanted, wanted)),
             )
-            rows = rows if dims == 1 else rows.flatten(0, dims - 1)
-            wanted = self._keys.asked_for(rows).to(after.dtype)
+            self._look_at_time(episodes.first.diff())
+            if "actual" in self.options.sources:
+                wanted = stored_as(self._keys.asked_for(rows), after, self._keys.next_achieved)
             self._stored = stored = _Stored(storage, state, rows, before, after, wanted, episodes, {})
         return stored
 
@@ -459,7 +462,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             goals = stored.after[candidate]
             weight = keep = None
             if self.weights is not None and not self.weights.alike:
-                weight = checked_weights(self.weights(goals))
+                weight = checked_weights(self.weights(goals), goals)
             if self.filter_achieved:
                 keep = self._keep(stored.before[group[part]].unsqueeze(2), goals.unsqueeze(1)).all(1)
             drawn, valid[part] = draw(combine(steps < width, weight, keep), 1, generator=generator)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import replace
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -44,7 +44,25 @@ from torchrl_her.replay_buffers.runs.streams import check_generators
 _ROWS = 1 << 17
 _STATE_FILE = "her_writer.pt"
 
-OnWrite = Callable[[TensorDictBase, list[int], list[int]], None]
+OnWrite = Callable[[TensorDictBase, list[int], list[int]], Callable[[], None] | None]
+
+
+class _Draft(NamedTuple):
+    """Real and virtual transitions of some episodes that are not yet written."""
+
+    runs: list[int]
+    real: Share
+    virtual: Share | None
+    numbers: dict[str, list[int]]  # as they are counted
+    weighted: bool  # whether weights are told the virtual goals
+    ids: int  # how many trajectory ids they take
+
+    @property
+    def counts(self) -> list[int]:
+        """How many transitions each run has, real and virtual."""
+        if self.virtual is None:
+            return self.real.counts
+        return [sum(both) for both in zip(self.real.counts, self.virtual.counts, strict=True)]
 
 
 class HERWriter(HindsightBase, RoundRobinWriter):
@@ -86,15 +104,17 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         options: how transitions are relabeled; None for the defaults.
 
     Keyword Args:
-        weights: prefers some goals to others; None for all alike. For several runs a list, one of each run
-            (``goal_weights``).
+        weights: prefers some goals to others, all goals of a batch as it did before that batch; None for all
+            alike. For several runs a list, one of each run (``goal_weights``).
         runs: R.
         generators: R sources of random numbers; None for the buffer's, with one run only.
         layers: for episodes that carry the layer of a curriculum in which they were played, one rule for each
             layer; they take the place of ``reward_fn``. None if episodes have no layers.
         on_write: called with all that is written, real and virtual transitions, as ``(rows, runs, counts)``:
-            rows run after run, which runs these are, and how many rows each has. It comes when they are
-            stored, and may come several times for one batch. See :class:`~torchrl_her.modules.RunningNorm`.
+            rows run after run, which runs these are, and how many rows each has. It comes before they are
+            stored, and may come several times for one batch; if it raises an error, nothing of the batch is
+            stored. It may return a function that undoes it, for rows that could not be stored. See
+            :class:`~torchrl_her.modules.RunningNorm`.
         **changes: options by name, as in the example; all are listed in
             :class:`~torchrl_her.HindsightOptions`.
 
@@ -254,7 +274,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
         Raises:
             ValueError: the writer cannot work beside another part of the buffer or collector; trajectories
-                were split and padded; environments cannot be told apart.
+                were split and padded; environments cannot be told apart; goals or rewards, those of the
+                reward function too, are not finite or do not fit. Nothing of the batch is written then.
             KeyError: an entry is missing.
             RuntimeError: the buffer was made by another process.
         """
@@ -391,6 +412,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         if os.getpid() != self._process:
             raise RuntimeError(f"HERWriter writes only in the process that made its buffer: {SHARED}")
         refuse_beside_writer("HERWriter", self._storage, data, self.options, runs=self.runs)
+        self._keys.check(data, "collected", k=self.k)
         if not self.layers:
             refuse_layers("HERWriter", data, self.options)
 
@@ -414,18 +436,23 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             rows, lanes, order, ends, self._keys, kind=batch.kind, held=held, resumed=self._loaded
         )
         episodes, left = find_episodes(lanes, ends, order)
+        if len(left) == 0:
+            self._look_at_time(episodes.lengths)
         if self.runs == 1:  # then TorchRL's own cursor counts
             self._rings.cursors[0] = self._cursor
         places = Places(run, len(batch), runs=self.runs, device=lanes.device)
         entries = min(_ROWS, self.capacity) // (self.k + 1), _ROWS // (self.k + 1)
         own = None if run is None else run[episodes.rows[:, :1]].flatten()
-        recent = list(self._recent)
+        recent, settings, drafts, first_id = list(self._recent), self._settings(), [], self._episodes
         for layer, part, run_of in self._by_layer(rows, episodes, own):
             lately = recent[layer].after(rows, part, run_of, self._keys, sizes=self.options.remembered)
             recent[layer] = lately
-            settings = self._settings()
             for piece in split_runs(part, run_of, settings, each=entries[0], together=entries[1]):
-                self._write(batch, piece, places, lately, self._rule(layer, piece.runs[0]))
+                rule = self._rule(layer, piece.runs[0])
+                drafts.append(self._draft(batch, piece, lately, rule, first_id=first_id))
+                first_id += drafts[-1].ids
+        self._commit(rows, drafts, places)
+        self._episodes = first_id
         return places.rows(self._rings.cursors, self.capacity)[held:], left, recent
 
     def _no_goals(self, runs: int) -> list[RecentGoals]:
@@ -449,13 +476,10 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         alike = [own.alike for own in self.goal_weights] or [True] * self.runs
         return [(id(self.reward_of(run)), alike[run]) for run in range(self.runs)]
 
-    def _write(
-        self, batch: Batch, piece: Piece, places: Places, recent: RecentGoals, rule: LayerRule
-    ) -> None:
-        """Stores the real and virtual transitions of some episodes, and notes where the real ones went.
-
-        If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out.
-        """
+    def _draft(
+        self, batch: Batch, piece: Piece, recent: RecentGoals, rule: LayerRule, *, first_id: int
+    ) -> _Draft:
+        """What is to be written of some episodes. Nothing is written or counted yet: it may be refused."""
         rows, runs, options, keys = batch.rows, piece.runs, self.options, self._keys
         reward_fn, own, virtual = rule.reward_fn, self.goal_weights if rule.weighted else [], None
         source, goals = draw_for_runs(
@@ -468,50 +492,62 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             generators=[self._rng] if self.generators is None else [self.generators[run] for run in runs],
             recent=recent,
         )
+        real = real_share(rows, piece, options, keys, first_id=first_id + len(source))
+        numbers = {"real": real.counts, **real_positives(*real, self.achieved_reward)}
         if len(source) > 0:
-            first = self._new_ids(len(source))
             virtual = virtual_share(
-                rows, batch.run, piece, source, goals, reward_fn, options, keys, first_id=first
+                rows, batch.run, piece, source, goals, reward_fn, options, keys, first_id=first_id
             )
-            self._note(rows, virtual, runs, rule)
-        real = real_share(rows, piece, options, keys, first_id=self._new_ids(len(piece.episodes.lengths)))
-        self._counts.add(runs, real=real.counts, **real_positives(*real, self.achieved_reward))
-        exclude = [*self._exclude, *in_root_and_next([keys.env_ids])]
-        out = join_copies(rows, virtual, real, exclude=exclude, virtual_key=options.virtual_key)
-        counts = real.counts
-        if virtual is not None:
-            counts = [sum(both) for both in zip(real.counts, virtual.counts, strict=True)]
-        self._store(out, runs, counts)
-        places.note(runs, real.copies.root.split(real.counts), counts)
-        if self.on_write is not None:  # not before: rows that could not be stored would be counted, too
-            self.on_write(out, runs, counts)
+            positives = virtual_positives(
+                rows,
+                *virtual,
+                reward_fn,
+                keys,
+                achieved_reward=self.achieved_reward,
+                filtered=self.filter_achieved,
+            )
+            numbers |= {"virtual": virtual.counts, **positives}
+        ids = len(source) + len(piece.episodes.lengths) if options.per == "episode" else 0
+        return _Draft(runs, real, virtual, numbers, weighted=rule.weighted, ids=ids)
 
-    def _new_ids(self, count: int) -> int:
-        """The first of so many trajectory ids that no stored episode has, real or virtual."""
-        first = self._episodes
-        if self.options.per == "episode":
-            self._episodes += count
-        return first
+    def _commit(self, rows: TensorDictBase, drafts: list[_Draft], places: Places) -> None:
+        """Stores and counts real and virtual transitions, and notes where the real ones went.
+
+        If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out.
+        What is not ours is asked first: if it raises an error, nothing of the batch is stored or counted.
+        """
+        exclude = [*self._exclude, *in_root_and_next([self._keys.env_ids])]
+
+        def join(draft: _Draft) -> TensorDictBase:
+            copies = draft.virtual, draft.real
+            return join_copies(rows, *copies, exclude=exclude, virtual_key=self.options.virtual_key)
+
+        shown: list[TensorDictBase] = []
+        undo: list[Callable[[], None] | None] = []
+        try:
+            if self.on_write is not None:
+                shown = [join(draft) for draft in drafts]
+                for out, draft in zip(shown, drafts, strict=True):
+                    undo.append(self.on_write(out, draft.runs, draft.counts))
+            for draft in drafts:
+                if draft.virtual is not None and self.goal_weights and draft.weighted:
+                    goals = draft.virtual.copies.changes[self._keys.goals[0]]
+                    self._weights_of_runs().update(goals, draft.runs, draft.virtual.counts)
+            for place, draft in enumerate(drafts):
+                # Not all at once if nobody has to see them: that would touch fresh memory.
+                self._store(shown[place] if shown else join(draft), draft.runs, draft.counts)
+                self._counts.add(draft.runs, **draft.numbers)
+                places.note(draft.runs, draft.real.copies.root.split(draft.real.counts), draft.counts)
+        except Exception:
+            for back in reversed(undo):
+                if callable(back):
+                    back()
+            raise
 
     def _weights_of_runs(self) -> WeightsOfRuns:
         """The weights of all runs, of which there are some."""
         own = self.goal_weights
         return own[0].of_runs(own) if isinstance(own[0], GoalWeights) else WeightsOfRuns(own)
-
-    def _note(self, rows: TensorDictBase, virtual: Share, runs: list[int], rule: LayerRule) -> None:
-        """Counts virtual transitions, and tells the weights which goals were written."""
-        positives = virtual_positives(
-            rows,
-            *virtual,
-            rule.reward_fn,
-            self._keys,
-            achieved_reward=self.achieved_reward,
-            filtered=self.filter_achieved,
-        )
-        self._counts.add(runs, virtual=virtual.counts, **positives)
-        if self.goal_weights and rule.weighted:
-            goals = virtual.copies.changes[self._keys.goals[0]]
-            self._weights_of_runs().update(goals, runs, virtual.counts)
 
     def _store(self, rows: TensorDictBase, runs: list[int], counts: list[int]) -> None:
         """Writes rows as the plain writer does, but slice by slice: far faster than with an index for each.

@@ -14,6 +14,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_her.checks import check_finite, check_whole
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.replay_buffers.runs.buffer import runs_of, sizes_of
 from torchrl_her.replay_buffers.writer import HERWriter
@@ -73,13 +74,11 @@ class CollectsAhead(Protocol):
 _MUST_BE_FINITE = ("action", "observation", "achieved_goal", "desired_goal", "reward")
 
 
-def check_finite(batch: TensorDictBase, keys: tuple[str, ...] = _MUST_BE_FINITE) -> None:
-    """Raises a ValueError that names the entry if a batch holds NaN or infinite numbers."""
-    for key in keys:
-        for name in (key, ("next", key)):
-            value = batch.get(name, None)
-            if value is not None and not bool(value.isfinite().all()):
-                raise ValueError(f"the collected {name!r} must be finite, got NaN or infinity in it")
+def _check_batch(batch: TensorDictBase) -> None:
+    """Refuses a batch that holds NaN or infinity where networks or rewards would see it."""
+    names = [name for key in _MUST_BE_FINITE for name in (key, ("next", key))]
+    entries = {name: batch.get(name, None) for name in names}
+    check_finite({f"the collected {name!r}": own for name, own in entries.items() if own is not None})
 
 
 class Trainer:
@@ -143,14 +142,7 @@ class Trainer:
         batches_per_sample: int = 32,
         average: PolicyAverage | None = None,
     ) -> None:
-        counts = {
-            "epoch_frames": epoch_frames,
-            "batch_size": batch_size,
-            "batches_per_sample": batches_per_sample,
-        }
-        for name, count in counts.items():
-            if count < 1:
-                raise ValueError(f"{name} must be at least 1, got {count}")
+        check_whole(epoch_frames=epoch_frames, batch_size=batch_size, batches_per_sample=batches_per_sample)
         if not 0 < frames_per_update < math.inf:
             raise ValueError(f"frames_per_update must be positive and finite, got {frames_per_update}")
         if runs_of(buffer) != runs:
@@ -221,7 +213,7 @@ class Trainer:
         """
         while self.frames < end:
             batch = self.collector.next()
-            check_finite(batch)
+            _check_batch(batch)
             if ("collector", "traj_ids") not in batch.keys(True):
                 raise ValueError("the collector must mark trajectories: episodes are cut where epochs begin")
             is_last = self.frames + batch.numel() // self.runs >= end

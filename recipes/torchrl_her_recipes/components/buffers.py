@@ -24,6 +24,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
 from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_goal_weights
+from torchrl_her_recipes.components.memory import check_buffer_size
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.learners import priority_power
 from torchrl_her_recipes.config.recipe import Recipe
@@ -58,7 +59,11 @@ def make_buffer(
         norm: counts what is written and normalizes what is sampled; None for raw transitions.
         devices: where the buffer is, and the learner that samples from it.
         capacity: in transitions of each run; the recipe's if None.
+
+    Raises:
+        ValueError: the device's memory cannot hold it.
     """
+    check_buffer_size(recipe, env, devices.replay, not_stored=_NOT_STORED)
     size = recipe.replay.buffer_size if capacity is None else capacity
     algorithm, task, runs = get_algorithm(recipe.hindsight.algo), goal_env(env), len(generators)
     own = [make_goal_weights(each, task, space) for each in recipe.of_runs() if algorithm.hindsight]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,7 +65,6 @@ class CollectionConfig(Group):
         "environment steps for each gradient step; 0.5: two gradient steps for each environment step; "
         "auto: 2, or 5 with this package's tasks",
         above=0,
-        below=math.inf,
     )
     warmup_frames: int = option(
         AUTO,
@@ -199,7 +197,6 @@ class NoveltyConfig(Group):
         None,
         "exponent of the weights; the default is 1, and 3 / g for rare goals of g numbers, if g is above 3",
         above=0,
-        below=math.inf,
     )
     memory: int = option(10_000, "virtual goals among which others are rare, the newest ones", at_least=1)
 
@@ -269,12 +266,9 @@ class BehaviorConfig(Group):
     )
     candidates: int = option(100, "achieved goals of which one is proposed", at_least=1)
     goal_memory: int = option(50_000, "newest achieved goals that are remembered", at_least=1)
-    cutoff: float = option(-3.0, "mega proposes no goal of a lower value, at first")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not math.isfinite(self.cutoff):
-            raise ValueError(f"behavior.cutoff must be finite, got {self.cutoff}")
+    cutoff: float = option(
+        -3.0, "mega proposes no goal of a lower value, at first", shown_as="behavior.cutoff"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

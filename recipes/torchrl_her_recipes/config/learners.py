@@ -46,7 +46,9 @@ class LearnerConfig(Group):
         AUTO, "discount factor; auto: 1 - 1 / steps of an episode, from 0.9 to 0.99", above=0, below=1
     )
     learning_rate: float = option(1e-3, "learning rate of Adam", above=0)
-    max_grad_norm: float = option(3.0, "gradients of each network are clipped to this norm", above=0)
+    max_grad_norm: float = option(
+        3.0, "gradients of each network are clipped to this norm", above=0, infinite=True
+    )
     hidden: int = option(
         AUTO, "width of the hidden layers; auto: 256, or 64 with this package's tasks", at_least=1
     )
@@ -60,7 +62,9 @@ class LearnerConfig(Group):
     normalize: bool = option(
         True, "whether observations and goals are normalized, by mean and deviation of all that was written"
     )
-    normalize_clip: float = option(5.0, "normalized values are clipped to plus and minus this", above=0)
+    normalize_clip: float = option(
+        5.0, "normalized values are clipped to plus and minus this", above=0, infinite=True
+    )
     normalize_least_std: float | None = option(
         None,
         "least deviation that values are divided by; 1/10,000 of each entry's mean if not given",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import MISSING, Field, field, fields
 from difflib import get_close_matches
+from math import isfinite
 from typing import Any
 
 from torchrl_her_recipes.config.values import as_kind
@@ -22,6 +23,7 @@ def option(
     at_most: float | None = None,
     below: float | None = None,
     choices: tuple[str, ...] = (),
+    infinite: bool = False,
     shown_as: str = "",
 ) -> Any:
     """A field of a group of options.
@@ -32,10 +34,17 @@ def option(
         help: a few words, shown by ``torchrl-her train -h``.
         at_least, above, at_most, below: the range of a number.
         choices: the values that are allowed.
+        infinite: whether a number may be infinite, as a limit that limits nothing.
         shown_as: what messages call it, if not by the field's name.
     """
     limits = {"at_least": at_least, "above": above, "at_most": at_most, "below": below}
-    metadata = {"help": help, "choices": choices, "limits": limits, "shown_as": shown_as}
+    metadata = {
+        "help": help,
+        "choices": choices,
+        "limits": limits,
+        "infinite": infinite,
+        "shown_as": shown_as,
+    }
     return field(default=default, metadata=metadata)
 
 
@@ -76,6 +85,8 @@ def _check_value(own: Field[Any], value: Any) -> None:
     if not all(tests[name](limit) for name, limit in given.items()):  # NaN fails all of them
         allowed = " and ".join(f"{name.replace('_', ' ')} {limit}" for name, limit in given.items())
         raise ValueError(f"{_shown(own)} must be {allowed}, got {value}")
+    if isinstance(value, float) and not (isfinite(value) or own.metadata.get("infinite")):
+        raise ValueError(f"{_shown(own)} must be finite, got {value}")
 
 
 def default_of(own: Field[Any]) -> Any:

@@ -48,8 +48,12 @@ def test_redq_is_sac_with_other_defaults() -> None:
         ({"learner": "sac", "action_noise": 0.1}, "learner=sac has no option action_noise"),
         ({"action_noise": -0.1}, "action_noise must be at least 0, got -0.1"),
         ({"uniform_share": 1.1}, "uniform_share must be at least 0 and at most 1, got 1.1"),
-        ({"frames_per_update": "inf"}, "frames_per_update must be above 0 and below inf, got inf"),
-        ({"frames_per_update": 0}, "frames_per_update must be above 0 and below inf, got 0.0"),
+        ({"frames_per_update": "inf"}, "frames_per_update must be finite, got inf"),
+        ({"frames_per_update": 0}, "frames_per_update must be above 0, got 0.0"),
+        ({"learning_rate": "inf"}, "learning_rate must be finite, got inf"),
+        ({"action_penalty": "inf"}, "action_penalty must be finite, got inf"),
+        ({"priority_beta": "inf"}, "priority_beta must be finite, got inf"),
+        ({"sharpness": "inf", "algo": "filtered_her_rare"}, "sharpness must be finite, got inf"),
     ],
 )
 def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:

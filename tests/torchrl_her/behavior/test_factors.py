@@ -115,7 +115,7 @@ def test_bad_options() -> None:
         Directed(nearness, target=-1)
     with pytest.raises(ValueError, match="temperature must be positive and finite, got 0"):
         Directed(nearness, temperature=0)
-    with pytest.raises(ValueError, match="memory must be positive, got 0"):
+    with pytest.raises(ValueError, match="memory must be positive and finite, got 0"):
         Successes(1, memory=0)
 
 

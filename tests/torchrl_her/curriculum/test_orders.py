@@ -119,7 +119,7 @@ def test_a_teacher_goes_on_from_its_state() -> None:
 def test_bad_options() -> None:
     with pytest.raises(ValueError, match=r"uniform_share must be in \(0, 1\], got 0"):
         TeacherStudent(THREE, uniform_share=0)
-    with pytest.raises(ValueError, match="memory must be positive, got -1"):
+    with pytest.raises(ValueError, match="memory must be positive and finite, got -1"):
         TeacherStudent(THREE, memory=-1)
     with pytest.raises(ValueError, match="2 runs need 2 generators"):
         EpisodeLayers(THREE, runs=2)

@@ -197,3 +197,11 @@ def test_a_file_that_lacks_something_is_refused(tmp_path: Path) -> None:
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         Demonstrations.load(tmp_path / "none.pt")
+
+
+@pytest.mark.parametrize("key", ["observation", "action", ("next", "achieved_goal"), ("next", "reward")])
+def test_demonstrations_must_be_finite(key: str | tuple[str, str]) -> None:
+    batch = make_batch([[2]])
+    batch[key][0, 1] = float("nan")
+    with pytest.raises(ValueError, match=r"of demonstrations must be finite, got nan in it"):
+        Demonstrations.from_rollout(batch)

@@ -49,7 +49,7 @@ def test_goals_less_than_a_cell_outside_count_at_the_edge_without_a_word() -> No
 
 def test_goals_outside_count_at_the_edge_and_are_named_once() -> None:
     grid = GoalGrid((0.0, 0.0), (1.0, 1.0), (2, 2))
-    goals = torch.tensor([[0.1, 0.1], [0.25, 7.5], [-3e38, math.inf], [math.inf, -math.inf]])
+    goals = torch.tensor([[0.1, 0.1], [0.25, 7.5], [-3e38, 3e38], [3e38, -3e38]])
     with pytest.warns(
         UserWarning, match=r"goal \[0.25, 7.5\] lies outside.*low=\(0.0, 0.0\), high=\(1.0, 1.0\)"
     ):
@@ -59,10 +59,11 @@ def test_goals_outside_count_at_the_edge_and_are_named_once() -> None:
         GoalGrid(0.0, 1.0, [2]).cell(torch.tensor([[2.0]]))
 
 
-def test_nan_is_named_and_counted_in_the_first_cell() -> None:
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_goals_that_are_not_finite_are_in_no_cell(bad: float) -> None:
     grid = GoalGrid((0.0, 0.0), (1.0, 1.0), (2, 2))
-    with pytest.warns(UserWarning, match=r"goal \[0.75, nan\] lies outside"):
-        assert grid.cell(torch.tensor([[0.1, 0.1], [0.75, math.nan]])).tolist() == [0, 2]
+    with pytest.raises(ValueError, match=f"goals must be finite, got {bad} in it"):
+        grid.cell(torch.tensor([[0.1, 0.1], [0.75, bad]]))
 
 
 def test_no_goals_have_no_cells() -> None:

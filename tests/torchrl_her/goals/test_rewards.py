@@ -52,9 +52,9 @@ def test_reward_has_the_type_of_the_goals() -> None:
     assert reward.shape == terminated.shape == (3, 1)
 
 
-@pytest.mark.parametrize("threshold", [0.0, -0.1, math.nan])
+@pytest.mark.parametrize("threshold", [0.0, -0.1, math.nan, math.inf])
 def test_a_threshold_must_be_positive(threshold: float) -> None:
-    with pytest.raises(ValueError, match=f"threshold must be positive, got {threshold}"):
+    with pytest.raises(ValueError, match=f"threshold must be positive and finite, got {threshold}"):
         GoalReward(threshold)
 
 

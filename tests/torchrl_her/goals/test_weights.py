@@ -21,16 +21,23 @@ def test_the_base_class_weighs_all_alike_and_remembers_nothing() -> None:
 
 
 def test_weights_become_floating_numbers() -> None:
-    assert checked_weights(torch.tensor([True, False])).tolist() == [1.0, 0.0]
+    goals = torch.zeros(2, 3)
+    assert checked_weights(torch.tensor([True, False]), goals).tolist() == [1.0, 0.0]
     kept = torch.tensor([0.5, 0.0], dtype=torch.float64)
-    assert checked_weights(kept) is kept
-    assert checked_weights(torch.empty(0)).shape == (0,)
+    assert checked_weights(kept, goals) is kept
+    assert checked_weights(torch.empty(0), goals[:0]).shape == (0,)
 
 
 @pytest.mark.parametrize("bad", [-1e-9, float("nan"), float("inf")])
 def test_weights_that_are_negative_or_not_finite_are_refused(bad: float) -> None:
     with pytest.raises(ValueError, match="weights of goals must be finite and at least 0, got"):
-        checked_weights(torch.tensor([1.0, bad, 2.0]))
+        checked_weights(torch.tensor([1.0, bad, 2.0]), torch.zeros(3, 1))
+
+
+@pytest.mark.parametrize("shape", [(4,), (3, 1), ()])
+def test_weights_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"weights of goals must be \[3\] for goals \[3, 2\], got"):
+        checked_weights(torch.ones(shape), torch.zeros(3, 2))
 
 
 def test_weights_from_logarithms_by_hand() -> None:

@@ -61,8 +61,9 @@ def test_uniform_actions_and_noise_on_all_others() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"noise": -0.1}, "noise must be at least 0, got -0.1"),
-        ({"noise": math.nan}, "noise must be at least 0, got nan"),
+        ({"noise": -0.1}, "noise must be at least 0 and finite, got -0.1"),
+        ({"noise": math.inf}, "noise must be at least 0 and finite, got inf"),
+        ({"noise": math.nan}, "noise must be at least 0 and finite, got nan"),
         ({"uniform_share": 1.5}, r"uniform_share must be in \[0, 1\], got 1.5"),
     ],
 )

@@ -138,7 +138,9 @@ def test_rows_without_the_flag_are_refused() -> None:
 
 
 def test_a_negative_weight_is_refused() -> None:
-    with pytest.raises(ValueError, match="the weight of behavior cloning must be at least 0, got -1"):
+    with pytest.raises(
+        ValueError, match="the weight of behavior cloning must be at least 0 and finite, got -1"
+    ):
         Cloning(weight=-1.0)
 
 

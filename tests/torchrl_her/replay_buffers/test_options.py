@@ -271,3 +271,22 @@ def test_a_function_that_leaves_the_episode_is_refused_when_it_is_used(make: Cal
 
     with pytest.raises(ValueError, match="goal strategy 'beyond' gives step"):
         relabeled(make, strategy=beyond)
+
+
+@both
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("k", 2.5, "k must be a whole number, got 2.5"),
+        ("k", "4", "k must be a whole number, got '4'"),
+        ("k", True, "k must be a whole number, got True"),
+        ("n_steps", 2.0, "n_steps must be a whole number, got 2.0"),
+        ("recent_achieved", "9", "recent_achieved must be a whole number, got '9'"),
+        ("achieved_reward", float("nan"), "achieved_reward must be finite, got nan"),
+    ],
+)
+def test_numbers_that_are_not_whole_or_not_finite_are_named(
+    make: Callable[..., Any], option: str, value: object, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(REWARD, **{option: value})

@@ -74,8 +74,10 @@ class Batch:
             )
         place = self.ids.device  # what is held may have come with a checkpoint
         run = None if held.run is None or self.run is None else torch.cat((held.run.to(place), self.run))
-        ids = torch.cat((held.ids.to(place), self.ids))
-        return Batch(torch.cat((held.rows.to(place), self.rows)), self.kind, ids, run)
+        ids, rows = torch.cat((held.ids.to(place), self.ids)), held.rows.to(place)
+        if self.rows.device is None:  # lazy stacks are joined only if both or none say where they are
+            rows = rows.copy().clear_device_()
+        return Batch(torch.cat((rows, self.rows)), self.kind, ids, run)
 
     def lanes(self) -> Tensor:
         """Numbers [n] of environments or trajectories, those of one run above those of the run before."""

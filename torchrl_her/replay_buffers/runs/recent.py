@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl_her.goals.strategies import RECENT
 from torchrl_her.goals.weights import spread_evenly
 from torchrl_her.replay_buffers.episodes import Episodes
-from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
+from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of, stored_as
 
 Goals = tuple[Tensor | None, ...]
 
@@ -75,7 +75,7 @@ class RecentGoals:
             else:
                 number, goals, row = lengths, achieved, episodes.rows[episodes.inside]
             # Of the type of achieved goals, as all virtual goals are.
-            new = goals.index_select(0, row).to(achieved.dtype)
+            new = stored_as(goals.index_select(0, row), achieved, keys.next_achieved)
             counts = [len(new)]
             if run is not None:
                 counts = number.new_zeros(len(out[name])).index_add_(0, run, number).tolist()

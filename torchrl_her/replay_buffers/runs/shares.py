@@ -54,7 +54,7 @@ def real_share(
     if options.per == "episode":
         real = with_ends(real, rows, episodes, keys)
         real = _with_ids(real, episode_numbers(episodes) + first_id, keys)
-    return Share(real, piece.sums(episodes.lengths))
+    return Share(real.like(rows), piece.sums(episodes.lengths))
 
 
 def virtual_share(
@@ -89,7 +89,7 @@ def virtual_share(
         virtual = virtual_copies(
             *of, achieved_reward=achieved_reward, n_steps=options.n_steps, gamma=options.gamma
         )
-    return Share(virtual, piece.counts(virtual.root, run))
+    return Share(virtual.like(rows), piece.counts(virtual.root, run))
 
 
 def _with_ids(copies: Copies, ids: Tensor, keys: TransitionKeys) -> Copies:

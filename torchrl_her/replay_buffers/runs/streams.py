@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchrl_her.checks import check_whole
+
 Generators = Sequence[torch.Generator | None]
 
 
@@ -78,8 +80,7 @@ def check_generators(runs: int, generators: Sequence[torch.Generator] | None) ->
     Raises:
         ValueError: there is no run, or not a generator for each of several runs.
     """
-    if runs < 1:
-        raise ValueError(f"runs must be at least 1, got {runs}")
+    check_whole(runs=runs)
     if generators is None:
         if runs > 1:
             raise ValueError(f"{runs} runs need {runs} generators, one of each run, got None")

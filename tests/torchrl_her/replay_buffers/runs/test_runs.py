@@ -187,6 +187,7 @@ def _shown(value: object) -> str:
 @pytest.mark.parametrize(
     "options", CASES, ids=lambda options: "-".join(map(_shown, options.values())) or "plain"
 )
+@pytest.mark.filterwarnings("ignore:all [0-9]+ episodes have one step")
 @settings(max_examples=4, deadline=None, derandomize=True, phases=[Phase.generate])
 @given(data=st.data())
 def test_each_run_is_the_run_that_it_is_alone(options: dict[str, Any], data: st.DataObject) -> None:

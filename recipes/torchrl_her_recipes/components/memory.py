@@ -1,0 +1,80 @@
+"""Sizes that a machine's memory cannot hold: refused by the names of their options."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+from torchrl.envs import EnvBase
+
+from torchrl_her.replay_buffers.keys import in_root_and_next
+from torchrl_her_recipes.config.recipe import Recipe
+
+_ALLOCATORS_SAY = (
+    "not enough memory",
+    "can't allocate memory",
+    "out of memory",
+    "size calculation overflowed",
+)
+_NO_SIZES = ("seed", "epochs", "epoch_frames", "warmup_frames", "checkpoint_interval", "hard_update_interval")
+
+
+def check_buffer_size(
+    recipe: Recipe, env: EnvBase, device: torch.device, *, not_stored: Sequence[str] = ()
+) -> None:
+    """Refuses a replay buffer that is larger than the memory of its device.
+
+    Args:
+        recipe: of the runs.
+        env: of their task; each of its transitions is a row.
+        device: where the buffer is.
+
+    Keyword Args:
+        not_stored: entries that the buffer leaves out.
+
+    Raises:
+        ValueError: the buffer is larger.
+    """
+    step = env.fake_tensordict().exclude(*in_root_and_next(not_stored))
+    row = sum(entry.numel() * entry.element_size() for entry in step.values(True, True)) // env.numel()
+    size, runs, there = recipe.replay.buffer_size, recipe.run.num_runs, memory_of(device)
+    if size * runs * row > there:
+        raise ValueError(
+            f"buffer_size={size} needs {size * runs * row / 1e9:.0f} GB for num_runs={runs}, {row} bytes for "
+            f"each transition, but {device} has {there / 1e9:.0f} GB"
+        )
+
+
+def memory_of(device: torch.device) -> float:
+    """Bytes of memory of a device; infinity where nobody tells."""
+    if device.type == "cuda" and torch.cuda.device_count():
+        return float(torch.cuda.get_device_properties(device).total_memory)
+    if device.type != "cpu" or not hasattr(os, "sysconf"):
+        return torch.inf
+    return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+
+
+@contextmanager
+def sizes_named(recipe: Recipe) -> Iterator[None]:
+    """Turns an allocator's error into one that names the largest number of the recipe.
+
+    Raises:
+        ValueError: there is not enough memory.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        text = str(error).lower()
+        if not isinstance(error, MemoryError) and not any(word in text for word in _ALLOCATORS_SAY):
+            raise
+        numbers = {
+            name: value
+            for group in recipe.changed().values()
+            for name, value in group.items()
+            if type(value) is int and name not in _NO_SIZES
+        }
+        largest = max(numbers, key=numbers.__getitem__, default="buffer_size")
+        value = numbers.get(largest, recipe.replay.buffer_size)
+        raise ValueError(f"{largest}={value} needs more memory than there is") from error

@@ -1,0 +1,53 @@
+"""Sizes beyond the memory of the machine."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from torchrl_her_recipes import build, make_recipe
+from torchrl_her_recipes.components import memory
+from torchrl_her_recipes.components.memory import sizes_named
+
+SMALL = {"task": "hand_v0", "num_envs": 2, "steps_per_batch": 2, "pictures": False}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        # 9 + 2 numbers and 3 flags before and after the action, 3 of the action, and a reward
+        (
+            {"buffer_size": 10**12, "num_runs": 2},
+            "buffer_size=1000000000000 needs 220000 GB for num_runs=2, 110 bytes for each transition, but",
+        ),
+        ({"hidden": 10**7}, "hidden=10000000 needs more memory than there is"),
+        ({"learner": "tqc", "quantiles": 10**10}, "quantiles=10000000000 needs more memory than there is"),
+    ],
+)
+def test_sizes_beyond_memory_are_refused_by_name(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build(make_recipe(**SMALL, **options))
+
+
+def test_a_buffer_that_just_fits_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = make_recipe(**SMALL, buffer_size=1_000, batch_size=16)
+    monkeypatch.setattr(memory, "memory_of", lambda device: 110_000.0)
+    assert build(recipe).buffer.storage.max_size == 1_000
+    monkeypatch.setattr(memory, "memory_of", lambda device: 109_999.0)
+    with pytest.raises(ValueError, match="buffer_size=1000 needs 0 GB"):
+        build(recipe)
+
+
+def test_other_errors_stay_what_they_are() -> None:
+    with pytest.raises(RuntimeError, match="no reason"), sizes_named(make_recipe(**SMALL)):
+        raise RuntimeError("no reason")
+    with pytest.raises(ValueError, match="buffer_size=1000000 needs more memory"), sizes_named(make_recipe()):
+        raise MemoryError
+
+
+def test_limits_that_limit_nothing_may_be_infinite() -> None:
+    recipe = make_recipe(**SMALL, max_grad_norm=math.inf, normalize=True, normalize_clip=math.inf)
+    assert build(recipe).recipe.learner.max_grad_norm == torch.inf
