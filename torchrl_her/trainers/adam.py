@@ -73,8 +73,9 @@ class RunsAdam(torch.optim.Adam):
             torch._foreach_mul_(second, beta2)
             torch._foreach_addcmul_(second, gradients, gradients, 1 - beta2)
             for own, state, m, v in zip(parameters, states, first, second, strict=True):
-                state["step"] += 1
-                count = state["step"].double()
+                state["step"] = count = state["step"].to(own.device)  # torch loads it onto the CPU
+                count += 1
+                count = count.double()
                 size = (group["lr"] / (1 - beta1**count)).to(own.dtype)
                 spread = (1 - beta2**count).sqrt().to(own.dtype)
                 own.sub_(size * m / (v.sqrt() / spread + group["eps"]))
