@@ -60,6 +60,12 @@ class RunsAdam(torch.optim.Adam):
         state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter.data) for _ in range(2))
         return state
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Puts back what ``state_dict`` gave; torch's own Adam leaves the counts on the CPU."""
+        super().load_state_dict(state_dict)
+        for parameter, state in self.state.items():
+            state["step"] = state["step"].to(parameter.device)
+
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> Any:
         """One step of each run, with its own bias corrections."""
@@ -73,9 +79,8 @@ class RunsAdam(torch.optim.Adam):
             torch._foreach_mul_(second, beta2)
             torch._foreach_addcmul_(second, gradients, gradients, 1 - beta2)
             for own, state, m, v in zip(parameters, states, first, second, strict=True):
-                state["step"] = count = state["step"].to(own.device)  # torch loads it onto the CPU
-                count += 1
-                count = count.double()
+                state["step"] += 1
+                count = state["step"].double()
                 size = (group["lr"] / (1 - beta1**count)).to(own.dtype)
                 spread = (1 - beta2**count).sqrt().to(own.dtype)
                 own.sub_(size * m / (v.sqrt() / spread + group["eps"]))
