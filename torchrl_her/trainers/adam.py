@@ -60,6 +60,12 @@ class RunsAdam(torch.optim.Adam):
         state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter.data) for _ in range(2))
         return state
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Puts back what ``state_dict`` gave; torch's own Adam leaves the counts on the CPU."""
+        super().load_state_dict(state_dict)
+        for parameter, state in self.state.items():
+            state["step"] = state["step"].to(parameter.device)
+
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> Any:
         """One step of each run, with its own bias corrections."""

@@ -152,7 +152,7 @@ def test_a_change_of_layer_empties_and_restarts_one_run_alone() -> None:
     components = build(climbing(num_runs=2, success_threshold=1.0, window=30))
     run(components, progress=False)
     networks = weights(components)
-    steps = [float(state["step"]) for state in components.optimizer.state.values()]
+    steps = [state["step"].tolist() for state in components.optimizer.state.values()]
     lines = move(components, run=1)
     assert lines == ["seed 1: 'reach' learned after 1,600 frames, 'throw' begins"]
     assert [size > 0 for size in sizes_of(components.buffer)] == [True, False]
@@ -168,7 +168,7 @@ def test_a_change_of_layer_empties_and_restarts_one_run_alone() -> None:
     assert writer.reward_of(1).threshold == pytest.approx(0.1)
     assert writer.reward_of(0).threshold == pytest.approx(0.06)
     assert torch.equal(weights(components), networks)
-    assert [float(state["step"]) for state in components.optimizer.state.values()] == steps
+    assert [state["step"].tolist() for state in components.optimizer.state.values()] == steps
 
 
 def test_training_goes_on_in_two_layers_at_once() -> None:
