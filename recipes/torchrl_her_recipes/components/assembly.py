@@ -100,6 +100,7 @@ def _assemble(recipe: Recipe) -> Components:
         goal_target=None if space is None else space.target,
         generators=generators if own is generators else [*generators, *own],
         rewards=rewards,
+        bounds=bounds,
         curriculum=state,
         behavior=behavior,
         virtual_env=_virtual_env(recipe, task, rewards) if recipe.evaluation.virtual_goals else None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -18,6 +18,7 @@ from torchrl_her.goals.rewards import EnvReward
 from torchrl_her.trainers.checkpoint import buffer_state_dict, load_buffer_state_dict
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
+from torchrl_her_recipes.components.envs import action_bounds
 from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
@@ -120,7 +121,7 @@ def load_demonstrations(
             f"`torchrl-her record {recipe.task.name} --out {options.file}` writes it"
         ) from error
     _check(every, recipe, env)
-    recorded = every.first(options.episodes).to(getattr(torch, recipe.run.dtype))
+    recorded = _scaled(every.first(options.episodes), env).to(getattr(torch, recipe.run.dtype))
     own = RunDemonstrations(recorded, env, state)
     if options.as_starts:
         if recipe.behavior.name != "real":
@@ -150,6 +151,15 @@ def _check(every: Demonstrations, recipe: Recipe, env: EnvBase) -> None:
                 f"{options.file} holds demonstrations of {task} with other options: {key!r} of width {own}, "
                 f"not {width}"
             )
+
+
+def _scaled(own: Demonstrations, env: EnvBase) -> Demonstrations:
+    """Demonstrations with actions from -1 to 1, as learners take them, instead of the task's own."""
+    low, high = action_bounds(env)
+    if low.eq(-1).all() and high.eq(1).all():
+        return own
+    action = (own.rows["action"] - low) / (high - low) * 2 - 1
+    return replace(own, rows=own.rows.copy().set("action", action.to(own.rows["action"].dtype)))
 
 
 def _make_starts(recipe: Recipe, own: RunDemonstrations) -> DemonstrationStarts:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import closing
-from typing import Any
+from typing import Any, cast
 
 import torch
+from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs import ActionScaling, EnvBase, TransformedEnv
 
@@ -36,11 +37,18 @@ def evaluation_envs(recipe: Recipe) -> int:
     return math.ceil(episodes / rounds)
 
 
-def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictures: bool = False) -> EnvBase:
+def make_task_envs(
+    recipe: Recipe,
+    num_envs: int,
+    seeds: Sequence[int],
+    *,
+    pictures: bool = False,
+    scaled: bool = True,
+) -> EnvBase:
     """Environments of the recipe's task: ``num_envs`` for each seed.
 
     All environments of recipes are made here, so this is also where modules that recipes name are imported,
-    or refused. Continuous actions are from -1 to 1, whatever the task's own bounds are.
+    or refused.
 
     Args:
         recipe: of a run.
@@ -49,6 +57,8 @@ def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictu
 
     Keyword Args:
         pictures: whether they are to give pictures, if they can.
+        scaled: whether continuous actions are from -1 to 1, whatever the task's own bounds are, as learners
+            take them. Exported policies and recorded demonstrations have the task's own.
 
     Raises:
         ValueError: options that the task does not take, or a module that must not be imported.
@@ -65,10 +75,22 @@ def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictu
     if pictures:
         options = {**get_task_spec(task.name).for_pictures, **options}
     env = make_env(task.name, num_envs=num_envs * len(seeds), seed=seeds, **options)
-    actions = env.action_spec
-    if isinstance(actions, Bounded) and not (actions.low.eq(-1).all() and actions.high.eq(1).all()):
+    low, high = action_bounds(env)
+    if scaled and not (low.eq(-1).all() and high.eq(1).all()):
         return TransformedEnv(env, ActionScaling())
     return env
+
+
+def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
+    """The least and the greatest actions of a task, [actions]; -1 and 1 if it has no finite ones.
+
+    Those of the task itself are returned, below a transform that scales them.
+    """
+    actions = cast(EnvBase, goal_env(env)).action_spec_unbatched
+    if isinstance(actions, Bounded) and bool((actions.low.isfinite() & actions.high.isfinite()).all()):
+        return actions.low, actions.high
+    one = torch.ones(actions.shape, device=actions.device)
+    return -one, one
 
 
 def resolved(recipe: Recipe) -> Recipe:

@@ -45,7 +45,10 @@ from ..small import small
             {"processes": 3, "num_envs": 64, "epoch_frames": 6_400},
             "num_envs=64 cannot be shared out among processes=3: it must be a multiple of it",
         ),
-        ({"epoch_frames": 100, "num_envs": 64}, "epoch_frames=100 must be at least num_envs times steps_per_batch, 640"),
+        (
+            {"epoch_frames": 100, "num_envs": 64},
+            "epoch_frames=100 must be at least num_envs times steps_per_batch, 640",
+        ),
         (
             {"demonstrations.episodes": 3},
             "demonstrations.episodes=3 needs a file: demonstrations.file=FILE, as `torchrl-her record`",
@@ -259,7 +262,9 @@ def test_networks_have_the_shape_that_is_asked_for(learner: str) -> None:
 
 def test_critics_of_a_run_depend_on_its_seed_alone() -> None:
     alone, beside = (
-        build(small(learner="td3", critics=3, norm="none", seed=seed, num_runs=runs)).loss.qvalue_network_params
+        build(
+            small(learner="td3", critics=3, norm="none", seed=seed, num_runs=runs)
+        ).loss.qvalue_network_params
         for seed, runs in ((4, 1), (3, 2))
     )
     for one, two in zip(alone.values(True, True), beside.values(True, True), strict=True):
