@@ -179,5 +179,5 @@ def _make_starts(recipe: Recipe, own: RunDemonstrations) -> DemonstrationStarts:
 def rows_needed(recipe: Recipe, own: RunDemonstrations) -> int:
     """How many rows of a run the demonstrations have at most, virtual ones among them."""
     hindsight = get_algorithm(recipe.hindsight.algo).hindsight
-    copies = sum(recipe.hindsight.sources.values()) if hindsight else 0
+    copies = sum(recipe.hindsight.sources.values()) * recipe.hindsight.refill if hindsight else 0
     return len(own.recorded.rows) * (1 + copies)

@@ -63,7 +63,7 @@ class CollectionConfig(Group):
     frames_per_update: float = option(
         AUTO,
         "environment steps for each gradient step; 0.5: two gradient steps for each environment step; "
-        "auto: 2, or 5 with this package's tasks",
+        "auto: 1, or 5 with this package's tasks",
         above=0,
     )
     warmup_frames: int = option(
@@ -145,6 +145,11 @@ class HindsightConfig(Group):
         "in place of k and strategy, how many virtual goals come from where, as in '{future: 2, actual: 2}': "
         "any strategy, actual (goals wanted in recent episodes), achieved (goals achieved in them); auto: "
         "three future ones and an actual one, or none if k or strategy is given",
+    )
+    refill: int = option(
+        5,
+        "where the filter leaves transitions without goals, the others get up to this many times as many",
+        at_least=1,
     )
     n_steps: int = option(1, "steps that a transition spans, at most (n-step returns)", at_least=1)
 

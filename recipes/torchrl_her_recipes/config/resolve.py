@@ -57,7 +57,7 @@ _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
     "gamma": _gamma,
     "hidden": lambda _recipe, facts: 64 if facts.batched else 256,
     "num_envs": _num_envs,
-    "frames_per_update": lambda _recipe, facts: 5.0 if facts.batched else 2.0,
+    "frames_per_update": lambda _recipe, facts: 5.0 if facts.batched else 1.0,
     "epoch_frames": _epoch_frames,
     "warmup_frames": _warmup_frames,
 }

@@ -32,12 +32,12 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
             idle[group, name] = f"with task={task}"
     with_algo = f"with algo={algorithm.name}"
     if not algorithm.hindsight:
-        for name in ("k", "strategy", "goal_sources"):
+        for name in ("k", "strategy", "goal_sources", "refill"):
             idle["hindsight", name] = with_algo
         for group in WEIGHTS:
             all_of(group, with_algo)
     elif not groups.hindsight.sources:
-        idle["hindsight", "strategy"] = "with k=0"
+        idle["hindsight", "strategy"] = idle["hindsight", "refill"] = "with k=0"
         for group in WEIGHTS:
             all_of(group, "with k=0")
     elif algorithm.weights:
@@ -56,6 +56,8 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
             idle["ibs", "cells"] = idle["ibs", "recent"] = "with estimator=kernel"
         if algorithm.instructive == "sequential":
             idle["ibs", "floor"] = with_algo
+    if not algorithm.filter_achieved:
+        idle["hindsight", "refill"] = with_algo
     if algorithm.hindsight and groups.hindsight.goal_sources not in (None, AUTO):
         idle["hindsight", "k"] = idle["hindsight", "strategy"] = "with goal_sources"
     if not algorithm.curriculum:
