@@ -100,7 +100,8 @@ def draw_for_runs(
     weights: WeightsOfRuns | None,
     generators: Generators,
     recent: RecentGoals,
-) -> tuple[Tensor, Tensor]:
+    times: int = 1,
+) -> tuple[Tensor, Tensor, list[int]]:
     """Draws the virtual goals of episodes of several runs, each run with its own weights and generator.
 
     Each source is a factor of its own: its goals are drawn by candidate times weight times filter, where
@@ -117,14 +118,16 @@ def draw_for_runs(
         weights: of all runs; None for all goals alike.
         generators: m of them.
         recent: the goals of recent episodes of all runs, those of these episodes among them.
+        times: how many times as many goals as the options say are drawn in the own episode.
 
     Returns:
-        ``(source, goals)``, [V] and [V, g]: the transitions to be relabeled, one after the other, each of
-        them for up to k goals. Those without a goal that may be drawn are left out.
+        ``(source, goals, relabeled)``. The first two are [V] and [V, g]: the transitions to be relabeled, one
+        after the other, each of them for up to k goals. Those without a goal that may be drawn are left out.
+        The third has m numbers: how many transitions of each run got goals of the own episode.
     """
     episodes = piece.episodes
     if options.k == 0:  # then the batch may be without goals
-        return episodes.lengths[:0], episodes.lengths[:0]
+        return episodes.lengths[:0], episodes.lengths[:0], [0] * len(piece.runs)
     drawn = _Transitions.of(episodes, options.per)
     before, after = entry_of(rows, keys.achieved), entry_of(rows, keys.next_achieved)
     keep = None
@@ -133,17 +136,20 @@ def draw_for_runs(
     draws = drawn.draws(generators, piece.position)
     pools: list[Tensor] = []
     parts: list[tuple[Tensor, Tensor]] = []
+    relabeled = torch.zeros_like(drawn.row, dtype=torch.bool)
     for source, number in options.sources.items():
         if source in RECENT:
             pool, lines = recent.lines(str(source), piece.runs)
             candidates, counts, tries = drawn.pool(pool, lines, piece.position), [1] * len(piece.runs), TRIES
         else:
-            candidates, tries = drawn.candidates(after, episodes, source), 0
+            candidates, tries, number = drawn.candidates(after, episodes, source), 0, times * number
             counts = piece.sums(torch.ones_like(episodes.lengths))
         own_weights = None if weights is None else partial(weights, runs=piece.runs, counts=counts)
         index, valid = choose_goals(
             candidates, number, weights=own_weights, keep=keep, draws=draws, tries=tries
         )
+        if source not in RECENT:
+            relabeled |= valid
         parts.append((index + sum(map(len, pools)), valid.unsqueeze(-1).expand_as(index)))
         pools.append(candidates.goals)
     index, valid = parts[0]
@@ -153,7 +159,8 @@ def draw_for_runs(
     if not bool(valid.all()):
         some = valid.flatten().nonzero().squeeze(-1)
         row, goals = row.index_select(0, some), goals.index_select(0, some)
-    return row, (pools[0] if len(pools) == 1 else torch.cat(pools)).index_select(0, goals)
+    goals = (pools[0] if len(pools) == 1 else torch.cat(pools)).index_select(0, goals)
+    return row, goals, piece.sums(torch.bincount(drawn.episode[relabeled], minlength=len(episodes.lengths)))
 
 
 class _Transitions(NamedTuple):

@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
+from torchrl_her.checks import check_whole
 from torchrl_her.files.reading import read_tensors
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, weights_by_run
@@ -110,6 +111,9 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         generators: R sources of random numbers; None for the buffer's, with one run only.
         layers: for episodes that carry the layer of a curriculum in which they were played, one rule for each
             layer; they take the place of ``reward_fn``. None if episodes have no layers.
+        refill: where the filter leaves transitions without goals, the others get more goals of their episode,
+            so that there are about as many in all: up to this many times as many; 1: no more. It goes by the
+            share of transitions that got goals so far, of each run.
         on_write: called with all that is written, real and virtual transitions, as ``(rows, runs, counts)``:
             rows run after run, which runs these are, and how many rows each has. It comes before they are
             stored, and may come several times for one batch; if it raises an error, nothing of the batch is
@@ -180,13 +184,18 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
         layers: Sequence[LayerRule] | None = None,
+        refill: int = 1,
         on_write: OnWrite | None = None,
         **changes: Any,
     ) -> None:
         self.generators, self.on_write = check_generators(runs, generators), on_write
         self.layers = check_layers(layers)
+        check_whole(refill=refill, least=1)
+        self.refill = refill
         own = weights_by_run(weights, runs)
         super().__init__(reward_fn, options, weights=own[0] if own and runs == 1 else None, **changes)
+        if refill > 1 and self.options.per == "episode":
+            raise ValueError(f"refill={refill} is for per='transition': the filter looks at each of them")
         self._weights = own  # of several runs
         self.runs = runs
         self._own_rewards: dict[int, RewardFunction] = {}  # of runs that differ from ``reward_fn``
@@ -441,7 +450,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         if self.runs == 1:  # then TorchRL's own cursor counts
             self._rings.cursors[0] = self._cursor
         places = Places(run, len(batch), runs=self.runs, device=lanes.device)
-        entries = min(_ROWS, self.capacity) // (self.k + 1), _ROWS // (self.k + 1)
+        most = self.k * self.refill + 1  # copies of a transition
+        entries = max(1, min(_ROWS, self.capacity) // most), _ROWS // most
         own = None if run is None else run[episodes.rows[:, :1]].flatten()
         recent, settings, drafts, first_id = list(self._recent), self._settings(), [], self._episodes
         for layer, part, run_of in self._by_layer(rows, episodes, own):
@@ -474,7 +484,14 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     def _settings(self) -> list[Hashable]:
         """For each run, what must be the same for runs that are written at once."""
         alike = [own.alike for own in self.goal_weights] or [True] * self.runs
-        return [(id(self.reward_of(run)), alike[run]) for run in range(self.runs)]
+        return [(id(self.reward_of(run)), alike[run], self._times(run)) for run in range(self.runs)]
+
+    def _times(self, run: int) -> int:
+        """How many times as many goals a run's transitions get, to make up for those that get none."""
+        counts = self._counts.counts[run]
+        if self.refill == 1 or not counts.real:
+            return 1
+        return min(self.refill, max(1, round(counts.real / max(1, counts.relabeled))))
 
     def _draft(
         self, batch: Batch, piece: Piece, recent: RecentGoals, rule: LayerRule, *, first_id: int
@@ -482,7 +499,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         """What is to be written of some episodes. Nothing is written or counted yet: it may be refused."""
         rows, runs, options, keys = batch.rows, piece.runs, self.options, self._keys
         reward_fn, own, virtual = rule.reward_fn, self.goal_weights if rule.weighted else [], None
-        source, goals = draw_for_runs(
+        source, goals, relabeled = draw_for_runs(
             rows,
             piece,
             reward_fn,
@@ -491,9 +508,10 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             weights=self._weights_of_runs() if own and not own[runs[0]].alike else None,
             generators=[self._rng] if self.generators is None else [self.generators[run] for run in runs],
             recent=recent,
+            times=self._times(runs[0]),
         )
         real = real_share(rows, piece, options, keys, first_id=first_id + len(source))
-        numbers = {"real": real.counts, **real_positives(*real, self.achieved_reward)}
+        numbers = {"real": real.counts, "relabeled": relabeled, **real_positives(*real, self.achieved_reward)}
         if len(source) > 0:
             virtual = virtual_share(
                 rows, batch.run, piece, source, goals, reward_fn, options, keys, first_id=first_id

@@ -213,6 +213,46 @@ def test_an_episode_in_which_nothing_moved_writes_real_rows_only() -> None:
     assert buffer.writer.counts.virtual == 0
 
 
+def moved_in(step: int, length: int) -> TensorDict:
+    """An episode in which what is achieved moves once, in one of its steps."""
+    batch = make_batch([[length]])
+    for part, late in ((batch, 0), (batch["next"], 1)):
+        part["achieved_goal"][..., 0] = (torch.arange(length) + late > step).float() * 9
+        part["achieved_goal"][..., 1:] = 0
+    return batch
+
+
+@pytest.mark.parametrize(("refill", "times"), [(1, [1, 1, 1]), (3, [1, 3, 2]), (9, [1, 5, 2])])
+def test_what_the_filter_keeps_makes_up_for_what_it_leaves_out(refill: int, times: list[int]) -> None:
+    """Relabeled were none, then 2 of 10 transitions, then 2 + 8 of 20."""
+    buffer = make_buffer(filter_achieved=True, refill=refill, goal_sources={"future": 2, "actual": 1})
+    written = []
+    for step in (1, 7, 0):  # relabeled are the transitions up to this one
+        before = buffer.writer.counts.virtual
+        buffer.extend(moved_in(step, 10))
+        written.append(buffer.writer.counts.virtual - before - 10)  # a goal that was wanted, for each
+    assert written == [2 * relabeled * more for relabeled, more in zip((2, 8, 1), times, strict=True)]
+    assert buffer.writer.counts.relabeled == 11
+    buffer.empty()
+    buffer.extend(moved_in(1, 10))
+    assert buffer.writer.counts.virtual == 4 + 10  # it counts from 0 again
+
+
+def test_goals_are_made_up_for_where_nothing_was_kept_so_far() -> None:
+    buffer = make_buffer(filter_achieved=True, refill=4, k=2)
+    buffer.extend(moved_in(10, 10))
+    assert buffer.writer.counts.relabeled == 0
+    buffer.extend(moved_in(0, 10))
+    assert buffer.writer.counts.virtual == 2 * 4
+
+
+def test_refill_is_for_single_transitions() -> None:
+    with pytest.raises(ValueError, match="refill=2 is for per='transition'"):
+        HERWriter(REWARD, per="episode", refill=2)
+    with pytest.raises(ValueError, match="refill must be"):
+        HERWriter(REWARD, refill=0)
+
+
 def test_the_filter_asks_the_reward_even_where_nothing_ever_terminates() -> None:
     reward = GoalReward(0.5)
     endless = EnvReward(lambda a, d: reward(a, d)[0], lambda a, d: torch.zeros_like(a[..., :1]).bool())

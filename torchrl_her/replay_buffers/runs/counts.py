@@ -18,12 +18,14 @@ from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
 class WriterCounts:
     """How many transitions were written; the positive ones are those that achieved their goal.
 
-    ``useful_virtual_positive`` leaves out virtual transitions whose goal was already achieved in the state
-    before. It counts what the filter keeps, or would keep if it were on.
+    ``relabeled`` counts the real transitions that got goals of their own episode. ``useful_virtual_positive``
+    leaves out virtual transitions whose goal was already achieved in the state before. It counts what the
+    filter keeps, or would keep if it were on.
     """
 
     real: int = 0
     virtual: int = 0
+    relabeled: int = 0
     real_positive: int = 0
     virtual_positive: int = 0
     useful_virtual_positive: int = 0

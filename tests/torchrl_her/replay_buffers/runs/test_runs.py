@@ -163,6 +163,7 @@ CASES: list[dict[str, Any]] = [
     {"sampler": "uniform", "strategy": "final"},
     {"capacity": 37, "filter_achieved": True},
     {"capacity": 5},
+    {"goal_sources": {"final": 2, "actual": 1}, "filter_achieved": True, "refill": 4},
     {"n_steps": 3, "gamma": 0.9},
     {"k": 0},
     {"packed": False, "capacity": 60},
