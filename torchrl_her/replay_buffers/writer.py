@@ -195,7 +195,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         own = weights_by_run(weights, runs)
         super().__init__(reward_fn, options, weights=own[0] if own and runs == 1 else None, **changes)
         if refill > 1 and self.options.per == "episode":
-            raise ValueError(f"refill={refill} is for per='transition', where the filter looks at each of them")
+            raise ValueError(f"refill={refill} is for per='transition': the filter looks at each of them")
         self._weights = own  # of several runs
         self.runs = runs
         self._own_rewards: dict[int, RewardFunction] = {}  # of runs that differ from ``reward_fn``

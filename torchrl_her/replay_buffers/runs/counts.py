@@ -18,9 +18,9 @@ from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
 class WriterCounts:
     """How many transitions were written; the positive ones are those that achieved their goal.
 
-    ``relabeled`` counts the real transitions that got goals of their own episode: with the filter, those before
-    which at least one of these goals was not achieved yet. ``useful_virtual_positive`` leaves out virtual transitions whose goal was already achieved in the state
-    before. It counts what the filter keeps, or would keep if it were on.
+    ``relabeled`` counts the real transitions that got goals of their own episode. ``useful_virtual_positive``
+    leaves out virtual transitions whose goal was already achieved in the state before. It counts what the
+    filter keeps, or would keep if it were on.
     """
 
     real: int = 0
