@@ -147,6 +147,24 @@ class Recipe:
         """
         return _assemble(place(values))
 
+    @classmethod
+    def of_file(cls, values: Mapping[str, Any]) -> Recipe:
+        """The recipe that a file keeps: all values of :meth:`to_dict`, whatever the defaults are by now.
+
+        Raises:
+            ValueError: as for :meth:`from_dict`, or an option is missing, as in files of an older version.
+        """
+        recipe = cls.from_dict(values)
+        missing = [
+            name
+            for group, own in recipe.to_dict().items()
+            for name in own
+            if name not in (values.get(group) or {})
+        ]
+        if missing:
+            raise ValueError(f"an older version wrote it, without {', '.join(missing)}: train it again")
+        return recipe
+
 
 def check_extending(values: Mapping[str, Any]) -> None:
     """Refuses options that would change what a run has trained already.

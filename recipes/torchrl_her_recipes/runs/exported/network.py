@@ -118,11 +118,11 @@ class ScaledActions(nn.Module):
         self.net = net
         least, greatest = torch.tensor(low), torch.tensor(high)
         self.register_buffer("middle", (greatest + least) / 2)
-        self.register_buffer("half", (greatest - least) / 2)
+        self.register_buffer("reach", (greatest - least) / 2)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """[..., widths] of the inputs to [..., actions]."""
-        return self.middle + self.half * self.net(*inputs)
+        return self.middle + self.reach * self.net(*inputs)
 
 
 class TensorPolicy(nn.Module):
