@@ -195,5 +195,7 @@ def _policy_of(state: dict[str, Any]) -> TrainedPolicy:
 
 def _card_of(state: dict[str, Any]) -> PolicyCard:
     if "card" not in state:
-        raise ValueError("an older version wrote it, without a card: train it again, or play it with that version")
+        raise ValueError(
+            "an older version wrote it, without a card: train it again, or play it with that version"
+        )
     return PolicyCard.from_dict(state["card"])

@@ -38,6 +38,7 @@ _TAGGED: dict[str, Any] = {
     "epoch_frames": _FRAMES,
     "warmup_frames": 40,
     "frames_per_update": 5,
+    "goal_sources": None,  # of the same episode alone
     "checkpoint_interval": 100,
 }
 _TABLE = ("seconds",)  # columns that differ
@@ -118,7 +119,9 @@ def _stopped() -> dict[str, Any]:
 
 def _weights() -> dict[str, Any]:
     """Which of two policies played: they want -1 and 1."""
-    components = build(tagged(num_runs=1, epsilon_start=0.0, epsilon_end=0.0))
+    components = build(
+        tagged(num_runs=1, epsilon_start=0.0, epsilon_end=0.0, uniform_share=0.2, action_noise=0.05)
+    )
     collector, (*_, bias) = components.collector, components.actor.parameters()
     assert isinstance(collector, ProcessCollector)
 

@@ -32,7 +32,8 @@ def test_frames_are_rounded_up_to_whole_epochs() -> None:
 def test_some_tasks_have_options_of_their_own(tmp_path: Path) -> None:
     path = tmp_path / "own.yaml"
     path.write_text(
-        "recipe: {epochs: 3, k: 2, epoch_frames: 20480}\nvary: {task: [hand_v0, hand_v1], algo: [her, filtered_her]}\n"
+        "recipe: {epochs: 3, k: 2, epoch_frames: 20480}\n"
+        "vary: {task: [hand_v0, hand_v1], algo: [her, filtered_her]}\n"
         "for_task:\n  hand_v1: {run: {epochs: 7}}\n"
     )
 

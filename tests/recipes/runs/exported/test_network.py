@@ -37,7 +37,7 @@ def test_the_policy_is_the_learner_s_own_greedy_one(options: dict[str, Any]) -> 
 
 @pytest.mark.parametrize("learner", ["ddpg", "sac"])
 def test_actions_reach_the_limits_of_the_task(learner: str) -> None:
-    policy = tiny_policy(learner=learner, normalize=False, scale=3.0)  # from -3 to 6
+    policy = tiny_policy(learner=learner, normalize=False, norm="none", scale=3.0)  # from -3 to 6
     far = states(policy.card, 200).apply(lambda own: 100 * own)
     action = policy.actor(far)["action"]
     assert float(action.min()) == pytest.approx(-3.0, abs=1e-4)
