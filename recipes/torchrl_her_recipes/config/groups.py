@@ -128,7 +128,7 @@ class ReplayConfig(Group):
             raise ValueError(f"batch_size={self.batch_size} must fit buffer_size={self.buffer_size}")
 
 
-FUTURE_AND_ACTUAL = {"future": 3, "actual": 1}  # as "future-actual" goals of MRL (Pitis et al., 2020)
+FUTURE_AND_ACTUAL = {"future": 3, "actual": 2}  # as "future-actual" goals of MRL (Pitis et al., 2020)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +144,7 @@ class HindsightConfig(Group):
         AUTO,
         "in place of k and strategy, how many virtual goals come from where, as in '{future: 2, actual: 2}': "
         "any strategy, actual (goals wanted in recent episodes), achieved (goals achieved in them); auto: "
-        "three future ones and an actual one, or none if k or strategy is given",
+        "three future ones and two actual ones, or none if k or strategy is given",
     )
     refill: int = option(
         5,

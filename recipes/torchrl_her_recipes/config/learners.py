@@ -43,15 +43,13 @@ class LearnerConfig(Group):
     )
     device: str = option("cpu", "where the networks are: cpu, cuda, cuda:1, ..., or auto")
     gamma: float = option(
-        AUTO, "discount factor; auto: 1 - 1 / steps of an episode, from 0.9 to 0.99", above=0, below=1
+        AUTO, "discount factor; auto: 1 - 2 / steps of an episode, from 0.9 to 0.99", above=0, below=1
     )
     learning_rate: float = option(1e-3, "learning rate of Adam", above=0)
     max_grad_norm: float = option(
         3.0, "gradients of each network are clipped to this norm", above=0, infinite=True
     )
-    hidden: int = option(
-        AUTO, "width of the hidden layers; auto: 256, or 64 with this package's tasks", at_least=1
-    )
+    hidden: int = option(256, "width of the hidden layers", at_least=1)
     depth: int = option(3, "how many hidden layers the networks have", at_least=2)
     activation: str = option("relu", "behind each hidden layer", choices=("relu", "tanh", "elu"))
     norm: str = option(

@@ -30,8 +30,8 @@ class EnvFacts:
 
 
 def _gamma(_recipe: Recipe, facts: EnvFacts) -> float:
-    """A horizon of an episode's length."""
-    return round(min(max(1 - 1 / facts.max_steps, _GAMMA[0]), _GAMMA[1]), 4)
+    """A horizon of half an episode."""
+    return round(min(max(1 - 2 / facts.max_steps, _GAMMA[0]), _GAMMA[1]), 4)
 
 
 def _num_envs(recipe: Recipe, facts: EnvFacts) -> int:
@@ -55,7 +55,6 @@ def _warmup_frames(recipe: Recipe, facts: EnvFacts) -> int:
 _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
     "goal_sources": lambda recipe, _facts: recipe.hindsight.sources,
     "gamma": _gamma,
-    "hidden": lambda _recipe, facts: 64 if facts.batched else 256,
     "num_envs": _num_envs,
     "frames_per_update": lambda _recipe, facts: 5.0 if facts.batched else 1.0,
     "epoch_frames": _epoch_frames,
@@ -68,7 +67,7 @@ def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
 
     Example:
         >>> auto_options(Recipe().replace(gamma=0.95))[:2]
-        [('hindsight', 'goal_sources'), ('learner', 'hidden')]
+        [('hindsight', 'goal_sources'), ('collection', 'num_envs')]
     """
     homes = {own.name: group.name for group in fields(recipe) for own in fields(getattr(recipe, group.name))}
     names = [(homes[name], name) for name in _VALUES]
@@ -82,7 +81,7 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
     Example:
         >>> recipe = resolve(Recipe(), EnvFacts(max_steps=50))
         >>> recipe.learner.gamma, recipe.collection.num_envs, recipe.collection.epoch_frames
-        (0.98, 8, 5000)
+        (0.96, 8, 5000)
     """
     for group, name in auto_options(recipe):
         value = _VALUES[name](recipe, facts)

@@ -118,7 +118,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         idle["learner", "products"] = "with dtype=float64"
     elif groups.learner.norm == "batch":
         idle["learner", "products"] = "with norm=batch"
-    elif groups.learner.hidden != AUTO and groups.learner.hidden < 32:
+    elif groups.learner.hidden < 32:
         idle["learner", "products"] = "with hidden below 32"
     if getattr(groups.learner, "uniform_share", None) == 1.0:
         idle["learner", "action_noise"] = "with uniform_share=1"

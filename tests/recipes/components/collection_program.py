@@ -119,9 +119,7 @@ def _stopped() -> dict[str, Any]:
 
 def _weights() -> dict[str, Any]:
     """Which of two policies played: they want -1 and 1."""
-    components = build(
-        tagged(num_runs=1, epsilon_start=0.0, epsilon_end=0.0, uniform_share=0.2, action_noise=0.05)
-    )
+    components = build(tagged(num_runs=1, epsilon_start=0.0, epsilon_end=0.0))
     collector, (*_, bias) = components.collector, components.actor.parameters()
     assert isinstance(collector, ProcessCollector)
 

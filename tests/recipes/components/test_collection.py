@@ -145,8 +145,8 @@ def test_the_policy_is_one_batch_old(apart: dict[str, Any]) -> None:
     assert (first < -0.9).all()
     assert (ahead < -0.9).all()  # it was begun before the policy changed
     assert (then > 0.9).all()
-    share = (exploring < 0.9).float().mean()  # epsilon 1: a fifth is uniform, a few noises are large
-    assert 0.1 < share < 0.6
+    share = (exploring < 0.9).float().mean()  # epsilon 1: six tenths are uniform, a few noises are large
+    assert 0.4 < share < 0.9
 
 
 def test_statistics_of_normalized_inputs_reach_the_processes(apart: dict[str, Any]) -> None:

@@ -15,19 +15,19 @@ from torchrl_her_recipes.config.shipped import preset_names
 @pytest.mark.parametrize(
     ("max_steps", "batched", "values"),
     [
-        (50, False, (0.98, 256, 8, 2.0, 5_000, 1_000)),
-        (50, True, (0.98, 64, 64, 5.0, 12_800, 3_200)),
-        (300, False, (0.99, 256, 8, 2.0, 30_000, 2_400)),
-        (4, False, (0.9, 256, 8, 2.0, 400, 1_000)),
-        (1, True, (0.9, 64, 64, 5.0, 640, 1_000)),
+        (50, False, (0.96, 8, 1.0, 5_000, 1_000)),
+        (50, True, (0.96, 64, 5.0, 12_800, 3_200)),
+        (300, False, (0.99, 8, 1.0, 30_000, 2_400)),
+        (4, False, (0.9, 8, 1.0, 400, 1_000)),
+        (1, True, (0.9, 64, 5.0, 640, 1_000)),
     ],
 )
 def test_values_follow_from_the_environment(max_steps: int, batched: bool, values: tuple[float, ...]) -> None:
     recipe = resolve(make_recipe(), EnvFacts(max_steps=max_steps, batched=batched))
     own = recipe.collection
     sizes = (own.num_envs, own.frames_per_update, own.epoch_frames, own.warmup_frames)
-    assert (recipe.learner.gamma, recipe.learner.hidden, *sizes) == values
-    assert recipe.hindsight.goal_sources == {"future": 3, "actual": 1}
+    assert (recipe.learner.gamma, *sizes) == values
+    assert recipe.hindsight.goal_sources == {"future": 3, "actual": 2}
     assert auto_options(recipe) == []
 
 
@@ -57,7 +57,7 @@ def test_the_folder_of_a_run_has_the_values(tmp_path: Path) -> None:
     sizes = {"num_envs": 4, "epoch_frames": 80, "epochs": 1, "episodes": 2, "hidden": 8}
     run(build(make_recipe(task="hand_v0", pictures=False, **sizes)), tmp_path / "run", progress=False)
     written = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
-    assert written["learner"]["gamma"] == 0.98
+    assert written["learner"]["gamma"] == 0.96
     assert written["collection"]["frames_per_update"] == 5.0
     assert "auto" not in {
         value for name in ("collection", "hindsight") for value in map(str, written[name].values())
