@@ -19,7 +19,7 @@ from ..small import assert_same, small, stop_after
 
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
-    """A folder with a run that still has the buffer it need not keep, one that keeps it, and an unfinished one."""
+    """A folder with a run that still has its buffer, one that is to keep it, and an unfinished one."""
     folder = tmp_path / "runs"
     recipe = small(epoch_frames=480)
     run(build(recipe), folder / "study" / "kept", progress=False)
