@@ -25,9 +25,11 @@ def action_cost(action: Tensor, *, l2: float = 0.0, saturation: float = 0.0) -> 
         [...].
 
     Example:
+        >>> import torch
         >>> action_cost(torch.tensor([1.0, 0.0]), l2=0.5).item()
         0.25
-        >>> action_cost(torch.tensor([3.0, -1.0]).tanh(), saturation=0.5).item()  # 0.5 * (1 + 0) / 2
+        >>> cost = action_cost(torch.tensor([3.0, -1.0]).tanh(), saturation=0.5)  # 0.5 * (1 + 0) / 2
+        >>> round(cost.item(), 4)
         0.25
     """
     cost = l2 * action.square().mean(-1)

@@ -21,6 +21,7 @@ _LENGTHS = ("num_runs", "epochs", "epoch_frames", "frames")
 _QUICK: dict[str, Any] = {
     "num_runs": 2,
     "epochs": 2,
+    "frames": None,
     "epoch_frames": 3_200,
     "num_envs": 16,
     "episodes": 20,
@@ -149,6 +150,8 @@ def _word(name: str, value: Any, values: Sequence[Any]) -> str:
         entries = {key: [each.get(key) for each in values] for key in value}
         differing = {key: own for key, own in entries.items() if any(other != own[0] for other in own)}
         return "_".join(_word(key, value[key], own) for key, own in differing.items())
+    if isinstance(value, Mapping):
+        return "_".join(_word(name, own, [None]) for own in value.values())
     short = name.rpartition(".")[2]
     return str(value) if short in ("task", "algo") else f"{short}={value}"
 
