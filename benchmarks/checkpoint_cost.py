@@ -18,7 +18,7 @@ from machine import describe, publish, table
 
 from torchrl_her import save_checkpoint
 from torchrl_her.replay_buffers import sizes_of
-from torchrl_her_recipes import Recipe, build, make_recipe
+from torchrl_her_recipes import Recipe, build, load_preset, make_recipe
 from torchrl_her_recipes.runs.state import run_state
 
 
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.set_num_threads(1)
-    recipe = make_recipe(epochs=options.epochs)
+    recipe = make_recipe(load_preset("throwing"), epochs=options.epochs)
     rows = []
     for runs in options.runs:
         with tempfile.TemporaryDirectory(dir=".") as folder:  # not in a /tmp that may be memory

@@ -26,7 +26,8 @@ import torch
 from machine import describe, one_core, publish, table
 from peers.ours import Ours
 
-from torchrl_her_recipes import Recipe, make_recipe
+from torchrl_her_recipes import Recipe, load_preset, make_recipe
+from torchrl_her_recipes.config.shortcuts import merge
 
 NOT_MEASURED = "not measured"
 STEPS = 64  # of a measurement: two draws
@@ -62,6 +63,7 @@ def recipe_of(setting: Setting, device: str, compile: str) -> Recipe:
         "buffer_size": 100_000,
         **setting.options,
     }
+    values = merge(load_preset("throwing"), values)
     return make_recipe(values, num_runs=setting.runs, **{"learner.device": device, "compile": compile})
 
 

@@ -32,8 +32,9 @@ from torchrl_her_envs import goal_env
 from torchrl_her_recipes import Recipe, build, make_recipe
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.shipped import load_preset
+from torchrl_her_recipes.config.shortcuts import merge
 
-HAND = {"task": "hand_v0", "algo": "her"}  # all else is the default
+HAND = merge(load_preset("throwing"), {"task": "hand_v0", "algo": "her"})
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 

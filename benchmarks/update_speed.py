@@ -24,7 +24,7 @@ from peers.peer import Peer
 from peers.sb3 import SB3DDPG, SB3TD3
 from peers.sbx_td3 import SBXTD3
 
-from torchrl_her_recipes import Recipe, make_recipe
+from torchrl_her_recipes import Recipe, load_preset, make_recipe
 
 TASK = "hand_v1"
 FILL = 20_480  # frames in the buffers before anything is timed
@@ -61,7 +61,7 @@ class Timing(NamedTuple):
 
 def recipe_for(**options: Any) -> Recipe:
     """A long run, in which ``compile=auto`` compiles whatever gains by it."""
-    return make_recipe(task=TASK, algo="her", episodes=1, epochs=1_000, **options)
+    return make_recipe(load_preset("throwing"), task=TASK, algo="her", episodes=1, epochs=1_000, **options)
 
 
 def frames_in_round(recipe: Recipe) -> int:

@@ -23,8 +23,7 @@ import torch
 from machine import describe, publish, table
 
 from torchrl_her.trainers.trainer import Trainer
-from torchrl_her_recipes import Components, Recipe, build, make_recipe
-from torchrl_her_recipes.config.values import read_yaml
+from torchrl_her_recipes import Components, Recipe, build, load_preset, make_recipe
 
 PRESET = Path(__file__).parents[1] / "presets" / "fetch_push.yaml"
 BATCHES = 50  # of a timed piece: an epoch of the preset, whose first batch the learner waits for
@@ -146,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.set_num_threads(1)
-    preset = make_recipe(read_yaml(PRESET))
+    preset = make_recipe(load_preset(str(PRESET)))
     cases = {"the preset": compare(preset, options.repeats)}
     balanced = preset.replace(frames_per_update=cases["the preset"][0].balanced())
     cases["both take equally long"] = compare(balanced, options.repeats)

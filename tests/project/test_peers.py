@@ -19,7 +19,7 @@ import pytest
 import torch
 
 from torchrl_her_envs import make_env
-from torchrl_her_recipes import Recipe, make_recipe
+from torchrl_her_recipes import Recipe, load_preset, make_recipe
 
 pytest.importorskip("stable_baselines3")
 
@@ -47,7 +47,7 @@ def recipe(**options: Any) -> Recipe:
     """Rounds of 40 frames and 10 gradient steps."""
     base = {"task": "hand_v1", "algo": "her", "hidden": 24, "batch_size": 16, "buffer_size": 2_000}
     sizes = {"num_envs": 4, "steps_per_batch": 10, "frames_per_update": 4, "epoch_frames": 40, "episodes": 2}
-    return make_recipe({**base, **sizes}, **options)
+    return make_recipe({**load_preset("throwing"), **base, **sizes}, **options)
 
 
 def make_peer(name: str) -> Any:

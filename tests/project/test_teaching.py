@@ -17,6 +17,7 @@ from PIL import Image
 
 from torchrl_her_envs.throwing.tasks import TASKS
 from torchrl_her_recipes import make_recipe
+from torchrl_her_recipes.components.envs import resolved
 from torchrl_her_recipes.config.shipped import policy_facts
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -167,19 +168,19 @@ def test_what_the_page_says_of_stable_baselines3_is_so() -> None:
     assert (defaults(sb3.SAC)["learning_rate"], defaults(sb3.SAC)["ent_coef"]) == (0.0003, "auto")
     her = defaults(sb3.HerReplayBuffer)
     assert (her["n_sampled_goal"], her["goal_selection_strategy"]) == (4, "future")
-    ours = make_recipe(task="hand_v0", algo="her")
+    ours = resolved(make_recipe(task="gym:torchrl_her_envs:torchrl_her/HandReach-v0", algo="her"))
     learner = make_recipe(task="hand_v0", algo="her", learner="sac").learner
-    assert (learner.gamma, learner.tau, learner.temperature, learner.learning_rate) == (
-        0.98,
-        0.02,
+    assert (ours.learner.gamma, learner.tau, learner.temperature, learner.learning_rate) == (
+        0.96,
+        0.05,
         0.1,
         0.001,
     )
-    assert (ours.collection.warmup_frames, ours.collection.num_envs) == (3200, 64)
-    assert ours.collection.frames_per_update == 20
+    assert (ours.collection.warmup_frames, ours.collection.num_envs) == (1000, 8)
+    assert ours.collection.frames_per_update == 1
     for words in (
-        "default 3,200 instead of 100",
-        "`gamma=0.98` instead of 0.99",
-        "`tau=0.02` instead of 0.005",
+        "at least 1,000, instead of 100",
+        "`gamma=0.96` for episodes of 50 steps instead of 0.99",
+        "`tau=0.05` instead of 0.005",
     ):
         assert words in page

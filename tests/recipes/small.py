@@ -17,6 +17,9 @@ SMALL: dict[str, Any] = {
     "epochs": 2,
     "epoch_frames": 1_600,
     "num_envs": 8,
+    "frames_per_update": 20,
+    "hidden": 64,
+    "gamma": 0.98,
     "warmup_frames": 400,
     "batch_size": 32,
     "buffer_size": 20_000,
@@ -29,7 +32,7 @@ SMALL: dict[str, Any] = {
 
 def small(**options: Any) -> Recipe:
     """A recipe that runs in about a second."""
-    return make_recipe(SMALL, **options)
+    return make_recipe({**SMALL, "goal_sources": {"future": 3, "actual": 1}}, **options)
 
 
 def stop_after(components: Components, batches: int) -> None:

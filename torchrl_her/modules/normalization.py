@@ -18,6 +18,8 @@ from torch import Tensor, nn
 from torchrl_her.checks import check_whole
 from torchrl_her.modules.networks import by_run
 
+_RELATIVE_STD = 1e-4  # of the mean: smaller deviations are hardly more than what float32 rounds
+
 
 class Moments(NamedTuple):
     """How many values there were, and their mean and variance; of each entry, [...] of float64 all three.
@@ -97,8 +99,8 @@ class RunningNorm(nn.Module):
     Keyword Args:
         runs: R.
         clip: normalized values are clipped to [-clip, clip].
-        least_std: standard deviations below this count as this, so that entries that hardly ever change are
-            not blown up.
+        least_std: least standard deviation, so that entries that hardly ever change are not blown up, in the
+            unit of the values. None for one ten-thousandth of an entry's mean, in whatever unit it is.
 
     Attributes:
         widths: as given.
@@ -132,14 +134,14 @@ class RunningNorm(nn.Module):
         *,
         runs: int = 1,
         clip: float = 5.0,
-        least_std: float = 0.01,
+        least_std: float | None = None,
     ) -> None:
         super().__init__()
         if not widths:
             raise ValueError("widths must name at least one entry to normalize, got none")
         check_whole(runs=runs, **{f"the width of {key!r}": own for key, own in widths.items()})
         for name, number in (("clip", clip), ("least_std", least_std)):
-            if not number > 0:
+            if number is not None and not number > 0:
                 raise ValueError(f"{name} must be above 0, got {number}")
         self.widths = {unravel_key(key): width for key, width in widths.items()}
         self.runs, self.clip, self.least_std, self.frozen = runs, clip, least_std, False
@@ -156,8 +158,15 @@ class RunningNorm(nn.Module):
 
     def moments_of(self, key: NestedKey, run: int = 0) -> Moments:
         """Number, mean and variance of an entry's values so far, [width] each; a view."""
-        columns = self._columns_of(key)
+        columns = self.columns_of(key)
         return Moments(*(own[run, columns] for own in (self.n, self.mean, self.var)))
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviations [R, W] by which values are divided; 1 where nothing was counted."""
+        rounding = self.mean.abs() * _RELATIVE_STD + torch.finfo(torch.float32).tiny
+        least = rounding if self.least_std is None else rounding.new_tensor(self.least_std)
+        return self.var.sqrt().maximum(least)
 
     def restart(
         self, run: int | None = None, *, key: NestedKey | None = None, places: Sequence[int] | None = None
@@ -172,7 +181,7 @@ class RunningNorm(nn.Module):
             places: which numbers of the entry; None for all.
         """
         columns = torch.arange(self.n.shape[-1], device=self.n.device)
-        columns = columns if key is None else columns[self._columns_of(key)]
+        columns = columns if key is None else columns[self.columns_of(key)]
         columns = columns if places is None else columns[list(places)]
         for own, start in ((self.n, 0.0), (self.mean, 0.0), (self.var, 1.0)):
             (own if run is None else own[run : run + 1])[:, columns] = start
@@ -274,13 +283,12 @@ class RunningNorm(nn.Module):
         Raises:
             ValueError: the values have another width, or cannot be divided among the runs.
         """
-        columns = self._columns_of(key)
+        columns = self.columns_of(key)
         self._check(key, values)
         self._check_blocks(values.shape[:-1])
         if not values.is_floating_point():  # means and deviations would be rounded to whole numbers, too
             values = values.to(torch.get_default_dtype())
-        n, mean, var = (own[:, columns] for own in (self.n, self.mean, self.var))
-        std = var.sqrt().clamp(min=self.least_std)
+        n, mean, std = (own[:, columns] for own in (self.n, self.mean, self.std))
         limit = torch.where(n > 0, self.clip, torch.inf)  # nothing is changed before the first update
         mean, std, limit = (own.to(values).unsqueeze(1) for own in (mean, std, limit))
         return normalize(by_run(values, self.runs), mean, std, limit).view(values.shape)
@@ -300,8 +308,8 @@ class RunningNorm(nn.Module):
                 out.set(after, self.normalize(key, value))
         return out
 
-    def _columns_of(self, key: NestedKey) -> slice:
-        """Where an entry's numbers are among those of all."""
+    def columns_of(self, key: NestedKey) -> slice:
+        """The columns of an entry in ``n``, ``mean``, ``var`` and ``std``."""
         columns = self._columns.get(unravel_key(key))
         if columns is None:
             raise KeyError(f"{key!r} is not normalized, only {', '.join(map(repr, self.widths))}")

@@ -81,7 +81,10 @@ def structures(dtype: torch.dtype) -> Structures:
         ("entries", ctypes.c_int),
         ("seen next_seen", ctypes.POINTER(entry)),
         ("action choice reward terminated weight discount noise own_noise low high idle drawn", pointer),
-        ("gamma least greatest penalty max_norm tau policy_noise noise_limit target_entropy", real),
+        (
+            "gamma least greatest penalty saturation max_norm tau policy_noise noise_limit target_entropy",
+            real,
+        ),
         ("adam", ctypes.POINTER(adam)),
         ("priorities losses", pointer),
     )

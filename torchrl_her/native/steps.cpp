@@ -46,7 +46,7 @@ struct Job {
     const real *low, *high;  // [actions]
     const uint8_t* idle;     // [runs]
     const int32_t* drawn;    // [steps, runs, target_critics], critics
-    real gamma, least, greatest, penalty, max_norm, tau, policy_noise, noise_limit, target_entropy;
+    real gamma, least, greatest, penalty, saturation, max_norm, tau, policy_noise, noise_limit, target_entropy;
     const Adam* adam;  // [runs, steps]
     real* priorities;  // [runs, rows]
     real* losses;      // [3, steps, runs]
@@ -56,6 +56,7 @@ namespace {
 
 const real kHalfLogTwoPi = real(0.91893853320467274178), kLogTwo = real(0.69314718055994530942);
 const real kMostTanh = 1 - (sizeof(real) == 4 ? real(1e-6) : real(1e-15));  // as TorchRL's TanhNormal
+const real kFreeArgument = 2, kLargestAction = real(1 - 1e-6);  // as in objectives/action_cost.py
 const real kLeastScale = -10, kGreatestScale = 2;  // of SAC, as in modules/stochastic_actor.py
 
 // Whether the actor draws actions from a distribution, with a temperature.
@@ -323,7 +324,7 @@ class Learner {
         loss(1) = real(value_loss / batch);
     }
 
-    // A deterministic actor: it follows the first critic, or the mean of all, less the action L2 penalty.
+    // A deterministic actor: it follows the first critic, or the mean of all, less the cost of actions.
     void learn_actions() {
         const int batch = job_.batch, actions = job_.actions, followed = job_.target_critics ? job_.critics : 1;
         Network& actor = networks_[0];
@@ -345,12 +346,21 @@ class Learner {
                     for (int a = 0; a < actions; ++a) action_slope[b][a] += own[b][a];
         }
         const real price = job_.penalty / (real(batch) * actions);
+        const real saturation = job_.saturation / (real(batch) * actions);
+        double excesses = 0;
         for (int b = 0; b < batch; ++b)
             for (int a = 0; a < actions; ++a) {
-                action_slope[b][a] += 2 * price * action[b][a];
-                squares += action[b][a] * action[b][a];
+                const real own = action[b][a], size = std::abs(own);
+                action_slope[b][a] += 2 * price * own;
+                squares += own * own;
+                if (saturation == 0) continue;
+                const real excess = std::atanh(std::min(size, kLargestAction)) - kFreeArgument;
+                if (excess <= 0) continue;
+                excesses += excess * excess;
+                if (size < kLargestAction)
+                    action_slope[b][a] += 2 * saturation * std::copysign(excess, own) / (1 - own * own);
             }
-        loss(0) = real(squares * price - sum / batch);
+        loss(0) = real(squares * price + excesses * saturation - sum / batch);
         actor.backward(acted, action_slope, true);
     }
 

@@ -1,5 +1,6 @@
-"""TorchRL's losses of DDPG, TD3, SAC, TQC and DQN, with clamped targets and an action L2 penalty."""
+"""TorchRL's losses of DDPG, TD3, SAC, TQC and DQN, with clamped targets and costs of actions."""
 
+from torchrl_her.objectives.action_cost import action_cost
 from torchrl_her.objectives.cloning import DEMONSTRATION, ClonesDemonstrations, Cloning, cloning_terms
 from torchrl_her.objectives.critics import critic_value, critic_values
 from torchrl_her.objectives.ddpg import CloningDDPGLoss, PenalizedDDPGLoss, make_ddpg_loss
@@ -23,6 +24,7 @@ __all__ = [
     "PenalizedTD3Loss",
     "PenalizedTQCLoss",
     "RunsHardUpdate",
+    "action_cost",
     "clamped_td0",
     "cloning_terms",
     "critic_value",

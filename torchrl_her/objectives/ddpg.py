@@ -1,4 +1,4 @@
-"""DDPG from TorchRL's loss, with clamped targets and an action L2 penalty."""
+"""DDPG from TorchRL's loss, with clamped targets and a cost of actions."""
 
 from __future__ import annotations
 
@@ -11,31 +11,32 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss
 
+from torchrl_her.objectives.action_cost import action_cost
 from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
 from torchrl_her.objectives.targets import clamped_td0
 
 
 class PenalizedDDPGLoss(DDPGLoss):
-    """TorchRL's DDPG loss with an action L2 penalty.
-
-    The penalty keeps actions away from the flat ends of tanh: an actor that saturates early gets no
-    gradient any more. As in OpenAI's HER, the mean square of the actions, times ``action_penalty``, is
-    added to the actor's loss.
+    """TorchRL's DDPG loss with a cost of actions, see :func:`~torchrl_her.objectives.action_cost`.
 
     Args:
         *args: of :class:`torchrl.objectives.DDPGLoss`.
         **kwargs: of the same.
-        action_penalty: the weight of the penalty, at least 0.
+        action_penalty: weight of the action L2 penalty, at least 0.
+        saturation_penalty: weight of the saturation penalty, at least 0.
     """
 
-    def __init__(self, *args: Any, action_penalty: float, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, action_penalty: float = 0.0, saturation_penalty: float = 0.0, **kwargs: Any
+    ) -> None:
         super().__init__(*args, **kwargs)
-        self.action_penalty = action_penalty
+        self.action_penalty, self.saturation_penalty = action_penalty, saturation_penalty
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        with action_penalty_of(self.actor_network, self.action_penalty) as penalties:
+        with actions_of(self.actor_network) as actions:
             loss, metadata = super().loss_actor(tensordict)
-        return loss + (penalties[0] if loss.ndim else penalties[0].mean()), metadata
+        cost = action_cost(actions[0], l2=self.action_penalty, saturation=self.saturation_penalty)
+        return loss + (cost if loss.ndim else cost.mean()), metadata
 
 
 class CloningDDPGLoss(ClonesDemonstrations, PenalizedDDPGLoss):
@@ -53,30 +54,29 @@ class CloningDDPGLoss(ClonesDemonstrations, PenalizedDDPGLoss):
 
 
 @contextmanager
-def action_penalty_of(actor: TensorDictModule, weight: float) -> Iterator[list[Tensor]]:
-    """Collects the action L2 penalty [...] of each call of an actor in the ``with`` block.
+def actions_of(actor: TensorDictModule) -> Iterator[list[Tensor]]:
+    """Collects the actions [..., a] of each call of an actor in the ``with`` block.
 
     Args:
         actor: its first output is the action.
-        weight: of the penalty.
 
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> actor = TensorDictModule(nn.Identity(), in_keys=["wish"], out_keys=["action"])
-        >>> with action_penalty_of(actor, 0.5) as penalties:
-        ...     _ = actor(TensorDict({"wish": torch.tensor([[1.0, 1.0], [0.0, 2.0]])}, [2]))
-        >>> penalties[0].tolist()
-        [0.5, 1.0]
+        >>> with actions_of(actor) as actions:
+        ...     _ = actor(TensorDict({"wish": torch.tensor([[1.0], [2.0]])}, [2]))
+        >>> actions[0].tolist()
+        [[1.0], [2.0]]
     """
-    penalties: list[Tensor] = []
+    actions: list[Tensor] = []
 
     def note(_module: nn.Module, _inputs: Any, output: TensorDictBase) -> None:
-        penalties.append(weight * output.get(actor.out_keys[0]).square().mean(-1))
+        actions.append(output.get(actor.out_keys[0]))
 
     hook = actor.register_forward_hook(note)
     try:
-        yield penalties
+        yield actions
     finally:
         hook.remove()
 
@@ -88,6 +88,7 @@ def make_ddpg_loss(
     gamma: float = 0.98,
     reward_range: tuple[float, float] | None = (-1.0, 0.0),
     action_penalty: float = 0.0,
+    saturation_penalty: float = 0.0,
     reduction: Literal["mean", "none"] = "mean",
     cloning: Cloning | None = None,
 ) -> DDPGLoss:
@@ -99,8 +100,8 @@ def make_ddpg_loss(
         gamma: discount, in [0, 1).
         reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
             leave them as they are.
-        action_penalty: weight of the action L2 penalty, see
-            :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        action_penalty, saturation_penalty: weights of the costs of actions, see
+            :func:`~torchrl_her.objectives.action_cost`.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
         cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 
@@ -120,6 +121,7 @@ def make_ddpg_loss(
         delay_actor=True,
         delay_value=True,
         action_penalty=action_penalty,
+        saturation_penalty=saturation_penalty,
         reduction=reduction,
         **own,
     )

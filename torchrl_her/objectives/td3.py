@@ -1,4 +1,4 @@
-"""TD3 from TorchRL's loss, with clamped targets and an action L2 penalty."""
+"""TD3 from TorchRL's loss, with clamped targets and a cost of actions."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from torchrl.objectives import TD3Loss
 from torchrl.objectives.utils import distance_loss
 
 from torchrl_her.modules.noise import RunNoise
+from torchrl_her.objectives.action_cost import action_cost
 from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
 from torchrl_her.objectives.critics import as_critics, checked_subset, keep_weights, least_of_some
 from torchrl_her.objectives.targets import clamped_td0
 
 
 class PenalizedTD3Loss(TD3Loss):
-    """TorchRL's TD3 loss with an action L2 penalty, and with random numbers of each run's own.
+    """TorchRL's TD3 loss with a cost of actions, and with random numbers of each run's own.
 
     Targets have the least value of all critics, or of some that are drawn at random in each gradient step, as
     in REDQ (Chen et al., 2021). In the second case the actor follows the mean of all critics instead of the
@@ -29,7 +30,7 @@ class PenalizedTD3Loss(TD3Loss):
     Args:
         *args: of :class:`torchrl.objectives.TD3Loss`.
         **kwargs: of the same, without ``policy_noise`` and ``noise_clip``.
-        action_penalty: the weight of the penalty, see :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        action_penalty, saturation_penalty: see :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
         target_critics: how many critics are drawn for targets; 0 for all.
         target_noise: standard deviation of the noise on the target's actions.
         target_noise_clip: the greatest noise.
@@ -43,6 +44,7 @@ class PenalizedTD3Loss(TD3Loss):
         self,
         *args: Any,
         action_penalty: float = 0.0,
+        saturation_penalty: float = 0.0,
         target_critics: int = 0,
         target_noise: float = 0.2,
         target_noise_clip: float = 0.5,
@@ -50,7 +52,7 @@ class PenalizedTD3Loss(TD3Loss):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, policy_noise=0.0, noise_clip=0.0, **kwargs)
-        self.action_penalty = action_penalty
+        self.action_penalty, self.saturation_penalty = action_penalty, saturation_penalty
         self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
         self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
         self.noise = noise or RunNoise()
@@ -61,9 +63,10 @@ class PenalizedTD3Loss(TD3Loss):
         values = self._values(acted, self._cached_detach_qvalue_network_params)
         value = values.mean(0) if self.target_critics else values[0]
         loss = self._reduce_loss(-value, tensordict=tensordict, weights=weights)
-        penalty = self.action_penalty * acted.get(self.tensor_keys.action).square().mean(-1)
+        action = acted.get(self.tensor_keys.action)
+        cost = action_cost(action, l2=self.action_penalty, saturation=self.saturation_penalty)
         metadata = {"state_action_value_actor": values.detach()}
-        return loss + (penalty if loss.ndim else penalty.mean()), metadata
+        return loss + (cost if loss.ndim else cost.mean()), metadata
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         weights = self._maybe_get_priority_weight(tensordict)
@@ -129,6 +132,7 @@ def make_td3_loss(
     gamma: float = 0.98,
     reward_range: tuple[float, float] | None = (-1.0, 0.0),
     action_penalty: float = 0.0,
+    saturation_penalty: float = 0.0,
     generators: Sequence[torch.Generator] | None = None,
     reduction: Literal["mean", "none"] = "mean",
     cloning: Cloning | None = None,
@@ -149,8 +153,8 @@ def make_td3_loss(
         gamma: discount, in [0, 1).
         reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
             leave them as they are.
-        action_penalty: weight of the action L2 penalty, see
-            :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        action_penalty, saturation_penalty: weights of the costs of actions, see
+            :func:`~torchrl_her.objectives.action_cost`.
         generators: of the random numbers of each run; None for torch's own.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
         cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
@@ -176,6 +180,7 @@ def make_td3_loss(
         num_qvalue_nets=critics,
         loss_function="l2",
         action_penalty=action_penalty,
+        saturation_penalty=saturation_penalty,
         target_critics=target_critics,
         noise=RunNoise(generators),
         reduction=reduction,

@@ -114,6 +114,7 @@ class FusedCall:
         job.gamma = float(estimator.gamma)
         job.least, job.greatest = getattr(estimator, "low", -math.inf), getattr(estimator, "high", math.inf)
         job.penalty = getattr(loss, "action_penalty", 0.0)
+        job.saturation = getattr(loss, "saturation_penalty", 0.0)
         job.target_critics = getattr(loss, "target_critics", 0)
         if self._algorithm is Algorithm.TQC:
             dropped, quantiles = loss.top_quantiles_to_drop_per_net, loss.qvalue_network.module.outputs

@@ -47,6 +47,7 @@ class BatchedEnv(TaskTraits, EnvBase):
     max_steps: int
     dtype_shown: torch.dtype = torch.float32
     goes_on = True
+    batched = True
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(device="cpu", batch_size=(num_envs,))

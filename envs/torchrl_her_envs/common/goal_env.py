@@ -49,6 +49,9 @@ class GoalEnv(Protocol):
     @property
     def goes_on(self) -> bool: ...
 
+    @property
+    def batched(self) -> bool: ...
+
     def layers(self) -> list[dict[str, Any]]: ...
 
     def state_names(self) -> dict[str, list[int]]: ...
@@ -107,6 +110,11 @@ class TaskTraits:
 
         Layers of a curriculum have goals of their own, so their episodes then go on as well.
         """
+        return False
+
+    @property
+    def batched(self) -> bool:
+        """Whether a batch is stepped as a whole, at little cost for each of its environments."""
         return False
 
     def layers(self) -> list[dict[str, Any]]:

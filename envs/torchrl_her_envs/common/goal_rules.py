@@ -134,9 +134,7 @@ def check_rewards(
             "met from the start?)"
         )
     far, equal = far + 0.0, equal + 0.0  # never -0.0
-    seen = np.unique(np.round([far, *others], _DIGITS) + 0.0)
-    missed = seen[seen < equal]
-    dense = len(missed) > _MOST_VALUES
+    missed, dense = _missed(far, equal, others), is_dense(far, equal, others)
     if given is None:
         if dense:
             some = missed[np.linspace(0, len(missed) - 1, _SHOWN).astype(int)]
@@ -154,6 +152,21 @@ def check_rewards(
             f"{equal:g}, that of equal ones, got {given!r}"
         )
     return float(missed[0]), float(given), dense
+
+
+def is_dense(far: float, equal: float, others: Sequence[float] | np.ndarray) -> bool:
+    """Whether goals that are not achieved have different rewards; arguments as for :func:`check_rewards`.
+
+    Example:
+        >>> is_dense(-1.0, 0.0, [-1.0, 0.0]), is_dense(-3.0, 0.0, [-1.0, -2.5, -0.5])
+        (False, True)
+    """
+    return len(_missed(far, equal, others)) > _MOST_VALUES
+
+
+def _missed(far: float, equal: float, others: Sequence[float] | np.ndarray) -> np.ndarray:
+    seen = np.unique(np.round([far, *others], _DIGITS) + 0.0)
+    return seen[seen < equal]
 
 
 def check_same_rewards(name: str, stepped: np.ndarray, computed: np.ndarray) -> str:

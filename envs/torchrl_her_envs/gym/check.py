@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
+from torchrl_her_envs.gym.goal_functions import GoalFunction
 from torchrl_her_envs.gym.layout import Layout
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -21,6 +22,9 @@ SUCCESS = "is_success"
 _OUR_OPTIONS = ("max_steps", "parallel", "termination", "achieved_reward", "pictures")
 _EPISODES = 8  # whose goals the environment's functions are tried with
 _TRIED_STEPS = 100
+_LIMIT_STEPS = 1_000  # that are played to see where an environment truncates an episode itself
+_LIMIT = 100  # of episodes that it does not truncate
+_HALVINGS = 30
 
 
 def spec_of(env: gymnasium.Env) -> EnvSpec:
@@ -108,8 +112,6 @@ def check_goal_env(id: str, env: gymnasium.Env) -> None:
         raise ValueError(f"{id}'s actions must be a Box or Discrete, got {env.action_space}")
     if isinstance(env.action_space, spaces.Box) and not env.action_space.is_bounded():
         raise ValueError(f"{id}'s actions must have bounds, got {env.action_space}")
-    if spec_of(env).max_episode_steps is None:
-        raise ValueError(f"{id} has no time limit: give max_steps")
 
 
 def _check_shown(id: str, shown: spaces.Space) -> None:
@@ -172,6 +174,62 @@ class Trial:
         chosen = np.unique(np.linspace(0, len(self.reward) - 1, _EPISODES).astype(int))
         achieved, desired = self.achieved[chosen], self.desired[chosen]
         return np.repeat(achieved, len(chosen), 0), np.tile(desired, (len(chosen), 1))
+
+
+def find_limit(env: gymnasium.Env) -> int:
+    """The length of the longest episode of random actions that an environment truncates; 100 without one."""
+    env.action_space.seed(0)
+    longest = length = 0
+    env.reset(seed=0)
+    for _ in range(_LIMIT_STEPS):
+        *_, terminated, truncated, _ = env.step(env.action_space.sample())
+        length += 1
+        if truncated:
+            longest = max(longest, length)
+        if terminated or truncated:
+            env.reset()
+            length = 0
+    return longest or _LIMIT
+
+
+def find_achieved_reward(
+    env: gymnasium.Env, layout: Layout, reward: GoalFunction, achieved: np.ndarray, desired: np.ndarray
+) -> float | None:
+    """The reward from which on an environment's own ``_is_success`` calls a goal achieved.
+
+    Fetch and highway-env have this method. It is asked on the way from each desired goal to the achieved one.
+
+    Args:
+        env: with a dense reward.
+        layout: of its goals.
+        reward: its reward function.
+        achieved, desired: [m, g] goals, most of which are not achieved.
+
+    Returns:
+        None if there is no such method, or what it says does not follow from the reward.
+    """
+    if not env.has_wrapper_attr("_is_success"):
+        return None
+    own = env.get_wrapper_attr("_is_success")
+
+    def goals(share: np.ndarray) -> np.ndarray:
+        return (desired + share[:, None] * (achieved - desired)).astype(desired.dtype)
+
+    def met(share: np.ndarray) -> np.ndarray:
+        pairs = zip(goals(share), desired, strict=True)
+        return np.array([bool(own(*map(layout.unflatten, pair))) for pair in pairs])
+
+    missed = ~met(np.ones(len(desired)))
+    achieved, desired = achieved[missed], desired[missed]
+    near, far = np.zeros(len(desired)), np.ones(len(desired))
+    if not len(desired) or not met(near).all():
+        return None
+    for _ in range(_HALVINGS):
+        middle = (near + far) / 2
+        there = met(middle)
+        near, far = np.where(there, middle, near), np.where(there, far, middle)
+    least = reward(goals(near), desired)
+    return float(least.min()) if np.allclose(least, least.min(), rtol=1e-3) else None
 
 
 def try_steps(env: gymnasium.Env, layout: Layout) -> Trial:

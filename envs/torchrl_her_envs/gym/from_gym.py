@@ -24,6 +24,8 @@ from torchrl_her_envs.common.goal_rules import (
     check_same_rewards,
     check_termination,
     choose_ends,
+    is_dense,
+    say_once,
     warn_once,
 )
 from torchrl_her_envs.common.rendering.pictures import captioned, resized
@@ -34,6 +36,8 @@ from torchrl_her_envs.gym.check import (
     SUCCESS,
     TERMINATED,
     check_goal_env,
+    find_achieved_reward,
+    find_limit,
     goals_to_try,
     has_compute_terminated,
     make_one,
@@ -66,17 +70,19 @@ def make_gym_env(
             gymnasium-robotics need no import.
         num_envs: number of environments.
         seed: of all environments; R seeds for R equal blocks of them, each as if alone.
-        max_steps: length of an episode; the environment's own if None.
+        max_steps: length of an episode. If None, the registered one, or that with which the environment
+            truncates episodes of random actions, or 100.
         parallel: a process for each environment, which pays where a step takes milliseconds and there are
             several cores.
         termination: what ends an episode at its goal, see :class:`GymGoalEnv`.
-        achieved_reward: the reward from which on a goal counts as achieved, for dense rewards.
+        achieved_reward: the reward from which on a goal counts as achieved, for dense rewards; if None, that
+            from which on the environment's method ``_is_success`` says so.
         pictures: whether to make it with ``render_mode="rgb_array"``, if it has that mode.
         options: for the environment, as ``gymnasium.make`` takes them (``render_mode``, for instance).
 
     Raises:
         ValueError: there is no such environment, it does not take an option, it lacks something that GoalEnv
-            asks for, it has no time limit, its reward is dense and ``achieved_reward`` is not given, or
+            asks for, its reward is dense, ``achieved_reward`` is not given and cannot be found, or
             environments cannot be shared out among the seeds.
         ImportError: a package that it needs is not installed.
 
@@ -94,6 +100,12 @@ def make_gym_env(
     with ExitStack() as opened:
         reference_env = opened.enter_context(closing(make_one(id, options)))
         check_goal_env(id, reference_env)
+        if spec_of(reference_env).max_episode_steps is None:
+            options["max_episode_steps"] = limit = find_limit(reference_env)
+            say_once(
+                f"{id} has no registered time limit: episodes are cut off after {limit} steps (max_steps)"
+            )
+            reference_env = opened.enter_context(closing(make_one(id, options)))
         if pictures and draws(reference_env) and "render_mode" not in options:
             choose_renderer()
             options["render_mode"] = PICTURES
@@ -153,7 +165,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
 
     Raises:
         ValueError: environments cannot be shared out among the seeds, an achieved goal gives no more
-            reward than a missed one, the reward is dense and ``achieved_reward`` is None, or
+            reward than a missed one, the reward is dense and no ``achieved_reward`` is given or found, or
             ``termination`` is unknown or needs what the environment lacks.
     """
 
@@ -182,8 +194,16 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         self._reward_of = self._function(REWARD, goals)
         trial = try_steps(env, layout)
         far, equal = self._reward_of.tried[:2].tolist()
+        others = self._reward_of(*trial.pairs())
+        if achieved_reward is None and is_dense(far, equal, others):
+            achieved_reward = find_achieved_reward(env, layout, self._reward_of, *trial.pairs())
+            if achieved_reward is not None:
+                say_once(
+                    f"{id} has a dense reward: goals count as achieved from {achieved_reward:.4g} on "
+                    "(achieved_reward), where _is_success becomes true"
+                )
         self.missed_reward, self.achieved_reward, self.dense_reward = check_rewards(
-            id, far, equal, self._reward_of(*trial.pairs()), achieved_reward
+            id, far, equal, others, achieved_reward
         )
         warn_once(check_same_rewards(id, trial.reward, self._reward_of(trial.achieved, trial.desired)))
         has_own = has_compute_terminated(env, *(layout.unflatten(own[0]) for own in goals))

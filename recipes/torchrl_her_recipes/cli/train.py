@@ -18,6 +18,7 @@ from torchrl_her_recipes.cli.train_options import (
     requests,
 )
 from torchrl_her_recipes.config.imports import foreign_module, imported_modules
+from torchrl_her_recipes.config.resolve import auto_options
 
 
 @click.command(cls=OptionsCommand, short_help="train, or go on with a run")
@@ -60,6 +61,9 @@ def train(options: tuple[str, ...], multirun: bool, jobs: int | None, resume: Pa
 def _train(wanted: RunRequest) -> recipes.RunResult:
     components = recipes.build(wanted.recipe)
     _say_start(wanted.folder)
+    if chosen := auto_options(wanted.recipe):
+        values = (f"{name}={getattr(getattr(components.recipe, group), name)}" for group, name in chosen)
+        click.echo(f"chosen for this environment (auto): {' '.join(values)}")
     if wanted.recipe.learner.device == "auto":
         click.echo(f"learner.device=auto: {next(components.loss.parameters()).device}")
     return recipes.run(components, wanted.folder)

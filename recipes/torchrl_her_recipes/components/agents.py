@@ -23,7 +23,7 @@ from torchrl_her_recipes.components.curricula import is_guided
 from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.learner import Agent, LearnerBuilder, Networks
 from torchrl_her_recipes.components.normalization import acting, make_norm
-from torchrl_her_recipes.config.learners import AUTO, LEARNERS, Actions, LearnerSpec
+from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, Actions, LearnerSpec
 from torchrl_her_recipes.config.options import default_of
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
@@ -92,7 +92,7 @@ def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:
             with it.
     """
     actions: Actions = "discrete" if isinstance(env.action_spec, Categorical) else "continuous"
-    name = AUTO[actions] if recipe.learner.name == "auto" else recipe.learner.name
+    name = BY_ACTIONS[actions] if recipe.learner.name == "auto" else recipe.learner.name
     spec = LEARNERS[name]
     if spec.actions != actions:
         fitting = " or ".join(each.name for each in LEARNERS.values() if each.actions == actions)

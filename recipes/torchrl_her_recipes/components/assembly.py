@@ -27,7 +27,7 @@ from torchrl_her_recipes.components.curricula import (
 )
 from torchrl_her_recipes.components.demonstrations import load_demonstrations, rows_needed
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
-from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
+from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs, resolved
 from torchrl_her_recipes.components.goal_space import goal_space
 from torchrl_her_recipes.components.memory import sizes_named
 from torchrl_her_recipes.components.streams import Stream
@@ -49,6 +49,7 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     """
     if allow_import:
         permit_task(recipe.task.name)
+    recipe = resolved(recipe)
     with sizes_named(recipe):
         return _assemble(recipe)
 
@@ -99,6 +100,7 @@ def _assemble(recipe: Recipe) -> Components:
         goal_target=None if space is None else space.target,
         generators=generators if own is generators else [*generators, *own],
         rewards=rewards,
+        bounds=bounds,
         curriculum=state,
         behavior=behavior,
         virtual_env=_virtual_env(recipe, task, rewards) if recipe.evaluation.virtual_goals else None,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import multiprocessing
 import signal
+import sys
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -13,6 +16,7 @@ from functools import partial
 from importlib import import_module
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
+from pathlib import Path
 from queue import Empty
 from typing import Any, Protocol
 
@@ -230,6 +234,7 @@ class ProcessCollector(BaseCollector):
         frames = len(recipe.seeds) * share_of_envs(recipe) * config.steps_per_batch
         if config.ray is not None:
             return _start_on_cluster(recipe, make, _to_send(self.policy), frames)
+        _check_main_script(f"processes={config.processes}")
         kind = SyncWorkers if config.sync else AsyncWorkers
         with _interrupts_later():  # processes that were interrupted while they start would say so at length
             workers = kind(
@@ -278,6 +283,19 @@ class ProcessCollector(BaseCollector):
                     f"its own error stands above: {error}"
                 ) from error
             raise
+
+
+def _check_main_script(asked: str) -> None:
+    """Raises a RuntimeError if processes that import the main script would train, too, and so never start."""
+    path = getattr(sys.modules["__main__"], "__file__", None)
+    if path is None or multiprocessing.get_start_method(allow_none=True) == "fork":
+        return
+    guards = (own.test for own in ast.parse(Path(path).read_bytes()).body if isinstance(own, ast.If))
+    if not any("__name__" in ast.unparse(guard) for guard in guards):
+        raise RuntimeError(
+            f"{asked} starts processes that import {path}: put what trains there under "
+            "`if __name__ == '__main__':`"
+        )
 
 
 def _start_on_cluster(

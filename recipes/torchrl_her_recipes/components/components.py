@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from copy import deepcopy
 from dataclasses import dataclass
@@ -63,6 +64,7 @@ class Components:
             measured; None if they are not counted in cells.
         generators: sources of the random numbers of each run (exploration, relabeling, sampling).
         rewards: of a missed goal and of an achieved one.
+        bounds: the least and the greatest reward; infinite where there are none.
         norm: statistics of observations and goals by which actor and sampled transitions are normalized, or
             None.
         average: follows the actor, and is what is evaluated, filmed and kept in its place; or None.
@@ -88,6 +90,7 @@ class Components:
     goal_target: Tensor | None
     generators: list[torch.Generator]
     rewards: tuple[float, float] = (-1.0, 0.0)
+    bounds: tuple[float, float] = (-math.inf, math.inf)
     curriculum: CurriculumState | None = None
     norm: RunningNorm | None = None
     average: PolicyAverage | None = None

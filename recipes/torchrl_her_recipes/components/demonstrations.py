@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -18,6 +18,7 @@ from torchrl_her.goals.rewards import EnvReward
 from torchrl_her.trainers.checkpoint import buffer_state_dict, load_buffer_state_dict
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
+from torchrl_her_recipes.components.envs import action_bounds
 from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
@@ -120,7 +121,7 @@ def load_demonstrations(
             f"`torchrl-her record {recipe.task.name} --out {options.file}` writes it"
         ) from error
     _check(every, recipe, env)
-    recorded = every.first(options.episodes).to(getattr(torch, recipe.run.dtype))
+    recorded = _scaled(every.first(options.episodes), env).to(getattr(torch, recipe.run.dtype))
     own = RunDemonstrations(recorded, env, state)
     if options.as_starts:
         if recipe.behavior.name != "real":
@@ -152,6 +153,15 @@ def _check(every: Demonstrations, recipe: Recipe, env: EnvBase) -> None:
             )
 
 
+def _scaled(own: Demonstrations, env: EnvBase) -> Demonstrations:
+    """Demonstrations with actions from -1 to 1, as learners take them, instead of the task's own."""
+    low, high = action_bounds(env)
+    if low.eq(-1).all() and high.eq(1).all():
+        return own
+    action = (own.rows["action"] - low) / (high - low) * 2 - 1
+    return replace(own, rows=own.rows.copy().set("action", action.to(own.rows["action"].dtype)))
+
+
 def _make_starts(recipe: Recipe, own: RunDemonstrations) -> DemonstrationStarts:
     options, runs = recipe.demonstrations, recipe.run.num_runs
     return DemonstrationStarts(
@@ -169,5 +179,5 @@ def _make_starts(recipe: Recipe, own: RunDemonstrations) -> DemonstrationStarts:
 def rows_needed(recipe: Recipe, own: RunDemonstrations) -> int:
     """How many rows of a run the demonstrations have at most, virtual ones among them."""
     hindsight = get_algorithm(recipe.hindsight.algo).hindsight
-    copies = sum(recipe.hindsight.sources.values()) if hindsight else 0
+    copies = sum(recipe.hindsight.sources.values()) * recipe.hindsight.refill if hindsight else 0
     return len(own.recorded.rows) * (1 + copies)

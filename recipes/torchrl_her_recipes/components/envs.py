@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from contextlib import closing
+from typing import Any, cast
 
 import torch
-from torchrl.envs import EnvBase
+from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.envs import ActionScaling, EnvBase, TransformedEnv
 
+from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_envs.registry import GYM, get_task_spec, make_env
 from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.resolve import EnvFacts, auto_options, resolve
 
+_FACTS: dict[str, EnvFacts] = {}  # of tasks whose environments were made before
 _AT_ONCE = 20  # environments of gymnasium's in an evaluation: each is a simulation of 10 MB and more
 
 
@@ -31,7 +37,14 @@ def evaluation_envs(recipe: Recipe) -> int:
     return math.ceil(episodes / rounds)
 
 
-def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictures: bool = False) -> EnvBase:
+def make_task_envs(
+    recipe: Recipe,
+    num_envs: int,
+    seeds: Sequence[int],
+    *,
+    pictures: bool = False,
+    scaled: bool = True,
+) -> EnvBase:
     """Environments of the recipe's task: ``num_envs`` for each seed.
 
     All environments of recipes are made here, so this is also where modules that recipes name are imported,
@@ -44,6 +57,8 @@ def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictu
 
     Keyword Args:
         pictures: whether they are to give pictures, if they can.
+        scaled: whether continuous actions are from -1 to 1, whatever the task's own bounds are, as learners
+            take them. Exported policies and recorded demonstrations have the task's own.
 
     Raises:
         ValueError: options that the task does not take, or a module that must not be imported.
@@ -59,4 +74,35 @@ def make_task_envs(recipe: Recipe, num_envs: int, seeds: Sequence[int], *, pictu
         options["dtype"] = getattr(torch, recipe.run.dtype)
     if pictures:
         options = {**get_task_spec(task.name).for_pictures, **options}
-    return make_env(task.name, num_envs=num_envs * len(seeds), seed=seeds, **options)
+    env = make_env(task.name, num_envs=num_envs * len(seeds), seed=seeds, **options)
+    low, high = action_bounds(env)
+    if scaled and not (low.eq(-1).all() and high.eq(1).all()):
+        return TransformedEnv(env, ActionScaling())
+    return env
+
+
+def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
+    """The least and the greatest actions of a task, [actions]; -1 and 1 if it has no finite ones.
+
+    Those of the task itself are returned, below a transform that scales them.
+    """
+    actions = cast(EnvBase, goal_env(env)).action_spec_unbatched
+    if isinstance(actions, Bounded) and bool((actions.low.isfinite() & actions.high.isfinite()).all()):
+        return actions.low, actions.high
+    one = torch.ones(actions.shape, device=actions.device)
+    return -one, one
+
+
+def resolved(recipe: Recipe) -> Recipe:
+    """The recipe with a value for each option that is ``auto``, from what its environment is.
+
+    Raises:
+        ValueError: see :func:`make_task_envs`.
+    """
+    if not auto_options(recipe):
+        return recipe
+    if (facts := _FACTS.get(repr(recipe.task))) is None:
+        with closing(make_task_envs(recipe, 1, [0])) as env:
+            task = goal_env(env)
+            facts = _FACTS[repr(recipe.task)] = EnvFacts(max_steps=task.max_steps, batched=task.batched)
+    return resolve(recipe, facts)

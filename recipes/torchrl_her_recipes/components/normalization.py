@@ -20,7 +20,10 @@ def make_norm(recipe: Recipe, widths: Mapping[str, int]) -> RunningNorm | None:
     """
     if not recipe.learner.normalize:
         return None
-    return RunningNorm(dict(widths), runs=recipe.run.num_runs, clip=recipe.learner.normalize_clip)
+    own = recipe.learner
+    return RunningNorm(
+        dict(widths), runs=recipe.run.num_runs, clip=own.normalize_clip, least_std=own.normalize_least_std
+    )
 
 
 def acting(actor: TensorDictModuleBase, norm: RunningNorm | None) -> TensorDictModuleBase:

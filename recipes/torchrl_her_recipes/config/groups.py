@@ -11,7 +11,7 @@ from torchrl_her_envs.registry import check_options as check_task_options
 from torchrl_her_envs.registry import check_task, get_task_spec
 from torchrl_her_recipes.config.algorithms import check_goal_sources, check_strategy, get_algorithm
 from torchrl_her_recipes.config.loggers import check_loggers
-from torchrl_her_recipes.config.options import check_options, option
+from torchrl_her_recipes.config.options import AUTO, check_options, option
 from torchrl_her_recipes.config.plain_files import read_yaml
 
 
@@ -55,15 +55,22 @@ class TaskConfig(Group):
 class CollectionConfig(Group):
     """How experience is collected; numbers are for each run."""
 
-    epoch_frames: int = option(20_480, "environment steps in an epoch", at_least=1)
-    num_envs: int = option(64, "environments that are stepped together", at_least=1)
+    epoch_frames: int = option(AUTO, "environment steps in an epoch; auto: 100 episodes' length", at_least=1)
+    num_envs: int = option(
+        AUTO, "environments that are stepped together; auto: 8, or 64 of this package's tasks", at_least=1
+    )
     steps_per_batch: int = option(10, "steps of each environment between two rounds of updates", at_least=1)
     frames_per_update: float = option(
-        20.0,
-        "environment steps for each gradient step; 0.5: two gradient steps for each environment step",
+        AUTO,
+        "environment steps for each gradient step; 0.5: two gradient steps for each environment step; "
+        "auto: 1, or 5 with this package's tasks",
         above=0,
     )
-    warmup_frames: int = option(3_200, "environment steps before the first gradient step", at_least=0)
+    warmup_frames: int = option(
+        AUTO,
+        "environment steps before the first gradient step; auto: an episode of each environment",
+        at_least=0,
+    )
     processes: int = option(
         0,
         "processes that collect while this one learns, for slow environments; 0: this one collects",
@@ -80,6 +87,8 @@ class CollectionConfig(Group):
         super().__post_init__()
         if self.ray is not None and self.processes == 0:
             raise ValueError(f"ray={self.ray} needs to know how many processes collect there: processes=4")
+        if AUTO in (self.num_envs, self.epoch_frames):
+            return
         if self.processes and self.num_envs % self.processes:
             raise ValueError(
                 f"num_envs={self.num_envs} cannot be shared out among processes={self.processes}: "
@@ -119,6 +128,9 @@ class ReplayConfig(Group):
             raise ValueError(f"batch_size={self.batch_size} must fit buffer_size={self.buffer_size}")
 
 
+FUTURE_AND_ACTUAL = {"future": 3, "actual": 2}  # as "future-actual" goals of MRL (Pitis et al., 2020)
+
+
 @dataclass(frozen=True, kw_only=True)
 class HindsightConfig(Group):
     """How transitions are relabeled with virtual goals."""
@@ -129,9 +141,15 @@ class HindsightConfig(Group):
         "future", "where virtual goals come from: future, final, episode, or a registered name"
     )
     goal_sources: Any = option(
-        None,
+        AUTO,
         "in place of k and strategy, how many virtual goals come from where, as in '{future: 2, actual: 2}': "
-        "any strategy, actual (goals wanted in recent episodes), achieved (goals achieved in them)",
+        "any strategy, actual (goals wanted in recent episodes), achieved (goals achieved in them); auto: "
+        "three future ones and two actual ones, or none if k or strategy is given",
+    )
+    refill: int = option(
+        5,
+        "where the filter leaves transitions without goals, the others get up to this many times as many",
+        at_least=1,
     )
     n_steps: int = option(1, "steps that a transition spans, at most (n-step returns)", at_least=1)
 
@@ -139,12 +157,14 @@ class HindsightConfig(Group):
         super().__post_init__()
         get_algorithm(self.algo)
         check_strategy(self.strategy)
-        if self.goal_sources is not None:
+        if self.goal_sources not in (None, AUTO):
             object.__setattr__(self, "goal_sources", check_goal_sources(self.goal_sources))
 
     @property
     def sources(self) -> dict[str, int]:
         """How many virtual goals of each transition come from where; empty if there are none."""
+        if self.goal_sources == AUTO:
+            return dict(FUTURE_AND_ACTUAL)
         if self.goal_sources is not None:
             return dict(self.goal_sources)
         return {self.strategy: self.k} if self.k else {}
@@ -346,6 +366,9 @@ class RunConfig(Group):
     seed: int = option(0, "seed of everything random", at_least=0)
     num_runs: int = option(1, "independent runs side by side; run i has the seed `seed + i`", at_least=1)
     epochs: int = option(30, "epochs; each ends with an evaluation", at_least=1)
+    frames: int | None = option(
+        None, "environment steps of each run, in place of epochs; rounded up to whole ones", at_least=1
+    )
     checkpoint_interval: int = option(10, "epochs between two checkpoints", at_least=1)
     keep_checkpoints: int = option(2, "how many of the newest checkpoints are kept", at_least=1)
     keep_buffer: bool = option(

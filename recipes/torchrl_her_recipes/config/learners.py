@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 from torchrl_her_recipes.config.groups import Group
-from torchrl_her_recipes.config.options import option, what_there_is
+from torchrl_her_recipes.config.options import AUTO, option, what_there_is
 
 Actions = Literal["continuous", "discrete"]
 
@@ -42,26 +42,33 @@ class LearnerConfig(Group):
         shown_as="learner",
     )
     device: str = option("cpu", "where the networks are: cpu, cuda, cuda:1, ..., or auto")
-    gamma: float = option(0.98, "discount factor", above=0, below=1)
+    gamma: float = option(
+        AUTO, "discount factor; auto: 1 - 2 / steps of an episode, from 0.9 to 0.99", above=0, below=1
+    )
     learning_rate: float = option(1e-3, "learning rate of Adam", above=0)
     max_grad_norm: float = option(
         3.0, "gradients of each network are clipped to this norm", above=0, infinite=True
     )
-    hidden: int = option(64, "width of the hidden layers", at_least=1)
+    hidden: int = option(256, "width of the hidden layers", at_least=1)
     depth: int = option(3, "how many hidden layers the networks have", at_least=2)
     activation: str = option("relu", "behind each hidden layer", choices=("relu", "tanh", "elu"))
     norm: str = option(
-        "none",
+        "layer",
         "normalization of hidden layers: layer, in all networks; batch, in critics only",
         choices=("none", "layer", "batch"),
     )
     normalize: bool = option(
-        False, "whether observations and goals are normalized, by mean and deviation of all that was written"
+        True, "whether observations and goals are normalized, by mean and deviation of all that was written"
     )
     normalize_clip: float = option(
         5.0, "normalized values are clipped to plus and minus this", above=0, infinite=True
     )
-    tau: float = option(0.02, "rate of the soft target update", at_least=0, at_most=1)
+    normalize_least_std: float | None = option(
+        None,
+        "least deviation that values are divided by; 1/10,000 of each entry's mean if not given",
+        above=0,
+    )
+    tau: float = option(0.05, "rate of the soft target update", at_least=0, at_most=1)
     average_decay: float = option(
         0.9995,
         "what stays, in a gradient step, of the average of the actor's weights that is evaluated and kept; "
@@ -100,9 +107,9 @@ class EpsilonConfig(LearnerConfig):
 
     has_epsilon: ClassVar[bool] = True
 
-    epsilon_start: float = option(1.0, "share of exploring actions in the first epoch", at_least=0, at_most=1)
-    epsilon_decay: float = option(0.9, "factor of epsilon each epoch", above=0, at_most=1)
-    epsilon_end: float = option(0.05, "lowest epsilon", at_least=0, at_most=1)
+    epsilon_start: float = option(0.5, "share of exploring actions in the first epoch", at_least=0, at_most=1)
+    epsilon_decay: float = option(0.99, "factor of epsilon each epoch", above=0, at_most=1)
+    epsilon_end: float = option(0.1, "lowest epsilon", at_least=0, at_most=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -134,10 +141,10 @@ class NoiseConfig(EpsilonConfig):
     """
 
     action_noise: float = option(
-        0.05, "standard deviation of noise on exploring actions, as a share of their range", at_least=0
+        0.1, "standard deviation of noise on exploring actions, as a share of their range", at_least=0
     )
     uniform_share: float = option(
-        0.2, "share of exploring actions that are uniform; the others have noise", at_least=0, at_most=1
+        0.6, "share of exploring actions that are uniform; the others have noise", at_least=0, at_most=1
     )
 
 
@@ -147,8 +154,9 @@ class DDPGConfig(NoiseConfig):
 
     clones: ClassVar[bool] = True
 
-    action_penalty: float = option(
-        0.3, "action L2 penalty, which keeps actions off the ends of tanh", at_least=0
+    action_penalty: float = option(0.0, "action L2 penalty, which pulls all actions towards 0", at_least=0)
+    saturation_penalty: float = option(
+        0.3, "penalty on actions at the ends of tanh, from where an actor does not learn", at_least=0
     )
     clamp_targets: bool = option(True, _CLAMPED)
 
@@ -306,7 +314,7 @@ for _spec in (
 ):
     register_learner(_spec)
 
-AUTO: dict[Actions, str] = {"continuous": "ddpg", "discrete": "dqn"}
+BY_ACTIONS: dict[Actions, str] = {"continuous": "ddpg", "discrete": "dqn"}
 
 
 def check_learner(name: str) -> None:
@@ -328,7 +336,7 @@ def priority_power(name: str) -> int:
         (2, 1)
     """
     check_learner(name)
-    return LEARNERS[AUTO["continuous"] if name == "auto" else name].priority_power
+    return LEARNERS[BY_ACTIONS["continuous"] if name == "auto" else name].priority_power
 
 
 def options_of(name: str) -> type[LearnerConfig]:
@@ -339,4 +347,4 @@ def options_of(name: str) -> type[LearnerConfig]:
         'SACConfig'
     """
     check_learner(name)
-    return LEARNERS[AUTO["continuous"] if name == "auto" else name].options
+    return LEARNERS[BY_ACTIONS["continuous"] if name == "auto" else name].options

@@ -11,6 +11,8 @@ from torchrl_her_recipes.config.values import as_kind
 
 _KINDS = {"str": str, "bool": bool, "int": int, "float": float}
 
+AUTO = "auto"  # the value of an option that is chosen by what the task's environment is, see `.resolve`
+
 
 def option(
     default: Any,
@@ -27,7 +29,8 @@ def option(
     """A field of a group of options.
 
     Args:
-        default: the value that works for most tasks; None where the task or the learner has its own.
+        default: the value that works for most tasks; None where the task or the learner has its own, and
+            :data:`AUTO` where it follows from the environment before training begins.
         help: a few words, shown by ``torchrl-her train -h``.
         at_least, above, at_most, below: the range of a number.
         choices: the values that are allowed.
@@ -53,7 +56,7 @@ def check_options(group: Any) -> None:
     """
     for own in fields(group):
         value = getattr(group, own.name)
-        if value is None and own.default is None:
+        if own.default in (None, AUTO) and value == own.default:
             continue
         kind = _KINDS.get(str(own.type).removesuffix(" | None"))
         if kind is not None:

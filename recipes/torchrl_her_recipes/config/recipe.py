@@ -22,8 +22,8 @@ from torchrl_her_recipes.config.groups import (
     TaskConfig,
 )
 from torchrl_her_recipes.config.imports import permit_task
-from torchrl_her_recipes.config.learners import AUTO, LEARNERS, DDPGConfig, LearnerConfig, options_of
-from torchrl_her_recipes.config.options import default_of, what_there_is
+from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, DDPGConfig, LearnerConfig, options_of
+from torchrl_her_recipes.config.options import AUTO, default_of, what_there_is
 from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, Nested, over, place
 from torchrl_her_recipes.config.without_effect import without_effect
 
@@ -35,6 +35,9 @@ EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints", "keep_buffer",
 class Recipe:
     """Every choice of a training run, as groups of options with plain values.
 
+    Options that are ``auto`` get their values from the task's environment when the run is built, see
+    :func:`~torchrl_her_recipes.config.resolve.resolve`.
+
     :func:`make_recipe` makes one from the short names of options. Lengths are environment steps ("frames").
 
     Raises:
@@ -42,8 +45,8 @@ class Recipe:
 
     Example:
         >>> recipe = Recipe(hindsight=HindsightConfig(algo="her"), run=RunConfig(seed=3))
-        >>> recipe.learner.gamma, recipe.total_frames
-        (0.98, 614400)
+        >>> recipe.learner.learning_rate, recipe.learner.gamma
+        (0.001, 'auto')
     """
 
     task: TaskConfig = field(default_factory=TaskConfig)
@@ -60,6 +63,9 @@ class Recipe:
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self) -> None:
+        if self.run.frames is not None and self.collection.epoch_frames != AUTO:
+            epochs = -(-self.run.frames // self.collection.epoch_frames)
+            object.__setattr__(self, "run", replace(self.run, frames=None, epochs=epochs))
         wanted = options_of(self.learner.name)
         if type(self.learner) is not wanted:
             got = type(self.learner).__name__
@@ -69,7 +75,7 @@ class Recipe:
             )
         for (group, name), why in without_effect(self).items():
             value = getattr(getattr(self, group), name)
-            if value != _default(getattr(self, group), name):
+            if value not in (None, _default(getattr(self, group), name)):
                 shown = f"{group}.{name}" if group in LONG_ONLY else name
                 raise ValueError(f"{shown}={value} has no effect {why}: leave it out")
 
@@ -141,6 +147,24 @@ class Recipe:
         """
         return _assemble(place(values))
 
+    @classmethod
+    def of_file(cls, values: Mapping[str, Any]) -> Recipe:
+        """The recipe that a file keeps: all values of :meth:`to_dict`, whatever the defaults are by now.
+
+        Raises:
+            ValueError: as for :meth:`from_dict`, or an option is missing, as in files of an older version.
+        """
+        recipe = cls.from_dict(values)
+        missing = [
+            name
+            for group, own in recipe.to_dict().items()
+            for name in own
+            if name not in (values.get(group) or {})
+        ]
+        if missing:
+            raise ValueError(f"an older version wrote it, without {', '.join(missing)}: train it again")
+        return recipe
+
 
 def check_extending(values: Mapping[str, Any]) -> None:
     """Refuses options that would change what a run has trained already.
@@ -197,7 +221,9 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     _drop_options_of_another_learner(below, given)
     _drop_options_of_another_task(below, given)
     _drop_another_curriculum(below, given)
-    _drop_other_goal_sources(below, given)
+    _drop_other_goal_sources(given)
+    if "epochs" in given.get("run", {}):
+        below.get("run", {}).pop("frames", None)
     for group, own in without_effect(_groups(over(below, given))):
         if own not in given.get(group, {}) and own in below.get(group, {}):
             del below[group][own]
@@ -213,7 +239,7 @@ def _learner_of(*values: Nested) -> str:
     """The learner that is named in the first of some values, or that ``auto`` stands for on their task."""
     name, task = _named("learner", "auto", *values), _named("task", TaskConfig.name, *values)
     actions = get_task_spec(task).actions if isinstance(task, str) and name == "auto" else None
-    return name if actions is None else AUTO[actions]
+    return name if actions is None else BY_ACTIONS[actions]
 
 
 def _drop_options_of_another_learner(below: Nested, given: Nested) -> None:
@@ -258,16 +284,16 @@ def _drop_another_curriculum(below: Nested, given: Nested) -> None:
         below.get("curriculum", {}).pop("name", None)
 
 
-def _drop_other_goal_sources(below: Nested, given: Nested) -> None:
-    """Leaves out the goal sources of the base where k or the strategy is asked for."""
+def _drop_other_goal_sources(given: Nested) -> None:
+    """Asks for no goal sources, not even those of the base, where k or the strategy is asked for."""
     asked = given.get("hindsight", {})
     short = {name: asked[name] for name in ("k", "strategy") if name in asked}
     if not short:
         return
-    if asked.get("goal_sources") is not None:
+    if asked.get("goal_sources", AUTO) not in (None, AUTO):
         shown = " and ".join(f"{name}={value}" for name, value in short.items())
         raise ValueError(f"{shown} and goal_sources={asked['goal_sources']} say the same: give one of them")
-    below.get("hindsight", {}).pop("goal_sources", None)
+    asked["goal_sources"] = None
 
 
 def _assemble(values: Nested) -> Recipe:

@@ -11,7 +11,7 @@ from textwrap import shorten
 from typing import Any, Literal, get_args
 
 from torchrl_her_envs.registry import get_task_spec
-from torchrl_her_recipes.config.learners import AUTO
+from torchrl_her_recipes.config.learners import BY_ACTIONS
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.plain_files import read_yaml
 from torchrl_her_recipes.config.recipe import Recipe, compose
@@ -301,7 +301,7 @@ def space_for(recipe: Recipe) -> Space:
         ValueError: the learner has none.
     """
     actions = get_task_spec(recipe.task.name).actions or "continuous"
-    learner = AUTO[actions] if recipe.learner.name == "auto" else recipe.learner.name
+    learner = BY_ACTIONS[actions] if recipe.learner.name == "auto" else recipe.learner.name
     if learner not in space_names():
         known = ", ".join(space_names())
         raise ValueError(f"learner={learner} has no space of its own ({known} have): give one, --space FILE")

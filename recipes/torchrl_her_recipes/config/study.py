@@ -17,10 +17,11 @@ from torchrl_her_recipes.config.shipped import CONF, load_preset
 from torchrl_her_recipes.config.shortcuts import locate, merge, place
 
 _STUDIES = CONF / "study"
-_LENGTHS = ("num_runs", "epochs", "epoch_frames")
+_LENGTHS = ("num_runs", "epochs", "epoch_frames", "frames")
 _QUICK: dict[str, Any] = {
     "num_runs": 2,
     "epochs": 2,
+    "frames": None,
     "epoch_frames": 3_200,
     "num_envs": 16,
     "episodes": 20,
@@ -149,6 +150,8 @@ def _word(name: str, value: Any, values: Sequence[Any]) -> str:
         entries = {key: [each.get(key) for each in values] for key in value}
         differing = {key: own for key, own in entries.items() if any(other != own[0] for other in own)}
         return "_".join(_word(key, value[key], own) for key, own in differing.items())
+    if isinstance(value, Mapping):
+        return "_".join(_word(name, own, [None]) for own in value.values())
     short = name.rpartition(".")[2]
     return str(value) if short in ("task", "algo") else f"{short}={value}"
 
@@ -202,19 +205,11 @@ def _shortened(
     study = Study(name=path.stem, **values)
     if not study.name.strip("."):
         raise ValueError("a study is called as its file, which needs a name before the suffix")
-    recipe = merge(load_preset(preset) if preset else {}, study.recipe)
-    asked = merge(_QUICK if quick else {}, {} if seeds is None else {"num_runs": seeds})
-
-    def shortened(own: Mapping[str, Any]) -> dict[str, Any]:
-        """Options with those that were asked for, and as many epochs as hold the frames."""
-        if frames is None:
-            return merge(own, asked)
-        first = {name: values[0] for name, values in study.vary.items()}
-        epoch_frames = compose(merge(recipe, own, asked), first).collection.epoch_frames
-        return merge(own, asked, {"epochs": -(-frames // epoch_frames)})
-
-    for_task = {task: shortened(own) for task, own in study.for_task.items()}
-    return replace(study, recipe=merge(recipe, shortened({})), for_task=for_task)
+    sizes = {"num_runs": seeds, "frames": frames}
+    asked = merge(_QUICK if quick else {}, {name: size for name, size in sizes.items() if size is not None})
+    recipe = merge(load_preset(preset) if preset else {}, study.recipe, asked)
+    for_task = {task: merge(own, asked) for task, own in study.for_task.items()}
+    return replace(study, recipe=recipe, for_task=for_task)
 
 
 def _set_in(own: Mapping[str, Any], names: Iterable[str]) -> list[str]:

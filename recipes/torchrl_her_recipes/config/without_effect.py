@@ -7,6 +7,7 @@ from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.algorithms import get_algorithm
+from torchrl_her_recipes.config.options import AUTO
 
 WEIGHTS = ("ibs", "novelty")  # the groups of options of weights of goals
 
@@ -31,12 +32,12 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
             idle[group, name] = f"with task={task}"
     with_algo = f"with algo={algorithm.name}"
     if not algorithm.hindsight:
-        for name in ("k", "strategy", "goal_sources"):
+        for name in ("k", "strategy", "goal_sources", "refill"):
             idle["hindsight", name] = with_algo
         for group in WEIGHTS:
             all_of(group, with_algo)
     elif not groups.hindsight.sources:
-        idle["hindsight", "strategy"] = "with k=0"
+        idle["hindsight", "strategy"] = idle["hindsight", "refill"] = "with k=0"
         for group in WEIGHTS:
             all_of(group, "with k=0")
     elif algorithm.weights:
@@ -55,7 +56,9 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
             idle["ibs", "cells"] = idle["ibs", "recent"] = "with estimator=kernel"
         if algorithm.instructive == "sequential":
             idle["ibs", "floor"] = with_algo
-    if algorithm.hindsight and groups.hindsight.goal_sources is not None:
+    if not algorithm.filter_achieved:
+        idle["hindsight", "refill"] = with_algo
+    if algorithm.hindsight and groups.hindsight.goal_sources not in (None, AUTO):
         idle["hindsight", "k"] = idle["hindsight", "strategy"] = "with goal_sources"
     if not algorithm.curriculum:
         all_of("curriculum", with_algo)
@@ -105,7 +108,8 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         for name in ("priority_alpha", "priority_beta"):
             idle["replay", name] = f"with sampler={groups.replay.sampler}"
     if not groups.learner.normalize:
-        idle["learner", "normalize_clip"] = "with normalize=false"
+        for name in ("normalize_clip", "normalize_least_std"):
+            idle["learner", name] = "with normalize=false"
     if groups.learner.compile == "never":
         idle["learner", "products"] = "with compile=never"
     elif not groups.learner.device.startswith(("cpu", "auto")):

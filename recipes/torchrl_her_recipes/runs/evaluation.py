@@ -17,7 +17,7 @@ from torchrl_her.trainers.metrics import discounted_return, final_distance, q_bi
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
-from torchrl_her_recipes.runs.saturation import saturation
+from torchrl_her_recipes.runs.notices import saturation
 from torchrl_her_recipes.runs.toy_values import measure_values
 
 

@@ -96,7 +96,7 @@ def export_policy(
 
 def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int = 1 << 41) -> float:
     """The share of greedy episodes in which a policy achieves its goal."""
-    env = make_task_envs(policy.recipe.replace(task=policy.task), episodes, [seed])
+    env = make_task_envs(policy.recipe.replace(task=policy.task), episodes, [seed], scaled=False)
     rollout = evaluate(env, policy.actor, max_steps=goal_env(env).max_steps)
     achieved = success(rollout, achieved_reward=reward_range(goal_env(env))[1])
     env.close()
@@ -105,7 +105,7 @@ def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int =
 
 def played_states(policy: TrainedPolicy, *, episodes: int = 16, seed: int = 1 << 42) -> TensorDictBase:
     """What a policy sees in some greedy episodes of its task, [rows]."""
-    env = make_task_envs(policy.recipe.replace(task=policy.task), episodes, [seed])
+    env = make_task_envs(policy.recipe.replace(task=policy.task), episodes, [seed], scaled=False)
     rollout = evaluate(env, policy.actor, max_steps=goal_env(env).max_steps)
     env.close()
     return rollout.select(*KEYS).flatten()
@@ -163,7 +163,7 @@ def _for_task(policy: TrainedPolicy, task: str) -> TrainedPolicy:
         ValueError: the task shows or wants something else than what the policy reads and writes.
     """
     if task != policy.task:
-        policy.card.check_plays(make_task_envs(policy.recipe.replace(task=task), 1, [0]), task)
+        policy.card.check_plays(make_task_envs(policy.recipe.replace(task=task), 1, [0], scaled=False), task)
     policy = replace(policy, card=replace(policy.card, task=task))
     return replace(policy, card=replace(policy.card, success=measure_success(policy)))
 

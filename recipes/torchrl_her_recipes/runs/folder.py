@@ -127,7 +127,7 @@ class RunFolder:
         self._check_links()
         values = read_mapping(self.config)
         with naming(self.config):
-            return Recipe.from_dict(values)
+            return Recipe.of_file(values)
 
     def _check_links(self) -> None:
         """Raises a ValueError if something would be written through a link to a place elsewhere."""

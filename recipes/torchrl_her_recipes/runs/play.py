@@ -22,7 +22,10 @@ _HOLD = 25  # times that the last frame is repeated
 def load_actor(
     folder: str | Path, *, run: int = 0, best: bool = False, allow_import: bool = False
 ) -> TensorDictModuleBase:
-    """The greedy policy that a run ended with, or its best one.
+    """The greedy policy that a run ended with, or its best one, as the run's own environments take it.
+
+    Its continuous actions are from -1 to 1, and in a curriculum it reads the padded inputs of a layer.
+    :func:`~torchrl_her_recipes.load_policy` gives the policy for the task itself.
 
     Args:
         folder: of the run, or ``policy.pt`` or ``best.pt`` in it.

@@ -91,7 +91,7 @@ def find_player(
     if kept is None and (str(source) in policy_names() or Path(source).is_file()):
         trained = load_trained(source, allow_import=allow_import)
         recipe = trained.recipe.replace(task=trained.task)
-        env = make_task_envs(recipe, goals, [seed], pictures=True)
+        env = make_task_envs(recipe, goals, [seed], pictures=True, scaled=False)
         trained.card.check_plays(env, trained.task)
         achieved = reward_range(goal_env(env))[1]
         return Player(

@@ -12,11 +12,10 @@ from torch import Tensor
 
 from torchrl_her.trainers.checkpoint import load_checkpoint
 from torchrl_her_recipes.config.imports import permit_task
-from torchrl_her_recipes.config.learners import AUTO
 from torchrl_her_recipes.config.plain_files import reason
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.shipped import TRAINED, policy_names
-from torchrl_her_recipes.runs.exported.card import KEYS, PolicyCard
+from torchrl_her_recipes.runs.exported.card import PolicyCard
 from torchrl_her_recipes.runs.exported.network import load_network
 from torchrl_her_recipes.runs.exported.of_run import read_run
 from torchrl_her_recipes.runs.exported.onnx_file import SUFFIX, read_onnx
@@ -190,27 +189,13 @@ def _named(path: Path, make: Callable[..., _Made], value: object) -> _Made:
 
 
 def _policy_of(state: dict[str, Any]) -> TrainedPolicy:
-    card, recipe = _card_of(state), Recipe.from_dict(state["recipe"])
+    card, recipe = _card_of(state), Recipe.of_file(state["recipe"])
     return TrainedPolicy(card, load_network(card, recipe, state["actor"]), recipe)
 
 
 def _card_of(state: dict[str, Any]) -> PolicyCard:
-    """The card of a .pt file; of older files, made of what they have. All of those are of DDPG and TD3."""
-    if "card" in state:
-        return PolicyCard.from_dict(state["card"])
-    recipe, actions = Recipe.from_dict(state["recipe"]), state["actions"]
-    return PolicyCard(
-        task=state["task"],
-        widths=dict(zip(KEYS, state["widths"], strict=True)),
-        dtype=recipe.run.dtype,
-        action_shape=(actions,),
-        action_dtype=recipe.run.dtype,
-        low=(-1.0,) * actions,
-        high=(1.0,) * actions,
-        normalize_clip=recipe.learner.normalize_clip if recipe.learner.normalize else None,
-        algorithm=recipe.hindsight.algo,
-        learner=AUTO["continuous"] if recipe.learner.name == "auto" else recipe.learner.name,
-        seed=recipe.run.seed,
-        frames=state["frames"],
-        success=state["success"],
-    )
+    if "card" not in state:
+        raise ValueError(
+            "an older version wrote it, without a card: train it again, or play it with that version"
+        )
+    return PolicyCard.from_dict(state["card"])

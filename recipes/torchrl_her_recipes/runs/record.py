@@ -82,7 +82,7 @@ def record_demonstrations(
     check_free(out, force=force)
     recipe = make_recipe(task=task, seed=seed)
     most = _OF_GYM_AT_ONCE if task.startswith(GYM) else _AT_ONCE
-    with closing(make_task_envs(recipe, min(episodes, most), [seed])) as env:
+    with closing(make_task_envs(recipe, min(episodes, most), [seed], scaled=False)) as env:
         player, who = _find_policy(recipe, env, policy, allow_import=allow_import)
         facts = {"policy": who, "seed": seed, "torchrl_her": __version__}
         recorded = _play(env, player, task, episodes, keep_all=keep_all, facts=facts)

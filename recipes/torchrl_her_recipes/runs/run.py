@@ -31,9 +31,9 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap, goal_map
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.log_to import LogByName
+from torchrl_her_recipes.runs.notices import notices
 from torchrl_her_recipes.runs.plots import plot_curves, plot_goals
 from torchrl_her_recipes.runs.progress import Progress
-from torchrl_her_recipes.runs.saturation import saturation_notices
 from torchrl_her_recipes.runs.state import load_run_state, run_state
 from torchrl_her_recipes.runs.virtual_goals import at_virtual_goals
 
@@ -256,7 +256,7 @@ def _run(
                 seconds = rows[-1]["seconds"] if rows else 0.0
                 rows += _epoch(components, trainer, shown, between_batches, seconds, best)
                 stopped = hooks.epoch()
-                for line in saturation_notices(rows, recipe):
+                for line in notices(rows, recipe, components.bounds):
                     shown.say(line)
                 if home is not None:
                     with _despite_a_full_disk("table", trainer):

@@ -25,8 +25,8 @@ def expected_seconds(recipe: Recipe, epochs: int) -> float:
     """About how long some epochs of a batched run take on one core.
 
     Example:
-        >>> from torchrl_her_recipes import make_recipe
-        >>> fifteen = make_recipe(num_runs=15)
+        >>> from torchrl_her_recipes import load_preset, make_recipe
+        >>> fifteen = make_recipe(load_preset("throwing"), num_runs=15)
         >>> round(expected_seconds(fifteen, fifteen.run.epochs) / 60)
         13
     """

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from torchrl_her_recipes.components.envs import resolved
 from torchrl_her_recipes.config.imports import check_permitted, permit_task
 from torchrl_her_recipes.config.study import Study, curve_label
 from torchrl_her_recipes.runs.plots import plot_comparison
@@ -46,7 +47,8 @@ def plan_study(study: Study, folder: Path) -> Plan:
     Raises:
         ValueError: the folder has a run of other options under the same name.
     """
-    return Plan(job for label, recipe in study.cells() for job in plan_batches(label, recipe, folder))
+    cells = ((label, resolved(recipe)) for label, recipe in study.cells())
+    return Plan(job for label, recipe in cells for job in plan_batches(label, recipe, folder))
 
 
 def run_study(

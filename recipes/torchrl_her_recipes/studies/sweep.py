@@ -12,6 +12,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from torchrl_her.files.writing import write_text
+from torchrl_her_recipes.components.envs import resolved
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.run import last_success
@@ -48,7 +49,7 @@ def plan_sweep(runs: Mapping[str, Recipe], folder: Path) -> Plan:
     Raises:
         ValueError: a run in the folder has the same name and other options.
     """
-    jobs = [Job(label=label, recipe=recipe, folder=folder / label) for label, recipe in runs.items()]
+    jobs = [Job(label=label, recipe=resolved(own), folder=folder / label) for label, own in runs.items()]
     for job in jobs:
         if _begun(job) != job.recipe:
             raise ValueError(f"{job.folder} holds a run with other options; choose another folder")

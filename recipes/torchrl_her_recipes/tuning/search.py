@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -15,6 +15,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 from tqdm import tqdm
 
+from torchrl_her_recipes.components.envs import resolved
 from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.search import Search
 from torchrl_her_recipes.runs.folder import RunFolder
@@ -99,6 +100,7 @@ def tune(
     if minutes is not None and not minutes > 0:
         raise ValueError(f"minutes must be above 0, got {minutes}")
     check_permitted(search.recipe.task.name)
+    search = replace(search, recipe=resolved(search.recipe))
     home = SearchFolder(folder)
     home.check(search)
     sampler = make_sampler(search.sampler, search.recipe.run.seed)

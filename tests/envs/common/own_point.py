@@ -88,6 +88,24 @@ class Endless(Point):
     max_steps = None  # type: ignore[assignment]
 
 
+class Levers(Point):
+    """A point that is moved by actions in units of their own; those beyond the bounds are an error."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__(size)
+        low, high = torch.tensor([0.0, -30.0]), torch.tensor([10.0, 50.0])
+        self.action_spec = Bounded(low.expand(size, 2), high.expand(size, 2))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        assert self.action_spec.is_in(tensordict["action"])
+        low, high = self.action_spec.space.low, self.action_spec.space.high
+        return super()._step(tensordict.replace(action=(tensordict["action"] - low) / (high - low) * 2 - 1))
+
+
+def make_levers(num_envs: int) -> Levers:
+    return Levers(num_envs)
+
+
 class Wide(Point):
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         return super().compute_reward(achieved_goal, desired_goal).squeeze(-1)

@@ -194,6 +194,33 @@ def test_with_an_achieved_reward_a_dense_reward_is_as_good_as_another() -> None:
     assert reward_bounds(plain())[1] == 0.0
 
 
+class Telling(Plain):
+    """With a dense reward and the method by which Fetch and highway-env tell success."""
+
+    def __init__(self, *, strange: bool = False) -> None:
+        super().__init__(dense=True)
+        self.strange = strange
+
+    def _is_success(self, achieved: np.ndarray, desired: np.ndarray) -> bool:
+        gap = abs(float((achieved - desired).item()))
+        return gap < (0.5 + 0.3 * float(desired.item()) if self.strange else 1.25)
+
+
+gymnasium.register("tests/Telling-v0", Telling, max_episode_steps=6)
+
+
+def test_the_achieved_reward_of_a_dense_one_is_found_if_the_environment_tells_success(
+    said: pytest.LogCaptureFixture,
+) -> None:
+    env = make_gym_env("tests/Telling-v0")
+    assert env.dense_reward
+    assert env.achieved_reward == pytest.approx(-1.25)
+    line = "tests/Telling-v0 has a dense reward: goals count as achieved from -1.25 on"
+    assert any(record.getMessage().startswith(line) for record in said.records)
+    with pytest.raises(ValueError, match="has a dense reward"):  # success does not follow from the reward
+        make_gym_env("tests/Telling-v0", strange=True)
+
+
 def test_rewards_of_steps_that_goals_do_not_explain_are_noticed(said: pytest.LogCaptureFixture) -> None:
     class Costly(Plain):
         def step(self, action: Any) -> Any:

@@ -128,9 +128,25 @@ def test_only_environments_that_are_done_begin_anew() -> None:
     assert new[~goes_on].all()  # no episode starts at its goal, where many ended
 
 
+class OwnLimit(Walk):
+    """It truncates its episodes itself, after seven steps."""
+
+    def reset(self, **options: Any) -> Any:
+        self.steps = 0
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        shown, reward, terminated, _, info = super().step(action)
+        return shown, reward, terminated, self.steps == 7, info
+
+
+gymnasium.register("tests/Own-Limit-v0", OwnLimit, kwargs={"ends": False})
+
+
 def test_an_environment_without_a_time_limit_is_given_one() -> None:
-    with pytest.raises(ValueError, match="tests/Endless-v0 has no time limit: give max_steps"):
-        make_gym_env("tests/Endless-v0")
+    assert make_gym_env("tests/Endless-v0").max_steps == 100
+    assert make_gym_env("tests/Own-Limit-v0").max_steps == 7
     env = make_gym_env("tests/Endless-v0", max_steps=3, ends=False)
     assert env.max_steps == 3
     assert rollout(env, 9)["next", "truncated"].flatten().tolist() == [False, False, True] * 3

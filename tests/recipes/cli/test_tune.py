@@ -34,10 +34,10 @@ def test_a_search_says_what_it_varies_and_how_to_train_the_best(
     command = ["tune", *_small(gamma=0.95), "--trials", "2", "--sampler", "random"]
     assert main(command) == 0
     said = capsys.readouterr().out.splitlines()
-    # What is given is not varied: gamma, and batch_size among the options that make it small.
+    # What is given is not varied: gamma, and batch_size and hidden among the options that make it small.
     assert said[:2] == [
         "search: runs/tune_bit_flip_filtered_her",
-        "varied: learning_rate, tau, hidden, norm, epsilon_decay, epsilon_end, k",
+        "varied: learning_rate, tau, norm, epsilon_decay, epsilon_end, k",
     ]
     assert re.fullmatch(r"trial 0: score \d+% \(best \d+%, trial 0\)", said[2])
     assert said[4].startswith("trial ")

@@ -38,6 +38,7 @@ _TAGGED: dict[str, Any] = {
     "epoch_frames": _FRAMES,
     "warmup_frames": 40,
     "frames_per_update": 5,
+    "goal_sources": None,  # of the same episode alone
     "checkpoint_interval": 100,
 }
 _TABLE = ("seconds",)  # columns that differ

@@ -35,7 +35,8 @@ def test_steps_and_their_discount_are_the_recipe_s(n_steps: int) -> None:
 
 def test_goals_are_drawn_from_where_the_recipe_says() -> None:
     for values, expected in (
-        ({}, {"future": 4}),
+        ({"goal_sources": "auto"}, {"future": 3, "actual": 2}),
+        ({"k": 4}, {"future": 4}),
         ({"k": 2, "strategy": "final"}, {"final": 2}),
         ({"goal_sources": {"future": 2, "actual": 3}}, {"future": 2, "actual": 3}),
         ({"algo": "no_hindsight"}, {}),

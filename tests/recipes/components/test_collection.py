@@ -145,8 +145,8 @@ def test_the_policy_is_one_batch_old(apart: dict[str, Any]) -> None:
     assert (first < -0.9).all()
     assert (ahead < -0.9).all()  # it was begun before the policy changed
     assert (then > 0.9).all()
-    share = (exploring < 0.9).float().mean()  # epsilon 1: a fifth is uniform, a few noises are large
-    assert 0.1 < share < 0.6
+    share = (exploring < 0.9).float().mean()  # epsilon 1: six tenths are uniform, a few noises are large
+    assert 0.4 < share < 0.9
 
 
 def test_statistics_of_normalized_inputs_reach_the_processes(apart: dict[str, Any]) -> None:
@@ -230,3 +230,17 @@ def test_nothing_starts_before_it_is_needed() -> None:
     components.close()
     with pytest.raises(NotImplementedError, match="seeds of processes that collect are those of the recipe"):
         components.collector.set_seed(3)
+
+
+def test_a_script_that_its_processes_would_run_again_is_refused(tmp_path: Path) -> None:
+    script = tmp_path / "train.py"
+    sizes = "processes=2, epochs=1, epoch_frames=80, num_envs=4, hidden=8, pictures=False"
+    script.write_text(
+        "from torchrl_her_recipes import build, make_recipe, run\n"
+        f"run(build(make_recipe(task='hand_v0', {sizes})), progress=False)\n"
+    )
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=SECONDS)
+    assert ended.returncode == 1
+    said = ended.stderr.splitlines()[-1]
+    assert said.startswith("RuntimeError: processes=2 starts processes that import ")
+    assert said.endswith("put what trains there under `if __name__ == '__main__':`")

@@ -94,6 +94,7 @@ ELSEWHERE = pytest.mark.parametrize(
 @ELSEWHERE
 def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> None:
     options = {**CURRICULUM, **SHORT, **TWO, "learner.device": name, "checkpoint_interval": 1}
+    options |= {"seed": 2, "epsilon_start": 1.0}  # of which a run comes to the second layer
     whole = run(build(small(epochs=3, **options)), tmp_path / "whole", progress=False)
     run(build(small(epochs=2, **options)), tmp_path / "parts", progress=False)
     layers = load_checkpoint(tmp_path / "parts" / "checkpoint.pt")["guide"]["layer"]

@@ -93,7 +93,7 @@ def test_each_run_is_the_one_that_it_would_be_alone() -> None:
 
 
 def test_normalization_is_an_option() -> None:
-    components = build(small())
+    components = build(small(normalize=False))
     assert components.norm is None
     assert not isinstance(components.actor, NormalizedPolicy)
     assert len(components.buffer.transform) == 0

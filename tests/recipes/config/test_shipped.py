@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from torchrl_her_recipes import load_preset, make_recipe
+from torchrl_her_recipes.config.resolve import auto_options
 from torchrl_her_recipes.config.shipped import preset_names, preset_summary
+from torchrl_her_recipes.config.study import load_study, study_names
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -17,6 +19,39 @@ def test_every_preset_makes_a_recipe_and_says_what_it_is_for(name: str) -> None:
     for group, own in values.items():
         assert own == {key: recipe[group][key] for key in own}
     assert 10 < len(preset_summary(name)) < 90
+
+
+# The defaults before there were any for unknown environments; shipped presets and studies build on them.
+THROWING = {
+    "hindsight": {"goal_sources": None, "refill": 1},
+    "collection": {"epoch_frames": 20_480, "num_envs": 64, "frames_per_update": 20, "warmup_frames": 3_200},
+    "learner": {
+        "gamma": 0.98,
+        "hidden": 64,
+        "norm": "none",
+        "normalize": False,
+        "tau": 0.02,
+        "action_penalty": 0.3,
+        "saturation_penalty": 0.0,
+        "epsilon_start": 1.0,
+        "epsilon_decay": 0.9,
+        "epsilon_end": 0.05,
+        "uniform_share": 0.2,
+        "action_noise": 0.05,
+    },
+}
+
+
+def test_numbers_of_shipped_presets_and_studies_do_not_follow_the_defaults() -> None:
+    assert load_preset("throwing") == THROWING
+    for name in preset_names():
+        values = load_preset(name)
+        for group, own in THROWING.items():
+            assert own.keys() <= values[group].keys(), name
+    for name in set(study_names()) - {"defaults"}:
+        for label, recipe in load_study(name).cells():
+            assert auto_options(recipe) == [], label
+            assert recipe.learner.normalize_least_std is not None or not recipe.learner.normalize, label
 
 
 def test_a_file_of_ones_own(tmp_path: Path) -> None:

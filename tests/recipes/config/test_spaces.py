@@ -15,7 +15,7 @@ from torchrl_her_recipes.config.spaces import make_space, space_names
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_every_learner_has_a_space_that_its_recipes_take(learner: str) -> None:
     task = "bit_flip" if learner == "dqn" else "hand_v0"
-    recipe = make_recipe(task=task, learner=learner)
+    recipe = make_recipe(load_preset("throwing"), task=task, learner=learner)
     space = space_for(recipe)
     Search(recipe=recipe, space=space)
     assert space.name == learner

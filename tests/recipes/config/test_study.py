@@ -32,7 +32,8 @@ def test_frames_are_rounded_up_to_whole_epochs() -> None:
 def test_some_tasks_have_options_of_their_own(tmp_path: Path) -> None:
     path = tmp_path / "own.yaml"
     path.write_text(
-        "recipe: {epochs: 3, k: 2}\nvary: {task: [hand_v0, hand_v1], algo: [her, filtered_her]}\n"
+        "recipe: {epochs: 3, k: 2, epoch_frames: 20480}\n"
+        "vary: {task: [hand_v0, hand_v1], algo: [her, filtered_her]}\n"
         "for_task:\n  hand_v1: {run: {epochs: 7}}\n"
     )
 
@@ -92,7 +93,7 @@ def test_cases_alone_are_enough() -> None:
             {"cases": {"w": {"window": 5}}, "vary": {"algo": ["her"]}},
             "her_w: window=5 has no effect with algo",
         ),
-        ({"cases": {"a": {}, "b": {"k": 4}}}, "the same run twice: a and b"),
+        ({"cases": {"a": {}, "b": {"tau": 0.05}}}, "the same run twice: a and b"),
     ],
 )
 def test_nothing_is_compared_with_itself(values: dict[str, Any], message: str) -> None:

@@ -35,6 +35,8 @@ ALL: dict[str, Any] = {
     "window": 10,
     "success_threshold": 0.01,
     "guided_share": 0.5,
+    "norm": "none",
+    "normalize": False,
 }
 
 

@@ -19,13 +19,13 @@ from ..small import assert_same, small, stop_after
 
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
-    """A folder with a run of an older version, one that keeps its buffer, and an unfinished one."""
+    """A folder with a run that still has its buffer, one that is to keep it, and an unfinished one."""
     folder = tmp_path / "runs"
     recipe = small(epoch_frames=480)
     run(build(recipe), folder / "study" / "kept", progress=False)
     run(build(recipe), folder / "old", progress=False)
     config = folder / "old" / "config.yaml"
-    config.write_text(config.read_text().replace("  keep_buffer: true\n", ""))
+    config.write_text(config.read_text().replace("keep_buffer: true", "keep_buffer: false"))
     (folder / "old" / "checkpoint.1.pt").write_bytes(bytes(1_000))
     stopped = build(recipe)
     stop_after(stopped, 8)

@@ -104,6 +104,24 @@ def test_entries_that_hardly_change_are_not_blown_up() -> None:
     torch.testing.assert_close(norm(rows(2.01))["observation"], torch.tensor([[0.1]]))
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_the_unit_of_values_makes_no_difference(unit: float) -> None:
+    norm, plain = make_norm(), make_norm()
+    plain.update(rows(3.0, 3.002, 2.998))
+    norm.update(rows(3.0 * unit, 3.002 * unit, 2.998 * unit))
+    wanted = plain(rows(3.001, 50.0))["observation"]
+    torch.testing.assert_close(
+        norm(rows(3.001 * unit, 50.0 * unit))["observation"], wanted, rtol=1e-2, atol=0
+    )
+    assert wanted[1].item() == norm.clip
+
+
+def test_constant_entries_become_zero_until_they_change() -> None:
+    norm = make_norm()
+    norm.update(rows(3.0, 3.0))
+    assert norm(rows(3.0, 3.0003))["observation"].flatten().tolist() == [0.0, pytest.approx(1.0, rel=1e-2)]
+
+
 def test_values_may_count_more_often_than_once() -> None:
     norm = make_norm()
     norm.update(rows(0.0, goals=[8.0]))

@@ -36,6 +36,7 @@ def make_loss(
     critics: int = 2,
     target_critics: int = 0,
     penalty: float = 0.3,
+    saturation_penalty: float = 0.0,
     bounded: bool | None = None,
     dtype: torch.dtype = torch.float64,
     **network: Any,
@@ -61,7 +62,8 @@ def make_loss(
     critic = make_critic(WIDTHS, ACTIONS, outputs=outputs, **options).to(dtype)
     if algorithm == "ddpg":
         actor = make_actor(WIDTHS, ACTIONS, **options).to(dtype)
-        return make_ddpg_loss(actor, critic, action_penalty=penalty, reduction="none", **clamped)
+        costs = {"action_penalty": penalty, "saturation_penalty": saturation_penalty}
+        return make_ddpg_loss(actor, critic, reduction="none", **costs, **clamped)
     generators = [torch.Generator().manual_seed(run) for run in range(runs)]
     shared: dict[str, Any] = {
         "critics": critics,
@@ -72,9 +74,8 @@ def make_loss(
     }
     if algorithm == "td3":
         actor = make_actor(WIDTHS, ACTIONS, **options).to(dtype)
-        return make_td3_loss(actor, critic, action_spec=spec, target_critics=target_critics, **shared).to(
-            dtype
-        )
+        shared |= {"action_spec": spec, "saturation_penalty": saturation_penalty}
+        return make_td3_loss(actor, critic, target_critics=target_critics, **shared).to(dtype)
     actor = make_stochastic_actor(WIDTHS, spec, **options).to(dtype)
     shared |= {"action_spec": spec, "runs": runs}
     if algorithm == "tqc":

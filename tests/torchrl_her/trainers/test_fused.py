@@ -77,6 +77,18 @@ def test_everything_is_as_with_torchrl_s_loss(
     check_equal(first, second, lambda seed: make_rows(algorithm, (runs, 24), seed, **extras), 3)
 
 
+@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
+def test_penalty_on_saturated_actions(algorithm: str) -> None:
+    loss = make_loss(algorithm, runs=2, saturation_penalty=0.5)
+    last = loss.actor_network_params["module", "layers", "3", "weight"]
+    last.data *= 2_000  # actions from one end of tanh to the other
+    rows = make_rows(algorithm, (2, 24))
+    argument = loss.actor_network(rows.flatten())["action"].atanh().abs()
+    assert argument.min() < 2 < argument.max() < 6
+    first, second = both(loss, runs=2, norm=1e3)
+    check_equal(first, second, lambda seed: make_rows(algorithm, (2, 24), seed), 3, atol=1e-9)
+
+
 @pytest.mark.parametrize("algorithm", ["td3", "sac"])
 @pytest.mark.parametrize("runs", [1, 3])
 @pytest.mark.parametrize("target_critics", [1, 2, 5])

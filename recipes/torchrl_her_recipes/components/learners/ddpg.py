@@ -63,6 +63,7 @@ class DDPGBuilder(LearnerBuilder):
             gamma=self.options.gamma,
             reward_range=self.bounds(rewards),
             action_penalty=self.options.action_penalty,
+            saturation_penalty=self.options.saturation_penalty,
             reduction="none",
             cloning=self.cloning,
         )

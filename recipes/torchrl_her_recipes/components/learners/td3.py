@@ -31,6 +31,7 @@ class TD3Builder(DDPGBuilder):
             gamma=self.options.gamma,
             reward_range=self.bounds(rewards),
             action_penalty=self.options.action_penalty,
+            saturation_penalty=self.options.saturation_penalty,
             generators=generators,
             reduction="none",
             cloning=self.cloning,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -35,8 +36,7 @@ class _Shown:
 def _action_spec(card: PolicyCard) -> TensorSpec:
     if card.discrete:
         return Categorical(int(card.high[0]) + 1, dtype=torch.int64)
-    low, high = (torch.tensor(side, dtype=torch.float32) for side in (card.low, card.high))
-    return Bounded(low, high, shape=card.action_shape, dtype=torch.float32)
+    return Bounded(-1.0, 1.0, shape=card.action_shape, dtype=torch.float32)  # as learners take them
 
 
 def load_network(card: PolicyCard, recipe: Recipe, weights: Mapping[str, Tensor]) -> TensorDictModuleBase:
@@ -55,7 +55,11 @@ def load_network(card: PolicyCard, recipe: Recipe, weights: Mapping[str, Tensor]
     actor = builder.player(1)
     player = _with_norm(actor, card, recipe)
     player.load_state_dict(dict(weights))
-    greedy = TensorDictModule(builder.greedy(actor), in_keys=list(KEYS), out_keys=["action"])
+    net = builder.greedy(actor)
+    bounds = (*card.low, *card.high)
+    if not card.discrete and {*map(abs, bounds)} != {1.0} and all(map(math.isfinite, bounds)):
+        net = ScaledActions(net, card.low, card.high)
+    greedy = TensorDictModule(net, in_keys=list(KEYS), out_keys=["action"])
     norm = player.norm if isinstance(player, NormalizedPolicy) else None
     return acting(greedy, norm).requires_grad_(False)
 
@@ -95,6 +99,30 @@ def _builder(card: PolicyCard, recipe: Recipe) -> LearnerBuilder:
 
 def _with_norm(actor: TensorDictModule, card: PolicyCard, recipe: Recipe) -> TensorDictModuleBase:
     return acting(actor, make_norm(recipe, card.widths))
+
+
+class ScaledActions(nn.Module):
+    """A network whose actions from -1 to 1 become those between a task's bounds.
+
+    Args:
+        net: gives actions [..., actions] from -1 to 1.
+        low, high: the least and the greatest action, one number for each entry.
+
+    Example:
+        >>> ScaledActions(nn.Identity(), [0.0, -4.0], [2.0, 4.0])(torch.tensor([-1.0, 0.5]))
+        tensor([0., 2.])
+    """
+
+    def __init__(self, net: nn.Module, low: Sequence[float], high: Sequence[float]) -> None:
+        super().__init__()
+        self.net = net
+        least, greatest = torch.tensor(low), torch.tensor(high)
+        self.register_buffer("middle", (greatest + least) / 2)
+        self.register_buffer("reach", (greatest - least) / 2)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """[..., widths] of the inputs to [..., actions]."""
+        return self.middle + self.reach * self.net(*inputs)
 
 
 class TensorPolicy(nn.Module):
@@ -151,7 +179,7 @@ class TensorPolicy(nn.Module):
 
 def _constants(norm: RunningNorm, key: str) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, deviation and limit of an entry, as :meth:`RunningNorm.normalize` uses them."""
-    n, mean, var = norm.moments_of(key)
-    std = var.sqrt().clamp(min=norm.least_std)
+    n, mean, _ = norm.moments_of(key)
+    std = norm.std[0, norm.columns_of(key)]
     limit = torch.where(n > 0, norm.clip, torch.inf)
     return mean.float(), std.float(), limit.float()

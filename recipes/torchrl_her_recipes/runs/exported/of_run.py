@@ -60,7 +60,7 @@ def read_run(kept: KeptPolicy, run: int | None, *, allow_import: bool = False) -
         raise ValueError(f"there is no run {chosen} in {kept.home.path}; it has runs 0 to {runs - 1}")
     if allow_import:
         permit_task(recipe.task.name)
-    env = make_task_envs(recipe, 1, [0])
+    env = make_task_envs(recipe, 1, [0], scaled=False)
     shown: dict[str, Any] = describe_env(env)
     card = PolicyCard(
         task=recipe.task.name,

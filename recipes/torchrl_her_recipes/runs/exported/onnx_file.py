@@ -149,7 +149,7 @@ def _card_of(metadata: dict[str, str]) -> tuple[PolicyCard, Recipe]:
     except (ValueError, RecursionError) as error:
         raise ValueError("is damaged: its description is not JSON") from error
     try:
-        return PolicyCard.from_dict(card), Recipe.from_dict(recipe)
+        return PolicyCard.from_dict(card), Recipe.of_file(recipe)
     except (ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"is no exported policy: {error}") from error
 

@@ -35,8 +35,9 @@ def test_the_policy_is_the_learner_s_own_greedy_one(options: dict[str, Any]) -> 
     assert len(written["action"].unique(dim=0)) > 1
 
 
-def test_sac_s_action_reaches_its_own_limits() -> None:
-    policy = tiny_policy(learner="sac", scale=3.0)  # from -3 to 6
+@pytest.mark.parametrize("learner", ["ddpg", "sac"])
+def test_actions_reach_the_limits_of_the_task(learner: str) -> None:
+    policy = tiny_policy(learner=learner, normalize=False, norm="none", scale=3.0)  # from -3 to 6
     far = states(policy.card, 200).apply(lambda own: 100 * own)
     action = policy.actor(far)["action"]
     assert float(action.min()) == pytest.approx(-3.0, abs=1e-4)
@@ -57,7 +58,7 @@ def test_tensors_alone_give_the_same_actions() -> None:
 
 
 def test_integers_deviate_by_their_value() -> None:
-    policy = tiny_policy(task="bit_flip", learner="dqn")
+    policy = tiny_policy(task="bit_flip", learner="dqn", normalize=False)
     seen = states(policy.card, 5)
     own = TensorPolicy(policy.actor)
     values = own.net.net(seen["observation"], seen["desired_goal"])

@@ -1,0 +1,89 @@
+"""Replaces options that are ``auto`` by values that fit what the task's environment is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+from torchrl_her_recipes.config.options import AUTO
+from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.without_effect import without_effect
+
+_GAMMA = (0.9, 0.99)  # least and greatest
+_WARMUP = 1_000  # environment steps, at least
+_EPISODES = 100  # in an epoch, where environments are stepped one by one
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvFacts:
+    """What the values of ``auto`` depend on.
+
+    Args:
+        max_steps: steps of an episode, at most.
+        batched: whether the environments of a batch are stepped together, at little cost for each of them.
+    """
+
+    max_steps: int
+    batched: bool = False
+
+
+def _gamma(_recipe: Recipe, facts: EnvFacts) -> float:
+    """A horizon of half an episode."""
+    return round(min(max(1 - 2 / facts.max_steps, _GAMMA[0]), _GAMMA[1]), 4)
+
+
+def _num_envs(recipe: Recipe, facts: EnvFacts) -> int:
+    """Few environments that are slow, so that they learn from each episode soon; some for each process."""
+    processes = max(recipe.collection.processes, 1)
+    return math.ceil((64 if facts.batched else 8) / processes) * processes
+
+
+def _epoch_frames(recipe: Recipe, facts: EnvFacts) -> int:
+    own = recipe.collection
+    episodes = _EPISODES if not facts.batched else 4 * own.num_envs
+    return max(episodes * facts.max_steps, own.num_envs * own.steps_per_batch)
+
+
+def _warmup_frames(recipe: Recipe, facts: EnvFacts) -> int:
+    """Until each environment has ended an episode: no transition is stored before."""
+    return max(recipe.collection.num_envs * facts.max_steps, _WARMUP)
+
+
+# In this order: later ones depend on earlier ones.
+_VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
+    "goal_sources": lambda recipe, _facts: recipe.hindsight.sources,
+    "gamma": _gamma,
+    "num_envs": _num_envs,
+    "frames_per_update": lambda _recipe, facts: 5.0 if facts.batched else 1.0,
+    "epoch_frames": _epoch_frames,
+    "warmup_frames": _warmup_frames,
+}
+
+
+def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
+    """Group and name of each option that is ``auto``, depends on the environment, and has an effect.
+
+    Example:
+        >>> auto_options(Recipe().replace(gamma=0.95))[:2]
+        [('hindsight', 'goal_sources'), ('collection', 'num_envs')]
+    """
+    homes = {own.name: group.name for group in fields(recipe) for own in fields(getattr(recipe, group.name))}
+    names = [(homes[name], name) for name in _VALUES]
+    idle = without_effect(recipe)
+    return [own for own in names if getattr(getattr(recipe, own[0]), own[1]) == AUTO and own not in idle]
+
+
+def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
+    """The same recipe with a value for each option that was ``auto``.
+
+    Example:
+        >>> recipe = resolve(Recipe(), EnvFacts(max_steps=50))
+        >>> recipe.learner.gamma, recipe.collection.num_envs, recipe.collection.epoch_frames
+        (0.96, 8, 5000)
+    """
+    for group, name in auto_options(recipe):
+        value = _VALUES[name](recipe, facts)
+        recipe = recipe.replace(**{f"{group}.{name}": value})
+    return recipe

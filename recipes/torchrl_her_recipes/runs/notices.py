@@ -1,0 +1,186 @@
+"""Says what goes wrong in a run while it does, once for each run, and which options help."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from torch import Tensor
+
+from torchrl_her_recipes.config.algorithms import get_algorithm
+from torchrl_her_recipes.config.recipe import Recipe
+
+Row = dict[str, float]  # of the table of metrics: one epoch of one run
+Rule = Callable[[Sequence[Row], Recipe], str | None]  # what is wrong with a run, given its rows
+
+_AT_BOUND = 0.99  # of the way from the middle of the range to its end
+_NEARLY_ALL = 0.95  # of the entries of all actions, or of virtual rows
+_STREAK = 3  # epochs in a row
+_LONG = 5
+_LITTLE = 0.5  # success from which on full speed may well be the right policy
+_FEW = 0.02  # of the virtual rows that would be written without the filter
+_BEYOND = 0.25  # of the range of returns
+
+
+def saturation(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """The share of an action's entries that are at their bounds.
+
+    Args:
+        action: [..., a].
+        low: [a], the least action; with an infinite bound, an entry is never at it.
+        high: [a], the greatest action.
+
+    Returns:
+        [...], from 0 to 1.
+
+    Example:
+        >>> import torch
+        >>> high = torch.tensor([1.0, 2.0])
+        >>> saturation(torch.tensor([[1.0, 0.0], [-0.995, 2.0]]), -high, high)
+        tensor([0.5000, 1.0000])
+    """
+    middle, half = (high + low) / 2, (high - low) / 2
+    bounded = half.isfinite()
+    return (((action - middle).abs() >= _AT_BOUND * half) & bounded).float().mean(-1)
+
+
+def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) -> list[str]:
+    """One line for each trouble that the newest epoch shows for the first time.
+
+    Args:
+        rows: the table of metrics so far, one row for each epoch and run.
+        recipe: of the runs.
+        bounds: the least and the greatest reward; infinite if there are none.
+
+    Returns:
+        The lines; none where all is well.
+    """
+    runs: dict[float, list[Row]] = {}
+    for row in rows:
+        runs.setdefault(row["run"], []).append(row)
+    rules = [_nothing_achieved, _nothing_to_relabel, _saturated, _beyond(bounds), _fallen]
+    lines = [
+        f"seed {own[-1]['seed']:.0f}: {said}"
+        for own in runs.values()
+        for rule in rules
+        if (said := rule(own, recipe)) and not any(rule(own[:end], recipe) for end in range(1, len(own)))
+    ]
+    every = list(runs.values())
+    if _differ(every) and not any(
+        _differ([own[:end] for own in every]) for end in range(_LONG, len(every[0]))
+    ):
+        lines.append(_DIFFER)
+    return lines
+
+
+def _success(row: Row) -> float:
+    return row.get("layer_success", row["success"])  # in a curriculum, at what is learned now
+
+
+def _nothing_achieved(rows: Sequence[Row], recipe: Recipe) -> str | None:
+    if len(rows) < _LONG or rows[-1].get("rows_real_positive", 1) or any(map(_success, rows)):
+        return None
+    return (
+        f"no goal has been achieved in {rows[-1]['frames']:,.0f} environment steps. What helps: "
+        "a curriculum (algo=cher), goals within reach (behavior=uniform_achieved) or demonstrations; "
+        f"`torchrl-her check task={recipe.task.name}` looks for the cause"
+    )
+
+
+def _nothing_to_relabel(rows: Sequence[Row], recipe: Recipe) -> str | None:
+    row = rows[-1]
+    if len(rows) < _STREAK or _success(row) >= _LITTLE or "rows_virtual" not in row:
+        return None
+    algorithm = get_algorithm(recipe.hindsight.algo)
+    if not algorithm.hindsight:
+        return None
+    if row["rows_virtual_positive"] > _NEARLY_ALL * row["rows_virtual"] > 0:
+        return (
+            f"{row['rows_virtual_positive'] / row['rows_virtual']:.0%} of the virtual goals were achieved "
+            "before the action: nothing can be learned from them. What helps: the filter "
+            "(algo=filtered_her), a curriculum (algo=cher) or demonstrations"
+        )
+    if algorithm.filter_achieved and row["rows_virtual"] <= _FEW * row["rows_real"] * sum(
+        recipe.hindsight.sources.values()
+    ):
+        return (
+            f"the filter has left {row['rows_virtual']:,.0f} virtual goals for {row['rows_real']:,.0f} "
+            "environment steps: what is achieved hardly changes. What helps: a curriculum (algo=cher), "
+            "longer episodes (task.options.max_steps) or demonstrations; "
+            f"`torchrl-her check task={recipe.task.name}` looks for the cause"
+        )
+    return None
+
+
+def _saturated(rows: Sequence[Row], recipe: Recipe) -> str | None:
+    """An actor that ends in tanh gets almost no gradient where its actions are at their bounds."""
+    last = rows[-_STREAK:]
+    stuck = [row.get("saturation", 0.0) >= _NEARLY_ALL and _success(row) < _LITTLE for row in last]
+    if len(last) < _STREAK or not all(stuck):
+        return None
+    learner = recipe.learner
+    helps = [f"learning_rate below {learner.learning_rate:g}", "a larger batch_size"]
+    if (penalty := getattr(learner, "saturation_penalty", None)) is not None:
+        helps.insert(0, f"saturation_penalty above {penalty:g}")
+    return (
+        f"nearly all greedy actions have been at their bounds for {_STREAK} epochs (now "
+        f"{last[-1]['saturation']:.0%}), with {_success(last[-1]):.0%} success; this actor may not learn "
+        f"any more. What helps: {' or '.join(helps)}"
+    )
+
+
+def _beyond(bounds: tuple[float, float]) -> Rule:
+    """A rule for values that no return can have."""
+
+    def rule(rows: Sequence[Row], recipe: Recipe) -> str | None:
+        gamma = float(recipe.learner.gamma)
+        horizon = 1 / (1 - gamma) if gamma < 1 else math.inf
+        low, high = min(0.0, horizon * bounds[0]), max(0.0, horizon * bounds[1])
+        margin = _BEYOND * (high - low)
+        last = rows[-_STREAK:]
+        outside = [not low - margin <= row.get("q", low) <= high + margin for row in last]
+        if math.isinf(margin) or len(last) < _STREAK or not all(outside):
+            return None
+        helps = [f"tau below {recipe.learner.tau:g}", f"learning_rate below {recipe.learner.learning_rate:g}"]
+        if not getattr(recipe.learner, "clamp_targets", True):
+            helps.insert(0, "clamp_targets=true")
+        return (
+            f"the value of the starts is {last[-1]['q']:.4g}, and returns are from {low:.4g} to {high:.4g}: "
+            f"the critic diverges. What helps: {' or '.join(helps)}"
+        )
+
+    return rule
+
+
+def _fallen(rows: Sequence[Row], recipe: Recipe) -> str | None:
+    means = _means([row["success"] for row in rows])
+    layers = {row.get("layer", 0.0) for row in rows[-2 * _STREAK :]}
+    if len(means) <= _STREAK or len(layers) > 1 or max(means) < _LITTLE or means[-1] > max(means) / 2:
+        return None
+    learner, helps = recipe.learner, [f"learning_rate below {recipe.learner.learning_rate:g}"]
+    if learner.norm != "layer":
+        helps.insert(0, "norm=layer")
+    if not getattr(learner, "average_decay", 1.0):
+        helps.insert(0, "average_decay=0.999")
+    return (
+        f"success was {max(means):.0%} and has fallen to {means[-1]:.0%}; best.pt has the best policy. "
+        f"What helps: {' or '.join(helps)}"
+    )
+
+
+_DIFFER = (
+    f"the runs have differed by more than half in success for {_LONG} epochs: report the worst run, too. "
+    "What helps: more gradient steps (a lower frames_per_update), average_decay=0.999 or, in a curriculum, "
+    "guided_share=0.5"
+)
+
+
+def _differ(runs: Sequence[Sequence[Row]]) -> bool:
+    last = [[row["success"] for row in own[-_LONG:]] for own in runs]
+    full = min(map(len, last)) == _LONG
+    return full and all(max(epoch) - min(epoch) > _LITTLE for epoch in zip(*last, strict=True))
+
+
+def _means(values: Sequence[float]) -> list[float]:
+    """The mean of every few values in a row."""
+    return [sum(values[end - _STREAK : end]) / _STREAK for end in range(_STREAK, len(values) + 1)]

@@ -1,0 +1,94 @@
+"""A task whose lengths are in another unit, to see whether an agent depends on units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_her_envs import make_env
+from torchrl_her_envs.common.goal_env import TaskTraits, goal_env
+
+_LENGTHS = ("observation", "achieved_goal", "desired_goal")
+
+
+class InUnits(TaskTraits, EnvBase):
+    """Environments with goals whose observations and goals are multiplied by a factor; actions are not.
+
+    Args:
+        env: of :func:`~torchrl_her_envs.make_env`.
+        factor: of all observations and goals, and of how near to a goal is achieved.
+    """
+
+    def __init__(self, env: EnvBase, factor: float) -> None:
+        super().__init__(device=env.device, batch_size=env.batch_size)
+        self.env, self.factor = env, factor
+        task = self.task = goal_env(env)
+        self.max_steps = task.max_steps
+        seen = {key: Unbounded(shape=env.observation_spec[key].shape) for key in _LENGTHS}
+        self.observation_spec = Composite(seen, shape=env.batch_size)
+        self.action_spec = env.action_spec.clone()
+        self.reward_spec = env.reward_spec.clone()
+        self.done_spec = env.full_done_spec.clone()
+        for name in ("missed_reward", "achieved_reward", "dense_reward"):
+            if hasattr(task, name):
+                setattr(self, name, getattr(task, name))
+
+    @property
+    def task_name(self) -> str:
+        return f"{self.task.task_name} times {self.factor:g}"
+
+    @property
+    def batched(self) -> bool:
+        return self.task.batched
+
+    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """The reward of the task: goals [..., g] to [..., 1]."""
+        return self.task.compute_reward(achieved_goal / self.factor, desired_goal / self.factor)
+
+    def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """Whether an episode of the task ends: goals [..., g] to [..., 1]."""
+        return self.task.compute_terminated(achieved_goal / self.factor, desired_goal / self.factor)
+
+    def set_seeds(self, seeds: Any) -> None:
+        self.task.set_seeds(seeds)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.task.set_seeds([seed or 0])
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        return self._multiplied(self.env._reset(tensordict, **kwargs))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self._multiplied(self.env._step(tensordict))
+
+    def _multiplied(self, shown: TensorDictBase) -> TensorDictBase:
+        kept = shown.exclude("state")
+        return kept.update({key: kept[key] * self.factor for key in _LENGTHS})
+
+
+def in_units(
+    task: str, factor: float, *, num_envs: int = 1, seed: Any = 0, dtype: torch.dtype = torch.float32
+) -> InUnits:
+    """Makes environments of a task in other units.
+
+    Args:
+        task: its name.
+        factor: of lengths.
+
+    Keyword Args:
+        num_envs: number of environments.
+        seed: of all of them; R seeds for R equal blocks.
+        dtype: of observations and goals.
+
+    Example:
+        >>> env = in_units("hand_v1", 1_000.0, num_envs=2)
+        >>> bool(env.reset()["desired_goal"].abs().max() > 10)
+        True
+    """
+    options = {} if dtype == torch.float32 else {"dtype": dtype}
+    return InUnits(make_env(task, num_envs=num_envs, seed=seed, **options), factor)
