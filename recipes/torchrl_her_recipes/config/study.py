@@ -9,6 +9,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.metrics import metric_names
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.plain_files import naming, read_mapping
@@ -188,8 +189,11 @@ def load_study(
         raise ValueError(f"{path}: a study has no {', '.join(unknown)}; it has preset, {', '.join(known)}")
     with naming(path):
         study = _shortened(path, values, preset, seeds=seeds, frames=frames, quick=quick)
-        list(study.cells())  # whether all of its recipes can work
-        return study
+        recipes = [recipe for _, recipe in study.cells()]  # whether all of them can work
+    if path.parent == _STUDIES:  # this package's own files may name modules
+        for recipe in recipes:
+            permit_task(recipe.task.name)
+    return study
 
 
 def _shortened(

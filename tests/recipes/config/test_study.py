@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 
 from torchrl_her_recipes import Study, load_study, study_names
+from torchrl_her_recipes.config import imports
+from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.study import curve_label
 
 ROOT = Path(__file__).parents[3]
@@ -143,3 +145,12 @@ def test_mappings_are_named_by_what_differs() -> None:
 def test_mistakes_are_named(values: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         list(Study(name="own", **values).cells())  # type: ignore[arg-type]
+
+
+def test_studies_of_this_package_may_name_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imports, "_permitted", set())
+    task = "gym:panda_gym:PandaReach-v3"
+    with pytest.raises(ValueError, match="would import the module 'panda_gym'"):
+        check_permitted(task)
+    load_study("defaults")
+    check_permitted(task)
