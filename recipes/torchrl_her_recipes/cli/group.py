@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import click
 
+from torchrl_her_recipes.cli.check import check
 from torchrl_her_recipes.cli.clean import clean
 from torchrl_her_recipes.cli.listing import listing
 from torchrl_her_recipes.cli.play import export, play
@@ -78,7 +79,7 @@ def group(context: click.Context) -> None:
         context.exit(BAD_INPUT)
 
 
-for _command in (train, record, play, export, plot, study, report, tune, clean, listing):
+for _command in (check, train, record, play, export, plot, study, report, tune, clean, listing):
     group.add_command(_command)
 
 

@@ -18,7 +18,7 @@ _NEARLY_ALL = 0.95  # of the entries of all actions, or of virtual rows
 _STREAK = 3  # epochs in a row
 _LONG = 5
 _LITTLE = 0.5  # success from which on full speed may well be the right policy
-_FEW = 0.02  # of the virtual rows that would be written without the filter
+_FEW = 0.02  # of the transitions
 _BEYOND = 0.25  # of the range of returns
 
 
@@ -100,12 +100,10 @@ def _nothing_to_relabel(rows: Sequence[Row], recipe: Recipe) -> str | None:
             "before the action: nothing can be learned from them. What helps: the filter "
             "(algo=filtered_her), a curriculum (algo=cher) or demonstrations"
         )
-    if algorithm.filter_achieved and row["rows_virtual"] <= _FEW * row["rows_real"] * sum(
-        recipe.hindsight.sources.values()
-    ):
+    if algorithm.filter_achieved and row["rows_relabeled"] <= _FEW * row["rows_real"]:
         return (
-            f"the filter has left {row['rows_virtual']:,.0f} virtual goals for {row['rows_real']:,.0f} "
-            "environment steps: what is achieved hardly changes. What helps: a curriculum (algo=cher), "
+            f"the filter has left {row['rows_relabeled']:,.0f} of {row['rows_real']:,.0f} transitions with "
+            "goals of their own episode: what is achieved hardly changes. What helps: a curriculum (algo=cher), "
             "longer episodes (task.options.max_steps) or demonstrations; "
             f"`torchrl-her check task={recipe.task.name}` looks for the cause"
         )

@@ -11,12 +11,16 @@ import pytest
 import torch
 
 from torchrl_her_recipes import build, make_recipe, run
+from torchrl_her_recipes.runs import notices as notices_module
 from torchrl_her_recipes.runs.notices import notices, saturation
 
 from ..small import small
 
 Rows = list[dict[str, float]]
 SPARSE = (-1.0, 0.0)
+ROWS = {"rows_real": 1, "rows_virtual": 2, "rows_relabeled": 0.5}  # for each frame
+SOURCE = Path(notices_module.__file__).read_text()
+PAGE = Path(__file__).parents[3] / "docs" / "not_learning.md"
 
 
 def table(epochs: int, run: int = 0, **values: Any) -> Rows:
@@ -31,7 +35,7 @@ def table(epochs: int, run: int = 0, **values: Any) -> Rows:
     rows = []
     for epoch in range(epochs):
         row = {"run": run, "seed": 5 + run, "epoch": epoch + 1, "frames": 100.0 * (epoch + 1)}
-        row |= {"rows_real": row["frames"], "rows_virtual": 2 * row["frames"]}
+        row |= {name: factor * row["frames"] for name, factor in ROWS.items()}
         own = {
             name: value[epoch] if isinstance(value, list) else value
             for name, value in (well | values).items()
@@ -81,14 +85,14 @@ def test_nothing_achieved() -> None:
 
 
 def test_the_filter_leaves_nothing() -> None:
-    nothing = table(5, success=0.0, rows_virtual_positive=0.0, rows_virtual=[0.0, 0.0, 1.0, 1.0, 2.0])
-    line = only(nothing, after=3, k=4)
-    assert line.startswith("seed 5: the filter has left 1 virtual goals for 300 environment steps")
+    nothing = table(5, success=0.0, rows_virtual_positive=0.0, rows_relabeled=[0.0, 0.0, 1.0, 1.0, 2.0])
+    line = only(nothing, after=3)
+    assert line.startswith("seed 5: the filter has left 1 of 300 transitions with goals of their own episode")
     assert not any(said(nothing, algo="no_hindsight"))
-    assert not any(said([row | {"success": 0.5} for row in nothing], k=4))  # it learns all the same
-    enough = [9.0, 17.0, 25.0, 33.0, 41.0]  # more than 0.02 * 4 of the environment steps
-    some = table(5, success=0.0, rows_virtual_positive=0.0, rows_virtual=enough)
-    assert not any(said(some, k=4))
+    assert not any(said([row | {"success": 0.5} for row in nothing]))  # it learns all the same
+    enough = [3.0, 5.0, 7.0, 9.0, 11.0]  # more than 0.02 of the transitions
+    some = table(5, success=0.0, rows_virtual_positive=0.0, rows_relabeled=enough)
+    assert not any(said(some))
 
 
 def test_virtual_goals_that_were_achieved_already() -> None:
@@ -181,3 +185,18 @@ def test_a_run_says_that_its_critic_diverges(capsys: pytest.CaptureFixture[str])
     wild = {"learner": "td3", "learning_rate": 10.0, "max_grad_norm": 1e9, "clamp_targets": False, "tau": 0.5}
     run(build(small(epochs=4, epoch_frames=800, hidden=8, norm="none", **wild)))
     assert sum("the critic diverges" in line for line in capsys.readouterr().out.splitlines()) == 1
+
+
+def test_the_page_about_them_has_each_of_them() -> None:
+    page = PAGE.read_text()
+    for words in (
+        "no goal has been achieved",
+        "the filter has left",
+        "of the virtual goals were achieved before the action",
+        "nearly all greedy actions have been at their bounds",
+        "the critic diverges",
+        "and has fallen",
+        "the runs have differed by more than half",
+    ):
+        assert words in page
+        assert words in SOURCE.replace('"\n            "', "")

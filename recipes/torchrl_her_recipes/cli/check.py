@@ -1,0 +1,55 @@
+"""``torchrl-her check``: a look at a task before anything is trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import yaml
+
+import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
+from torchrl_her_recipes.cli.permission import allow_import
+from torchrl_her_recipes.cli.say import file_name
+from torchrl_her_recipes.cli.train_options import OptionsCommand, complete, requests
+
+
+@click.command(cls=OptionsCommand, short_help="look at a task before training, and say what may help")
+@click.option("--steps", type=click.IntRange(1), default=3_000, show_default=True, help="that are played")
+@allow_import
+@click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
+def check(options: tuple[str, ...], steps: int) -> int:
+    """Play random actions on a task; for instance: torchrl-her check task=gym:FetchPush-v4
+
+    Options are those of `torchrl-her train`. Nothing is trained. In half a minute it says what hindsight has
+    to learn from there, and what may help.
+    """
+    (wanted,) = requests(options, multirun=False)
+    facts = recipes.look_at(wanted.recipe, steps=steps)
+    file = Path(f"{file_name(wanted.recipe.task.name)}_layers.yaml")
+    click.echo("\n".join(_table(facts)))
+    lines = recipes.advice(facts, wanted.recipe, str(file))
+    if any(str(file) in line for line in lines):
+        if not file.exists():
+            file.write_text(yaml.safe_dump(facts.layers, sort_keys=False, default_flow_style=None))
+        click.echo(f"  layers                {file}")
+    click.echo("")
+    click.echo(
+        "\n".join(f"- {line}" for line in lines) or "nothing was found that stands in the way of learning"
+    )
+    return 0
+
+
+def _table(facts: recipes.Facts) -> list[str]:
+    bounds = [] if facts.actions is None else sorted(set(facts.actions))
+    actions = ", ".join(f"{low:g} to {high:g}" for low, high in bounds[:4]) or "discrete"
+    rows = {
+        "played": f"{facts.steps:,} random steps, {facts.episodes} episodes of up to {facts.max_steps}",
+        "a step takes": f"{1e3 * facts.seconds:.2g} ms",
+        "actions": actions,
+        "observation": f"entries with standard deviations from {facts.scales[0]:.2g} to {facts.scales[1]:.2g}"
+        + (f", {len(facts.constant)} that never change" if facts.constant else ""),
+        "goals achieved": f"in {facts.achieved:.0%} of the episodes",
+        "what is achieved": f"changes in {facts.moved:.0%} of the episodes",
+        "the filter": f"leaves later goals of the episode to {facts.kept:.1%} of the transitions",
+    }
+    return [f"  {name:<20}  {said}" for name, said in rows.items()]
