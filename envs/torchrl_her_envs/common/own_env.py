@@ -50,9 +50,9 @@ def make_own_env(
 
     Args:
         path: ``"module:name"`` of a function or class that gives a TorchRL ``EnvBase``; the module is
-            imported. If it takes ``num_envs``, it is called once with it, and with ``seed`` and ``max_steps``
-            if it takes them, and must give environments of batch size ``[num_envs]``; ``seed`` is a number,
-            or R numbers if there are several. If not, it is called ``num_envs`` times, and must give
+            imported. If it takes ``num_envs``, it is called with it, and with ``seed`` and ``max_steps`` if
+            it takes them, and must give environments of batch size ``[num_envs]``; for R seeds once, if these
+            have ``set_seeds``, or else R times. If not, it is called ``num_envs`` times, and must give
             environments without a batch size, which are stepped one after the other.
         num_envs: number of environments.
         seed: of all environments; R seeds for R equal blocks of them.
@@ -83,23 +83,36 @@ def make_own_env(
     if not isinstance(seed, int) and len(seed) == 1:
         (seed,) = seed  # of a single run: what an environment of one's own expects
 
-    def make_many(count: int) -> list[EnvBase]:
-        ours = {"num_envs": count, "seed": seed if count == num_envs else 0, "max_steps": max_steps}
+    def make_one(count: int, seed: int | Sequence[int]) -> EnvBase:
+        ours = {"num_envs": count, "seed": seed, "max_steps": max_steps}
         given = {name: value for name, value in ours.items() if name in taken and value is not None}
-        calls = 1 if "num_envs" in taken else count
-        envs = [make(**given, **options) for _ in range(calls)]
-        for env in envs:
-            _check_made(path, env, [count] if "num_envs" in taken else [])
-        return envs
+        env = make(**given, **options)
+        _check_made(path, env, [count] if "num_envs" in taken else [])
+        return env
 
-    envs = make_many(num_envs)
+    def make_many(count: int, seed: int | Sequence[int]) -> list[EnvBase]:
+        if "num_envs" not in taken:
+            return [make_one(1, seed) for _ in range(count)]
+        if isinstance(seed, int):
+            return [make_one(count, seed)]
+        block_keys(seed, count)  # whether they can be shared out
+        share = count // len(seed)
+        first = make_one(share, seed[0])
+        if (isinstance(first, TaskTraits) and is_goal_env(first)) or callable(
+            getattr(first, "set_seeds", None)
+        ):  # it takes several seeds
+            first.close()
+            return [make_one(count, seed)]
+        return [first, *(make_one(share, own) for own in seed[1:])]
+
+    envs = make_many(num_envs, seed)
     if isinstance(envs[0], TaskTraits) and is_goal_env(envs[0]):
         if termination != "auto" or achieved_reward is not None:
             raise ValueError(f"{path} says itself how it ends and rewards: leave out {', '.join(_OURS[1:])}")
         return envs[0]
     # A single one is tried, so that what is found out does not depend on how many are asked for.
     tried = OwnGoalEnv(
-        make_many(1),
+        make_many(1, 0),
         name=path,
         max_steps=max_steps,
         termination=termination,
@@ -181,10 +194,10 @@ class OwnGoalEnv(TaskTraits, EnvBase):
     - ``max_steps``, the length of an episode; the option of that name is needed if it is missing.
     - ``layers()``, see :class:`~torchrl_her_envs.TaskTraits`.
     - ``render()``, a picture [height, width, 3] of uint8, or [N, height, width, 3] of a batch.
-    - ``set_seeds(seeds)`` of a batch, which several runs side by side need.
+    - ``set_seeds(seeds)`` of a batch, for R equal blocks; a batch without it has one seed.
 
     Args:
-        envs: N environments without a batch size, or one with a batch size [N].
+        envs: N environments without a batch size, or some with a batch size, N together.
         name: of the task.
         seed: of all environments; R seeds for R equal blocks of them.
         max_steps: length of an episode; the environment's attribute if None.
@@ -211,8 +224,8 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         rules: GoalRules | None = None,
     ) -> None:
         first = envs[0]
-        self._whole = len(first.batch_size) == 1  # one environment that is a batch
-        count = first.batch_size[0] if self._whole else len(envs)
+        self._whole = len(first.batch_size) == 1  # each environment is a batch
+        count = len(envs) * (first.batch_size[0] if self._whole else 1)
         super().__init__(device="cpu", batch_size=(count,))
         self._envs, self._name = list(envs), name
         limit = max_steps if max_steps is not None else getattr(first, "max_steps", None)
@@ -276,21 +289,19 @@ class OwnGoalEnv(TaskTraits, EnvBase):
             seeds: R of them.
 
         Raises:
-            ValueError: the environments cannot be shared out among R blocks, a seed is out of range, or R is
-                above 1 and the environment is a batch without ``set_seeds``.
+            ValueError: the environments cannot be shared out among R blocks, a seed is out of range, or they
+                are batches without ``set_seeds``, and not R of them.
         """
         keys = (block_keys(seeds, self.batch_size[0]) >> np.uint64(33)).tolist()
         # Many environments seed torch's own generator, which is that of the run.
         with torch.random.fork_rng(devices=[]):
-            if not self._whole:
-                for env, key in zip(self._envs, keys, strict=True):
-                    env.set_seed(key)
-            elif callable(own := getattr(self._envs[0], "set_seeds", None)):
+            if callable(own := getattr(self._envs[0], "set_seeds", None)) and self._whole:
                 own(seeds)
-            elif len(seeds) > 1:
-                raise ValueError(f"{self._name} needs a method set_seeds for {len(seeds)} runs side by side")
+            elif self._whole and len(self._envs) != len(seeds):
+                raise ValueError(f"{self._name} is seeded with {len(self._envs)} seeds, got {len(seeds)}")
             else:
-                self._envs[0].set_seed(keys[0])
+                for env, key in zip(self._envs, keys[:: len(keys) // len(self._envs)], strict=True):
+                    env.set_seed(key)
 
     def render(
         self,
@@ -305,7 +316,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
             return super().render(worlds)
         chosen = choose_indices(self.batch_size[0], worlds)
         if self._whole:
-            everything = self._envs[0].render()
+            everything = [picture for env in self._envs for picture in env.render()]
             drawn = [everything[index] for index in chosen]
         else:
             drawn = [self._envs[index].render() for index in chosen]
@@ -333,7 +344,10 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         if not self._latest:
             self._latest = [env.reset() for env in self._envs]
         elif self._whole:
-            self._latest = [self._envs[0].reset(self._latest[0].set("_reset", which))]
+            parts = zip(self._envs, self._latest, which.chunk(len(self._envs)), strict=True)
+            self._latest = [
+                env.reset(latest.set("_reset", own)) if own.any() else latest for env, latest, own in parts
+            ]
         else:
             for index in which.flatten().nonzero().flatten().tolist():
                 self._latest[index] = self._envs[index].reset()
@@ -343,7 +357,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get("action").to(self._envs[0].full_action_spec["action"].dtype)
-        taken = [actions] if self._whole else list(actions)
+        taken = actions.chunk(len(self._envs)) if self._whole else actions.unbind()
         after = []
         for index, (env, action) in enumerate(zip(self._envs, taken, strict=True)):
             stepped = env.step(self._latest[index].clone(False).set("action", action))
@@ -368,7 +382,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
 
     def _stack(self, each: list[TensorDictBase], key: str) -> Tensor:
         entries = [own.get(key) for own in each]
-        return entries[0] if self._whole else torch.stack(entries)
+        return torch.cat(entries) if self._whole else torch.stack(entries)
 
     def _flag(self, each: list[TensorDictBase], key: str) -> Tensor:
         """A flag [N, 1]; false where there is none."""

@@ -64,7 +64,7 @@ def test_seeds_give_each_environment_the_same_in_every_batch_and_leave_torch_alo
     assert torch.equal(torch.rand(1), expected)
 
 
-def test_a_function_is_given_one_seed_as_a_number_and_several_as_they_are(
+def test_a_function_is_given_each_seed_as_a_number(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     points, seen = importlib.import_module(HERE), []
@@ -77,14 +77,26 @@ def test_a_function_is_given_one_seed_as_a_number_and_several_as_they_are(
     for seed in (5, [5]):
         make_own_env(f"{HERE}:make_seeded", num_envs=2, seed=seed)
     assert seen == [5, 0, 5, 0]  # each time, one more is made to be tried
-    with pytest.raises(ValueError, match="needs a method set_seeds"):
-        make_own_env(f"{HERE}:make_seeded", num_envs=2, seed=[5, 6])
-    assert seen[4] == [5, 6]
+    make_own_env(f"{HERE}:make_seeded", num_envs=2, seed=[5, 6])
+    assert seen[4:] == [5, 6, 0]  # a batch of one environment for each
 
 
-def test_a_batch_serves_several_runs_only_if_it_can_seed_them() -> None:
-    with pytest.raises(ValueError, match="needs a method set_seeds for 2 runs side by side"):
-        make_own_env(f"{HERE}:make_points", num_envs=4, seed=[1, 2])
+def test_batches_that_cannot_be_seeded_in_blocks_serve_several_runs_one_each() -> None:
+    both, alone = (make_own_env(f"{HERE}:make_points", num_envs=n, seed=s) for n, s in ((6, [7, 8]), (3, 8)))
+    assert both.batch_size == (6,)
+    one, other = both.reset(), alone.reset()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(40):
+        action = torch.rand(6, 2, generator=generator) * 2 - 1
+        one, seen = both.step_and_maybe_reset(one.set("action", action))[::-1]
+        other, wanted = alone.step_and_maybe_reset(other.set("action", action[3:]))[::-1]
+        assert (seen[3:] == wanted).all()
+        assert (one[3:] == other).all()
+    assert both.render([0, 5]).shape == (2, 4, 6, 3)
+    with pytest.raises(ValueError, match="is seeded with 2 seeds, got 3"):
+        both.set_seeds([1, 2, 3])
+    with pytest.raises(ValueError, match="4 environments cannot be shared|cannot be shared"):
+        make_own_env(f"{HERE}:make_points", num_envs=4, seed=[1, 2, 3])
 
 
 def test_what_it_does_at_a_goal_does_not_depend_on_how_many_there_are() -> None:
