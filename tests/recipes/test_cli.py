@@ -142,7 +142,10 @@ def test_every_preset_runs(preset: Path) -> None:
             "there is no module 'no_such_module', neither in this folder",
         ),
         (["--import", "own.py", "list"], "named as in an import statement, without .py; got 'own.py'"),
-        (["trian"], "unknown command 'trian'; did you mean train? The commands are train, record, play"),
+        (
+            ["trian"],
+            "unknown command 'trian'; did you mean train? The commands are check, train, record, play",
+        ),
         (["train", "lerning_rate=3"], "no option 'lerning_rate'; did you mean learning_rate?"),
         (["train", "hand_v0"], "got 'hand_v0'; did you mean task=hand_v0?"),
         (["train", "ibs.flor=3"], "no option 'ibs.flor'; did you mean floor?"),
@@ -172,7 +175,10 @@ def test_every_preset_runs(preset: Path) -> None:
             ["play", "nowhere"],
             "nowhere is neither the folder of a run, nor the file of an exported policy, nor one",
         ),
-        (["fly"], "unknown command 'fly'; the commands are train, record, play, export, plot, study, report"),
+        (
+            ["fly"],
+            "unknown command 'fly'; the commands are check, train, record, play, export, plot, study, report",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

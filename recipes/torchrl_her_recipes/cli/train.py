@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 import yaml
@@ -47,6 +48,7 @@ def train(options: tuple[str, ...], multirun: bool, jobs: int | None, resume: Pa
         if not resume.is_dir():
             raise ValueError(f"{resume} is no folder of a run: it has no config.yaml")
         _say_start(resume)
+        _say_finished(recipes.RunFolder(resume), changes)
         return _say_end(recipes.resume(resume, options=changes))
     wanted = list(requests(options, multirun=multirun))  # all are checked before the first one starts
     if show:
@@ -99,6 +101,14 @@ def _sweep(wanted: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
 
 def _say_start(folder: Path) -> None:
     click.echo(f"run: {folder}")
+
+
+def _say_finished(home: recipes.RunFolder, changes: dict[str, Any]) -> None:
+    epochs, rows = home.recipe().run.epochs, home.rows()
+    if "epochs" not in changes and rows and rows[-1]["epoch"] >= epochs:
+        click.echo(
+            f"it has finished its {epochs} epochs; with keep_buffer=true in its recipe, epochs=N adds more"
+        )
 
 
 def _say_end(result: recipes.RunResult) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
@@ -34,11 +35,13 @@ COLORS = {  # of algorithms, the same in every picture
 _ORDER = ("her", "filtered_her", "filtered_her_ibs", "her_ibs", "unfiltered_cher", "her_ibs_sequential")
 _COLORS = tuple(dict.fromkeys([*(COLORS[name] for name in _ORDER), *COLORS.values()]))  # of all others
 _REGIONS = {"goals": "#63b3ed", "reach": "#fc8181"}
+_MOST_LINES = 15  # runs that are drawn one by one
+_MOST_COLUMNS = 6  # panels beside each other
 _SCREEN = 300  # pixels of the picture behind a heat map
 
 
 def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
-    """Draws the curves of a run; of several ones the median, and the 33rd to 67th percentile.
+    """Draws the curves of a run; of several ones the median, the 33rd to 67th percentile, and each of them.
 
     Args:
         rows: the table of metrics, one row an epoch and run.
@@ -57,6 +60,10 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
         axes.grid(alpha=0.3)
         if limits is not None:
             axes.set_ylim(*limits)
+    several = len({row["run"] for row in rows}) > 1
+    said = ["line: median, band: 33rd to 67th percentile, thin lines: single runs"] if several else []
+    said += ["dotted: a run goes on to the next layer"] if layer_changes(rows) else []
+    figure.supxlabel("; ".join(said), fontsize=9)
     save_figure(figure, path)
 
 
@@ -82,15 +89,21 @@ def plot_comparison(
     """
     columns = [(title, curves, name) for name in metrics for title, curves in panels.items()]
     rows = len(metrics) if len(panels) > 1 else 1
-    width = len(columns) // rows
+    if len(metrics) == 1:
+        rows = math.ceil(len(columns) / _MOST_COLUMNS)
+    width = math.ceil(len(columns) / rows)
     figure = Figure(figsize=(1.0 + 4.2 * width, 3.8 * rows), layout="constrained")
-    grid = figure.subplots(rows, width, sharey="row" if width == len(panels) else False, squeeze=False)
-    for axes, (title, curves, name) in zip(grid.flat, columns, strict=True):
+    grid = figure.subplots(
+        rows, width, sharey="row" if len(metrics) == 1 or width == len(panels) else False, squeeze=False
+    )
+    for axes, (title, curves, name) in zip(grid.flat, columns, strict=False):
         draw_curves(axes, curves, name, colors(list(curves)))
         axes.set(title=title, xlabel="environment steps of each run")
         axes.legend(fontsize=8)
-        if axes not in grid[:, 0] and width == len(panels):
+        if axes not in grid[:, 0] and (len(metrics) == 1 or width == len(panels)):
             axes.set_ylabel("")
+    for axes in grid.flat[len(columns) :]:
+        axes.set_visible(False)
     gap = " " if rows == 1 else "\n"
     grid[0, 0].set_ylabel(f"{grid[0, 0].get_ylabel()}{gap}(median, 33rd to 67th percentile)")
     save_figure(figure, path)
@@ -146,8 +159,11 @@ def draw_curve(
     color: str = "#2b6cb0",
     label: str | None = None,
 ) -> None:
-    """One metric over environment steps, on given axes: median, and 33rd to 67th percentile."""
+    """One metric over environment steps, on given axes: median, 33rd to 67th percentile, and single runs."""
     frames, low, middle, high = band(rows, name)
+    each = by_frames(rows, name)[1]
+    if 1 < each.shape[1] <= _MOST_LINES:
+        axes.plot(frames, each, color=color, linewidth=0.6, alpha=0.4)
     axes.plot(frames, middle, color=color, label=label, marker="o" if len(frames) == 1 else None)
     axes.fill_between(frames, low, high, color=color, alpha=0.25, linewidth=0)
 

@@ -166,6 +166,8 @@ def read_weights(name: str | Path) -> dict[str, Tensor]:
 def _path_of(name: str | Path) -> Path:
     path = TRAINED / f"{name}.pt" if str(name) in policy_names() else Path(name)
     if not path.is_file():
+        if path.suffix or len(path.parts) > 1:
+            raise ValueError(f"there is no file {path}")
         raise ValueError(f"there is no policy {str(name)!r}; there are {', '.join(policy_names())}")
     return path
 

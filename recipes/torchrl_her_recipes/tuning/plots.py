@@ -15,6 +15,7 @@ from torchrl_her_recipes.config.spaces import Entry, Space
 from torchrl_her_recipes.runs.plots import COLORS, save_figure
 from torchrl_her_recipes.tuning.standing import TrialRow
 
+_MANY_TRIALS = 20
 _COLOR, _PALE = COLORS["filtered_her_ibs"], COLORS["her_ibs_sequential"]
 
 
@@ -39,16 +40,18 @@ def plot_history(trials: Sequence[TrialRow], path: Path) -> None:
     save_figure(figure, path)
 
 
-def plot_importance(importance: Mapping[str, float], path: Path) -> None:
+def plot_importance(importance: Mapping[str, float], path: Path, *, trials: int) -> None:
     """Draws how much each option matters.
 
     Args:
         importance: as a share of 1, the largest first.
         path: of the picture.
+        trials: that it was found from; few of them only let one guess.
     """
     figure = Figure(figsize=(7.0, 1.2 + 0.32 * len(importance)), layout="constrained")
     axes = figure.subplots()
-    axes.set_title("how much each option decides about good trials")
+    guess = f" (a guess, from {trials} trials)" if trials < _MANY_TRIALS else ""
+    axes.set_title(f"how much each option decides about good trials{guess}")
     bars = axes.barh(list(importance), list(importance.values()), color=_COLOR)
     axes.bar_label(bars, fmt="{:.0%}", padding=3, fontsize=8)
     axes.invert_yaxis()

@@ -35,7 +35,7 @@ def write_standing(search: Search, home: SearchFolder, study: Study, *, pictures
             plot_history(standing.trials, home.history)
             plot_options(standing.trials, search.space, home.options)
             if standing.importance:
-                plot_importance(standing.importance, home.importance)
+                plot_importance(standing.importance, home.importance, trials=len(standing.ranked))
     except OSError as error:  # a full disk: the trials are worth more
         warnings.warn(f"the results in {home.path} are not up to date: {error}", stacklevel=2)
     return standing

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from torchrl_her_envs import TASKS, ThrowingEnv, make_env
-from torchrl_her_recipes.runs.plots import COLORS, colors, draw_goals
+from torchrl_her_recipes.runs.plots import COLORS, colors, draw_curve, draw_goals, plot_comparison
 
 GOALS = [(0.627, 0.021), (-0.35, 0.4), (0.9, -0.7), (0.1, 0.85)]  # the first is the one of the bug report
 
@@ -113,3 +115,25 @@ def test_no_two_lines_of_a_picture_have_one_color() -> None:
         assert list(palette) == labels
         assert len(set(palette.values())) == len(labels)
     assert colors([*COLORS, "case"])["case"] in COLORS.values()  # none is left: they begin again
+
+
+def rows(runs: int) -> list[dict[str, float]]:
+    return [
+        {"run": run, "frames": 100.0 * epoch, "success": 0.1 * run % 1}
+        for epoch in (1, 2, 3)
+        for run in range(runs)
+    ]
+
+
+@pytest.mark.parametrize(("runs", "lines"), [(1, 1), (3, 4), (15, 16), (16, 1)])
+def test_up_to_fifteen_runs_have_a_line_each_beneath_their_median(runs: int, lines: int) -> None:
+    axes = Figure().subplots()
+    draw_curve(axes, rows(runs), "success")
+    assert len(axes.lines) == lines
+    assert axes.lines[-1].get_linewidth() > 1 or runs == 1
+
+
+def test_many_panels_are_in_several_rows(tmp_path: Path) -> None:
+    plot_comparison({f"task {number}": {"her": rows(2)} for number in range(8)}, tmp_path / "many.png")
+    with Image.open(tmp_path / "many.png") as picture:
+        assert picture.width < 3 * picture.height
