@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_her.goals.rewards import RewardFunction, ask_reward
 from torchrl_her.replay_buffers.episodes import Episodes
-from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of, failed, stored_as
+from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of, failures, stored_as
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, n_step_return, windows
 
 
@@ -90,7 +90,7 @@ def virtual_copies(
     """Some transitions for other goals, each for its own.
 
     Over several steps, a transition ends where it terminates: by the reward function, or because the episode
-    did so although its goal was not achieved.
+    did so although its goal was not achieved. What such a failure cost besides the goal's reward is kept.
 
     Args:
         rows: [n], collected transitions.
@@ -101,17 +101,19 @@ def virtual_copies(
         achieved_reward: the reward of an achieved goal.
         keys, n_steps, gamma: as for :func:`real_copies`.
     """
-    achieved, fallen = entry_of(rows, keys.next_achieved), failed(rows, keys, reward_fn, achieved_reward)
+    achieved = entry_of(rows, keys.next_achieved)
+    failed, cost = failures(rows, keys, reward_fn, achieved_reward)
     if n_steps == 1 or gamma is None:
         reward, terminated = ask_reward(reward_fn, achieved.index_select(0, source), goals)
-        terminated = terminated | fallen.index_select(0, source)
+        reward, terminated = reward + cost[source], terminated | failed[source]
         truncated = entry_of(rows, keys.truncated).index_select(0, source)
         return Copies(source, source, keys.changes(goals, reward, terminated, truncated), reward.flatten())
     window, inside = _windows(rows, episodes, source, n_steps)
     reward, terminated = ask_reward(
         reward_fn, achieved[window], goals.unsqueeze(1).expand(-1, window.shape[1], -1)
     )
-    out = n_step_return(reward, terminated | fallen[window], inside, gamma)
+    reward = reward + cost[window]
+    out = n_step_return(reward, terminated | failed[window], inside, gamma)
     last = _at(window, out.last)
     truncated = entry_of(rows, keys.truncated).index_select(0, last)
     changes = keys.changes(goals, out.reward, out.terminated, truncated)
@@ -145,7 +147,8 @@ def virtual_episodes(
     table, inside = episodes.rows[number], episodes.inside[number]
     wanted = goals.unsqueeze(1).expand(-1, table.shape[1], -1)
     reward, terminated = ask_reward(reward_fn, entry_of(rows, keys.next_achieved)[table], wanted)
-    terminated = terminated | failed(rows, keys, reward_fn, achieved_reward)[table]
+    failed, cost = failures(rows, keys, reward_fn, achieved_reward)
+    reward, terminated = reward + cost[table], terminated | failed[table]
     ended = terminated.squeeze(-1).cumsum(-1) - terminated.squeeze(-1).to(torch.int64)
     used = inside & (ended == 0)
     stop = used.clone()

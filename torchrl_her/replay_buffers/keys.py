@@ -12,6 +12,8 @@ from torch import Tensor
 from torchrl_her.checks import check_finite
 from torchrl_her.goals.rewards import RewardFunction, ask_reward
 
+_LEAST_COST = 1e-4  # relative: what is less is an error of rounding
+
 
 @dataclass(frozen=True)
 class TransitionKeys:
@@ -83,12 +85,12 @@ class TransitionKeys:
         }
 
 
-def failed(
+def failures(
     transitions: TensorDictBase, keys: TransitionKeys, reward_fn: RewardFunction, achieved_reward: float
-) -> Tensor:
-    """Where an episode terminated although its goal was not achieved, as by a fall: [n, 1] of bool.
+) -> tuple[Tensor, Tensor]:
+    """Where an episode terminated although its goal was not achieved, as by a fall, and what that cost.
 
-    It would have terminated there whatever the goal, so it does for virtual goals, too.
+    It would have terminated there whatever the goal, and at the same cost, so it does for virtual goals, too.
 
     Args:
         transitions: [n], as collected.
@@ -96,23 +98,33 @@ def failed(
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
         achieved_reward: the reward of an achieved goal.
 
+    Returns:
+        ``(failed, cost)``, [n, 1] of bool, and of rewards: how much less than the reward of the goals there
+        was, 0 where nothing failed.
+
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_her import GoalReward, HindsightOptions
         >>> goals = {"achieved_goal": torch.tensor([[0.0], [5.0]]), "desired_goal": torch.zeros(2, 1)}
-        >>> after = {"terminated": torch.ones(2, 1).bool(), "reward": torch.tensor([[0.0], [-1.0]]), **goals}
+        >>> after = {"terminated": torch.ones(2, 1).bool(), "reward": torch.tensor([[0.0], [-6.0]]), **goals}
         >>> keys = HindsightOptions().transition_keys()
-        >>> failed(TensorDict({"next": after}, [2]), keys, GoalReward(0.1), 0.0).tolist()
-        [[False], [True]]
+        >>> failed, cost = failures(TensorDict({"next": after}, [2]), keys, GoalReward(0.1), 0.0)
+        >>> failed.tolist(), cost.tolist()
+        ([[False], [True]], [[0.0], [-5.0]])
     """
     reward, terminated = (entry_of(transitions, key).reshape(-1) for key in (keys.reward, keys.terminated))
-    out = terminated & (reward < achieved_reward)
-    at = out.nonzero().squeeze(-1)
+    failed, cost = terminated & (reward < achieved_reward), torch.zeros_like(reward)
+    at = failed.nonzero().squeeze(-1)
     if len(at) > 0:  # what the reward function terminates was a success, though with another reward
         goals = (entry_of(transitions, key)[at] for key in (keys.next_achieved, keys.goals[1]))
-        out[at] = ~ask_reward(reward_fn, *goals)[1].flatten()
-    return out.unsqueeze(-1)
+        own_reward, own_end = (answer.flatten() for answer in ask_reward(reward_fn, *goals))
+        failed[at] = ~own_end
+        less = (reward[at] - own_reward).to(cost.dtype)
+        cost[at] = less.where(
+            ~own_end & (less < -_LEAST_COST * (1 + own_reward.abs())), torch.zeros_like(less)
+        )
+    return failed.unsqueeze(-1), cost.unsqueeze(-1)
 
 
 def under_next(key: NestedKey) -> NestedKey:

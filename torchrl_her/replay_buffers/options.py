@@ -60,7 +60,8 @@ class HindsightOptions:
             (Filtered-HER). This asks the reward and not ``terminated``, since many environments never
             terminate.
         achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved. A
-            transition that terminated with a lower reward fell: it terminates for virtual goals, too.
+            transition that terminated with a lower reward failed, as by a fall: it terminates for virtual
+            goals, too, and costs as much.
         exclude: entries to leave out, in the root and under ``next``. ``state`` is one of them because it
             holds the real goal. Add whatever else was computed from the desired goal.
         achieved_goal_key, desired_goal_key: goals, in the root and under ``next``.

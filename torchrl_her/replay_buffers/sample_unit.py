@@ -32,7 +32,7 @@ from torchrl_her.goals.rewards import RewardFunction, ask_reward
 from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
-from torchrl_her.replay_buffers.keys import device_of, entry_of, failed, stored_as
+from torchrl_her.replay_buffers.keys import device_of, entry_of, failures, stored_as
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_return, windows
 from torchrl_her.replay_buffers.neighbors import (
     MASK,
@@ -255,7 +255,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         else:
             achieved = entry_of(data, self._keys.next_achieved)[rows]
             reward, terminated = ask_reward(self.reward_fn, achieved, chosen.goals)
-            terminated = terminated | failed(data, self._keys, self.reward_fn, self.achieved_reward)[rows]
+            failed, cost = failures(data, self._keys, self.reward_fn, self.achieved_reward)
+            reward, terminated = reward + cost[rows], terminated | failed[rows]
         truncated = entry_of(out, self._keys.truncated)[rows]
         for key, value in self._keys.changes(chosen.goals, reward, terminated, truncated).items():
             entry = entry_of(out, key)
@@ -333,9 +334,10 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         if len(virtual) > 0:
             wanted = goals.unsqueeze(1).expand(-1, window.shape[1], -1)
             own_reward, own_end = ask_reward(self.reward_fn, stored.after[window[virtual]], wanted)
-            fallen = failed(stored.rows, self._keys, self.reward_fn, self.achieved_reward)[window[virtual]]
+            failed, cost = failures(stored.rows, self._keys, self.reward_fn, self.achieved_reward)
+            own_reward = own_reward + cost[window[virtual]]
             reward[virtual] = stored_as(own_reward, reward[0], self._keys.reward).view_as(own_reward)
-            end[virtual] = own_end | fallen
+            end[virtual] = own_end | failed[window[virtual]]
         returns = n_step_return(reward, end, inside, gamma)
         last = window.gather(-1, returns.last.unsqueeze(-1)).squeeze(-1)
         return _Ahead(stored.rows.get("next")[last], returns)

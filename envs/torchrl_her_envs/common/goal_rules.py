@@ -172,6 +172,8 @@ def _missed(far: float, equal: float, others: Sequence[float] | np.ndarray) -> n
 def check_same_rewards(name: str, stepped: np.ndarray, computed: np.ndarray) -> str:
     """A warning for rewards of steps [n] that differ from those computed for their goals; empty if none does.
 
+    Steps in which an episode failed are left out: what that cost is kept in virtual transitions.
+
     Example:
         >>> check_same_rewards("walk", np.array([-1.0, -1.2]), np.array([-1.0, -1.0]))
         'walk: a step gave the reward -1.2, and compute_reward -1 for the same goals, ...'

@@ -43,7 +43,7 @@ class Facts:
         max_steps: length of an episode.
         actions: the least and the greatest value of each entry; None if actions are discrete.
         scales: the least and the greatest standard deviation of entries of the observation.
-        disagree: share of steps whose reward is not that of ``compute_reward``.
+        disagree: share of steps whose reward is not that of ``compute_reward``, failures aside.
         achieved: share of the episodes in which the goal was achieved.
         moved: share of the episodes in which what is achieved changed enough to be another goal.
         kept: share of transitions for which the filter finds a later goal of the episode.
@@ -135,6 +135,8 @@ def _facts(
         achieved.append(bool(meets(there, own["next", "desired_goal"]).any()))
     computed = task.compute_reward(rows["next", "achieved_goal"], rows["next", "desired_goal"])
     reward = rows["next", "reward"]
+    went_on = ~rows["next", "terminated"] | (computed >= achieved_reward)  # what a failure costs is kept
+    differ = went_on & ((reward - computed).abs() > _DIGITS * (1 + computed.abs()))
     ended = [bool(own["next", "terminated"].any()) for own in played]
     seen = rows["observation"].double()
     spread = seen.std(0)
@@ -147,7 +149,7 @@ def _facts(
         max_steps=task.max_steps,
         actions=actions,
         scales=(float(moving.min()), float(moving.max())) if len(moving) else (0.0, 0.0),
-        disagree=float(((reward - computed).abs() > _DIGITS * (1 + computed.abs())).float().mean()),
+        disagree=float(differ.float().mean()),
         achieved=sum(achieved) / count,
         moved=sum(moved) / count,
         kept=float(torch.cat(kept).float().mean()),
@@ -267,7 +269,7 @@ def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> li
     if facts.disagree:
         lines.append(
             f"{facts.disagree:.0%} of the steps have another reward than compute_reward gives: "
-            "virtual transitions lack what is added there, such as a cost of actions or of a crash"
+            "virtual transitions lack what is added there, such as a cost of actions"
         )
     if facts.goal_inside:
         lines.append(

@@ -991,6 +991,26 @@ def test_a_fall_terminates_virtual_transitions_too(options: dict[str, Any]) -> N
     assert torch.equal(rows["next", "done"][:, 0], at_end)
 
 
+@pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.5}])
+def test_what_a_fall_cost_is_kept_for_other_goals(options: dict[str, Any]) -> None:
+    never = EnvReward(lambda a, d: REWARD(a, d)[0] - 1.0, lambda a, d: torch.zeros_like(a[..., :1]).bool())
+    drawn = []
+    for cost in (0.0, 5.0):
+        buffer = make_buffer(reward=never, k=NEVER_REAL, **options)
+        batch = flat([[4]], terminated=True)
+        own = never(batch["next", "achieved_goal"], batch["next", "desired_goal"])[0]
+        batch["next", "reward"] = own - torch.where(batch["next", "terminated"], cost, 0.0)
+        buffer.extend(batch)
+        torch.manual_seed(0)
+        drawn.append(buffer.sample(100))
+    free, costly = drawn
+    assert torch.equal(free["desired_goal"], costly["desired_goal"])
+    at_end = free["next", "observation"][:, :1] == 4
+    steps = free.get("steps_to_next_obs", torch.ones_like(at_end, dtype=torch.int64))
+    expected = free["next", "reward"] - torch.where(at_end, 5.0 * 0.5 ** (steps - 1), 0.0)
+    torch.testing.assert_close(costly["next", "reward"], expected)
+
+
 def test_a_buffer_that_is_shared_between_processes_is_refused() -> None:
     buffer = make_beside(shared=True)
     buffer.extend(flat([[5]]))

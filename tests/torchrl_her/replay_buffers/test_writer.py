@@ -1047,6 +1047,27 @@ def test_a_fall_terminates_virtual_transitions_too(options: dict[str, Any]) -> N
     assert torch.equal(virtual["next", "done"][:, 0], at_end)
 
 
+@pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.5}, {"per": "episode"}])
+def test_what_a_fall_cost_is_kept_for_other_goals(options: dict[str, Any]) -> None:
+    never = EnvReward(lambda a, d: REWARD(a, d)[0] - 1.0, lambda a, d: torch.zeros_like(a[..., :1]).bool())
+    stored = []
+    for cost in (0.0, 5.0):
+        batch = fall([[4]])
+        end = batch["next"][:, -1]
+        batch["next", "reward"][:, -1] = never(end["achieved_goal"], end["desired_goal"])[0] - cost
+        torch.manual_seed(0)
+        buffer = make_buffer(reward=never, k=2, **options)
+        buffer.extend(batch)
+        stored.append(split(buffer)[1])
+    free, costly = stored
+    assert torch.equal(free["desired_goal"], costly["desired_goal"])
+    at_end = free["next", "observation"][:, :1] == 4
+    steps = free.get("steps_to_next_obs", torch.ones_like(at_end, dtype=torch.int64))
+    expected = free["next", "reward"] - torch.where(at_end, 5.0 * 0.5 ** (steps - 1), 0.0)
+    torch.testing.assert_close(costly["next", "reward"], expected)
+    assert at_end.any()
+
+
 def test_slices_of_a_list_are_refused() -> None:
     """TorchRL writes its marks into the list."""
     buffer = TensorDictReplayBuffer(
