@@ -47,6 +47,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "lift_ablation": str(HERE / "studies" / "lift_ablation.yaml"),
     "fetch_ibs": "fetch_ibs",
     "hand_reach": str(HERE / "studies" / "hand_reach.yaml"),
+    "defaults": "defaults",
     "window": "window",
     "initialisation": "initialisation",
 }

@@ -24,6 +24,7 @@ from torchrl_her_recipes import (
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config import imports
 from torchrl_her_recipes.config.imports import check_permitted, permit_everything, permit_task
+from torchrl_her_recipes.config.trust import is_own, remember
 
 from .foreign_task import write_module
 from .small import overrides, small
@@ -62,13 +63,19 @@ def module_of(task: str) -> str:
 def test_an_environment_of_one_s_own_end_to_end(
     stranger: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Trained because it was typed; everything that reads the folder afterwards asks."""
+    """Trained because it was typed; everything that reads the folder for somebody else asks."""
     assert main(["train", *overrides(task=stranger, folder="run", pictures=True, **TINY)]) == 0
     assert "has no compute_terminated" in capsys.readouterr().err
     assert Path("run/policy.gif").stat().st_size > 500
     module, refused = module_of(stranger), REFUSED.format(module_of(stranger))
     unload(stranger)
     forget(monkeypatch)
+    assert main(["play", "run", "--goals", "2"]) == 0  # this user has trained it
+    assert "of 2 goals achieved: run/play.gif" in capsys.readouterr().out
+    Path("run/play.gif").unlink()
+    unload(stranger)
+    forget(monkeypatch)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of_somebody_else"))
     for command in (["play", "run"], ["export", "run"], ["train", "--resume", "run"]):
         assert main(command) == 2
         assert refused in capsys.readouterr().err
@@ -91,6 +98,22 @@ def test_an_environment_of_one_s_own_end_to_end(
     assert imports._permitted == set()
     assert load_trained("maze.pt", allow_import=True).task == stranger
     check_permitted(stranger)
+
+
+def test_a_run_that_was_moved_or_changed_is_nobody_s_own(tmp_path: Path) -> None:
+    config = tmp_path / "run" / "config.yaml"
+    config.parent.mkdir()
+    config.write_text("task: {name: 'mine:make'}")
+    assert not is_own(config)
+    remember(config, "hand_v1")  # names no module
+    assert not is_own(config)
+    remember(config, "mine:make")
+    assert is_own(config)
+    moved = config.parent.rename(tmp_path / "moved") / "config.yaml"
+    assert not is_own(moved)
+    remember(moved, "mine:make")
+    moved.write_text("task: {name: 'theirs:make'}")
+    assert not is_own(moved)
 
 
 def test_presets_and_studies_are_files_of_somebody_too(

@@ -15,8 +15,10 @@ import yaml
 from filelock import FileLock, Timeout
 
 from torchrl_her.files.writing import part_of, write_text
+from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import naming, read_json, read_mapping, read_table
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.trust import is_own, remember
 
 _COUNTED = ("run", "seed", "epoch", "frames")  # columns of the table
 _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict", "gymnasium", "pymunk", "numpy")
@@ -102,6 +104,7 @@ class RunFolder:
         }
         write_text(self.about, json.dumps(about, indent=2) + "\n")
         write_text(self.config, yaml.safe_dump(recipe.to_dict(), sort_keys=False))
+        remember(self.config, recipe.task.name)
 
     def describe_best(self, epoch: int, success: float) -> None:
         """Adds to what :meth:`describe` wrote which evaluation the best policy is of.
@@ -114,7 +117,7 @@ class RunFolder:
         write_text(self.about, json.dumps(about, indent=2) + "\n")
 
     def recipe(self) -> Recipe:
-        """The recipe of the run.
+        """The recipe of the run; if this user has trained it, the module that its task names may be imported.
 
         Raises:
             ValueError: this is no folder of a run, its configuration cannot be read, or a link in it leads
@@ -127,7 +130,10 @@ class RunFolder:
         self._check_links()
         values = read_mapping(self.config)
         with naming(self.config):
-            return Recipe.of_file(values)
+            recipe = Recipe.of_file(values)
+        if is_own(self.config):
+            permit_task(recipe.task.name)
+        return recipe
 
     def _check_links(self) -> None:
         """Raises a ValueError if something would be written through a link to a place elsewhere."""
