@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import io
+from contextlib import redirect_stderr
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -93,7 +95,8 @@ def _register_robotics(id: str) -> str:
     """Registers the environments of gymnasium-robotics; returns what to say if they are not installed."""
     if ":" not in id and id not in gymnasium.registry:
         try:
-            importlib.import_module("gymnasium_robotics")
+            with redirect_stderr(io.StringIO()):  # what it says there is of environments without goals
+                importlib.import_module("gymnasium_robotics")
         except ModuleNotFoundError:
             return " (gymnasium-robotics is not installed: pip install '.[robotics]')"
     return ""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -108,3 +110,9 @@ def test_films_without_a_display(suffix: str, tmp_path: Path) -> None:
     assert frames[0].shape == (64, 128, 3)
     assert frames[0].float().std() > 20  # there is something to see
     assert write_video(frames, tmp_path / f"film{suffix}").stat().st_size > 1_000
+
+
+def test_nothing_is_printed_when_they_are_made() -> None:
+    program = "from torchrl_her_envs.gym.check import make_one; make_one('FetchReach-v4', {}).close()"
+    made = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert made.stdout + made.stderr == ""
