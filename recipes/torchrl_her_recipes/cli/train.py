@@ -16,7 +16,9 @@ from torchrl_her_recipes.cli.train_options import (
     RunRequest,
     complete,
     extending,
+    folder_option,
     requests,
+    with_folder,
 )
 from torchrl_her_recipes.config.imports import foreign_module, imported_modules
 from torchrl_her_recipes.config.resolve import auto_options
@@ -32,13 +34,22 @@ from torchrl_her_recipes.config.resolve import auto_options
     help="go on with the run in this folder; with epochs=N, up to so many epochs",
 )
 @click.option("--show", is_flag=True, help="print all options of the run as YAML, and train nothing")
+@folder_option
 @allow_import
 @click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
-def train(options: tuple[str, ...], multirun: bool, jobs: int | None, resume: Path | None, show: bool) -> int:
+def train(
+    options: tuple[str, ...],
+    multirun: bool,
+    jobs: int | None,
+    resume: Path | None,
+    show: bool,
+    folder: str | None,
+) -> int:
     """Train a policy; for instance: torchrl-her train task=hand_v0 algo=filtered_her seed=0
 
     Options are named by themselves (gamma=0.95) or with their group (learner.gamma=0.95).
     """
+    options = with_folder(options, folder)
     if jobs is not None and not multirun:
         raise click.UsageError("--jobs is for a sweep: give -m as well")
     if resume is not None:

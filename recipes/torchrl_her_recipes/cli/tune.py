@@ -13,7 +13,7 @@ import torchrl_her_recipes as recipes  # its names are loaded when they are used
 from torchrl_her_recipes.cli.overrides import ARGUMENTS
 from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, file_name
-from torchrl_her_recipes.cli.train_options import complete, single
+from torchrl_her_recipes.cli.train_options import complete, folder_option, single, with_folder
 from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.config.search import PRUNERS, SAMPLERS, Search
@@ -49,10 +49,12 @@ _SEEDS = 3  # of a trial
     help="which trials are ended early: those below the median, all but a third at each rung of successive "
     "halving, or none (default: median)",
 )
+@folder_option
 @allow_import
 @click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
 def tune(
     options: tuple[str, ...],
+    folder: str | None,
     trials: int | None,
     minutes: float | None,
     jobs: int | None,
@@ -65,7 +67,7 @@ def tune(
     Options are given as to train; those that are given are not varied. Each trial trains num_runs seeds side
     by side. The same command goes on with a search.
     """
-    given = single(options)
+    given = single(with_folder(options, folder))
     folder, preset = (given.pop(name, None) for name in ARGUMENTS[::-1])
     base = merge({"num_runs": _SEEDS}, load_preset(preset) if preset else {})
     recipe = make_recipe(base, **given)

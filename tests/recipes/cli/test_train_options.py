@@ -11,7 +11,7 @@ import yaml
 
 from torchrl_her_recipes import Recipe, cli, make_recipe
 from torchrl_her_recipes.cli.train import train
-from torchrl_her_recipes.cli.train_options import complete, requests
+from torchrl_her_recipes.cli.train_options import complete, requests, with_folder
 from torchrl_her_recipes.config.shortcuts import LONG_ONLY, option_names
 
 
@@ -82,3 +82,11 @@ def test_folders_have_names_that_every_file_system_takes() -> None:
     several = requests((*tasks, "seed=0,1"), multirun=True)
     for folder in (one.folder, *(each.folder for each in several)):
         assert re.fullmatch(r"[\w./-]+", str(folder))
+
+
+def test_the_folder_is_given_in_either_way() -> None:
+    for options in (with_folder(("seed=3",), "there"), with_folder(("seed=3", "folder=there"), None)):
+        (wanted,) = requests(options, multirun=False)
+        assert wanted.folder == Path("there")
+    with pytest.raises(ValueError, match="folder"):
+        list(requests(with_folder(("folder=here",), "there"), multirun=False))
