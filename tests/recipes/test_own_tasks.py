@@ -24,7 +24,7 @@ from torchrl_her_recipes import (
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config import imports
 from torchrl_her_recipes.config.imports import check_permitted, permit_everything, permit_task
-from torchrl_her_recipes.config.trust import is_own, remember
+from torchrl_her_recipes.runs.trust import is_own, remember
 
 from .foreign_task import write_module
 from .small import overrides, small

@@ -18,7 +18,7 @@ from torchrl_her.files.writing import part_of, write_text
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import naming, read_json, read_mapping, read_table
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.trust import is_own, remember
+from torchrl_her_recipes.runs.trust import is_own, remember
 
 _COUNTED = ("run", "seed", "epoch", "frames")  # columns of the table
 _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict", "gymnasium", "pymunk", "numpy")
