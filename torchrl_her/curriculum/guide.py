@@ -189,7 +189,7 @@ class GuidedExploration(TensorDictModuleBase):
     def _look(self, state: Tensor, layer: Tensor) -> tuple[Tensor, ...]:
         """What some layers show, one for each row: the network's input, the achieved and the desired goal."""
         index = self._columns.to(state.device)[layer.flatten().clamp(min=0)]
-        entries = take_columns(torch.nn.functional.pad(state, (0, 1)), index)
+        entries = take_columns(self.curriculum.extend(state), index)
         goal = self.curriculum.goal_width
         return entries.split([self.curriculum.input_width, goal, goal], -1)
 

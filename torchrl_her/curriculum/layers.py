@@ -11,6 +11,7 @@ import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
@@ -30,12 +31,15 @@ class CurriculumLayer:
         name: for messages and reports.
         observation, achieved_goal, desired_goal: indices into the state vector, or names for them that
             :class:`~torchrl_her.Curriculum` is given.
+        constant_goal: in place of ``desired_goal`` the same goal for all episodes, as a gap in a wall; in the
+            unit of the achieved goal.
         threshold: the goal is achieved at distances below this, in the unit of the state.
         instructive: whether IBS weights apply in this layer.
 
     Raises:
         ValueError: a list is empty, an index is negative or repeated, the desired goal shares an index with
-            another list, the goals differ in width, or the threshold is not positive.
+            another list, the goals differ in width, both kinds of goals are given, a constant goal is not
+            finite, or the threshold is not positive.
 
     Example:
         >>> CurriculumLayer(
@@ -47,8 +51,9 @@ class CurriculumLayer:
     name: str
     observation: Indices
     achieved_goal: Indices
-    desired_goal: Indices
+    desired_goal: Indices = ()
     threshold: float
+    constant_goal: Sequence[float] = ()
     instructive: bool = True
 
     def __post_init__(self) -> None:
@@ -56,10 +61,11 @@ class CurriculumLayer:
             raise ValueError(
                 f"layer {self.name!r}: threshold must be positive and finite, got {self.threshold}"
             )
+        self._check_constant_goal()
         for key in _LISTS:
             given = getattr(self, key)
             entries = [given] if isinstance(given, str) else list(given)
-            if not entries:
+            if not entries and not (key == "desired_goal" and self.constant_goal):
                 raise ValueError(f"layer {self.name!r}: {key} must not be empty")
             object.__setattr__(
                 self, key, tuple(e if isinstance(e, str) else operator.index(e) for e in entries)
@@ -67,11 +73,18 @@ class CurriculumLayer:
         if not any(isinstance(entry, str) for key in _LISTS for entry in getattr(self, key)):
             self._check_indices()
 
+    def _check_constant_goal(self) -> None:
+        object.__setattr__(self, "constant_goal", tuple(map(float, self.constant_goal)))
+        if not all(map(math.isfinite, self.constant_goal)):
+            raise ValueError(f"layer {self.name!r}: constant_goal must be finite, got {self.constant_goal}")
+        if self.constant_goal and self.desired_goal:
+            raise ValueError(f"layer {self.name!r}: give desired_goal or constant_goal, got both")
+
     def _check_indices(self) -> None:
         """The checks that need no width of the state, once all names are resolved."""
         for key in _LISTS:
             entries = getattr(self, key)
-            if min(entries) < 0:
+            if min(entries, default=0) < 0:
                 raise ValueError(f"layer {self.name!r}: {key} must have indices of at least 0, got {entries}")
             if len(set(entries)) < len(entries):
                 raise ValueError(f"layer {self.name!r}: {key} must have each index once, got {entries}")
@@ -81,10 +94,11 @@ class CurriculumLayer:
                 raise ValueError(
                     f"layer {self.name!r}: desired_goal must share no index with {key}, got {shared} in both"
                 )
-        if len(self.achieved_goal) != len(self.desired_goal):
+        goal = self.desired_goal or self.constant_goal
+        if len(self.achieved_goal) != len(goal):
             raise ValueError(
-                f"layer {self.name!r}: achieved_goal and desired_goal must be of one width, "
-                f"got {self.achieved_goal} and {self.desired_goal}"
+                f"layer {self.name!r}: achieved_goal and the goal must be of one width, "
+                f"got {self.achieved_goal} and {goal}"
             )
 
 
@@ -105,18 +119,19 @@ class Curriculum:
         names: the indices into the state that names in the layers' lists stand for.
 
     Attributes:
-        layers: the layers, with indices in place of names.
+        layers: the layers, with indices in place of names and of constant goals.
+        appended: the zero and the constant goals that :meth:`extend` puts behind a state.
         observation_width, goal_width: widths of these entries, the same in every layer.
         input_width: width of the network's input.
         first_inputs: number of inputs that the first layer uses; they are the leading ones.
         state_index: [layers, observation_width + 2 * goal_width], indices of observation, achieved and
-            desired goal in the state with a zero appended.
+            desired goal in the extended state.
         input_index: [layers, input_width], indices of the network's input in the observation with the
             desired goal and a zero appended.
 
     Raises:
         ValueError: there is no layer, a name is unknown, an index lies outside of the state, goals differ in
-            width, or a layer is wider than the last one.
+            width, a layer is wider than the last one, or the last one has a constant goal.
 
     Example:
         >>> parts = {"hand": [0, 1], "ball": [2], "hole": [3]}
@@ -144,12 +159,22 @@ class Curriculum:
     ) -> None:
         if not layers:
             raise ValueError("a curriculum needs at least one layer, got none")
-        self.layers = tuple(_resolve(layer, names or {}) for layer in layers)
+        resolved = [_resolve(layer, names or {}) for layer in layers]
+        if resolved[-1].constant_goal:
+            raise ValueError(
+                f"layer {resolved[-1].name!r}: the last layer is the full task, its goal must not be constant"
+            )
         self.state_width = state_width
-        self.observation_width = len(self.layers[-1].observation)
-        self.goal_width = len(self.layers[-1].desired_goal)
-        for layer in self.layers:
-            self._check(layer)
+        self.observation_width = len(resolved[-1].observation)
+        self.goal_width = len(resolved[-1].desired_goal)
+        for layer in resolved:
+            self._check(layer, resolved[-1])
+        self.appended = [0.0, *(number for layer in resolved for number in layer.constant_goal)]
+        ends = accumulate((len(layer.constant_goal) for layer in resolved), initial=state_width + 1)
+        self.layers = tuple(
+            replace(layer, desired_goal=range(start, end), constant_goal=()) if end > start else layer
+            for layer, (start, end) in zip(resolved, pairwise(ends), strict=True)
+        )
         self.input_width = self.observation_width + self.goal_width
         self.first_inputs = len(self.layers[0].observation) + self.goal_width
         self.state_index = torch.tensor([self._state_index(layer) for layer in self.layers])
@@ -158,18 +183,37 @@ class Curriculum:
     def __len__(self) -> int:
         return len(self.layers)
 
-    def _check(self, layer: CurriculumLayer) -> None:
-        last = self.layers[-1]
+    def extend(self, state: Tensor) -> Tensor:
+        """States [..., state_width] with the zero and the constant goals behind them, which layers refer to.
+
+        Example:
+            >>> gap = CurriculumLayer(
+            ...     name="gap", observation=[0], achieved_goal=[0], constant_goal=[5.0], threshold=0.5
+            ... )
+            >>> cross = CurriculumLayer(
+            ...     name="cross", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.5
+            ... )
+            >>> curriculum = Curriculum([gap, cross], 2)
+            >>> curriculum.extend(torch.tensor([3.0, 9.0])).tolist(), curriculum.layers[0].desired_goal
+            ([3.0, 9.0, 0.0, 5.0], (3,))
+        """
+        extended = torch.nn.functional.pad(state, (0, len(self.appended)))
+        if len(self.appended) > 1:
+            extended[..., self.state_width :] = extended.new_tensor(self.appended)
+        return extended
+
+    def _check(self, layer: CurriculumLayer, last: CurriculumLayer) -> None:
         for key in _LISTS:
-            highest = max(getattr(layer, key))
+            highest = max(getattr(layer, key), default=0)
             if highest >= self.state_width:
                 raise ValueError(
                     f"layer {layer.name!r}: {key} has index {highest}, "
                     f"but the state has {self.state_width} entries: at most {self.state_width - 1} is allowed"
                 )
-        if len(layer.desired_goal) != self.goal_width:
+        width = len(layer.desired_goal or layer.constant_goal)
+        if width != self.goal_width:
             raise ValueError(
-                f"layer {layer.name!r}: the goal has {len(layer.desired_goal)} entries, but all layers need "
+                f"layer {layer.name!r}: the goal has {width} entries, but all layers need "
                 f"as many as the last one, {last.name!r}: {self.goal_width}"
             )
         if len(layer.observation) > self.observation_width:

@@ -307,8 +307,7 @@ class StateToObs(_LayerTransform):
         """Sets what the layers see; returns the goals and the squared thresholds [B, 1]."""
         state = self._get(tensordict, self.in_keys[0], self.curriculum.state_width)
         index, squares = self._lookup(state, self._rows_layers(tensordict))
-        with_zero = torch.nn.functional.pad(state, (0, 1))
-        entries = take_columns(with_zero, index).split(self._widths, -1)
+        entries = take_columns(self.curriculum.extend(state), index).split(self._widths, -1)
         for key, entry in zip(self.out_keys, entries, strict=True):
             tensordict.set(key, entry)
         return entries[1], entries[2], squares

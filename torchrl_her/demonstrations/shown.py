@@ -79,7 +79,7 @@ def in_layer(demonstrations: Demonstrations, curriculum: Curriculum, layer: int)
                 f"the curriculum needs states of width {curriculum.state_width}, demonstrations of "
                 f"{demonstrations.task} have {state.shape[-1]}"
             )
-        shown = take_columns(torch.nn.functional.pad(state, (0, 1)), index).split(widths, -1)
+        shown = take_columns(curriculum.extend(state), index).split(widths, -1)
         own.update(dict(zip(("observation", "achieved_goal", "desired_goal"), shown, strict=True)))
     after["terminated"] = torch.zeros_like(after["terminated"])
     rows.set("next", after)

@@ -81,8 +81,8 @@ def choose_ends(
     """
     if termination == "success" and not tells_success:
         raise ValueError(
-            f"termination=success needs info['is_success'], which {name} does not give: "
-            "choose reward or never"
+            f"task.options.termination=success needs info['is_success'], which {name} does not give: "
+            "choose task.options.termination=reward or never"
         )
     if termination != "auto":
         return termination
@@ -97,8 +97,11 @@ def choose_ends(
     elif bool(achieved.any()):
         why = f"in a trial it ended where a goal was achieved, so goals end an episode, where {where}"
     else:
-        why = f"goals are taken to end an episode, where {where}; if it goes on, choose termination=never"
-    say_once(f"{name} has no compute_terminated: {why} (termination={ends})")
+        why = (
+            f"goals are taken to end an episode, where {where}; if it goes on, choose "
+            "task.options.termination=never"
+        )
+    say_once(f"{name} has no compute_terminated: {why} (task.options.termination={ends})")
     return ends
 
 
@@ -141,9 +144,9 @@ def check_rewards(
             example = f"{equal - 0.05 * (equal - far):.2g}"
             raise ValueError(
                 f"{name} has a dense reward: goals that are not achieved give "
-                f"{', '.join(f'{value:g}' for value in some)} and more, equal ones {equal:g}. Give "
-                "achieved_reward, the reward from which on a goal counts as achieved, as in "
-                f"task.options.achieved_reward={example}, or choose a sparse reward"
+                f"{', '.join(f'{value:g}' for value in some)} and more, equal ones {equal:g}. Say from "
+                f"which reward on a goal counts as achieved, as in task.options.achieved_reward={example}, "
+                "or choose a sparse reward"
             )
         return float(missed[0]), equal, False
     if isinstance(given, bool) or not isinstance(given, int | float) or not far < given <= equal:

@@ -230,7 +230,10 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         self._envs, self._name = list(envs), name
         limit = max_steps if max_steps is not None else getattr(first, "max_steps", None)
         if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
-            raise ValueError(f"{name} needs max_steps, a whole number of at least 1, got {limit!r}")
+            raise ValueError(
+                f"{name} needs a time limit, a whole number of steps, as in task.options.max_steps=100, "
+                f"got {limit!r}"
+            )
         self.max_steps = limit
         self._check(first)
         self._make_specs(first)

@@ -103,7 +103,8 @@ def make_gym_env(
         if spec_of(reference_env).max_episode_steps is None:
             options["max_episode_steps"] = limit = find_limit(reference_env)
             say_once(
-                f"{id} has no registered time limit: episodes are cut off after {limit} steps (max_steps)"
+                f"{id} has no registered time limit: episodes are cut off after {limit} steps "
+                f"(task.options.max_steps={limit})"
             )
             reference_env = opened.enter_context(closing(make_one(id, options)))
         if pictures and draws(reference_env) and "render_mode" not in options:
@@ -199,8 +200,8 @@ class GymGoalEnv(TaskTraits, GymWrapper):
             achieved_reward = find_achieved_reward(env, layout, self._reward_of, *trial.pairs())
             if achieved_reward is not None:
                 say_once(
-                    f"{id} has a dense reward: goals count as achieved from {achieved_reward:.4g} on "
-                    "(achieved_reward), where _is_success becomes true"
+                    f"{id} has a dense reward: goals count as achieved where _is_success becomes true "
+                    f"(task.options.achieved_reward={achieved_reward:.4g})"
                 )
         self.missed_reward, self.achieved_reward, self.dense_reward = check_rewards(
             id, far, equal, others, achieved_reward

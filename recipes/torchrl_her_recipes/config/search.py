@@ -49,7 +49,7 @@ class Search:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
         if self.sampler == "cmaes" and sum(entry.kind != "choice" for entry in self.space) < 2:
             raise ValueError(
-                f"sampler=cmaes needs two options that are no choices, and the space {self.space.name} "
+                f"--sampler cmaes needs two options that are no choices, and the space {self.space.name} "
                 "has fewer: take tpe or random"
             )
         self.space.check(self.recipe)

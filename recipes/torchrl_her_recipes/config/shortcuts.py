@@ -44,6 +44,10 @@ GROUPS: dict[str, type[Group]] = {
 LONG_ONLY = ("demonstrations",)  # its options are always named with it: of what would ``file`` be?
 
 
+# what tasks of gymnasium and of one's own take, whatever else they take
+TASK_OPTIONS = ("max_steps", "termination", "achieved_reward", "parallel")
+
+
 class Entries(dict[str, Any]):
     """Some entries of a mapping, as ``task.options.bits=8`` gives them: the other entries stay."""
 
@@ -98,6 +102,8 @@ def locate(name: str) -> tuple[str, str]:
     named = [each for each, known in names.items() if "name" in known]
     if long := [f"{group}.{name}" for group in LONG_ONLY if name in names[group]]:
         raise ValueError(f"no option {name!r}; did you mean {long[0]}?")
+    if name in TASK_OPTIONS:
+        raise ValueError(f"{name} is an option of the task: write task.options.{name}=...")
     short = [known for group, known in names.items() if group not in LONG_ONLY]
     every = [own for known in short for own in known if own != "name"] + named
     raise ValueError(f"no option {name!r}{nearest(name, every)}; `torchrl-her train -h` lists them")

@@ -75,7 +75,7 @@ def make_sampler(name: str, seed: int) -> BaseSampler:
         ImportError: it needs a package that is not installed.
     """
     if name == "cmaes" and find_spec("cmaes") is None:
-        raise ImportError("sampler=cmaes needs cmaes: pip install '.[tune]'")
+        raise ImportError("--sampler cmaes needs cmaes: pip install '.[tune]'")
     made: dict[str, Callable[[int], BaseSampler]] = {
         "tpe": lambda own: TPESampler(seed=own),
         "random": lambda own: RandomSampler(seed=own),

@@ -136,7 +136,7 @@ def test_pictures(name: str) -> None:
         (f"{HERE}:NOT_CALLABLE", {}, "needs a function or class 'NOT_CALLABLE'"),
         (f"{HERE}:make_number", {}, "must give a TorchRL EnvBase, got int"),
         (f"{HERE}:Bare", {}, "lacks the method 'compute_reward'"),
-        (f"{HERE}:Endless", {}, "needs max_steps, a whole number of at least 1, got None"),
+        (f"{HERE}:Endless", {}, "needs a time limit, .* as in task.options.max_steps=100, got None"),
         (f"{HERE}:Wide", {}, r"compute_reward .* must give a tensor \[.*1\] for goals"),
         (f"{HERE}:Point", {"size": 2}, r"must give environments of batch size \[\], got \[2\], or take"),
         (f"{HERE}:Point", {"speed": 2}, "takes no option 'speed'; its options are max_steps, .* dense"),

@@ -89,7 +89,11 @@ def steps(env: GymGoalEnv, count: int = 60) -> Any:
         ({}, "success", r"ended where a goal was achieved, .* where info\['is_success'\] is true"),
         ({"tells": False}, "reward", "ended where .* where the reward is that of an achieved goal"),
         ({"stops": False}, "never", "it went on after a goal was achieved, so goals never end an episode"),
-        ({"unseen": True}, "success", "goals are taken to end .*; if it goes on, choose termination=never"),
+        (
+            {"unseen": True},
+            "success",
+            "goals are taken to end .*; if it goes on, choose task.options.termination=never",
+        ),
         ({"unseen": True, "tells": False}, "reward", "goals are taken to end an episode"),
     ],
 )
@@ -100,7 +104,7 @@ def test_what_ends_an_episode_is_found_by_trying_and_said_once(
         assert plain(**options).ends == ends
     (record,) = said.records
     assert record.getMessage().startswith("tests/Plain-v0 has no compute_terminated: ")
-    assert record.getMessage().endswith(f"(termination={ends})")
+    assert record.getMessage().endswith(f"(task.options.termination={ends})")
     assert re.search(why, record.getMessage()), record.getMessage()
 
 
@@ -159,7 +163,10 @@ def test_what_was_asked_for_takes_the_place_of_the_method() -> None:
     ("options", "message"),
     [
         ({"termination": "sometimes"}, "must be one of auto, success, reward, never, got 'sometimes'"),
-        ({"termination": "success", "tells": False}, r"termination=success needs info\['is_success'\]"),
+        (
+            {"termination": "success", "tells": False},
+            r"task.options.termination=success needs info\['is_success'\]",
+        ),
         (
             {"dense": True},
             "Plain-v0 has a dense reward: .* give -4, .*, -1 and more, equal ones 0",
@@ -215,7 +222,7 @@ def test_the_achieved_reward_of_a_dense_one_is_found_if_the_environment_tells_su
     env = make_gym_env("tests/Telling-v0")
     assert env.dense_reward
     assert env.achieved_reward == pytest.approx(-1.25)
-    line = "tests/Telling-v0 has a dense reward: goals count as achieved from -1.25 on"
+    line = "tests/Telling-v0 has a dense reward: goals count as achieved where _is_success becomes true"
     assert any(record.getMessage().startswith(line) for record in said.records)
     with pytest.raises(ValueError, match="has a dense reward"):  # success does not follow from the reward
         make_gym_env("tests/Telling-v0", strange=True)

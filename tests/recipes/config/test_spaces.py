@@ -156,7 +156,7 @@ def test_what_the_recipe_does_not_take_is_refused(text: str, message: str, tmp_p
 def test_samplers_and_spaces_that_do_not_go_together() -> None:
     recipe = make_recipe(task="hand_v0")
     space = make_space("mine", {"k": {"kind": "int", "low": 1, "high": 4}})
-    with pytest.raises(ValueError, match="sampler=cmaes needs two options that are no choices"):
+    with pytest.raises(ValueError, match="--sampler cmaes needs two options that are no choices"):
         Search(recipe=recipe, space=space, sampler="cmaes")
     with pytest.raises(ValueError, match="sampler must be one of tpe, random, cmaes, got 'grid'"):
         Search(recipe=recipe, space=space, sampler="grid")  # type: ignore[arg-type]

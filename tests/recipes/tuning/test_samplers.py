@@ -55,5 +55,5 @@ def test_seeds_differ_and_tpe_learns_where_good_trials_are() -> None:
 
 def test_a_sampler_whose_package_is_missing_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchrl_her_recipes.tuning.samplers.find_spec", lambda _name: None)
-    with pytest.raises(ImportError, match=r"sampler=cmaes needs cmaes: pip install '.\[tune\]'"):
+    with pytest.raises(ImportError, match=r"--sampler cmaes needs cmaes: pip install '.\[tune\]'"):
         make_sampler("cmaes", 0)

@@ -112,11 +112,32 @@ def test_a_layer_keeps_what_it_is_given() -> None:
             r"layer 'one': desired_goal must share no index with achieved_goal, got \[0\]",
         ),
         ({"desired_goal": [2, 3]}, r"layer 'one': .* of one width, got \(0,\) and \(2, 3\)"),
+        ({"constant_goal": [0.5]}, r"layer 'one': give desired_goal or constant_goal, got both"),
+        ({"desired_goal": [], "constant_goal": [math.nan]}, r"constant_goal must be finite, got \(nan,\)"),
+        ({"desired_goal": [], "constant_goal": [1.0, 2.0]}, r"of one width, got \(0,\) and \(1.0, 2.0\)"),
+        ({"desired_goal": []}, r"layer 'one': desired_goal must not be empty"),
     ],
 )
 def test_bad_layers_are_named(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_layer(**options)
+
+
+def test_a_stage_may_have_a_constant_goal() -> None:
+    gap = CurriculumLayer(
+        name="gap", observation=[0, 1], achieved_goal=[0, 1], constant_goal=[5.0, 8.5], threshold=0.5
+    )
+    cross = CurriculumLayer(
+        name="cross", observation=[0, 1], achieved_goal=[0, 1], desired_goal=[2, 3], threshold=0.5
+    )
+    curriculum = Curriculum([gap, cross], 4)
+    states = torch.tensor([[1.0, 2.0, 3.0, 4.0], [6.0, 7.0, 8.0, 9.0]])
+    index = curriculum.state_index
+    assert curriculum.extend(states)[:, index[0]].tolist() == [
+        [1.0, 2.0, 1.0, 2.0, 5.0, 8.5],
+        [6.0, 7.0, 6.0, 7.0, 5.0, 8.5],
+    ]
+    assert curriculum.extend(states)[1, index[1]].tolist() == [6.0, 7.0, 6.0, 7.0, 8.0, 9.0]
 
 
 def test_indices_must_be_whole_numbers() -> None:
@@ -128,6 +149,7 @@ def test_indices_must_be_whole_numbers() -> None:
     ("layers", "message"),
     [
         ([], r"at least one layer, got none"),
+        ([make_layer(desired_goal=[], constant_goal=[1.0])], r"'one': .* its goal must not be constant"),
         ([make_layer(desired_goal=[9])], r"layer 'one': desired_goal has index 9, .* at most 4 is allowed"),
         (
             [make_layer("a", observation=[0, 1, 4]), make_layer("b")],
