@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import warnings
 from collections.abc import Sequence
 from typing import Literal, cast, get_args
 
@@ -27,10 +26,13 @@ def say_once(line: str) -> None:
 
 
 def warn_once(line: str) -> None:
-    """Warns, the first time in this process; not at all with an empty line."""
+    """Logs a warning, the first time in this process; nothing if the line is empty.
+
+    Without any handler, Python prints such a record as one line; a ``UserWarning`` would be two, with code.
+    """
     if line and line not in _said:
         _said.add(line)
-        warnings.warn(line, stacklevel=3)
+        _LOGGER.warning(line)
 
 
 def check_termination(word: str) -> Termination:

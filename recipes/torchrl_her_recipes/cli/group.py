@@ -36,7 +36,7 @@ _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 
 
 class _Commands(click.Group):
-    """Names the nearest command where there is none of the given name."""
+    """Names the nearest command where there is none of the given name; ``folder=DIR`` is ``--folder DIR``."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -44,7 +44,10 @@ class _Commands(click.Group):
         if self.get_command(ctx, args[0]) is None and not args[0].startswith("-"):
             known = self.list_commands(ctx)
             raise click.UsageError(f"unknown command {args[0]!r}{what_there_is(args[0], known, 'commands')}")
-        return super().resolve_command(ctx, args)
+        name, command, rest = super().resolve_command(ctx, args)
+        if command is not None and any(own.name == "folder" for own in command.params):
+            rest = [f"--{own}" if own.startswith("folder=") else own for own in rest]
+        return name, command, rest
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(self.commands)  # in the order in which people use them, not alphabetically
@@ -87,7 +90,7 @@ class _Notices(logging.Handler):
     """Shows what environments say about themselves, each in a line like a warning's."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        say_line(record.getMessage())
+        say_line(("warning: " if record.levelno >= logging.WARNING else "") + record.getMessage())
 
 
 def main(argv: Sequence[str] | None = None) -> int:

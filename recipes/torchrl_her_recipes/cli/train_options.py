@@ -22,7 +22,7 @@ from torchrl_her_recipes.config.recipe import Recipe, check_extending, make_reci
 from torchrl_her_recipes.config.shipped import load_preset, preset_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, option_names
 
-folder_option = click.option("--folder", metavar="DIR", help="where it goes; folder=DIR is the same")
+folder_option = click.option("--folder", metavar="DIR", help="where it goes")
 
 
 def with_folder(options: tuple[str, ...], folder: str | None) -> tuple[str, ...]:

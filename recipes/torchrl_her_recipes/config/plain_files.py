@@ -131,6 +131,10 @@ def parse_yaml(text: str) -> Any:
     """
     try:
         return yaml.load(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        said = ", ".join(part for part in (error.context, error.problem) if part)
+        raise ValueError(reason(f"line {mark.line + 1}: {said}" if mark else said)) from error
     except yaml.YAMLError as error:
         raise ValueError(reason(error)) from error
     except _DAMAGE as error:

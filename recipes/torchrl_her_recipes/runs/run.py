@@ -376,7 +376,26 @@ def _despite_a_full_disk(what: str, trainer: Trainer) -> Iterator[None]:
 def _finish(
     components: Components, trainer: Trainer, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool
 ) -> None:
-    """Draws the pictures and then writes the policy, whose file tells that the run has ended."""
+    """Draws the pictures and then writes the policy, whose file tells that the run has ended.
+
+    Raises:
+        OSError: a file cannot be written; the message says which are missing.
+    """
+    try:
+        _write_results(components, trainer, rows, home, has_buffer)
+    except OSError as error:
+        expected = [home.curves, home.video] if components.recipe.run.pictures else []
+        missing = [path.name for path in (*expected, home.policy) if not path.is_file()]
+        why = (error.strerror or str(error)).lower()
+        raise OSError(
+            f"cannot write {error.filename or ' or '.join(missing)}: {why}; "
+            f"{', '.join(missing)} will be written by: torchrl-her train --resume {home.path}"
+        ) from error
+
+
+def _write_results(
+    components: Components, trainer: Trainer, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool
+) -> None:
     goals = _save_goals(components, home) if has_buffer else _saved_goals(home)
     if components.recipe.run.pictures:
         _draw(components, rows, goals, home)

@@ -235,5 +235,6 @@ def test_rewards_of_steps_that_goals_do_not_explain_are_noticed(said: pytest.Log
             return shown, reward - 0.25, *rest
 
     gymnasium.register("tests/Costly-v0", Costly, max_episode_steps=6)
-    with pytest.warns(UserWarning, match="a step gave the reward -.*25, and compute_reward .* for the same"):
-        make_gym_env("tests/Costly-v0")
+    make_gym_env("tests/Costly-v0")
+    pattern = "a step gave the reward -.*25, and compute_reward .* for the same"
+    assert any(re.search(pattern, record.getMessage()) for record in said.records)

@@ -131,7 +131,13 @@ def test_unknown_names_list_what_there_is() -> None:
 def test_a_curriculum_comes_from_a_file(tmp_path: Path) -> None:
     """The state of treasure_hunt is [place, goal]: somewhere in the middle first, then where it shall go."""
     layers = [
-        {"name": "middle", "observation": [0], "achieved_goal": [0], "constant_goal": [0.5], "threshold": 0.5},
+        {
+            "name": "middle",
+            "observation": [0],
+            "achieved_goal": [0],
+            "constant_goal": [0.5],
+            "threshold": 0.5,
+        },
         {"name": "fine", "observation": [0], "achieved_goal": [0], "desired_goal": [1], "threshold": 0.1},
     ]
     path = tmp_path / "layers.yaml"

@@ -397,6 +397,16 @@ def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(tmp_p
     assert [event.step for event in events.Scalars("success/run_0")] == [800, 1600]
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no disk that is always full")
+def test_a_full_disk_at_the_end_says_what_is_missing(tmp_path: Path) -> None:
+    (tmp_path / "policy.part.pt").symlink_to("/dev/full")
+    said = r"cannot write .*policy\.pt: no space left on device; policy\.pt will be written by: .* --resume"
+    with pytest.raises(OSError, match=said):
+        run(build(small(epochs=1)), tmp_path, progress=False)
+    resume(tmp_path, progress=False)
+    assert (tmp_path / "policy.pt").is_file()
+
+
 def test_parts_that_were_swapped_must_be_given_to_resume(tmp_path: Path) -> None:
     def swapped(recipe: Recipe) -> Components:
         components = build(recipe)

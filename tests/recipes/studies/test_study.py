@@ -48,7 +48,7 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     path, folder = tmp_path / "mine.yaml", tmp_path / "runs"
     vary = {"algo": ["her", "filtered_her"]}
     path.write_text(yaml.safe_dump({"recipe": {**SMALL, "task": "hand_v0"}, "vary": vary}))
-    command = ["study", str(path), "--folder", str(folder), "--jobs", "1"]
+    command = ["study", str(path), f"folder={folder}", "--jobs", "1"]
     assert main([*command, "--plan"]) == 0
     said = capsys.readouterr().out
     assert "2 batched runs to go, 6,400 environment steps in all" in said
@@ -195,7 +195,7 @@ def test_without_ray_its_name_and_the_remedy_are_given(
             "a study has no recipes; it has preset, summary, recipe, vary, cases, for_task, figure",
         ),
         ([""], "mine.yaml cannot be read: it must hold names and values, got None"),
-        (["vary: {algo: ["], "mine.yaml cannot be read: while parsing"),
+        (["vary: {algo: ["], "mine.yaml cannot be read: line 1: while parsing"),
         (["recipe: {k: 2}"], "vary of mine must hold lists of values by option, got {}"),
         (["vary: {algo: her}"], "vary of mine must hold lists of values by option, got {'algo': 'her'}"),
         (["vary: {algo: [her, her]}"], "the study mine has two combinations that are called her"),
