@@ -107,7 +107,7 @@ def make_report_pages(app: Sphinx, error: Exception | None) -> None:
         made_of = [*(RESULTS / name).iterdir(), *code.glob("*.py"), *(code.parent / "templates").iterdir()]
         page = out / "index.html"
         if not page.exists() or page.stat().st_mtime < max(file.stat().st_mtime for file in made_of):
-            report_page.write_page(read_results(RESULTS / name), out)
+            report_page.write_page(read_results(RESULTS / name), out, back="../../results.html")
 
 
 def notebook_page(text: str, name: str) -> str:

@@ -21,7 +21,7 @@ from torchrl_her_envs.throwing.rendering.canvas import Canvas, Point
 from torchrl_her_envs.throwing.rendering.palette import Color
 
 IMAGES = Path(__file__).parent / "images"
-COLUMNS, SIDE, GAP, CAPTION = 4, 330, 16, 56  # pixels; 4 * 330 + 5 * 16 = 1400
+COLUMNS, SIDE, GAP, CAPTION = 4, 330, 16, 52  # pixels; 4 * 330 + 5 * 16 = 1400
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +58,12 @@ SCENES = {
 }
 
 LEGEND = (  # heights, and what is there
-    (0.93, "where the hand or arm reaches"),
-    (0.77, "where goals come from"),
+    (0.93, "within reach"),
+    (0.77, "goals"),
     (0.61, "ball"),
-    (0.45, "black hole: the goal"),
-    (0.27, "hand, open and closed"),
-    (0.08, "arm's end, open and closed"),
+    (0.45, "black hole"),
+    (0.27, "hand"),
+    (0.08, "gripper"),
 )
 
 
@@ -142,8 +142,8 @@ def legend() -> Image.Image:
     sprites.draw_gripper(canvas, (left + 0.06, arm), closed=True)
     image = Image.fromarray(canvas.finish().numpy())
     for y, words in LEGEND:
-        row, column = to_pixel((0.27, y), SIDE)
-        font = ImageFont.load_default(size=16)
+        row, column = to_pixel((0.3, y), SIDE)
+        font = ImageFont.load_default(size=34)
         ImageDraw.Draw(image).text((column, row), words, fill=palette.INK, font=font, anchor="lm")
     return image
 
@@ -156,16 +156,15 @@ def draw_swatch(canvas: Canvas, center: Point, half: float, fill: Color, edge: C
 
 
 def sheet() -> Image.Image:
-    """All tasks in a grid, each with its name and what is to be done, and the legend."""
-    cells = [(picture(name), name, task.summary) for name, task in TASKS.items()] + [(legend(), "", "")]
+    """All tasks in a grid, each with its name, in letters that can be read at 400 pixels, and the legend."""
+    cells = [(picture(name), name) for name in TASKS] + [(legend(), "")]
     rows = -(-len(cells) // COLUMNS)
     image = Image.new("RGB", (COLUMNS * (SIDE + GAP) + GAP, rows * (SIDE + CAPTION) + GAP), "white")
     draw = ImageDraw.Draw(image)
-    for index, (cell, name, summary) in enumerate(cells):
+    for index, (cell, name) in enumerate(cells):
         x, y = GAP + index % COLUMNS * (SIDE + GAP), GAP + index // COLUMNS * (SIDE + CAPTION)
         image.paste(cell, (x, y))
-        draw.text((x, y + SIDE + 3), name, fill=palette.INK, font=ImageFont.load_default(size=18))
-        draw.text((x, y + SIDE + 25), summary, fill=palette.METAL, font=ImageFont.load_default(size=14))
+        draw.text((x, y + SIDE + 3), name, fill=palette.INK, font=ImageFont.load_default(size=36))
     return image
 
 

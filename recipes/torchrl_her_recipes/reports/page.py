@@ -63,12 +63,13 @@ class Live:
     going: bool
 
 
-def write_page(results: Results, out: Path) -> Path:
+def write_page(results: Results, out: Path, *, back: str | None = None) -> Path:
     """Writes a page about results that were read before.
 
     Args:
         results: of a study, or of runs.
         out: where the page goes, its tables, and its pictures into `figures`.
+        back: an address that the page links to, of the pages that it belongs to.
 
     Returns:
         The page.
@@ -76,18 +77,21 @@ def write_page(results: Results, out: Path) -> Path:
     Raises:
         OSError: the page cannot be written.
     """
-    return render(describe(results, out), out)
+    return render(describe(results, out), out, back=back)
 
 
-def render(described: dict[str, Any], out: Path, *, live: Live | None = None) -> Path:
+def render(
+    described: dict[str, Any], out: Path, *, live: Live | None = None, back: str | None = None
+) -> Path:
     """Writes the page itself, which is replaced as a whole.
 
     Args:
         described: what is on it, from :func:`describe`.
         out: where it goes.
         live: for a page that renews itself; None for one that stays as it is.
+        back: an address of the pages that it belongs to.
     """
-    page = _template().render(described, live=live, written=f"{datetime.now():%Y-%m-%d %H:%M}")
+    page = _template().render(described, live=live, back=back, written=f"{datetime.now():%Y-%m-%d %H:%M}")
     path = out / "index.html"
     write_text(path, page)
     return path
