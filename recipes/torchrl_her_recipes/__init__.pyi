@@ -1,5 +1,7 @@
 from .components.assembly import build as build
 from .components.components import Components as Components
+from .components.first_look import Facts as Facts
+from .components.first_look import look_at as look_at
 from .components.learner import LearnerBuilder as LearnerBuilder
 from .config.algorithms import ALGORITHMS as ALGORITHMS
 from .config.algorithms import Algorithm as Algorithm
@@ -31,9 +33,7 @@ from .reports.tidy import write_results as write_results
 from .runs.callbacks import Callback as Callback
 from .runs.callbacks import EarlyStopping as EarlyStopping
 from .runs.callbacks import RunView as RunView
-from .runs.check import Facts as Facts
 from .runs.check import advice as advice
-from .runs.check import look_at as look_at
 from .runs.export import export_policy as export_policy
 from .runs.exported.card import PolicyCard as PolicyCard
 from .runs.folder import RunFolder as RunFolder

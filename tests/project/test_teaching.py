@@ -17,7 +17,7 @@ from PIL import Image
 
 from torchrl_her_envs.throwing.tasks import TASKS
 from torchrl_her_recipes import make_recipe
-from torchrl_her_recipes.components.envs import resolved
+from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.shipped import policy_facts
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -263,6 +263,8 @@ class CurriculumProgress:
         runs: R.
         window: number of samples that are averaged; with fewer a run stays in its layer.
         success_threshold: the mean at which a layer ends.
+        patience: number of evaluations (calls of :meth:`record`) after which a layer ends although the mean
+            is lower; None if it goes on.
 
     Attributes:
         layers: R numbers, the layer of each run, from 0.
@@ -294,16 +296,18 @@ class CurriculumProgress:
         runs: int = 1,
         window: int = 20,
         success_threshold: float = 0.9,
+        patience: int | None = None,
     ) -> None:
-        check_whole(runs=runs, window=window)
+        check_whole(runs=runs, window=window, patience=1 if patience is None else patience)
         if not 0.0 < success_threshold <= 1.0:
             raise ValueError(f"success_threshold must be in (0, 1], got {success_threshold}")
         self.curriculum, self.runs = curriculum, runs
-        self.window, self.success_threshold = window, success_threshold
+        self.window, self.success_threshold, self.patience = window, success_threshold, patience
         # Plain numbers: transforms read them in every step, and must not wait for a device.
         self.layers = (0,) * runs
         self._successes: list[list[float]] = [[] for _ in range(runs)]
         self._expert = [False] * runs
+        self._evaluations = [0] * runs  # in the present layer
 
     @property
     def layer(self) -> Tensor:
@@ -319,6 +323,11 @@ class CurriculumProgress:
     def successes(self) -> list[list[float]]:
         """Copies of the R windows: samples of the present layer, the latest at the end."""
         return [list(own) for own in self._successes]
+
+    @property
+    def evaluations(self) -> list[int]:
+        """How often each run was evaluated in its present layer."""
+        return list(self._evaluations)
 
     def mean_layer(self, run: int) -> float:
         """The layer that a run's episodes are played in, on average."""
@@ -338,7 +347,7 @@ class CurriculumProgress:
         if not 0 <= layer < len(self.curriculum):
             raise ValueError(f"layer must be in [0, {len(self.curriculum) - 1}], got {layer}")
         self.layers = (*self.layers[:run], layer, *self.layers[run + 1 :])
-        self._successes[run], self._expert[run] = [], False
+        self._successes[run], self._expert[run], self._evaluations[run] = [], False, 0
 
     def record(self, successes: Tensor) -> Tensor:
         """Adds samples of all runs; see :meth:`record_run`.
@@ -374,7 +383,12 @@ class CurriculumProgress:
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain data that :meth:`load_state_dict` takes."""
-        return {"layer": self.layer, "expert": self.expert, "successes": self.successes}
+        return {
+            "layer": self.layer,
+            "expert": self.expert,
+            "successes": self.successes,
+            "evaluations": self.evaluations,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Puts back what :meth:`state_dict` gave.
@@ -389,6 +403,7 @@ class CurriculumProgress:
             raise ValueError(f"the state's layers are {layers}, but there are {len(self.curriculum)} layers")
         self.layers, self._expert = layers, state["expert"].tolist()
         self._successes = [list(own)[-self.window :] for own in state["successes"]]
+        self._evaluations = list(state["evaluations"])
 
     def _record(self, run: int, samples: list[float]) -> bool:
         own, last = self._successes[run], len(self.curriculum) - 1
@@ -401,6 +416,10 @@ class CurriculumProgress:
                 self.set_layer(run, self.layers[run] + 1)
                 return True
             self._expert[run] = True
+        self._evaluations[run] += 1
+        if self.layers[run] < last and self._evaluations[run] == self.patience:
+            self.set_layer(run, self.layers[run] + 1)
+            return True
         return False
 
     def _check_run(self, run: int) -> int:

@@ -21,6 +21,7 @@ from torchrl_her_recipes.cli.train_options import (
     with_folder,
 )
 from torchrl_her_recipes.config.imports import foreign_module, imported_modules
+from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.resolve import auto_options
 
 
@@ -77,6 +78,12 @@ def _train(wanted: RunRequest) -> recipes.RunResult:
     if chosen := auto_options(wanted.recipe):
         values = (f"{name}={getattr(getattr(components.recipe, group), name)}" for group, name in chosen)
         click.echo(f"chosen for this environment (auto): {' '.join(values)}")
+    if wanted.recipe.hindsight.algo == AUTO and components.recipe.hindsight.algo == "cher":
+        inside = components.recipe.curriculum.layers[0]["achieved_goal"]
+        click.echo(
+            f"random actions seldom change what is achieved: entries {inside} of the observation are first "
+            "brought near it (algo=filtered_her does without)"
+        )
     if wanted.recipe.learner.device == "auto":
         click.echo(f"learner.device=auto: {next(components.loss.parameters()).device}")
     return recipes.run(components, wanted.folder)

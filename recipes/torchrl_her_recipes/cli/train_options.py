@@ -16,7 +16,7 @@ from torchrl_her_recipes.cli.overrides import ARGUMENTS, check_once, parse_overr
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
 from torchrl_her_recipes.config.learners import LEARNERS, options_of
-from torchrl_her_recipes.config.options import default_of
+from torchrl_her_recipes.config.options import AUTO, default_of
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe, check_extending, make_recipe
 from torchrl_her_recipes.config.shipped import load_preset, preset_names
@@ -120,8 +120,8 @@ def _recipe(values: Mapping[str, Any]) -> Recipe:
 
 def _label(recipe: Recipe) -> str:
     """The name of a run's folder; its letters are allowed on every file system."""
-    task = file_name(recipe.task.name)
-    return f"{task}_{recipe.hindsight.algo}_s{recipe.run.seed}"
+    algo = recipe.hindsight.algo
+    return "_".join([file_name(recipe.task.name), *([algo] if algo != AUTO else []), f"s{recipe.run.seed}"])
 
 
 class OptionsCommand(click.Command):

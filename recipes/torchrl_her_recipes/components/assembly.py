@@ -27,7 +27,8 @@ from torchrl_her_recipes.components.curricula import (
 )
 from torchrl_her_recipes.components.demonstrations import load_demonstrations, rows_needed
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
-from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs, resolved
+from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
+from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.components.goal_space import goal_space
 from torchrl_her_recipes.components.memory import sizes_named
 from torchrl_her_recipes.components.streams import Stream

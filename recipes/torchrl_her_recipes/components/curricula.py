@@ -119,6 +119,7 @@ def _make_progress(recipe: Recipe, curriculum: Curriculum) -> CurriculumProgress
             runs=runs,
             window=options.window,
             success_threshold=options.success_threshold,
+            patience=options.layer_epochs or None,
         )
     algorithm = get_algorithm(recipe.hindsight.algo)
     if algorithm.weights:

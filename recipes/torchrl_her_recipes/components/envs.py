@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import closing
 from typing import Any, cast
 
 import torch
@@ -16,9 +15,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_envs.registry import GYM, get_task_spec, make_env
 from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.resolve import EnvFacts, auto_options, resolve
 
-_FACTS: dict[str, EnvFacts] = {}  # of tasks whose environments were made before
 _AT_ONCE = 20  # environments of gymnasium's in an evaluation: each is a simulation of 10 MB and more
 
 
@@ -91,18 +88,3 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
         return actions.low, actions.high
     one = torch.ones(actions.shape, device=actions.device)
     return -one, one
-
-
-def resolved(recipe: Recipe) -> Recipe:
-    """The recipe with a value for each option that is ``auto``, from what its environment is.
-
-    Raises:
-        ValueError: see :func:`make_task_envs`.
-    """
-    if not auto_options(recipe):
-        return recipe
-    if (facts := _FACTS.get(repr(recipe.task))) is None:
-        with closing(make_task_envs(recipe, 1, [0])) as env:
-            task = goal_env(env)
-            facts = _FACTS[repr(recipe.task)] = EnvFacts(max_steps=task.max_steps, batched=task.batched)
-    return resolve(recipe, facts)

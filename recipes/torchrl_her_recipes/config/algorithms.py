@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from torchrl_her_recipes.config.options import what_there_is
+from torchrl_her_recipes.config.options import AUTO, what_there_is
 
 STRATEGIES = ("future", "final", "episode")  # goal strategies that come with the library
 RECENT = ("actual", "achieved")  # sources of goals besides strategies: those of recent episodes
@@ -129,6 +129,9 @@ ALGORITHMS: dict[str, Algorithm] = {
 }
 
 
+_UNRESOLVED = Algorithm(name=AUTO, filter_achieved=True)  # until the environment tells which one it is
+
+
 def register_algorithm(algorithm: Algorithm) -> None:
     """Makes an algorithm known by its name.
 
@@ -141,7 +144,7 @@ def register_algorithm(algorithm: Algorithm) -> None:
 
 
 def get_algorithm(name: str) -> Algorithm:
-    """The algorithm of a name.
+    """The algorithm of a name; for ``auto`` what all that it may become have in common.
 
     Raises:
         ValueError: there is none; the message lists those that there are.
@@ -150,6 +153,8 @@ def get_algorithm(name: str) -> Algorithm:
         >>> get_algorithm("her").filter_achieved
         False
     """
+    if name == AUTO:
+        return _UNRESOLVED
     if name not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {name!r}{what_there_is(name, ALGORITHMS, 'algorithms')}")
     return ALGORITHMS[name]

@@ -135,7 +135,11 @@ FUTURE_AND_ACTUAL = {"future": 3, "actual": 2}  # as "future-actual" goals of MR
 class HindsightConfig(Group):
     """How transitions are relabeled with virtual goals."""
 
-    algo: str = option("filtered_her", "an algorithm of `torchrl-her list`")
+    algo: str = option(
+        AUTO,
+        "an algorithm of `torchrl-her list`; auto: filtered_her, or cher where random actions seldom change "
+        "what is achieved, or with the layers of curriculum=FILE",
+    )
     k: int = option(4, "virtual transitions for each real one", at_least=0)
     strategy: str = option(
         "future", "where virtual goals come from: future, final, episode, or a registered name"
@@ -224,6 +228,7 @@ class CurriculumConfig(Group):
     )
     window: int = option(20, "a layer ends by the mean success of this many greedy episodes", at_least=1)
     success_threshold: float = option(0.9, "mean success at which a layer ends", above=0, at_most=1)
+    layer_epochs: int = option(0, "epochs after which a layer ends, learned or not; 0 for never", at_least=0)
     layer_epsilon: float = option(1.0, "epsilon of exploration when a layer begins", at_least=0, at_most=1)
     guided_share: float = option(
         0.0,

@@ -63,6 +63,8 @@ class Recipe:
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self) -> None:
+        if self.hindsight.algo == AUTO and self.curriculum.layers is not None:
+            object.__setattr__(self, "hindsight", replace(self.hindsight, algo="cher"))
         if self.run.frames is not None and self.collection.epoch_frames != AUTO:
             epochs = -(-self.run.frames // self.collection.epoch_frames)
             object.__setattr__(self, "run", replace(self.run, frames=None, epochs=epochs))

@@ -14,6 +14,7 @@ from torchrl_her_recipes.config.without_effect import without_effect
 _GAMMA = (0.9, 0.99)  # least and greatest
 _WARMUP = 1_000  # environment steps, at least
 _EPISODES = 100  # in an epoch, where environments are stepped one by one
+_LAYER_EPOCHS = 10  # epochs after which a layer that was not asked for ends, learned or not
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,10 +24,16 @@ class EnvFacts:
     Args:
         max_steps: steps of an episode, at most.
         batched: whether the environments of a batch are stepped together, at little cost for each of them.
+        layers: of a curriculum, if what is achieved seldom changes without one.
     """
 
     max_steps: int
     batched: bool = False
+    layers: Any = None
+
+
+def _algo(_recipe: Recipe, facts: EnvFacts) -> str:
+    return "cher" if facts.layers else "filtered_her"
 
 
 def _gamma(_recipe: Recipe, facts: EnvFacts) -> float:
@@ -53,6 +60,7 @@ def _warmup_frames(recipe: Recipe, facts: EnvFacts) -> int:
 
 # In this order: later ones depend on earlier ones.
 _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
+    "algo": _algo,
     "goal_sources": lambda recipe, _facts: recipe.hindsight.sources,
     "gamma": _gamma,
     "num_envs": _num_envs,
@@ -84,6 +92,13 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
         (0.96, 8, 5000)
     """
     for group, name in auto_options(recipe):
-        value = _VALUES[name](recipe, facts)
-        recipe = recipe.replace(**{f"{group}.{name}": value})
+        values = {f"{group}.{name}": _VALUES[name](recipe, facts)}
+        if name == "algo" and facts.layers:
+            values |= {
+                "layers": facts.layers,
+                "layer_epochs": _LAYER_EPOCHS,
+                "layer_epsilon": 0.5,
+                "guided_share": 0.5,
+            }
+        recipe = recipe.replace(**values)
     return recipe

@@ -48,14 +48,15 @@ def layer_success(
 
 def move_on(components: Components, state: CurriculumState, samples: Tensor, frames: int) -> list[str]:
     """Moves runs that have learned their layer to the next one, and returns a message for each of them."""
-    before = state.progress.layers
+    before, evaluations = state.progress.layers, state.progress.evaluations
     # As many as the window takes: more in one evaluation would give a lucky streak many chances.
     moved = state.progress.record(samples[:, : state.progress.window])
     learner, exploration, lines = components.recipe.learner, components.exploration, []
     for run in moved.nonzero().flatten().tolist():
         old, new = state.curriculum.layers[before[run]], state.progress.layer_of(run)
         seed = components.recipe.seeds[run]
-        lines.append(f"seed {seed}: {old.name!r} learned after {frames:,} frames, {new.name!r} begins")
+        learned = "learned" if evaluations[run] + 1 != state.progress.patience else "not learned, but left"
+        lines.append(f"seed {seed}: {old.name!r} {learned} after {frames:,} frames, {new.name!r} begins")
         if components.guide is not None:
             components.guide.follow(components.greedy, before[run], run=run)
         enter_layer(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from torchrl_her_recipes.components.envs import resolved
+from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.imports import check_permitted, permit_task
 from torchrl_her_recipes.config.study import Study, curve_label
 from torchrl_her_recipes.runs.plots import plot_comparison

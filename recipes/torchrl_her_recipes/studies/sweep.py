@@ -12,7 +12,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from torchrl_her.files.writing import write_text
-from torchrl_her_recipes.components.envs import resolved
+from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.run import last_success

@@ -15,7 +15,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 from tqdm import tqdm
 
-from torchrl_her_recipes.components.envs import resolved
+from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.search import Search
 from torchrl_her_recipes.runs.folder import RunFolder

@@ -31,6 +31,15 @@ def test_values_follow_from_the_environment(max_steps: int, batched: bool, value
     assert auto_options(recipe) == []
 
 
+def test_a_curriculum_comes_with_its_options() -> None:
+    layers = [{"name": "near"}, {"name": "all"}]
+    recipe = resolve(make_recipe(), EnvFacts(max_steps=50, layers=layers))
+    assert (recipe.hindsight.algo, recipe.curriculum.layers) == ("cher", layers)
+    assert (recipe.curriculum.layer_epochs, recipe.curriculum.guided_share) == (10, 0.5)
+    assert resolve(make_recipe(), EnvFacts(max_steps=50)).hindsight.algo == "filtered_her"
+    assert make_recipe(curriculum=layers).hindsight.algo == "cher"
+
+
 def test_values_that_are_given_stay() -> None:
     facts = EnvFacts(max_steps=50)
     recipe = resolve(make_recipe(gamma=0.5, num_envs=30, strategy="final", processes=2), facts)

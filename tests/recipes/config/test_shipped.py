@@ -23,7 +23,7 @@ def test_every_preset_makes_a_recipe_and_says_what_it_is_for(name: str) -> None:
 
 # The defaults before there were any for unknown environments; shipped presets and studies build on them.
 THROWING = {
-    "hindsight": {"goal_sources": None, "refill": 1},
+    "hindsight": {"algo": "filtered_her", "goal_sources": None, "refill": 1},
     "collection": {"epoch_frames": 20_480, "num_envs": 64, "frames_per_update": 20, "warmup_frames": 3_200},
     "learner": {
         "gamma": 0.98,

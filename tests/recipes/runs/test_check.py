@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_her_recipes import Facts, advice, build, look_at, make_recipe
 from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.components.first_look import resolved
 
 GOALS = ("observation", "achieved_goal", "desired_goal")
 HERE = "tests.recipes.runs.test_check"
@@ -104,17 +105,35 @@ def test_a_block_that_lies_still_is_told_and_layers_are_proposed() -> None:
     assert [task[key] for key in GOALS] == [[0, 2, 1], [1], "desired_goal"]
     assert reach["threshold"] < 0.3
     assert task["threshold"] == pytest.approx(0.1)
-    assert "algo=cher curriculum=layers.yaml" in said(facts)
-    assert "entries 2 to 2 of the observation" in said(facts)
-    assert "has a curriculum" in said(facts, algo="cher", curriculum=facts.layers)
+    assert "algo=cher curriculum=layers.yaml" in said(facts, algo="filtered_her")
+    assert "entries 2 to 2 of the observation" in said(facts, algo="filtered_her")
+    assert "has a curriculum" in said(facts)
 
 
-def test_what_is_proposed_can_be_trained(tmp_path: Path) -> None:
-    layers = look().layers
-    recipe = make_recipe(task=f"{HERE}:Push", algo="cher", curriculum=layers, hidden=8, num_envs=4)
+def test_a_block_that_lies_still_gets_a_curriculum() -> None:
+    recipe = make_recipe(task=f"{HERE}:Push", hidden=8, num_envs=4, seed=3)
     components = build(recipe)
     assert components.curriculum is not None
+    assert components.recipe.hindsight.algo == "cher"
+    assert components.recipe.curriculum.layers == look_at(recipe.replace(seed=0)).layers
+    assert components.recipe.curriculum.layer_epochs == 10
+    assert resolved(components.recipe) == components.recipe
     components.close()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"task.options": {"moves": False}},
+        {"task.options": {"cost": 0.5}},
+        {"task.options": {"wall": True}},  # what a failure costs is no reward of a curriculum
+        {"algo": "filtered_her"},
+        {"demonstrations.file": "some.pt", "demonstrations.episodes": 1},
+    ],
+)
+def test_others_get_none(options: dict[str, Any]) -> None:
+    recipe = resolved(make_recipe(task=f"{HERE}:Push", **options))
+    assert (recipe.hindsight.algo, recipe.curriculum.layers) == ("filtered_her", None)
 
 
 def test_what_never_changes_is_told() -> None:
@@ -124,8 +143,7 @@ def test_what_never_changes_is_told() -> None:
 
 
 def test_rewards_that_goals_do_not_explain_are_told() -> None:
-    with pytest.warns(UserWarning, match="a step gave the reward"):
-        facts = look(cost=0.5)
+    facts = look(cost=0.5)
     assert facts.disagree == 1.0
     assert said(facts).startswith("100% of the steps have another reward than compute_reward gives")
 
@@ -157,7 +175,7 @@ def test_on_the_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["check", f"task={HERE}:Push", "--steps", "1000"]) == 0
+    assert main(["check", f"task={HERE}:Push", "algo=filtered_her", "--steps", "1000"]) == 0
     out = capsys.readouterr().out
     file = next(tmp_path.glob("*_layers.yaml"))
     assert f"curriculum={file.name}" in out

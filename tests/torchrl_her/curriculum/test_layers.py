@@ -204,6 +204,19 @@ def test_only_a_full_window_counts() -> None:
     assert progress.layers == (1,)
 
 
+def test_a_layer_ends_after_some_evaluations_at_the_latest() -> None:
+    curriculum = Curriculum([make_layer("a"), make_layer("b")], 5)
+    progress = CurriculumProgress(curriculum, runs=2, window=2, patience=3)
+    poor = torch.tensor([[0.0], [0.5]])
+    assert progress.record(poor).tolist() == progress.record(poor).tolist() == [False, False]
+    again = CurriculumProgress(curriculum, runs=2, window=2, patience=3)
+    again.load_state_dict(progress.state_dict())
+    assert again.evaluations == [2, 2]
+    assert again.record(poor).tolist() == [True, True]
+    assert (again.layers, again.evaluations) == ((1, 1), [0, 0])
+    assert [again.record(poor).tolist() for _ in range(4)] == 4 * [[False, False]]  # the last one has no end
+
+
 def test_the_window_slides() -> None:
     progress = make_progress()
     assert not progress.record_run(0, flags("0000110"))

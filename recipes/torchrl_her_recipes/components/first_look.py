@@ -1,0 +1,288 @@
+"""What random actions show of a task, before anything is trained."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
+from torchrl_her_recipes.components.envs import action_bounds, make_task_envs
+from torchrl_her_recipes.config.options import AUTO
+from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.resolve import EnvFacts, auto_options, resolve
+
+_AT_ONCE = 8
+_STEPS = 3_000
+_SELDOM = 0.25  # of the episodes, in which what is achieved changes
+_FACTS: dict[str, EnvFacts] = {}  # of tasks that were looked at before
+_SECONDS = 20.0  # after which no further episodes begin
+_FUTURE = 16  # later goals of an episode that each transition is tried with
+_DIGITS = 1e-4  # relative, in which rewards must agree
+_TOUCH = 0.1  # quantile of distances at which something moves the achieved goal; later it may move by itself
+_NEAR = 0.5  # of the usual distance: how near positions come where the achieved goal moves
+_PAIRS = 32  # of goals, whose distance is looked at
+_HALVINGS = 20
+
+Meets = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What random actions showed of a task.
+
+    Attributes:
+        steps, episodes: how many were played.
+        seconds: that one step takes.
+        max_steps: length of an episode.
+        actions: the least and the greatest value of each entry; None if actions are discrete.
+        scales: the least and the greatest standard deviation of entries of the observation.
+        disagree: share of steps whose reward is not that of ``compute_reward``, failures aside.
+        achieved: share of the episodes in which the goal was achieved.
+        moved: share of the episodes in which what is achieved changed enough to be another goal.
+        kept: share of transitions for which the filter finds a later goal of the episode.
+        fallen: share of the episodes that terminated without the goal.
+        constant: entries of the observation that never changed.
+        goal_inside: entries of the observation that are the desired goal.
+        own_layers: whether the task has a curriculum of its own.
+        layers: of a curriculum, as :func:`propose_layers` gives them; empty if none is proposed.
+    """
+
+    steps: int
+    episodes: int
+    seconds: float
+    max_steps: int
+    actions: list[tuple[float, float]] | None
+    scales: tuple[float, float]
+    disagree: float
+    achieved: float
+    moved: float
+    kept: float
+    fallen: float
+    constant: list[int]
+    goal_inside: list[int]
+    own_layers: bool
+    layers: list[dict[str, Any]]
+
+
+def resolved(recipe: Recipe) -> Recipe:
+    """The recipe with a value for each option that is ``auto``, from what its environment is.
+
+    Where environments are stepped one by one and ``algo`` is ``auto``, random actions are played in one.
+
+    Raises:
+        ValueError: see :func:`~torchrl_her_recipes.components.envs.make_task_envs`.
+    """
+    if not auto_options(recipe):
+        return recipe
+    looks = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
+    known = f"{recipe.task} {looks}"
+    if (facts := _FACTS.get(known)) is None:
+        with closing(make_task_envs(recipe, 1, [0])) as env:
+            task = goal_env(env)
+            facts = EnvFacts(max_steps=task.max_steps, batched=task.batched)
+        if looks and not facts.batched:
+            facts = replace(facts, layers=_needed_layers(recipe))
+        _FACTS[known] = facts
+    return resolve(recipe, facts)
+
+
+def _needed_layers(recipe: Recipe) -> list[dict[str, Any]] | None:
+    """Layers for a task whose achieved goal seldom changes by chance; None if it needs none, or has none.
+
+    They are the same for each seed. A curriculum has rewards of its own, so the task's must be equal to them:
+    there are no failures, and no costs of actions.
+    """
+    facts = look_at(recipe.replace(seed=0), seconds=None)
+    differs = facts.fallen > 0 or facts.disagree > 0
+    return None if differs or facts.moved >= _SELDOM else facts.layers or None
+
+
+def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SECONDS) -> Facts:
+    """Plays random actions on the task of a recipe.
+
+    Args:
+        recipe: whose task it is; its seed is that of the environments and actions.
+
+    Keyword Args:
+        steps: how many.
+        seconds: after which no further episodes begin; None for all steps, however long they take.
+
+    Raises:
+        ValueError: the task cannot be made.
+
+    Example:
+        >>> from torchrl_her_recipes import make_recipe
+        >>> look_at(make_recipe(task="hand_v1"), steps=800).moved < 0.5  # the ball lies still
+        True
+    """
+    with (
+        closing(make_task_envs(recipe, _AT_ONCE, [recipe.run.seed])) as env,
+        torch.random.fork_rng(devices=[]),
+    ):
+        torch.manual_seed(recipe.run.seed)
+        task, began = goal_env(env), time.perf_counter()
+        played: list[TensorDictBase] = []
+        while not played or (
+            sum(len(own) for own in played) < steps
+            and (seconds is None or time.perf_counter() - began < seconds)
+        ):
+            rows = env.rollout(task.max_steps, break_when_any_done=False)
+            played += [episode for own in rows.unbind(0) for episode in _episodes(own)]
+        duration = (time.perf_counter() - began) / sum(len(own) for own in played)
+        bounds = (
+            None if env.action_spec.dtype == torch.int64 else torch.stack(action_bounds(env), -1).tolist()
+        )
+        return _facts(
+            played, task, duration, None if bounds is None else [(low, high) for low, high in bounds]
+        )
+
+
+def _episodes(rows: TensorDictBase) -> Iterator[TensorDictBase]:
+    """The episodes of an environment's rows [T]; the last one may not have ended."""
+    begin = 0
+    for end in (rows["next", "done"].flatten().nonzero().flatten() + 1).tolist():
+        yield rows[begin:end]
+        begin = end
+    if begin < len(rows):
+        yield rows[begin:]
+
+
+def _facts(
+    played: list[TensorDictBase], task: GoalEnv, seconds: float, actions: list[tuple[float, float]] | None
+) -> Facts:
+    rows = cast(TensorDictBase, torch.cat(cast(list[Tensor], played)))
+    achieved_reward = float(getattr(task, "achieved_reward", 0.0))
+
+    def meets(achieved: Tensor, desired: Tensor) -> Tensor:
+        """[...] of bool."""
+        return task.compute_reward(achieved, desired).squeeze(-1) >= achieved_reward
+
+    moved, kept, achieved = [], [], []
+    for own in played:
+        here, there = own["achieved_goal"], own["next", "achieved_goal"]
+        moved.append(not bool(meets(there, here[:1].expand_as(there)).all()))
+        kept.append(_kept(here, there, meets))
+        achieved.append(bool(meets(there, own["next", "desired_goal"]).any()))
+    computed = task.compute_reward(rows["next", "achieved_goal"], rows["next", "desired_goal"])
+    reward = rows["next", "reward"]
+    went_on = ~rows["next", "terminated"] | (computed >= achieved_reward)  # what a failure costs is kept
+    differ = went_on & ((reward - computed).abs() > _DIGITS * (1 + computed.abs()))
+    ended = [bool(own["next", "terminated"].any()) for own in played]
+    seen = rows["observation"].double()
+    spread = seen.std(0)
+    moving = spread[spread > 0]
+    count = len(played)
+    return Facts(
+        steps=len(rows),
+        episodes=count,
+        seconds=seconds,
+        max_steps=task.max_steps,
+        actions=actions,
+        scales=(float(moving.min()), float(moving.max())) if len(moving) else (0.0, 0.0),
+        disagree=float(differ.float().mean()),
+        achieved=sum(achieved) / count,
+        moved=sum(moved) / count,
+        kept=float(torch.cat(kept).float().mean()),
+        fallen=sum(end and not met for end, met in zip(ended, achieved, strict=True)) / count,
+        constant=(spread == 0).nonzero().flatten().tolist(),
+        goal_inside=_columns(seen, rows["desired_goal"].double()),
+        own_layers=_has_layers(task),
+        layers=propose_layers(rows, meets),
+    )
+
+
+def _has_layers(task: GoalEnv) -> bool:
+    try:
+        return len(task.layers()) > 1
+    except ValueError:
+        return False
+
+
+def _kept(here: Tensor, there: Tensor, meets: Meets) -> Tensor:
+    """Whether some later goal of an episode was not achieved before each transition, [T] of bool."""
+    steps = len(here)
+    later = torch.linspace(0, 1, min(_FUTURE, steps))
+    chosen = (
+        torch.arange(steps)[:, None] + (later * (steps - 1 - torch.arange(steps))[:, None]).round().long()
+    )
+    goals = there[chosen]  # [T, later, g]
+    return ~meets(here[:, None].expand_as(goals), goals).all(-1)
+
+
+def _columns(seen: Tensor, goal: Tensor) -> list[int]:
+    """Neighboring entries of observations [n, w] that are always the goals [n, g]; none if there are none."""
+    width = goal.shape[-1]
+    for first in range(seen.shape[-1] - width + 1):
+        if torch.allclose(seen[:, first : first + width], goal, rtol=1e-5, atol=1e-6):
+            return list(range(first, first + width))
+    return []
+
+
+def propose_layers(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
+    """Two layers of a curriculum: bring near what comes near the achieved goal where it moves, then the task.
+
+    The achieved goal must be observed, and other entries of the observation, as many, must be nearer to it in
+    the steps in which it moves than in others: those of a hand, for instance, that pushes it.
+
+    Args:
+        rows: transitions [n] of random actions.
+        meets: which achieved goals [..., g] are the desired ones [..., g], [...] of bool.
+
+    Returns:
+        Layers as ``curriculum=FILE.yaml`` takes them, or none if there are no such entries.
+    """
+    seen, goal = rows["observation"].double(), rows["achieved_goal"].double()
+    width, wide = goal.shape[-1], seen.shape[-1]
+    place = _columns(seen, goal)
+    step = (rows["next", "achieved_goal"].double() - goal).norm(dim=-1)
+    moving = step > 0.1 * step.max()
+    if not place or not bool(step.max() > 0) or bool(moving.all()) or wide < 2 * width:
+        return []
+    near: dict[int, tuple[float, float]] = {}
+    for first in range(wide - width + 1):
+        entries = seen[:, first : first + width]
+        if set(range(first, first + width)) & set(place) or bool((entries.std(0) == 0).any()):
+            continue
+        gap = (entries - goal).norm(dim=-1)
+        near[first] = (float(gap[moving].quantile(_TOUCH)), float(gap[~moving].median()))
+    best = min(near, key=lambda first: near[first][0], default=None)
+    if best is None or near[best][0] > _NEAR * near[best][1]:
+        return []
+    if (radius := _radius(rows, meets)) is None:
+        return []
+    others = [
+        entry for entry in range(wide) if entry not in place
+    ]  # and the goal of the first layer behind them
+    reach = {
+        "observation": others,
+        "achieved_goal": list(range(best, best + width)),
+        "desired_goal": list(place),
+    }
+    task = {"observation": others + place, "achieved_goal": list(place), "desired_goal": "desired_goal"}
+    return [
+        {"name": name, **entries, "threshold": float(f"{threshold:.2g}")}
+        for name, entries, threshold in (("reach", reach, max(near[best][0], radius)), ("task", task, radius))
+    ]
+
+
+def _radius(rows: TensorDictBase, meets: Meets) -> float | None:
+    """The distance within which a goal counts as achieved; None if it is not the same everywhere."""
+    achieved, desired = rows["achieved_goal"], rows["desired_goal"]
+    far = ~meets(achieved, desired)
+    achieved, desired = achieved[far][:_PAIRS], desired[far][:_PAIRS]
+    if not len(achieved) or not bool(meets(desired, desired).all()):
+        return None
+    near, away = torch.zeros(len(desired), 1), torch.ones(len(desired), 1)
+    for _ in range(_HALVINGS):
+        middle = (near + away) / 2
+        met = meets(desired + middle * (achieved - desired), desired)[:, None]
+        near, away = torch.where(met, middle, near), torch.where(met, away, middle)
+    radius = (near * (achieved - desired)).norm(dim=-1)
+    return float(radius.mean()) if float(radius.max() - radius.min()) < 0.05 * float(radius.mean()) else None
