@@ -66,4 +66,5 @@ from .studies.sweep import plan_sweep as plan_sweep
 from .studies.sweep import run_sweep as run_sweep
 from .studies.sweep import unfinished_sweep as unfinished_sweep
 from .studies.workers import make_workers as make_workers
+from .tuning.results import search_summary as search_summary
 from .tuning.search import tune as tune

@@ -90,12 +90,11 @@ def _say_trial(line: str) -> None:
 def _say(result: SearchResult) -> int:
     for number, reason in result.failed.items():
         fail(f"trial {number} failed: {reason}")
-    for line in result.standing.table():
+    for line in recipes.search_summary(result.study):
         click.echo(line)
-    best = result.standing.best
-    if best is not None:
+    if result.best is not None:
         click.echo(f"the best: torchrl-her train preset={result.folder / 'best.yaml'}")
     if result.interrupted:
         click.echo("interrupted: the same command goes on with it")
         return INTERRUPTED
-    return FAILED if best is None else 0
+    return FAILED if result.best is None else 0

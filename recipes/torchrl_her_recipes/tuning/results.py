@@ -1,4 +1,4 @@
-"""What came of a search: a table of its trials, the best as a preset, pictures."""
+"""Results of a search: a table of its trials, the best one as a preset, and Optuna's figures."""
 
 from __future__ import annotations
 
@@ -6,54 +6,87 @@ import csv
 import io
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
+import numpy as np
 import yaml
+from optuna.importance import get_param_importances
 from optuna.study import Study
+from optuna.trial import FrozenTrial, TrialState
+from optuna.visualization import matplotlib as figures
 
 from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.config.search import Search
-from torchrl_her_recipes.tuning.folder import SearchFolder
-from torchrl_her_recipes.tuning.plots import plot_history, plot_importance, plot_options
-from torchrl_her_recipes.tuning.standing import Standing, TrialRow, standing_of
+from torchrl_her_recipes.runs.plots import save_figure
+
+_FEWEST = 5  # complete trials, from which importances are estimated
+_SHOWN = 5  # trials in the table that is printed
 
 
-def write_standing(search: Search, home: SearchFolder, study: Study, *, pictures: bool = True) -> Standing:
-    """Writes the table, the best trial as a preset, and the pictures.
+def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], folder: Path) -> None:
+    """Writes ``trials.csv``, and the best trial as the preset ``best.yaml``.
 
     Args:
-        search: what is searched.
-        home: the folder.
-        study: in its database.
-        pictures: whether to draw.
+        search: that the trials belong to.
+        study: of Optuna.
+        trials: that count.
+        folder: of the search.
     """
-    standing = standing_of(study, [entry.name for entry in search.space])
-    try:
-        write_text(home.table, _csv(standing, [entry.name for entry in search.space]))
-        if standing.best is not None:
-            write_text(home.best, best_preset(search, standing.best, home))
-        if pictures and any(trial.score is not None for trial in standing.trials):
-            plot_history(standing.trials, home.history)
-            plot_options(standing.trials, search.space, home.options)
-            if standing.importance:
-                plot_importance(standing.importance, home.importance, trials=len(standing.ranked))
-    except OSError as error:  # a full disk: the trials are worth more
-        warnings.warn(f"the results in {home.path} are not up to date: {error}", stacklevel=2)
-    return standing
-
-
-def _csv(standing: Standing, names: Sequence[str]) -> str:
+    names = [entry.name for entry in search.space]
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(["trial", "state", "score", "epochs", *names])
-    for trial in standing.trials:
-        shown = "" if trial.score is None else trial.score
-        values = [trial.values.get(name, "") for name in names]
-        writer.writerow([trial.number, trial.state, shown, trial.epochs, *values])
-    return table.getvalue()
+    for own in trials:
+        value = own.value if own.value is not None else own.intermediate_values.get(own.last_step or 0, "")
+        values = [own.params.get(name, "") for name in names]
+        writer.writerow([own.number, own.state.name.lower(), value, own.last_step or 0, *values])
+    write_text(folder / "trials.csv", table.getvalue())
+    if any(own.state == TrialState.COMPLETE for own in trials):
+        best = study.best_trial
+        recipe = search.space.recipe(search.recipe, best.params)
+        about = f"# trial {best.number} of the search in {folder.name}: score {best.value:.3f}\n"
+        write_text(folder / "best.yaml", about + yaml.safe_dump(recipe.changed(), sort_keys=False))
 
 
-def best_preset(search: Search, best: TrialRow, home: SearchFolder) -> str:
-    """A trial as a preset: training with it repeats the trial, with its seeds."""
-    recipe = search.space.recipe(search.recipe, best.values)
-    about = f"# trial {best.number} of the search in {home.path.name}: score {best.score:.3f}\n"
-    return about + yaml.safe_dump(recipe.changed(), sort_keys=False)
+def importances(study: Study) -> dict[str, float]:
+    """Importance of each option for the score (PED-ANOVA), as fractions; empty for too few trials."""
+    done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if len(done) < _FEWEST or len({own.value for own in done}) < 2:
+        return {}
+    return dict(get_param_importances(study))
+
+
+def write_pictures(study: Study, folder: Path) -> None:
+    """Draws Optuna's figures: ``history.png``, ``options.png`` and ``importance.png``."""
+    if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that they are experimental, and limits of axes
+        drawn = {
+            "history": figures.plot_optimization_history(study, target_name="score"),
+            "options": figures.plot_slice(study, target_name="score"),
+        }
+        if importances(study):
+            drawn["importance"] = figures.plot_param_importances(study, target_name="score")
+    for name, axes in drawn.items():
+        save_figure(np.atleast_1d(np.asarray(axes, dtype=object)).flat[0].figure, folder / f"{name}.png")
+
+
+def search_summary(study: Study) -> list[str]:
+    """The best trials and the importance of each option, in lines for people."""
+    done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    ranked = sorted(done, key=lambda own: (-(own.value or 0.0), own.number))[:_SHOWN]
+    lines = [
+        f"trial {own.number}: score {own.value:.0%}  "
+        + " ".join(f"{name}={_short(value)}" for name, value in own.params.items())
+        for own in ranked
+    ]
+    if weights := importances(study):
+        guess = f" (a guess, from {len(done)} trials)" if len(done) < 20 else ""
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in weights.items())
+        lines.append(f"importance{guess}: {shares}")
+    return lines
+
+
+def _short(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

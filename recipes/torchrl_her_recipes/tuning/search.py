@@ -1,64 +1,77 @@
-"""Runs a search: trials of batched runs, several at once, which go on where they were killed."""
+"""Searches for good options with Optuna: each trial is a batched run in a worker process."""
 
 from __future__ import annotations
 
+import sqlite3
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
+import optuna
+import yaml
 from filelock import FileLock, Timeout
-from optuna.exceptions import StorageInternalError
+from optuna.exceptions import OptunaError
+from optuna.storages import RDBStorage
 from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 from tqdm import tqdm
 
+from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.imports import check_permitted
+from torchrl_her_recipes.config.plain_files import read_mapping
 from torchrl_her_recipes.config.search import Search
+from torchrl_her_recipes.runs.callbacks import Callback, RunView
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.score import score
-from torchrl_her_recipes.studies.jobs import Job, Outcome, kept_progress, read_progress
+from torchrl_her_recipes.studies.jobs import Job, Outcome
 from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
-from torchrl_her_recipes.tuning.database import create_database, load_study
-from torchrl_her_recipes.tuning.folder import SearchFolder
-from torchrl_her_recipes.tuning.pruning import PRUNED, reporting
-from torchrl_her_recipes.tuning.results import write_standing
-from torchrl_her_recipes.tuning.samplers import make_sampler
-from torchrl_her_recipes.tuning.standing import Standing
+from torchrl_her_recipes.tuning.results import write_pictures, write_results
 
+_NAME, _SETTINGS, _DATABASE = "search", "search.yaml", "search.db"
 _TICK = 1.0  # seconds
-_DRAW = 60.0  # seconds between two writings of all pictures
-_DEATHS = 3  # of the process of a trial, with no epoch gained in between
-_FAILURES = 5  # with no success: something else than the options is wrong
-_ERROR, _SECONDS = "error", "seconds"  # attributes of trials and of the study
-_AROUND = f"{reporting.__module__}:{reporting.__name__}"
+_ATTEMPTS = 3  # at a trial whose process dies
+_FAILURES = 5  # without any success: something other than the options is wrong
+_FOLDER, _ATTEMPT, _REPEATED, _PRUNED, _ERROR = "folder", "attempt", "repeated", "pruned", "error"
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchResult:
-    """What came of a search so far.
+    """Result of a search so far.
 
     Attributes:
-        standing: its trials, the best first.
-        folder: with the best as a preset, and the pictures.
-        interrupted: whether somebody stopped it. It goes on if it is run again.
-        failed: why, by the number of the trial.
+        study: Optuna's study. Trials with the attribute ``repeated`` were cut short and run again.
+        folder: with the best trial as a preset, a table and pictures.
+        interrupted: whether somebody stopped the search. The same call goes on with it.
     """
 
-    standing: Standing
+    study: Study
     folder: Path
     interrupted: bool = False
-    failed: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def trials(self) -> list[FrozenTrial]:
+        """All trials but those that were cut short."""
+        return _counted(self.study)
 
     @property
     def best(self) -> float | None:
-        """The best score; None if no trial has come to its end."""
-        first = self.standing.best
-        return None if first is None else first.score
+        """The best score; None if no trial is complete."""
+        done = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        return max((trial.value or 0.0 for trial in done), default=None)
+
+    @property
+    def failed(self) -> dict[int, str]:
+        """Why trials failed, by their numbers."""
+        failed = (trial for trial in self.trials if trial.state == TrialState.FAIL)
+        return {trial.number: trial.user_attrs.get(_ERROR, "") for trial in failed}
 
 
 def tune(
@@ -71,247 +84,273 @@ def tune(
     say: Callable[[str], None] = lambda _line: None,
     progress: bool = True,
 ) -> SearchResult:
-    """Searches for good options, or goes on with it: each trial is a batched run in a worker process.
+    """Searches for good options, or goes on with a search in the same folder.
 
-    Trials that were under way when a search was stopped or killed go on first. With one worker the result is
-    the same, bit for bit, as that of a search that was never stopped.
+    Runs of trials that were cut short go on from their checkpoints.
 
     Args:
-        search: what to do.
-        folder: where its database, its trials and its results go.
-        trials: how many there are to be in the folder; 50 by default if there is no limit of time.
-        minutes: no trial begins when all commands together have searched for so long.
-        workers: who does the trials; by default a process for each core. They are closed in the end.
-        say: called with a line when a trial ends.
+        search: recipe, space, sampler and pruner.
+        folder: of the search.
+
+    Keyword Args:
+        trials: number of trials in the folder at the end; 50 if ``minutes`` is not given either.
+        minutes: after which no further trial begins.
+        workers: run the trials; by default a process for each core. They are closed at the end.
+        say: called with a line for each trial that ends.
         progress: whether to show a progress bar.
 
-    Returns:
-        The trials, the best first, and the folder with the best as a preset.
-
     Raises:
-        ValueError: the folder holds another search, somebody is at work in it, a limit is not positive, or
-            the task names a module that must not be imported.
-        ImportError: Optuna is not installed, or the sampler needs a package that is not installed.
-        OSError: the database cannot be used any more, for instance because the disk is full.
-        KeyboardInterrupt: by a second Ctrl-C.
+        ValueError: the folder holds another search, another process is searching in it, a limit is not
+            positive, or the task names a module that must not be imported.
+        ImportError: the sampler needs a package that is not installed.
+        OSError: the database cannot be used, for instance because the disk is full.
+        KeyboardInterrupt: at a second Ctrl-C.
     """
     if trials is not None and trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")
     if minutes is not None and not minutes > 0:
         raise ValueError(f"minutes must be above 0, got {minutes}")
     check_permitted(search.recipe.task.name)
-    search = replace(search, recipe=resolved(search.recipe))
-    home = SearchFolder(folder)
-    home.check(search)
-    sampler = make_sampler(search.sampler, search.recipe.run.seed)
+    search, home = replace(search, recipe=resolved(search.recipe)), Path(folder)
     workers = workers or LocalWorkers()
     try:
-        home.path.mkdir(parents=True, exist_ok=True)
-        with FileLock(home.lock, timeout=0):
-            home.check(search)
-            home.describe(search)
-            create_database(home.database, search.space.values_of(search.recipe))
-            with load_study(home.database, sampler=sampler) as study:
-                rounds = _Rounds(search, home, study, workers, say)
-                rounds.run(trials or (50 if minutes is None else None), minutes, progress=progress)
-                return SearchResult(
-                    standing=rounds.write(),
-                    folder=home.path,
-                    interrupted=rounds.interrupted,
-                    failed={
-                        trial.number: trial.user_attrs.get(_ERROR, "")
-                        for trial in study.get_trials(deepcopy=False, states=(TrialState.FAIL,))
-                    },
-                )
+        home.mkdir(parents=True, exist_ok=True)
+        with FileLock(home / ".lock", timeout=0):
+            _describe(search, home / _SETTINGS)
+            study = _begin(search, home / _DATABASE)
+            limit = trials or (50 if minutes is None else None)
+            trial_runs = _TrialRuns(search, home, study, workers, say)
+            interrupted = trial_runs.run(limit, minutes, progress=progress)
+            write_pictures(study, home)
+            return SearchResult(study=study, folder=home, interrupted=interrupted)
     except Timeout as error:
-        raise ValueError(f"another process is searching in {home.path}") from error
-    except (StorageInternalError, SQLAlchemyError) as error:
+        raise ValueError(f"another process is searching in {home}") from error
+    except (OptunaError, SQLAlchemyError) as error:
         cause = error.__cause__ or error
         why = " ".join(str(getattr(cause, "orig", cause)).split())
-        raise OSError(f"{home.database} cannot be used ({why}); the same command goes on") from error
+        raise OSError(f"{home / _DATABASE} cannot be used ({why}); the same command goes on") from error
     finally:
         workers.close()
 
 
-class _Rounds:
-    """The trials of a search, from the one that begins next to those that are under way."""
+def _describe(search: Search, path: Path) -> None:
+    """Writes the settings of a search, or compares them with those that are there."""
+    if not path.exists():
+        write_text(path, yaml.safe_dump(search.to_plain(), sort_keys=False))
+        return
+    values = read_mapping(path)
+    try:
+        there = Search.from_plain(values)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    if different := there.difference(search):
+        raise ValueError(
+            f"{path.parent} holds a search with {different}: repeat its options, or choose another folder=DIR"
+        )
+
+
+def _begin(search: Search, database: Path) -> Study:
+    """Optuna's study; the first trial is the recipe as it is, and trials that were cut short come again."""
+    study = optuna.create_study(
+        storage=_storage(database),
+        study_name=_NAME,
+        direction="maximize",
+        load_if_exists=True,
+        pruner=_make_pruner(search),
+    )
+    begun = study.get_trials(deepcopy=False)
+    study.sampler = make_sampler(search.sampler, search.recipe.run.seed + len(begun))
+    first = search.space.values_of(search.recipe)
+    if not begun and first is not None:
+        study.enqueue_trial(first)
+    for trial in begun:
+        if trial.state == TrialState.RUNNING:
+            _repeat(study, trial)
+    return study
+
+
+def _storage(database: Path) -> RDBStorage:
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+    def connect() -> sqlite3.Connection:  # letters of the path may mean something else in an address
+        return sqlite3.connect(database, timeout=60, check_same_thread=False)
+
+    return RDBStorage("sqlite:///search.db", engine_kwargs={"creator": connect})
+
+
+def make_sampler(name: str, seed: int) -> optuna.samplers.BaseSampler:
+    """One of Optuna's samplers.
+
+    Raises:
+        ImportError: it needs a package that is not installed.
+    """
+    if name == "cmaes" and find_spec("cmaes") is None:
+        raise ImportError("--sampler cmaes needs cmaes: pip install '.[tune]'")
+    made: dict[str, Callable[[], optuna.samplers.BaseSampler]] = {
+        "tpe": lambda: optuna.samplers.TPESampler(seed=seed),
+        "random": lambda: optuna.samplers.RandomSampler(seed=seed),
+        "cmaes": lambda: optuna.samplers.CmaEsSampler(seed=seed, warn_independent_sampling=False),
+    }
+    return made[name]()
+
+
+def _make_pruner(search: Search) -> optuna.pruners.BasePruner:
+    epochs = search.recipe.run.epochs
+    if search.pruner == "median":  # no earlier than two fifths of the way: success comes late
+        return optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=2 * epochs // 5)
+    if search.pruner == "halving":
+        return optuna.pruners.SuccessiveHalvingPruner(min_resource=max(epochs // 9, 1), reduction_factor=3)
+    return optuna.pruners.NopPruner()
+
+
+def _counted(study: Study) -> list[FrozenTrial]:
+    """The trials that have begun, but for those that were cut short and are repeated."""
+    trials = study.get_trials(deepcopy=False)
+    return [own for own in trials if own.state != TrialState.WAITING and _REPEATED not in own.user_attrs]
+
+
+def _repeat(study: Study, trial: FrozenTrial | Trial, *, attempt: int = 0) -> None:
+    """Ends a trial that was cut short; another one with its values goes on with its run."""
+    Trial(study, trial._trial_id).set_user_attr(_REPEATED, True)
+    study.tell(trial.number, state=TrialState.FAIL)
+    home = trial.user_attrs.get(_FOLDER, _folder(trial.number))
+    study.enqueue_trial(trial.params, user_attrs={_FOLDER: home, _ATTEMPT: attempt})
+
+
+def _folder(number: int) -> str:
+    return f"trial_{number:04}"
+
+
+class _TrialRuns:
+    """The trials of a search, several at once."""
 
     def __init__(
-        self, search: Search, home: SearchFolder, study: Study, workers: Workers, say: Callable[[str], None]
+        self, search: Search, home: Path, study: Study, workers: Workers, say: Callable[[str], None]
     ) -> None:
         self.search, self.home, self.study, self.workers, self.say = search, home, study, workers, say
-        self.interrupted = False
-        self._began = time.monotonic()
-        self._before: float = study.user_attrs.get(_SECONDS, 0.0)
-        self._deaths: dict[int, list[int]] = {}  # the epochs that a trial had kept each time
-        self._failures = 0  # since this command began
-        self._drawn = time.monotonic()
-        self._left_over = [trial.number for trial in self._trials(TrialState.RUNNING)]
-        for trial in self._trials(TrialState.PRUNED, TrialState.FAIL):
-            self._drop_checkpoints(trial.number)  # if a search was killed before it did
+        self._running: dict[Future[Outcome], Trial] = {}
 
-    @property
-    def seconds(self) -> float:
-        """How long all commands together have searched."""
-        return self._before + time.monotonic() - self._began
-
-    def run(self, trials: int | None, minutes: float | None, *, progress: bool) -> None:
-        """Does trials up to a limit.
-
-        Args:
-            trials: how many there are to be in all.
-            minutes: after which none begins.
-            progress: whether to show a bar.
-        """
-        waiting: dict[Future[Outcome], int] = {}
-
-        def fill() -> None:
-            while len(waiting) < self.workers.at_once:
-                number = self._next(trials, minutes)
-                if number is None:
-                    return
-                job = self._job(number)
-                if job is not None:
-                    waiting[threads.submit(self.workers.run, job)] = number
-
-        def collect() -> None:
-            for future in wait(waiting, _TICK, FIRST_COMPLETED).done:
-                self._end(waiting.pop(future), _outcome(future))
-            bar.n = self._done
-            bar.set_postfix_str(self._running(waiting.values()))
-
-        # No bar in a file: there, lines say when a trial ends.
-        bar = tqdm(total=trials, initial=self._done, unit=" trials", disable=None if progress else True)
+    def run(self, trials: int | None, minutes: float | None, *, progress: bool) -> bool:
+        """Runs trials up to a limit; returns whether it was interrupted."""
+        end = None if minutes is None else time.monotonic() + 60 * minutes
+        bar = tqdm(total=trials, initial=self._done(), unit=" trials", disable=None if progress else True)
         with bar, ThreadPoolExecutor(max(self.workers.at_once, 1)) as threads, soft_interrupt() as check:
             try:
-                fill()
-                while waiting:
-                    collect()
-                    fill()
+                while True:
+                    while len(self._running) < self.workers.at_once and self._may_begin(trials, end):
+                        self._start(threads)
+                    if not self._running:
+                        return False
+                    self._collect()
+                    bar.n = self._done()
+                    bar.refresh()
                     check()
             except Interrupted:
-                self.interrupted = True
                 self.workers.stop()
-                while waiting:
-                    collect()
+                while self._running:
+                    self._collect()
+                return True
             finally:
                 self.workers.close()
-        self.study.set_user_attr(_SECONDS, self.seconds)
 
-    def write(self) -> Standing:
-        """Writes what came of the search so far."""
-        self._drawn = time.monotonic()
-        return write_standing(self.search, self.home, self.study)
-
-    def _running(self, numbers: Iterable[int]) -> str:
-        """How far the trials are that are under way: their numbers, with epochs."""
-        epochs = self.search.recipe.run.epochs
-        return ", ".join(
-            f"trial {number}: {read_progress(self.home.trial(number)).epochs}/{epochs} epochs"
-            for number in sorted(numbers)
-        )
-
-    @property
     def _done(self) -> int:
-        return sum(trial.state.is_finished() for trial in self.study.get_trials(deepcopy=False))
+        return sum(trial.state.is_finished() for trial in _counted(self.study))
 
-    def _trials(self, *states: TrialState) -> list[FrozenTrial]:
-        return self.study.get_trials(deepcopy=False, states=states)
+    def _may_begin(self, trials: int | None, end: float | None) -> bool:
+        counted = _counted(self.study)
+        failed = sum(trial.state == TrialState.FAIL for trial in counted)
+        if failed >= _FAILURES and failed == self._done():
+            return False
+        return (trials is None or len(counted) < trials) and (end is None or time.monotonic() < end)
 
-    def _trial(self, number: int) -> FrozenTrial:
-        return self.study.get_trials(deepcopy=False)[number]
-
-    def _next(self, trials: int | None, minutes: float | None) -> int | None:
-        """The number of the trial that is to be done next; None if there is none."""
-        if self._left_over:
-            return self._left_over.pop(0)
-        begun = sum(trial.state != TrialState.WAITING for trial in self.study.get_trials(deepcopy=False))
-        if self._failures >= _FAILURES and not self._trials(TrialState.COMPLETE, TrialState.PRUNED):
-            return None
-        if (trials is not None and begun >= trials) or (minutes is not None and self.seconds >= 60 * minutes):
-            return None
-        return self.study.ask().number
-
-    def _job(self, number: int) -> Job | None:
-        """What a trial runs; None if it has ended already, or cannot be."""
-        frozen = self._trial(number)
-        if PRUNED in frozen.user_attrs:  # the search was killed before it could note it down
-            self._end(number, Outcome())
-            return None
+    def _start(self, threads: ThreadPoolExecutor) -> None:
+        trial = self.study.ask()
         try:
-            # Values that the trial lacks, as its beginning was cut short, are what they would have been.
-            values = self.search.space.suggest(Trial(self.study, frozen._trial_id))
+            values = self.search.space.suggest(trial)
             recipe = self.search.space.recipe(self.search.recipe, values)
-        except ValueError as error:
-            self._end(number, Outcome(error=str(error)))
-            return None
-        folder = self.home.trial(number)
-        around = {
-            "database": str(self.home.database),
-            "pruner": self.search.pruner,
-            "epochs": recipe.run.epochs,
-            "number": number,
+        except ValueError as error:  # values that do not go together
+            self._tell(trial, TrialState.FAIL, error=str(error))
+            return
+        name = trial.user_attrs.get(_FOLDER, _folder(trial.number))
+        options = {
+            "database": str(self.home / _DATABASE),
+            "number": trial.number,
+            "search": self.search.to_plain(),
         }
-        return Job(label=folder.name, recipe=recipe, folder=folder, around=_AROUND, options=around)
+        around = f"{reporting.__module__}:{reporting.__name__}"
+        job = Job(label=name, recipe=recipe, folder=self.home / name, around=around, options=options)
+        self._running[threads.submit(self.workers.run, job)] = trial
 
-    def _end(self, number: int, outcome: Outcome) -> None:
-        """Notes down what came of a trial."""
+    def _collect(self) -> None:
+        for future in wait(self._running, _TICK, FIRST_COMPLETED).done:
+            trial, error = self._running.pop(future), future.exception()
+            outcome = Outcome(error=" ".join(f"{error!r}".split())) if error else future.result()
+            self._end(trial, outcome)
+
+    def _end(self, trial: Trial, outcome: Outcome) -> None:
+        """Tells Optuna what came of a trial, and renews the table."""
+        attempt = trial.user_attrs.get(_ATTEMPT, 0)
         if outcome.interrupted:
+            _repeat(self.study, trial, attempt=attempt)
             return
-        if outcome.died and self._goes_on(number):
-            self._left_over.append(number)
+        if outcome.died and attempt + 1 < _ATTEMPTS:
+            _repeat(self.study, trial, attempt=attempt + 1)
             return
-        home, state, value, error = (
-            RunFolder(self.home.trial(number)),
-            TrialState.COMPLETE,
-            None,
-            outcome.error,
-        )
-        if PRUNED in self._trial(number).user_attrs:
-            state, error = TrialState.PRUNED, ""
-        elif not error:
-            try:
-                value = score(home.rows())
-            except ValueError as broken:
-                error = str(broken)
-        if error:
-            state = TrialState.FAIL
-            self._failures += 1
-            Trial(self.study, self._trial(number)._trial_id).set_user_attr(_ERROR, error)
-        self.study.tell(number, value, state=state)
-        self.study.set_user_attr(_SECONDS, self.seconds)
-        if state != TrialState.COMPLETE:
-            self._drop_checkpoints(number)
-        self.say(self._line(number, error))
-        if time.monotonic() - self._drawn > _DRAW:
-            self.write()
+        frozen = self.study.get_trials(deepcopy=False)[trial.number]
+        run = RunFolder(self.home / trial.user_attrs.get(_FOLDER, _folder(trial.number)))
+        if _PRUNED in frozen.user_attrs:
+            self._tell(trial, TrialState.PRUNED)
+        elif outcome.error:
+            self._tell(trial, TrialState.FAIL, error=outcome.error)
         else:
-            write_standing(self.search, self.home, self.study, pictures=False)
-
-    def _goes_on(self, number: int) -> bool:
-        """Whether a trial whose process died is taken up again: not if it never gets any further."""
-        folder = self.home.trial(number)
-        kept = kept_progress(Job(label="", recipe=self.search.recipe, folder=folder)).epochs
-        deaths = self._deaths.setdefault(number, [])
-        deaths.append(kept)
-        return deaths.count(kept) < _DEATHS
-
-    def _drop_checkpoints(self, number: int) -> None:
-        """Removes what a trial could go on from, which is large, and of no use to one that never does."""
-        for path in RunFolder(self.home.trial(number)).checkpoints:
+            self._tell(trial, TrialState.COMPLETE, value=score(run.rows()))
+            return
+        for path in run.checkpoints:  # large, and nothing goes on from them
             path.unlink(missing_ok=True)
 
-    def _line(self, number: int, error: str) -> str:
-        trial = self._trial(number)
+    def _tell(self, trial: Trial, state: TrialState, *, value: float | None = None, error: str = "") -> None:
         if error:
-            return f"trial {number} failed: {error}"
-        best = max(self._trials(TrialState.COMPLETE), key=lambda own: own.value or 0.0, default=None)
-        record = "" if best is None else f" (best {best.value:.0%}, trial {best.number})"
-        if trial.state == TrialState.PRUNED:
-            return f"trial {number}: pruned after epoch {trial.user_attrs[PRUNED]}{record}"
-        return f"trial {number}: score {trial.value:.0%}{record}"
+            trial.set_user_attr(_ERROR, error)
+        self.study.tell(trial, value, state=state)
+        write_results(self.search, self.study, _counted(self.study), self.home)
+        line = {
+            TrialState.COMPLETE: f": score {value or 0.0:.0%}",
+            TrialState.PRUNED: f": pruned after epoch {trial.user_attrs.get(_PRUNED)}",
+        }.get(state, f" failed: {error}")
+        self.say(f"trial {trial.number}{line}")
 
 
-def _outcome(future: Future[Outcome]) -> Outcome:
-    error = future.exception()
-    return future.result() if error is None else Outcome(error=" ".join(f"{error!r}".split()))
+class _Reporter(Callback):
+    """Reports a trial's score after each epoch, and stops the trial if Optuna prunes it."""
+
+    def __init__(self, study: Study, number: int) -> None:
+        self.study = study
+        self.trial = Trial(study, study.get_trials(deepcopy=False)[number]._trial_id)
+
+    def on_epoch(self, run: RunView) -> bool:
+        """Whether the trial is pruned; never at its last epoch."""
+        epoch = run.trainer.epochs
+        self.trial.report(score(run.rows), epoch)
+        pruned = epoch < run.components.recipe.run.epochs and self.trial.should_prune()
+        if pruned:
+            self.trial.set_user_attr(_PRUNED, epoch)
+        return pruned
+
+
+@contextmanager
+def reporting(*, database: str, number: int, search: Mapping[str, Any]) -> Iterator[list[Callback]]:
+    """Surrounds the run of a trial in its worker process, and gives the run's callbacks.
+
+    Args:
+        database: of the search.
+        number: of the trial.
+        search: as plain values.
+    """
+    storage = _storage(Path(database))
+    pruner = _make_pruner(Search.from_plain(search))
+    study = optuna.load_study(study_name=_NAME, storage=storage, pruner=pruner)
+    try:
+        yield [_Reporter(study, number)]
+    finally:
+        storage.remove_session()
+        storage.engine.dispose()

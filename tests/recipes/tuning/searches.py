@@ -10,7 +10,7 @@ import pytest
 
 from torchrl_her_recipes import Search, make_recipe
 from torchrl_her_recipes.config.spaces import make_space
-from torchrl_her_recipes.tuning import results
+from torchrl_her_recipes.tuning import search as module
 from torchrl_her_recipes.tuning.search import SearchResult, tune
 
 from ..runs.killed import was_killed
@@ -54,8 +54,7 @@ def go_on(
     """Searches in this process, perhaps without the pictures of it."""
     with pytest.MonkeyPatch.context() as patch:
         if not pictures:
-            for name in ("plot_history", "plot_importance", "plot_options"):
-                patch.setattr(results, name, mock.Mock())
+            patch.setattr(module, "write_pictures", mock.Mock())
         workers = options.pop("workers", None) or Here()
         return tune(search, folder, trials=trials, workers=workers, progress=False, **options)
 
