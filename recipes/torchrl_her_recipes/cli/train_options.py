@@ -58,7 +58,7 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
             _check_single(name, text)
         (values,) = sweep(list(given.items()))
         recipe = _recipe(values)
-        yield RunRequest(recipe, Path(folder or f"runs/{now}_{_label(recipe)}"))
+        yield RunRequest(recipe, Path(folder or f"runs/{now}_{label(recipe)}"))
         return
     root = Path(folder or f"runs/sweep_{now}")
     before: list[Recipe] = []
@@ -68,7 +68,7 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
             shown = " ".join(f"{name}={value}" for name, value in values.items())
             raise ValueError(f"the sweep has the same run twice: {shown}; give each value once")
         before.append(recipe)
-        yield RunRequest(recipe, root / f"{_label(recipe)}_{number}")
+        yield RunRequest(recipe, root / f"{label(recipe)}_{number}")
 
 
 def extending(options: tuple[str, ...]) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def _recipe(values: Mapping[str, Any]) -> Recipe:
         return make_recipe(base, **own)
 
 
-def _label(recipe: Recipe) -> str:
+def label(recipe: Recipe) -> str:
     """The name of a run's folder; its letters are allowed on every file system."""
     algo = recipe.hindsight.algo
     return "_".join([file_name(recipe.task.name), *([algo] if algo != AUTO else []), f"s{recipe.run.seed}"])

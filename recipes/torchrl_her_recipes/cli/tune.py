@@ -12,8 +12,8 @@ from tqdm import tqdm
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `tune`
 from torchrl_her_recipes.cli.overrides import ARGUMENTS
 from torchrl_her_recipes.cli.permission import allow_import
-from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, file_name
-from torchrl_her_recipes.cli.train_options import complete, folder_option, single, with_folder
+from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail
+from torchrl_her_recipes.cli.train_options import complete, folder_option, label, single, with_folder
 from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.config.search import PRUNERS, SAMPLERS, Search
@@ -74,7 +74,7 @@ def tune(
     check_permitted(recipe.task.name)
     space = load_space(space_name) if space_name else space_for(recipe)
     search = Search(recipe=recipe, space=space.without(given), sampler=sampler, pruner=pruner)
-    home = Path(folder or f"runs/tune_{file_name(recipe.task.name)}_{recipe.hindsight.algo}")
+    home = Path(folder or f"runs/tune_{label(recipe)}")
     click.echo(f"search: {home}")
     click.echo(f"varied: {', '.join(entry.name for entry in search.space)}")
     workers: Any = recipes.make_workers(jobs=jobs)

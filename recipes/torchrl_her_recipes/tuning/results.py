@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from optuna.importance import get_param_importances
 from optuna.study import Study
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import FrozenTrial, Trial, TrialState
 from optuna.visualization import matplotlib as figures
 
 from torchrl_her.files.writing import write_text
@@ -21,6 +21,11 @@ from torchrl_her_recipes.runs.plots import save_figure
 
 _FEWEST = 5  # complete trials, from which importances are estimated
 _SHOWN = 5  # trials in the table that is printed
+
+
+def folder_of(trial: FrozenTrial | Trial) -> str:
+    """Name of the folder of a trial's run: that of the trial it repeats, if it repeats one."""
+    return str(trial.user_attrs.get("folder", f"trial_{trial.number:04}"))
 
 
 def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], folder: Path) -> None:
@@ -35,11 +40,13 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
     names = [entry.name for entry in search.space]
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["trial", "state", "score", "epochs", *names])
+    writer.writerow(["trial", "state", "score", "epochs", *names, "folder"])
     for own in trials:
         value = own.value if own.value is not None else own.intermediate_values.get(own.last_step or 0, "")
         values = [own.params.get(name, "") for name in names]
-        writer.writerow([own.number, own.state.name.lower(), value, own.last_step or 0, *values])
+        writer.writerow(
+            [own.number, own.state.name.lower(), value, own.last_step or 0, *values, folder_of(own)]
+        )
     write_text(folder / "trials.csv", table.getvalue())
     if any(own.state == TrialState.COMPLETE for own in trials):
         best = study.best_trial

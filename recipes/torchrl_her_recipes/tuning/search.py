@@ -33,13 +33,13 @@ from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.score import score
 from torchrl_her_recipes.studies.jobs import Job, Outcome
 from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
-from torchrl_her_recipes.tuning.results import write_pictures, write_results
+from torchrl_her_recipes.tuning.results import folder_of, write_pictures, write_results
 
 _NAME, _SETTINGS, _DATABASE = "search", "search.yaml", "search.db"
 _TICK = 1.0  # seconds
 _ATTEMPTS = 3  # at a trial whose process dies
 _FAILURES = 5  # without any success: something other than the options is wrong
-_FOLDER, _ATTEMPT, _REPEATED, _PRUNED, _ERROR = "folder", "attempt", "repeated", "pruned", "error"
+_ATTEMPT, _REPEATED, _PRUNED, _ERROR = "attempt", "repeated", "pruned", "error"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,12 +213,7 @@ def _repeat(study: Study, trial: FrozenTrial | Trial, *, attempt: int = 0) -> No
     """Ends a trial that was cut short; another one with its values goes on with its run."""
     Trial(study, trial._trial_id).set_user_attr(_REPEATED, True)
     study.tell(trial.number, state=TrialState.FAIL)
-    home = trial.user_attrs.get(_FOLDER, _folder(trial.number))
-    study.enqueue_trial(trial.params, user_attrs={_FOLDER: home, _ATTEMPT: attempt})
-
-
-def _folder(number: int) -> str:
-    return f"trial_{number:04}"
+    study.enqueue_trial(trial.params, user_attrs={"folder": folder_of(trial), _ATTEMPT: attempt})
 
 
 class _TrialRuns:
@@ -271,7 +266,7 @@ class _TrialRuns:
         except ValueError as error:  # values that do not go together
             self._tell(trial, TrialState.FAIL, error=str(error))
             return
-        name = trial.user_attrs.get(_FOLDER, _folder(trial.number))
+        name = folder_of(trial)
         options = {
             "database": str(self.home / _DATABASE),
             "number": trial.number,
@@ -297,7 +292,7 @@ class _TrialRuns:
             _repeat(self.study, trial, attempt=attempt + 1)
             return
         frozen = self.study.get_trials(deepcopy=False)[trial.number]
-        run = RunFolder(self.home / trial.user_attrs.get(_FOLDER, _folder(trial.number)))
+        run = RunFolder(self.home / folder_of(trial))
         if _PRUNED in frozen.user_attrs:
             self._tell(trial, TrialState.PRUNED)
         elif outcome.error:

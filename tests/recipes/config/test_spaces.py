@@ -76,7 +76,10 @@ BOMB = "a: &a [x, x]\n" + "".join(
         ("[" * 30_000, "cannot be read: it is nested more than 30 levels deep"),
         ("#" * 1_100_000, "cannot be read: it has more than 1,048,576 bytes"),
         (BOMB, "cannot be read: it has more than 50,000 values"),
-        ("!!python/object/apply:os.system ['touch it']", "cannot be read: line 1: could not determine a constructor"),
+        (
+            "!!python/object/apply:os.system ['touch it']",
+            "cannot be read: line 1: could not determine a constructor",
+        ),
         ("gama: {kind: float, low: 0, high: 1}", "no option 'gama'; did you mean gamma?"),
         ("gamma: 0.9", "gamma of a space must have a kind, as in .* got 0.9"),
         ("gamma: {kind: flaot, low: 0, high: 1}", "kind of gamma must be one of .* got 'flaot'"),
