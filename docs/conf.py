@@ -32,7 +32,7 @@ PAGES = {
     "../CHANGELOG.md": "changelog.md",
     "../results/README.md": "numbers.md",  # so it is called in pages of this folder
     "results/README.md": "numbers.md",  # and in RESULTS.md
-    "benchmarks/PROFILE.md": "profile.md",
+    "../benchmarks/PROFILE.md": "profile.md",
 }
 # The numbers of studies: a link to such a folder is, on the site, one to the page that is made of them.
 RESULTS = Path(__file__).parent.parent / "results"
@@ -86,14 +86,19 @@ def link_to_pages(text: str) -> str:
     Example:
         >>> link_to_pages("see [results](../RESULTS.md#speed)")
         'see [results](results.md#speed)'
+        >>> link_to_pages("the study [ibs](../../results/ibs) in a page of docs/results")
+        'the study <a href="ibs/index.html">ibs</a> in a page of docs/results'
         >>> link_to_pages("the study [ibs](results/ibs)")
         'the study <a href="results/ibs/index.html">ibs</a>'
     """
     for file, page in PAGES.items():
+        if file.startswith("../"):
+            text = text.replace(f"](../{file}", f"](../{page}")  # in pages of a folder here
         text = text.replace(f"]({file}", f"]({page}")
     for name in REPORTS:
-        link = rf"\[([^\]]+)\]\((?:\.\./)?results/{re.escape(name)}\)"
-        text = re.sub(link, rf'<a href="results/{name}/index.html">\1</a>', text)
+        for before, home in (("../../", ""), ("../", "results/"), ("", "results/")):
+            link = rf"\[([^\]]+)\]\({re.escape(before)}results/{re.escape(name)}\)"
+            text = re.sub(link, rf'<a href="{home}{name}/index.html">\1</a>', text)
     return text
 
 

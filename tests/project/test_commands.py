@@ -12,7 +12,7 @@ import torchrl_her_recipes
 from torchrl_her_recipes import Search, cli
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", ROOT / "RESULTS.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "RESULTS.md", *sorted((ROOT / "docs").glob("**/*.md"))]
 
 
 def commands(name: str) -> list[str]:

@@ -28,7 +28,7 @@ LIBRARY = (
     "native",
     "demonstrations",
 )
-PAGES = sorted(path.name for path in DOCS.glob("*.md"))
+PAGES = sorted(str(path.relative_to(DOCS)) for path in DOCS.glob("**/*.md"))
 
 
 def blocks(page: str) -> list[str]:
@@ -186,4 +186,4 @@ def test_pages_are_in_the_contents_and_their_links_and_pictures_are_there(page: 
     assert page == "index.md" or re.search(f"^{page.removesuffix('.md')}$", contents, re.MULTILINE)
     text = re.sub(r"```python\n.*?```", "", (DOCS / page).read_text(), flags=re.DOTALL)
     for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
-        assert (DOCS / target).exists(), target
+        assert ((DOCS / page).parent / target).exists(), target
