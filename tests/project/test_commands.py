@@ -52,8 +52,11 @@ def test_train(command: str) -> None:
 @pytest.mark.parametrize("command", [own for own in commands("study") if "--ray" not in own])
 def test_study(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = shlex.split(command)
-    assert cli.main([*arguments, *([] if "--plan" in arguments else ["--plan"])]) == 0
-    assert " batched runs to go, " in capsys.readouterr().out
+    code, said = cli.main([*arguments, *([] if "--plan" in arguments else ["--plan"])]), capsys.readouterr()
+    if "there is no module 'panda_gym'" in said.err:  # of the extra bench
+        pytest.skip("needs panda-gym")
+    assert code == 0, said.err
+    assert " batched runs to go, " in said.out
 
 
 @pytest.mark.parametrize("command", commands("tune"))

@@ -154,8 +154,8 @@ def test_the_map_of_the_repository_names_its_folders() -> None:
         assert parts <= mapped
 
 
-def test_the_readme_names_tests_that_there_are() -> None:
-    named = re.findall(r"`(test_\w+)`", (DOCS.parent / "README.md").read_text())
+def test_the_comparison_names_tests_that_there_are() -> None:
+    named = re.findall(r"`(test_\w+)`", (DOCS / "compatibility.md").read_text())
     assert len(named) > 8
     tests = "\n".join(path.read_text() for path in (DOCS.parent / "tests").rglob("test_*.py"))
     for name in named:
