@@ -60,10 +60,15 @@ def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> li
 
 
 def _remedy(facts: Facts, recipe: Recipe, layers_file: str) -> str:
-    algorithm = get_algorithm(recipe.hindsight.algo)
+    algorithm, shown = get_algorithm(recipe.hindsight.algo), "demonstrations (demonstrations.file=FILE)"
     if algorithm.curriculum and algorithm.filter_achieved:
-        return "This recipe has a curriculum; demonstrations (demonstrations.file=FILE) help, too"
-    shown = "demonstrations (demonstrations.file=FILE)"
+        layers = recipe.curriculum.layers
+        first = (
+            f", whose first goals are for entries {layers[0]['achieved_goal']} of the observation"
+            if layers
+            else ""
+        )
+        return f"This recipe has a curriculum{first}; {shown} help, too"
     if facts.own_layers:
         return f"What helps: the task's own curriculum (algo=cher) or {shown}"
     if facts.layers:
