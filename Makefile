@@ -7,10 +7,14 @@ BIN := $(VENV)/bin
 # to have it, each process that a test starts would compile all of torch, which takes six seconds.
 PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal --durations=15
 
-.PHONY: demo test test-full test-versions lint bench bench-gpu docs clean
+.PHONY: demo shell test test-full test-versions lint bench bench-gpu docs clean
+.SILENT:
 
 demo: $(VENV)/.ready  ## learn to pick up a ball and throw it, in a minute; ends with a curve and a GIF
 	$(BIN)/torchrl-her train preset=demo
+
+shell: $(VENV)/.ready  ## a shell in which torchrl-her can be called
+	VIRTUAL_ENV=$(abspath $(VENV)) PATH="$(abspath $(BIN)):$$PATH" $${SHELL:-sh}
 
 test: $(VENV)/.ready-test  ## tests and doctests; those of some files or folders only: make test TESTS=tests/envs
 	$(PYTEST) $(TESTS)
@@ -45,9 +49,10 @@ $(VENV)/.ready-test: EXTRAS := [test,lint,video]
 $(VENV)/.ready-bench: EXTRAS := [bench]
 $(VENV)/.ready-docs: EXTRAS := [docs,report]
 $(VENV)/.ready $(VENV)/.ready-test $(VENV)/.ready-bench $(VENV)/.ready-docs: pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; set PYTHON=") if sys.version_info < (3, 11) else None'
+	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; set PYTHON=") if sys.version_info < (3, 11) else None'
+	echo "Installing into $(VENV): about 6 GB, most of it for CUDA; UV_TORCH_BACKEND=cpu takes far less"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet uv  # installs torch in seconds; pip is the way out where it cannot
-	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uv pip install --quiet --editable '.$(EXTRAS)' \
+	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uv pip install --editable '.$(EXTRAS)' \
 		|| $(BIN)/python -m pip install --quiet --editable '.$(EXTRAS)'
 	touch $@
