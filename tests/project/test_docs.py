@@ -155,7 +155,7 @@ def test_the_map_of_the_repository_names_its_folders() -> None:
 
 
 def test_the_comparison_names_tests_that_there_are() -> None:
-    named = re.findall(r"`(test_\w+)`", (DOCS / "compatibility.md").read_text())
+    named = re.findall(r"`(test_\w+)`", (DOCS / "comparison.md").read_text())
     assert len(named) > 8
     tests = "\n".join(path.read_text() for path in (DOCS.parent / "tests").rglob("test_*.py"))
     for name in named:

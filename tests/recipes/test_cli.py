@@ -42,10 +42,10 @@ def test_train_play_and_resume(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train", "--resume", "out"]) == 0
 
 
-def test_the_default_folder_names_task_algorithm_and_seed() -> None:
+def test_the_default_folder_names_task_and_seed() -> None:
     assert cli.main(["train", "task=robot_v0", "seed=2", *overrides(epochs=1)]) == 0
     (folder,) = Path("runs").iterdir()
-    assert folder.name.endswith("robot_v0_filtered_her_s2")
+    assert folder.name.endswith("robot_v0_s2")
 
 
 def test_sweeps(capsys: pytest.CaptureFixture[str]) -> None:

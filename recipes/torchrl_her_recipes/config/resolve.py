@@ -74,7 +74,7 @@ def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
     """Group and name of each option that is ``auto``, depends on the environment, and has an effect.
 
     Example:
-        >>> auto_options(Recipe().replace(gamma=0.95))[:2]
+        >>> auto_options(Recipe().replace(gamma=0.95))[1:3]
         [('hindsight', 'goal_sources'), ('collection', 'num_envs')]
     """
     homes = {own.name: group.name for group in fields(recipe) for own in fields(getattr(recipe, group.name))}

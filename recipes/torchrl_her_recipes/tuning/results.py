@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from matplotlib import rc_context
 from optuna.importance import get_param_importances
 from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial, TrialState
@@ -67,7 +68,7 @@ def write_pictures(study: Study, folder: Path) -> None:
     """Draws Optuna's figures: ``history.png``, ``options.png`` and ``importance.png``."""
     if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
         return
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), rc_context():  # Optuna chooses a style for the whole process
         warnings.simplefilter("ignore")  # that they are experimental, and limits of axes
         drawn = {
             "history": figures.plot_optimization_history(study, target_name="score"),

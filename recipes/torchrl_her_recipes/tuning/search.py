@@ -308,8 +308,10 @@ class _TrialRuns:
             trial.set_user_attr(_ERROR, error)
         self.study.tell(trial, value, state=state)
         write_results(self.search, self.study, _counted(self.study), self.home)
+        done = state == TrialState.COMPLETE
+        best = f" (best {self.study.best_value:.0%}, trial {self.study.best_trial.number})" if done else ""
         line = {
-            TrialState.COMPLETE: f": score {value or 0.0:.0%}",
+            TrialState.COMPLETE: f": score {value or 0.0:.0%}{best}",
             TrialState.PRUNED: f": pruned after epoch {trial.user_attrs.get(_PRUNED)}",
         }.get(state, f" failed: {error}")
         self.say(f"trial {trial.number}{line}")

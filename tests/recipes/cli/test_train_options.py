@@ -51,8 +51,8 @@ def test_requests_and_their_folders() -> None:
     assert one.folder.name.endswith("_gym_FetchReach-v4_her_s0")
     several = list(requests(("seed=3,4", "folder=a,b"), multirun=True))
     assert [str(each.folder) for each in several] == [
-        "a,b/hand_v0_filtered_her_s3_0",
-        "a,b/hand_v0_filtered_her_s4_1",
+        "a,b/hand_v0_s3_0",
+        "a,b/hand_v0_s4_1",
     ]
 
 

@@ -36,18 +36,18 @@ def test_a_search_says_what_it_varies_and_how_to_train_the_best(
     said = capsys.readouterr().out.splitlines()
     # What is given is not varied: gamma, and batch_size and hidden among the options that make it small.
     assert said[:2] == [
-        "search: runs/tune_bit_flip_filtered_her",
+        "search: runs/tune_bit_flip_s0",
         "varied: learning_rate, tau, norm, epsilon_decay, epsilon_end, k",
     ]
     assert re.fullmatch(r"trial 0: score \d+% \(best \d+%, trial 0\)", said[2])
     assert said[4].startswith("trial ")
-    assert said[-1] == "the best: torchrl-her train preset=runs/tune_bit_flip_filtered_her/best.yaml"
+    assert said[-1] == "the best: torchrl-her train preset=runs/tune_bit_flip_s0/best.yaml"
 
-    assert main(["train", "preset=runs/tune_bit_flip_filtered_her/best.yaml", "--show"]) == 0
+    assert main(["train", "preset=runs/tune_bit_flip_s0/best.yaml", "--show"]) == 0
     assert "gamma: 0.95" in capsys.readouterr().out
     assert main([*command[:-1], "tpe"]) == 2
     refused = capsys.readouterr().err
-    assert "tune_bit_flip_filtered_her holds a search with --sampler=random, not --sampler=tpe" in refused
+    assert "tune_bit_flip_s0 holds a search with --sampler=random, not --sampler=tpe" in refused
     assert refused.count("\n") == 1
 
 

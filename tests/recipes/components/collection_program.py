@@ -213,7 +213,7 @@ def _failure(**options: Any) -> dict[str, Any]:
 
 
 def _breaks() -> dict[str, Any]:
-    return _failure(epochs=4, **{"task.options.fails_at": 130})
+    return _failure(algo="filtered_her", epochs=4, **{"task.options.fails_at": 130})
 
 
 def _cannot_start() -> dict[str, Any]:

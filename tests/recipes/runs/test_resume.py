@@ -184,7 +184,7 @@ def test_a_finished_run_that_is_given_more_epochs(options: dict[str, Any], tmp_p
 def test_epochs_extend_a_finished_run_and_an_interrupted_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recipe, whole = small(epochs=2, epoch_frames=800), tmp_path / "whole"
+    recipe, whole = small(algo="filtered_her", epochs=2, epoch_frames=800), tmp_path / "whole"
     run(build(recipe.replace(epochs=4)), whole, progress=False)
     run(build(recipe), tmp_path / "ended", progress=False)
     run(press_ctrl_c(build(recipe), 12), tmp_path / "stopped", progress=False)

@@ -18,7 +18,7 @@ from torchrl_her_recipes import Components, Recipe, build, load_actor, play, res
 
 from ..small import assert_same, small
 
-RECIPE = small(seed=3, pictures=True, epsilon_start=1.0, epsilon_decay=0.9)
+RECIPE = small(algo="filtered_her", seed=3, pictures=True, epsilon_start=1.0, epsilon_decay=0.9)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import pytest
 from filelock import FileLock
 from PIL import Image
@@ -57,6 +58,7 @@ def test_a_search_leaves_the_best_as_a_preset_and_more_trials_can_be_added(tmp_p
     for name in ("history", "importance", "options"):
         with Image.open(tmp_path / f"{name}.png") as picture:
             assert min(picture.size) > 200
+    assert matplotlib.rcParams["axes.facecolor"] == matplotlib.rcParamsDefault["axes.facecolor"]
     left = [path.name for path in tmp_path.iterdir() if path.name != ".lock" and path.is_file()]
     expected = ["best.yaml", "search.db", "search.yaml", "trials.csv"]
     assert sorted(left) == sorted([*expected, "history.png", "importance.png", "options.png"])
