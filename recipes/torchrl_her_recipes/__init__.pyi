@@ -57,7 +57,7 @@ from .runs.waste import Waste as Waste
 from .runs.waste import find_waste as find_waste
 from .runs.watch import Seen as Seen
 from .runs.watch import watch as watch
-from .studies.pictures import plot_runs as plot_runs
+from .studies.pictures import plot_virtual_goals as plot_virtual_goals
 from .studies.plan import duration as duration
 from .studies.study import plan_study as plan_study
 from .studies.study import run_study as run_study

@@ -44,8 +44,7 @@ class Study:
             it takes away. They may not set how many runs there are, or how long they are, and each of their
             options must have an effect with all that varies.
         for_task: options of the runs on some of the tasks alone, by the task's name.
-        figure: the metrics that are drawn over environment steps, or "times" for the steps until the
-            task ``chain`` is solved.
+        figure: the metrics that are drawn over environment steps.
 
     Raises:
         ValueError: there is nothing to compare, the values of an option are no list, there are options for a
@@ -92,10 +91,10 @@ class Study:
             if long := _set_in(own, _LENGTHS):
                 raise ValueError(f"cases of {self.name} set {long[0]} in {case}: it must be the same in all")
         drawn = [self.figure] if isinstance(self.figure, str) else list(self.figure)
-        if drawn != ["times"] and (not drawn or not set(drawn) <= set(metric_names())):
+        if not drawn or not set(drawn) <= set(metric_names()):
             known = ", ".join(metric_names())
-            raise ValueError(f"figure of {self.name} must be times, or some of {known}; got {self.figure!r}")
-        object.__setattr__(self, "figure", "times" if drawn == ["times"] else drawn)
+            raise ValueError(f"figure of {self.name} must be some of {known}; got {self.figure!r}")
+        object.__setattr__(self, "figure", drawn)
 
     def combinations(self) -> Iterator[dict[str, Any]]:
         """What each combination has of its own, in the order of :meth:`cells`; ``case`` names one."""
@@ -126,9 +125,6 @@ class Study:
             if twin := next((other for other, same in before.items() if same == recipe), None):
                 raise ValueError(f"the study {self.name} has the same run twice: {twin} and {label}")
             before[label] = recipe
-            if self.figure == "times" and recipe.task.name != "chain":
-                task = recipe.task.name
-                raise ValueError(f"the figure times of {self.name} is for the task chain, not {task}")
             yield label, recipe
 
 

@@ -1,4 +1,4 @@
-"""What agents make of the toy environments: values of actions in bit flipping and in the treasure hunt."""
+"""Values of actions in bit flipping and in the treasure hunt."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_her_envs.toy.bit_flip import BitFlip
 from torchrl_her_envs.toy.treasure_hunt import TreasureHunt
 from torchrl_her_recipes.components.devices import place_of
 
-_STATES = 256  # for each number of wrong bits
+STATES = 256  # for each number of wrong bits
 
 
 @torch.no_grad()
@@ -31,44 +31,6 @@ def some_wrong(
     place = torch.randint(2, (states, bits), generator=generator).float()
     differs = torch.rand(states, bits, generator=generator).argsort(-1) < wrong
     return place, torch.where(differs, 1.0 - place, place)
-
-
-def values_by_wrong_bits(
-    actor: TensorDictModuleBase, bits: int, *, states: int = _STATES, generator: torch.Generator | None = None
-) -> dict[str, Tensor]:
-    """Mean values of each kind of action over the number of wrong bits, from 0 to ``bits``.
-
-    Args:
-        actor: of DQN, for :class:`~torchrl_her_envs.BitFlip`.
-        bits: n.
-        states: random ones for each number of wrong bits.
-        generator: of these.
-
-    Returns:
-        [n + 1] for ``needed`` and ``needless`` flips, and for the ``useless`` action if there is one; NaN
-        where there is no such flip.
-    """
-    kinds: dict[str, list[Tensor]] = {}
-    for wrong in range(bits + 1):
-        place, goal = some_wrong(bits, wrong, states, generator)
-        differs = place != goal
-        values = action_values(actor, place, goal)
-        flips = values[:, :bits]
-        kinds.setdefault("needed", []).append(flips[differs].mean())
-        kinds.setdefault("needless", []).append(flips[~differs].mean())
-        if values.shape[1] > bits:
-            kinds.setdefault("useless", []).append(values[:, bits].mean())
-    return {kind: torch.stack(means) for kind, means in kinds.items()}
-
-
-def true_values(wrong: Tensor, gamma: float) -> Tensor:
-    """The value of a flip that is needed when ``wrong`` bits are, with -1 for all steps but the last."""
-    return -(1.0 - gamma ** (wrong - 1.0)) / (1.0 - gamma)
-
-
-def values_on_the_line(actor: TensorDictModuleBase, env: TreasureHunt) -> Tensor:
-    """The values [places, treasures, 2] of going left and right, for all places and treasures."""
-    return action_values(actor, *_all_pairs(env))
 
 
 def measure_values(actor: TensorDictModuleBase, env: GoalEnv, runs: int) -> dict[str, Tensor]:
@@ -100,7 +62,7 @@ def _measure_useless(env: BitFlip, actor: TensorDictModuleBase, runs: int) -> di
         return {}
     bits = env.bits
     generator = torch.Generator().manual_seed(0)
-    each = [some_wrong(bits, wrong, _STATES, generator) for wrong in range(1, bits + 1)]
+    each = [some_wrong(bits, wrong, STATES, generator) for wrong in range(1, bits + 1)]
     place, goal = (torch.cat(own) for own in zip(*each, strict=True))
     values = action_values(actor, place.repeat(runs, 1), goal.repeat(runs, 1)).view(runs, len(place), -1)
     needed = (place != goal).float()
@@ -114,7 +76,7 @@ def _measure_useless(env: BitFlip, actor: TensorDictModuleBase, runs: int) -> di
 
 @_measure.register
 def _right_way(env: TreasureHunt, actor: TensorDictModuleBase, runs: int) -> dict[str, Tensor]:
-    place, goal = (points.reshape(-1, 1) for points in _all_pairs(env))
+    place, goal = (points.reshape(-1, 1) for points in all_pairs(env))
     apart = (place != goal).squeeze(-1)
     place, goal = place[apart], goal[apart]
     values = action_values(actor, place.repeat(runs, 1), goal.repeat(runs, 1)).view(runs, len(place), 2)
@@ -122,7 +84,7 @@ def _right_way(env: TreasureHunt, actor: TensorDictModuleBase, runs: int) -> dic
     return {"right_way": right.float().mean(1)}
 
 
-def _all_pairs(env: TreasureHunt) -> tuple[Tensor, Tensor]:
+def all_pairs(env: TreasureHunt) -> tuple[Tensor, Tensor]:
     """All places along the first dimension, all treasures along the second: [places, treasures, 1] both."""
     goals = env.goal_distribution
     points = goals.from_uniform((torch.arange(goals.count)[:, None] + 0.5) / goals.count).float()

@@ -12,7 +12,6 @@ from torchrl_her_recipes.config.imports import check_permitted, permit_task
 from torchrl_her_recipes.config.study import Study, curve_label
 from torchrl_her_recipes.runs.plots import plot_comparison
 from torchrl_her_recipes.runs.run import last_success
-from torchrl_her_recipes.studies.chain_times import plot_times
 from torchrl_her_recipes.studies.plan import Plan
 from torchrl_her_recipes.studies.schedule import run_jobs
 from torchrl_her_recipes.studies.seed_batches import Batches, plan_batches
@@ -101,14 +100,8 @@ def run_study(
 
 
 def draw_study(study: Study, folder: Path) -> Path:
-    """Metrics over environment steps: a panel for each task, a curve for each combination of the rest.
-
-    Of a study whose figure is "times": how long chains took.
-    """
+    """Metrics over environment steps: a panel for each task, a curve for each combination of the rest."""
     path = folder / f"{study.name}.png"
-    if study.figure == "times":
-        plot_times([(recipe, Batches(folder / label).rows()) for label, recipe in study.cells()], path)
-        return path
     panels: dict[str, dict[str, list[dict[str, float]]]] = {}
     for label, recipe in study.cells():
         panels.setdefault(recipe.task.name, {})[curve_label(label, recipe)] = Batches(folder / label).rows()

@@ -111,7 +111,7 @@ def test_plot_goals_draws_them_again(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "goals.png"
-    assert main(["plot", "goals", str(finished), "--out", str(out)]) == 0
+    assert main(["plot", str(finished), "--out", str(out)]) == 0
     assert capsys.readouterr().out.strip() == str(out)
     with Image.open(out) as picture:
         assert picture.size[0] > picture.size[1] > 300
@@ -119,7 +119,7 @@ def test_plot_goals_draws_them_again(
 
 def test_a_run_without_a_map_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(build(small(algo="no_hindsight", epochs=1)), tmp_path / "run", progress=False)
-    assert main(["plot", "goals", str(tmp_path / "run")]) == 2
+    assert main(["plot", str(tmp_path / "run")]) == 2
     assert (
         capsys.readouterr()
         .err.strip()

@@ -86,7 +86,7 @@ KINDS = {
     ),
     "configuration": Kind("run/config.yaml", _use_run, TEXT, ("train", "--resume", "DIR")),
     "table": Kind("run/metrics.csv", _use_run, (*BYTES, damage.lines), ("export", "DIR", "--out", "NEW")),
-    "goals": Kind("run/goal_map.npz", GoalMap.load, BYTES, ("plot", "goals", "DIR", "--out", "NEW")),
+    "goals": Kind("run/goal_map.npz", GoalMap.load, BYTES, ("plot", "DIR", "--out", "NEW")),
     "preset": Kind(
         "mine.yaml",
         lambda path: list(requests((f"preset={path}",), multirun=False)),

@@ -99,18 +99,7 @@ def test_mappings_are_called_by_the_entries_that_differ() -> None:
     assert [label for label, _ in study.cells()] == ["her_length=4", "her_length=6"]
 
 
-def test_chains_are_compared_by_their_times_and_others_by_the_metrics_asked_for(tmp_path: Path) -> None:
-    sizes = [{"length": n, "layers": 2, "alternating": True} for n in (2, 4)]
-    times = Study(
-        name="times",
-        recipe={**SMALL, "task": "chain", "epochs": 1},
-        vary={"algo": ["her", "cher"], "options": sizes},
-        figure="times",
-    )
-    assert run_study(times, tmp_path / "a", workers=Here(), progress=False).figure
-    chains = [str(tmp_path / "a" / label) for label, _ in times.cells()]
-    assert main(["plot", "times", *chains, "--out", str(tmp_path / "again.png")]) == 0
-    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "a" / "times.png").read_bytes()
+def test_a_study_draws_the_metrics_asked_for(tmp_path: Path) -> None:
     metrics = Study(
         name="metrics",
         recipe={**SMALL, "task": "treasure_hunt", "options": {"step": 25}, "epochs": 1},
@@ -204,11 +193,7 @@ def test_without_ray_its_name_and_the_remedy_are_given(
         (["vary: {algo: [her]}\nrecipe: {1: 2}"], "options of mine must be names, got 1"),
         (["vary: {task.options: [{a: 1}, 3]}"], "hand_v0 takes no option 'a'"),
         (["vary: {task.options: [3]}"], "task.options must be a mapping of options by name, got 3"),
-        (["vary: {algo: [her]}\nfigure: [succes]"], "figure of mine must be times, or some of success, "),
-        (
-            ["vary: {algo: [her]}\nfigure: times"],
-            "times of mine is for the task chain, not hand_v0",
-        ),
+        (["vary: {algo: [her]}\nfigure: [succes]"], "figure of mine must be some of success, "),
     ],
 )
 def test_bad_input_is_one_clear_line(

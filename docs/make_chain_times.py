@@ -1,7 +1,12 @@
-"""How long it takes to solve the chain: appendix C's ideal learners, and what runs took beside them."""
+"""Draws how long chains took to be solved, beside the ideal learners of the thesis's appendix C.
+
+torchrl-her study chain --folder runs/chain
+python docs/make_chain_times.py runs/chain/*/    # draws docs/images/chain.png
+"""
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +18,7 @@ from matplotlib.figure import Figure
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.plots import COLORS, Rows, save_figure
+from torchrl_her_recipes.studies.seed_batches import Batches
 
 _RANDOM = 0.5  # p of the thesis: one of two actions goes forward
 _SOLVED = 0.9  # success of the greedy policy
@@ -152,3 +158,18 @@ def _draw_measured(axes: Axes, algo: str, cells: Mapping[int, tuple[Recipe, Rows
             label=label,
         )
         label = None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of the study's combinations")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "images" / "chain.png")
+    options = parser.parse_args()
+    runs = [Batches(folder) for folder in options.runs]
+    plot_times([(own.homes[0].recipe(), own.rows()) for own in runs], options.out)
+
+
+if __name__ == "__main__":
+    main()

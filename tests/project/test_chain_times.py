@@ -13,12 +13,12 @@ from PIL import Image
 
 from torchrl_her_envs import Chain
 from torchrl_her_recipes import Recipe, make_recipe
-from torchrl_her_recipes.studies.chain_times import (
-    episodes_to_solve,
-    ideal_episodes,
-    learning_steps,
-    plot_times,
-)
+
+from .test_teaching import script
+
+chain_times = script("make_chain_times")
+episodes_to_solve, plot_times = chain_times.episodes_to_solve, chain_times.plot_times
+ideal_episodes, learning_steps = chain_times.ideal_episodes, chain_times.learning_steps
 
 
 def played_out(length: int, layers: int, algo: str, p: float, learners: int) -> float:
