@@ -17,7 +17,7 @@ _KERNEL_DIMENSIONS = 3
 Values = Callable[[Tensor, Tensor, Sequence[int]], Tensor]
 
 
-class Offers(NamedTuple):
+class GoalCandidates(NamedTuple):
     """Goals of which one is proposed for each of m episodes that begin, run after run.
 
     Attributes:
@@ -50,7 +50,7 @@ class GoalFactor:
     The base class finds all goals alike.
 
     Attributes:
-        samples: how many of the achieved goals ``Offers.known`` is to have.
+        samples: how many of the achieved goals ``GoalCandidates.known`` is to have.
 
     Example:
         >>> class NotTooFar(GoalFactor):
@@ -60,7 +60,7 @@ class GoalFactor:
 
     samples: int = 0
 
-    def __call__(self, offers: Offers) -> Tensor:
+    def __call__(self, offers: GoalCandidates) -> Tensor:
         """[m, c] of at least 0, or of bool."""
         return offers.goals.new_ones(offers.goals.shape[:-1])
 
@@ -111,7 +111,7 @@ class Successes:
         self.rate = kept * self.rate.to(kept.device) + (1 - kept) * achieved / ended.clamp(min=1)
 
 
-class Rare(GoalFactor):
+class InverseDensity(GoalFactor):
     """Prefers goals with few others around them: the inverse of their density among all that were achieved.
 
     MEGA proposes the goal of the least density (Pitis et al., Maximum Entropy Gain Exploration for Long
@@ -132,8 +132,8 @@ class Rare(GoalFactor):
     Example:
         >>> known = torch.tensor([[0.0], [0.1], [0.2], [5.0]])
         >>> goals = torch.tensor([[[0.1], [5.0]]])
-        >>> offers = Offers(goals, goals, torch.zeros(1, 1), torch.zeros(1, 1), [1], [known])
-        >>> Rare()(offers).argmax().item()
+        >>> offers = GoalCandidates(goals, goals, torch.zeros(1, 1), torch.zeros(1, 1), [1], [known])
+        >>> InverseDensity()(offers).argmax().item()
         1
     """
 
@@ -144,7 +144,7 @@ class Rare(GoalFactor):
         check_whole(samples=samples, k=k)
         self.samples, self.sigma, self.k = samples, sigma, k
 
-    def __call__(self, offers: Offers) -> Tensor:
+    def __call__(self, offers: GoalCandidates) -> Tensor:
         parts = zip(offers.goals.split(list(offers.counts)), offers.known, strict=True)
         logs = torch.cat([self._log_density(goals, known) for goals, known in parts if len(goals)])
         return (logs.amin(1, keepdim=True) - logs).exp()  # 1 for the rarest
@@ -157,7 +157,7 @@ class Rare(GoalFactor):
         return log_neighbor_density(points, samples, min(self.k, len(samples))).to(goals)
 
 
-class Achievable(GoalFactor):
+class ValueCutoff(GoalFactor):
     """Leaves out goals that the critics do not yet believe in: those of a value below a cut-off.
 
     The cut-off is each run's own and moves with the success of its proposed goals: down, by a step for as
@@ -186,8 +186,8 @@ class Achievable(GoalFactor):
     Example:
         >>> values = lambda observation, goals, counts: -goals.abs()  # the nearer to 0 the better
         >>> goals = torch.tensor([[[1.0], [2.0], [9.0]], [[5.0], [4.0], [6.0]]])
-        >>> offers = Offers(goals, goals, torch.zeros(2, 1), torch.zeros(2, 1), [2])
-        >>> Achievable(values, cutoff=-3.0)(offers).tolist()
+        >>> offers = GoalCandidates(goals, goals, torch.zeros(2, 1), torch.zeros(2, 1), [2])
+        >>> ValueCutoff(values, cutoff=-3.0)(offers).tolist()
         [[True, True, False], [False, True, False]]
     """
 
@@ -212,7 +212,7 @@ class Achievable(GoalFactor):
         self.successes = Successes(runs, memory=memory)
         self.cutoff = torch.full((runs,), cutoff, dtype=torch.float64)
 
-    def __call__(self, offers: Offers) -> Tensor:
+    def __call__(self, offers: GoalCandidates) -> Tensor:
         value = self.values(offers.start, offers.goals, offers.counts).mean(-1).nan_to_num(-math.inf)
         own = self.cutoff.to(value)[offers.run].unsqueeze(1)
         believed = value >= own
@@ -231,7 +231,7 @@ class Achievable(GoalFactor):
         self.cutoff, self.successes.rate = state["cutoff"].clone(), state["rate"].clone()
 
 
-class Directed(GoalFactor):
+class DiscoverScore(GoalFactor):
     """Prefers goals that can be achieved, that critics disagree about, and that lead to the task's goal.
 
     The factor is exp(score / temperature), with the score of Diaz-Bone et al., DISCOVER: Automated Curricula
@@ -244,7 +244,7 @@ class Directed(GoalFactor):
     so that achievable goals count more, as long as fewer than ``target`` of the proposed goals are achieved,
     and falls otherwise.
 
-    With a single critic S is 0. :class:`Rare` then takes its place.
+    With a single critic S is 0. :class:`InverseDensity` then takes its place.
 
     Args:
         values: of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
@@ -267,8 +267,8 @@ class Directed(GoalFactor):
     Example:
         >>> values = lambda observation, goals, counts: -(observation.view(1, -1, 1) - goals).abs()
         >>> goals = torch.tensor([[[1.0], [3.0], [6.0]]])  # from 0, the task wants 4
-        >>> offers = Offers(goals, goals, torch.zeros(1, 1), torch.full((1, 1), 4.0), [1])
-        >>> Directed(values, alpha=0.0)(offers).log().tolist()  # towards the goal alone
+        >>> offers = GoalCandidates(goals, goals, torch.zeros(1, 1), torch.full((1, 1), 4.0), [1])
+        >>> DiscoverScore(values, alpha=0.0)(offers).log().tolist()  # towards the goal alone
         [[-2.0, 0.0, -1.0]]
     """
 
@@ -294,7 +294,7 @@ class Directed(GoalFactor):
         self.successes = Successes(runs, memory=memory, start=target)
         self.alpha = torch.full((runs,), alpha, dtype=torch.float64)
 
-    def __call__(self, offers: Offers) -> Tensor:
+    def __call__(self, offers: GoalCandidates) -> Tensor:
         near = self._bound(self.values(offers.start, offers.goals, offers.counts))
         far = self._bound(self.values(offers.reached, offers.target.unsqueeze(1), offers.counts))
         alpha = self.alpha.to(near)[offers.run].unsqueeze(1)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite
 from torchrl.envs import Transform
 
-from torchrl_her.behavior.factors import GoalFactor, Offers
+from torchrl_her.behavior.factors import GoalCandidates, GoalFactor
 from torchrl_her.behavior.memory import AchievedGoals
 from torchrl_her.checks import check_whole
 from torchrl_her.goals.factors import draw
@@ -20,7 +20,7 @@ from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights, weights_by_run
 from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
 
-Told = Literal["achieved", "proposed"]
+UpdateOn = Literal["achieved", "proposed"]
 
 
 class BehaviorGoals(Transform):
@@ -35,12 +35,12 @@ class BehaviorGoals(Transform):
     the proposed goal. The other episodes are as the environment has them. Environments for evaluation do
     without this transform.
 
-    | method | weights | told | factors | greedy |
+    | method | weights | update_on | factors | greedy |
     | --- | --- | --- | --- | --- |
     | uniform | none | | none | False |
     | IBS | :class:`~torchrl_her.Instructiveness` | proposed | none | False |
-    | MEGA | none | | ``Rare``, ``Achievable`` | True |
-    | DISCOVER | none | | ``Directed``; with a single critic ``Rare``, too | True |
+    | MEGA | none | | ``InverseDensity``, ``ValueCutoff`` | True |
+    | DISCOVER | none | | ``DiscoverScore``; with a single critic ``InverseDensity``, too | True |
 
     In a curriculum, put it behind :class:`~torchrl_her.StateToObs` and before :class:`~torchrl_her.ZeroPad`.
     It acts in the last layer, which is the full task, if ``layer_key`` is given or :meth:`set_active` is
@@ -57,7 +57,7 @@ class BehaviorGoals(Transform):
     Keyword Args:
         weights: of goals; for several runs a list, one of each. None for all alike.
         factors: others by which the weights are multiplied.
-        told: which goals the weights are told of by ``update``: those that are achieved, or those proposed.
+        update_on: goals that the weights are updated on: ``achieved`` or ``proposed`` ones.
         remember: whether achieved goals are remembered; if not, ``memory.add`` says which goals there are.
         greedy: whether the goal of the greatest product is proposed, and not one in proportion to it.
         real_share: share of the episodes in which the task's own goal stays.
@@ -66,8 +66,8 @@ class BehaviorGoals(Transform):
         runs: R.
         generators: sources of random numbers, one of each run; None for torch's own, with one run only.
         achieved_reward: the reward of an achieved goal.
-        goes_on: whether the environment can be stepped further after it terminated an episode; if not, the
-            episode is truncated there.
+        continues_after_termination: whether the environment can be stepped further after it terminated an
+            episode; if not, the episode is truncated there.
         observation_key, achieved_goal_key, desired_goal_key, reward_key, terminated_key, truncated_key,
             done_key: read, and all but the first two written.
         real_goal_key: where the task's own goal is written.
@@ -90,7 +90,8 @@ class BehaviorGoals(Transform):
         >>> from torchrl_her import GoalReward
         >>> from torchrl_her_envs import make_env
         >>> env = make_env("hand_v0", num_envs=4, seed=0)
-        >>> env = TransformedEnv(env, BehaviorGoals(GoalReward(0.1), real_share=0.0, goes_on=True))
+        >>> goals = BehaviorGoals(GoalReward(0.1), real_share=0.0, continues_after_termination=True)
+        >>> env = TransformedEnv(env, goals)
         >>> _ = env.rollout(10)  # which is remembered
         >>> begun = env.reset()
         >>> begun["proposed"].flatten().tolist()
@@ -105,7 +106,7 @@ class BehaviorGoals(Transform):
         *,
         weights: GoalWeights | Sequence[GoalWeights] | None = None,
         factors: Sequence[GoalFactor] = (),
-        told: Told = "achieved",
+        update_on: UpdateOn = "achieved",
         remember: bool = True,
         greedy: bool = False,
         real_share: float = 0.5,
@@ -114,7 +115,7 @@ class BehaviorGoals(Transform):
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
         achieved_reward: float = 0.0,
-        goes_on: bool = False,
+        continues_after_termination: bool = False,
         observation_key: NestedKey = "observation",
         achieved_goal_key: NestedKey = "achieved_goal",
         desired_goal_key: NestedKey = "desired_goal",
@@ -131,18 +132,29 @@ class BehaviorGoals(Transform):
         if not 0.0 <= real_share <= 1.0:
             raise ValueError(f"real_share must be in [0, 1], got {real_share}")
         check_whole(candidates=candidates)
-        if told not in get_args(Told):
-            raise ValueError(f"told must be one of {', '.join(get_args(Told))}, got {told!r}")
+        if update_on not in get_args(UpdateOn):
+            raise ValueError(f"update_on must be one of {', '.join(get_args(UpdateOn))}, got {update_on!r}")
         own = weights_by_run(weights, runs)
-        if truncated_key is None and not goes_on:
-            raise ValueError("goes_on=False needs a truncated_key, to say where the environment ended")
+        if truncated_key is None and not continues_after_termination:
+            raise ValueError(
+                "continues_after_termination=False needs a truncated_key, to say where the environment ended"
+            )
         out_keys = [desired_goal_key, real_goal_key, proposed_key, reached_key]
         super().__init__(in_keys=[observation_key, achieved_goal_key, desired_goal_key], out_keys=out_keys)
         self.generators: Generators = check_generators(runs, generators) or [None]
         self.reward_fn, self.weights, self.factors = reward_fn, own, list(factors)
         self.remember = remember
-        self.told, self.greedy, self.real_share, self.candidates = told, greedy, real_share, candidates
-        self.runs, self.achieved_reward, self.goes_on = runs, achieved_reward, goes_on
+        self.update_on, self.greedy, self.real_share, self.candidates = (
+            update_on,
+            greedy,
+            real_share,
+            candidates,
+        )
+        self.runs, self.achieved_reward, self.continues_after_termination = (
+            runs,
+            achieved_reward,
+            continues_after_termination,
+        )
         self.memory = AchievedGoals(memory, runs=runs)
         self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
         self.truncated_key = None if truncated_key is None else unravel_key(truncated_key)
@@ -243,7 +255,7 @@ class BehaviorGoals(Transform):
         done = terminated
         if self.truncated_key is not None:
             truncated = self._get(next_tensordict, self.truncated_key)
-            if not self.goes_on:
+            if not self.continues_after_termination:
                 truncated = truncated | (ended & ~terminated)
             next_tensordict.set(self.truncated_key, truncated)
             done = terminated | truncated
@@ -287,7 +299,7 @@ class BehaviorGoals(Transform):
         if part is not None and not bool(part.any()):
             return
         self.memory.add(achieved, _rows(self._get(after, self.in_keys[0])), which=part)
-        if self.weights and self.told == "achieved":
+        if self.weights and self.update_on == "achieved":
             goals = achieved if part is None else achieved[part]
             self._weights_of_runs().update(goals, range(self.runs), self._counts(part, len(achieved)))
 
@@ -304,7 +316,7 @@ class BehaviorGoals(Transform):
             return torch.zeros_like(begins), None
         counts = self._counts(chosen, len(begins))
         index = self.memory.draw(counts, self.candidates, self.generators)
-        offers = Offers(
+        offers = GoalCandidates(
             goals=self.memory.goals(index),
             reached=self.memory.observations(index),
             start=_rows(self._get(tensordict, self.in_keys[0]))[chosen],
@@ -327,7 +339,7 @@ class BehaviorGoals(Transform):
         if not bool(valid.all()):  # then the task's own goal stays
             chosen, goals = chosen.index_put((chosen.clone(),), valid), goals[valid]
             counts = self._counts(chosen, len(begins))
-        if self.weights and self.told == "proposed":
+        if self.weights and self.update_on == "proposed":
             self._weights_of_runs().update(goals, range(self.runs), counts)
         return chosen, goals
 
@@ -340,7 +352,7 @@ class BehaviorGoals(Transform):
         goals = self.memory.goals(self.memory.draw(own, number, self.generators))
         return [part.flatten(0, 1) for part in goals.split(own)]
 
-    def _likelihood(self, offers: Offers) -> Tensor:
+    def _likelihood(self, offers: GoalCandidates) -> Tensor:
         """How likely each goal is to be proposed, [m, c]."""
         likelihood = offers.goals.new_ones(offers.goals.shape[:-1])
         if self.weights and not self.weights[0].alike:

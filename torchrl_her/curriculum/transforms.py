@@ -135,9 +135,10 @@ class StateToObs(_LayerTransform):
     environment must set it at its time limit even if its own goal is achieved.
 
     Where the environment terminates an episode by itself, the layer's episode goes on if the environment can
-    be stepped further. If it cannot (``goes_on=False``, as with gymnasium's environments), the layer's
-    episode ends there, too: it is ``truncated`` unless the layer's goal was achieved in that step, so that
-    the critic goes on to estimate what would have come. The end says nothing about the layer's goal.
+    be stepped further. If it cannot (``continues_after_termination=False``, as with gymnasium's
+    environments), the layer's episode ends there, too: it is ``truncated`` unless the layer's goal was
+    achieved in that step, so that the critic goes on to estimate what would have come. The end says
+    nothing about the layer's goal.
 
     The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
     Put the transform around a ParallelEnv and not inside of its workers: they hold copies of ``progress`` and
@@ -165,12 +166,13 @@ class StateToObs(_LayerTransform):
             own (:class:`~torchrl_her.curriculum.EpisodeLayers`).
         truncated_key: read; None if the environment below has no time limit (a StepCounter after this
             transform may add one).
-        goes_on: whether the environment can be stepped further after it terminated an episode; if not,
-            ``truncated`` is written, too.
+        continues_after_termination: whether the environment can be stepped further after it terminated an
+            episode; if not, ``truncated`` is written, too.
 
     Raises:
-        ValueError: ``progress`` belongs to another curriculum, or ``goes_on`` is False without a
-            ``truncated_key``; when used, the state has another width, or the batch is not R equal blocks.
+        ValueError: ``progress`` belongs to another curriculum, or ``continues_after_termination`` is False
+            without a ``truncated_key``; when used, the state has another width, or the batch is
+            not R equal blocks.
         KeyError: when used, the environment has no such state or flags.
 
     Example:
@@ -206,15 +208,17 @@ class StateToObs(_LayerTransform):
         truncated_key: NestedKey | None = "truncated",
         done_key: NestedKey = "done",
         layer_key: NestedKey = "layer",
-        goes_on: bool = True,
+        continues_after_termination: bool = True,
     ) -> None:
-        if not goes_on and truncated_key is None:
-            raise ValueError("goes_on=False needs a truncated_key, to say where the environment ended")
+        if not continues_after_termination and truncated_key is None:
+            raise ValueError(
+                "continues_after_termination=False needs a truncated_key, to say where the environment ended"
+            )
         shown = [observation_key, achieved_goal_key, desired_goal_key]
         super().__init__(curriculum, progress, None, [state_key], shown, layer_key)
         self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
         self.truncated_key = None if truncated_key is None else unravel_key(truncated_key)
-        self.done_key, self.goes_on = unravel_key(done_key), goes_on
+        self.done_key, self.continues_after_termination = unravel_key(done_key), continues_after_termination
         goal = curriculum.goal_width
         self._widths = [curriculum.observation_width, goal, goal]
 
@@ -240,7 +244,7 @@ class StateToObs(_LayerTransform):
         done = terminated.clone()
         if self.truncated_key is not None:
             truncated = next_tensordict.get(self.truncated_key)
-            if not self.goes_on:
+            if not self.continues_after_termination:
                 truncated = truncated | (next_tensordict.get(self.terminated_key) & ~terminated)
                 next_tensordict.set(self.truncated_key, truncated)
             done |= truncated

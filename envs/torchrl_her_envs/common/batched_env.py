@@ -46,7 +46,7 @@ class BatchedEnv(TaskTraits, EnvBase):
     worlds: Any
     max_steps: int
     dtype_shown: torch.dtype = torch.float32
-    goes_on = True
+    continues_after_termination = True
     batched = True
 
     def __init__(self, num_envs: int) -> None:

@@ -47,7 +47,7 @@ class GoalEnv(Protocol):
     def can_render(self) -> bool: ...
 
     @property
-    def goes_on(self) -> bool: ...
+    def continues_after_termination(self) -> bool: ...
 
     @property
     def batched(self) -> bool: ...
@@ -105,7 +105,7 @@ class TaskTraits:
         return False
 
     @property
-    def goes_on(self) -> bool:
+    def continues_after_termination(self) -> bool:
         """Whether it can be stepped further after it terminated an episode.
 
         Layers of a curriculum have goals of their own, so their episodes then go on as well.

@@ -6,7 +6,14 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor, GoalValues, Rare
+from torchrl_her.behavior import (
+    BehaviorGoals,
+    DiscoverScore,
+    GoalFactor,
+    GoalValues,
+    InverseDensity,
+    ValueCutoff,
+)
 from torchrl_her.curriculum.layers import Curriculum
 from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her.goals.rewards import EnvReward, GoalReward, RewardFunction
@@ -65,7 +72,7 @@ def make_behavior(
     behavior = BehaviorGoals(
         _reward_of(task, None if state is None else state.curriculum),
         weights=own or None,
-        told="proposed" if options.name == "ibs" else "achieved",
+        update_on="proposed" if options.name == "ibs" else "achieved",
         greedy=options.name in _GREEDY,
         real_share=options.real_share,
         candidates=options.candidates,
@@ -73,7 +80,7 @@ def make_behavior(
         runs=recipe.run.num_runs,
         generators=generators_of(recipe, Stream.PROPOSED_GOALS),
         achieved_reward=rewards[1],
-        goes_on=task.goes_on,
+        continues_after_termination=task.continues_after_termination,
         **top,
     )
     if state is not None:
@@ -102,7 +109,7 @@ def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = 
         runs=recipe.run.num_runs,
         generators=generators_of(recipe, Stream.PROPOSED_GOALS),
         achieved_reward=rewards[1],
-        goes_on=task.goes_on,
+        continues_after_termination=task.continues_after_termination,
     )
 
 
@@ -128,9 +135,9 @@ def make_factors(
         before_critic=agent.norm,
     )
     if name == "mega":
-        return [Rare(), Achievable(values, runs=runs, **_cutoff(recipe, rewards))]
+        return [InverseDensity(), ValueCutoff(values, runs=runs, **_cutoff(recipe, rewards))]
     several = getattr(recipe.learner, "critics", 1) > 1  # their disagreement shows what is new
-    return [*([] if several else [Rare()]), Directed(values, runs=runs)]
+    return [*([] if several else [InverseDensity()]), DiscoverScore(values, runs=runs)]
 
 
 def _cutoff(recipe: Recipe, rewards: tuple[float, float]) -> dict[str, float]:

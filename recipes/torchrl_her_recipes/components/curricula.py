@@ -177,7 +177,9 @@ def in_layers(
         starts: starts episodes at demonstrations; None if there are no such episodes.
     """
     curriculum = progress.curriculum
-    shown = StateToObs(curriculum, progress, goes_on=goal_env(env).goes_on)
+    shown = StateToObs(
+        curriculum, progress, continues_after_termination=goal_env(env).continues_after_termination
+    )
     proposes = [] if behavior is None else [behavior]
     transforms: list[Transform] = [shown, *proposes, ZeroPad(curriculum, progress)]
     if "state" not in env.observation_spec:

@@ -121,11 +121,11 @@ def test_environments_that_never_terminate_run_into_their_time_limit() -> None:
 
 def test_only_environments_that_are_done_begin_anew() -> None:
     steps = rollout(walk(4), 60)
-    goes_on = ~steps["next", "done"].squeeze(-1)[:, :-1]
+    inside = ~steps["next", "done"].squeeze(-1)[:, :-1]
     for key in KEYS:
-        assert torch.equal(steps[key][:, 1:][goes_on], steps["next", key][:, :-1][goes_on])
+        assert torch.equal(steps[key][:, 1:][inside], steps["next", key][:, :-1][inside])
     new = (steps["achieved_goal"] != steps["desired_goal"]).squeeze(-1)[:, 1:]
-    assert new[~goes_on].all()  # no episode starts at its goal, where many ended
+    assert new[~inside].all()  # no episode starts at its goal, where many ended
 
 
 class OwnLimit(Walk):

@@ -59,9 +59,9 @@ def test_a_rollout_goes_on_over_ends() -> None:
     steps = make_env("robot_v1", num_envs=4, seed=1).rollout(120, break_when_any_done=False)
     done, first = steps["next", "done"].squeeze(-1), steps["state"][:, 1:]
     assert done.sum() >= 4 * 2
-    goes_on = ~done[:, :-1]
-    assert torch.equal(first[goes_on], steps["next", "state"][:, :-1][goes_on])
-    assert not torch.equal(first[~goes_on], steps["next", "state"][:, :-1][~goes_on])
+    inside = ~done[:, :-1]
+    assert torch.equal(first[inside], steps["next", "state"][:, :-1][inside])
+    assert not torch.equal(first[~inside], steps["next", "state"][:, :-1][~inside])
 
 
 def test_a_collector_gets_whole_episodes() -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_her import Instructiveness, load_checkpoint
-from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor, Rare
+from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalFactor, InverseDensity, ValueCutoff
 from torchrl_her.curriculum import EpisodeLayers, LayerOutcomes, TeacherStudent
 from torchrl_her.replay_buffers import rows_of_run
 from torchrl_her_recipes import Components, Recipe, build, make_recipe, resume, run
@@ -78,7 +78,12 @@ def test_goals_are_proposed_and_counted(way: str) -> None:
 
 @pytest.mark.parametrize(
     ("way", "factors"),
-    [("uniform_achieved", []), ("ibs", []), ("mega", [Rare, Achievable]), ("discover", [Directed])],
+    [
+        ("uniform_achieved", []),
+        ("ibs", []),
+        ("mega", [InverseDensity, ValueCutoff]),
+        ("discover", [DiscoverScore]),
+    ],
 )
 def test_each_way_has_its_factors(way: str, factors: list[type[GoalFactor]]) -> None:
     behavior = build(recipe(way)).behavior
@@ -91,7 +96,10 @@ def test_each_way_has_its_factors(way: str, factors: list[type[GoalFactor]]) -> 
 def test_a_single_critic_leaves_it_to_rare_goals_what_is_new() -> None:
     behavior = build(recipe("discover", learner="ddpg")).behavior
     assert behavior is not None
-    assert [type(own) for own in behavior.factors] == [Rare, Directed]  # TD3 above has two critics
+    assert [type(own) for own in behavior.factors] == [
+        InverseDensity,
+        DiscoverScore,
+    ]  # TD3 above has two critics
 
 
 def test_evaluation_asks_for_the_tasks_goals() -> None:
@@ -194,7 +202,7 @@ def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
     behavior = build(recipe("mega", gamma=0.98)).behavior
     assert behavior is not None
     achievable = behavior.factors[1]
-    assert isinstance(achievable, Achievable)
+    assert isinstance(achievable, ValueCutoff)
     assert (achievable.first, achievable.floor, achievable.step) == pytest.approx((-3.0, -50.0, 1.0))
     assert _cutoff(recipe("mega", gamma=0.98), (0.0, 1.0)) == pytest.approx(
         {"cutoff": 0.94, "floor": 0.0, "step": 0.02}  # gamma^d of a goal that is 3 steps' worth away

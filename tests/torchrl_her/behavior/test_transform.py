@@ -14,7 +14,7 @@ from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_her import GoalReward, GoalWeights, HERSampleUnit, HERWriter
-from torchrl_her.behavior import Achievable, BehaviorGoals, Directed, GoalFactor, Offers
+from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalCandidates, GoalFactor, ValueCutoff
 from torchrl_her.goals import RareGoals
 from torchrl_her.trainers import collector_state_dict, load_collector_state_dict
 
@@ -42,7 +42,7 @@ class Farther(GoalFactor):
     def __init__(self) -> None:
         self.ends: list[tuple[list[int], list[int]]] = []
 
-    def __call__(self, offers: Offers) -> Tensor:
+    def __call__(self, offers: GoalCandidates) -> Tensor:
         return (offers.reached - offers.start.unsqueeze(1)).squeeze(-1)  # observations are ten times goals
 
     def record(self, ended: Tensor, achieved: Tensor) -> None:
@@ -121,7 +121,7 @@ def test_an_episode_that_misses_is_truncated_as_it_would_be() -> None:
 
 
 def test_the_tasks_goal_does_not_end_an_episode_with_another() -> None:
-    env, _ = made(1, weights=Told(2.0), goes_on=True, line={"steps": 20})
+    env, _ = made(1, weights=Told(2.0), continues_after_termination=True, line={"steps": 20})
     played(env, 11)  # the task's goal is achieved at 9, then two steps of the next episode
     first = env.reset()
     env.base_env.place += 7.0
@@ -143,7 +143,7 @@ def test_an_environment_that_cannot_go_on_truncates() -> None:
 
 
 def test_a_fall_is_one_whatever_the_goal() -> None:
-    env, _ = made(1, weights=Told(2.0), goes_on=True, line={"edge": 3.5, "steps": 20})
+    env, _ = made(1, weights=Told(2.0), continues_after_termination=True, line={"edge": 3.5, "steps": 20})
     played(env, 3)
     first = env.reset()
     env.base_env.place += 3.0
@@ -191,10 +191,12 @@ def test_without_a_goal_that_may_be_proposed_the_tasks_own_stays() -> None:
     assert not begun["proposed"].any()
 
 
-@pytest.mark.parametrize(("told", "goals"), [("achieved", [1.0, 1.0, 2.0, 2.0]), ("proposed", [2.0, 2.0])])
-def test_what_weights_are_told(told: str, goals: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("update_on", "goals"), [("achieved", [1.0, 1.0, 2.0, 2.0]), ("proposed", [2.0, 2.0])]
+)
+def test_goals_that_weights_are_updated_on(update_on: str, goals: list[float]) -> None:
     weights = Told(2.0)
-    env, _ = made(weights=weights, told=told, candidates=50)
+    env, _ = made(weights=weights, update_on=update_on, candidates=50)
     played(env, 2)
     env.reset()
     assert weights.goals == goals
@@ -340,8 +342,8 @@ def test_bad_options() -> None:
         BehaviorGoals(REWARD, real_share=2)
     with pytest.raises(ValueError, match="candidates must be at least 1, got 0"):
         BehaviorGoals(REWARD, candidates=0)
-    with pytest.raises(ValueError, match="told must be one of achieved, proposed, got 'nothing'"):
-        BehaviorGoals(REWARD, told="nothing")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="update_on must be one of achieved, proposed, got 'nothing'"):
+        BehaviorGoals(REWARD, update_on="nothing")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="2 runs need a list of 2 weights, one of each run, got 1"):
         BehaviorGoals(REWARD, runs=2, weights=Told(1.0), generators=[torch.Generator()] * 2)
 
@@ -372,7 +374,7 @@ def test_it_works_where_the_environments_are(
         behavior = BehaviorGoals(
             REWARD,
             weights=[RareGoals(k=2, estimator="neighbors"), RareGoals(k=2, estimator="neighbors")],
-            factors=[Achievable(nearness, runs=2), Directed(nearness, runs=2)],
+            factors=[ValueCutoff(nearness, runs=2), DiscoverScore(nearness, runs=2)],
             real_share=0.3,
             greedy=True,
             candidates=20,
@@ -437,7 +439,9 @@ def test_a_success_with_another_reward_is_no_fall() -> None:
             return after.set("reward", after["reward"] - 0.01)
 
     generator = torch.Generator().manual_seed(0)
-    behavior = BehaviorGoals(REWARD, weights=Told(2.0), real_share=0.0, generators=[generator], goes_on=True)
+    behavior = BehaviorGoals(
+        REWARD, weights=Told(2.0), real_share=0.0, generators=[generator], continues_after_termination=True
+    )
     env = TransformedEnv(Costly(1, steps=20), behavior)
     played(env, 3)
     first = env.reset()
@@ -453,7 +457,7 @@ def test_without_a_time_limit() -> None:
         real_share=0.0,
         weights=Told(2.0),
         truncated_key=None,
-        goes_on=True,
+        continues_after_termination=True,
         generators=[torch.Generator()],
     )
     env = TransformedEnv(Line(1, steps=1000), behavior)
@@ -461,7 +465,7 @@ def test_without_a_time_limit() -> None:
     env.reset()
     rows = played(env, 3)
     assert rows["next", "done"].flatten().tolist() == [False, True, False]
-    with pytest.raises(ValueError, match="goes_on=False needs a truncated_key"):
+    with pytest.raises(ValueError, match="continues_after_termination=False needs a truncated_key"):
         BehaviorGoals(REWARD, truncated_key=None)
 
 

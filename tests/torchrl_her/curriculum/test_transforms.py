@@ -776,7 +776,9 @@ def test_an_input_that_was_stored_is_replaced() -> None:
 
 def wrap_ending(*layers: int, threshold: float = 0.5) -> TransformedEnv:
     progress = at(make_three(threshold), *layers)
-    return TransformedEnv(TinyEnv((2,)), StateToObs(progress.curriculum, progress, goes_on=False))
+    return TransformedEnv(
+        TinyEnv((2,)), StateToObs(progress.curriculum, progress, continues_after_termination=False)
+    )
 
 
 def test_an_end_of_the_environment_cuts_the_layer_s_episode_off() -> None:
@@ -802,5 +804,5 @@ def test_where_the_environment_can_go_on_so_does_the_layer() -> None:
 
 def test_an_end_needs_a_flag_to_be_noted_in() -> None:
     progress = at(make_three(), 0)
-    with pytest.raises(ValueError, match="goes_on=False needs a truncated_key"):
-        StateToObs(progress.curriculum, progress, goes_on=False, truncated_key=None)
+    with pytest.raises(ValueError, match="continues_after_termination=False needs a truncated_key"):
+        StateToObs(progress.curriculum, progress, continues_after_termination=False, truncated_key=None)

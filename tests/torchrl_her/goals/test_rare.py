@@ -1,4 +1,4 @@
-"""Rare goals weigh more: by hand, for any goals, after resuming, and in the writer."""
+"""InverseDensity goals weigh more: by hand, for any goals, after resuming, and in the writer."""
 
 from __future__ import annotations
 
