@@ -128,7 +128,7 @@ def test_mappings_are_named_by_what_differs() -> None:
             "cases of own set epochs in long: it must be the same in all",
         ),
         ({"vary": {"k": 3}}, "vary of own must hold lists of values by option"),
-        ({"vary": {"k": [1]}, "figure": "speed"}, "figure of own must be times, or some of success"),
+        ({"vary": {"k": [1]}, "figure": "speed"}, "figure of own must be some of success"),
         ({"vary": {"k": [1, 1]}}, "two combinations that are called k=1"),
         ({"vary": {"kk": [1]}}, "no option 'kk'"),
         (
