@@ -49,7 +49,8 @@ def test_configurations_are_read_without_torch() -> None:
 def lint_imports(folder: Path) -> str:
     """The report on the packages in a folder, in one line."""
     command = [Path(sys.executable).parent / "lint-imports", "--no-cache"]
-    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    paths = [str(folder), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     return " ".join(done.stdout.split())
 
