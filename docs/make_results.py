@@ -22,7 +22,7 @@ from torchrl_her_envs import make_env
 from torchrl_her_recipes.config.study import Study, load_study
 from torchrl_her_recipes.reports.results import LAST, Combination, at_the_end
 from torchrl_her_recipes.reports.tidy import is_results, read_results, write_results
-from torchrl_her_recipes.runs.plots import draw_curves, draw_goals, plot_comparison
+from torchrl_her_recipes.runs.plots import draw_goals, plot_comparison
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results"
@@ -52,13 +52,6 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "initialisation": "initialisation",
 }
 MAPS = ("ibs", "bias")  # studies whose maps of virtual goals are drawn
-# What others have published on the Fetch tasks: environment steps, and success read off their plots.
-PUBLISHED = {
-    "gym:FetchReach-v4": {"MRL": [(10_000, 1.0)]},
-    "gym:FetchPush-v4": {"MRL": [(250_000, 0.90), (450_000, 0.99)]},
-    "gym:FetchPickAndPlace-v4": {"MRL": [(550_000, 0.90), (750_000, 0.97)]},
-    "gym:FetchSlide-v4": {"MRL": [(770_000, 0.80)]},
-}
 
 Rows = list[dict[str, float]]
 
@@ -163,18 +156,6 @@ def draw_demonstrations(cells: Sequence[Combination], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def draw_beside_published(cells: Sequence[Combination], path: Path) -> None:
-    """A panel for each task: our curve, and what others have published."""
-    figure = Figure(figsize=(1.0 + 4.2 * len(cells), 3.8), layout="constrained")
-    for axes, cell in zip(figure.subplots(1, len(cells), squeeze=False)[0], cells, strict=True):
-        draw_curves(axes, {"torchrl-her": cell.rows}, "success", {"torchrl-her": "#2b6cb0"})
-        for name, points in PUBLISHED.get(cell.task, {}).items():
-            axes.plot(*zip(*points, strict=True), "o--", color="#dd6b20", label=f"{name} (published)")
-        axes.set(title=cell.task.removeprefix("gym:"), xlabel="environment steps of each run")
-        axes.legend(fontsize=8, loc="lower right")
-    figure.savefig(path, dpi=110)
-
-
 def draw_maps(cells: Sequence[Combination], path: Path) -> None:
     """Where virtual goals lie: a row for each task, q of each algorithm, and q* at the right."""
     tasks = list(dict.fromkeys(cell.task for cell in cells))
@@ -214,11 +195,8 @@ def main() -> None:
             print_table(cells)
             if name == "wall":
                 print_speed(cells, 0.8)
-            if name == "fetch" and any(not cell.missing for cell in every):
-                draw_beside_published(
-                    [cell for cell in every if not cell.missing], options.images / "fetch.png"
-                )
-                continue
+            if name == "fetch":
+                cells = [cell for cell in every if not cell.missing]
             if name == "fetch_ibs":
                 cells = [beginning_of_fetch(cells[0]), *cells]
             if name == "divergence":
