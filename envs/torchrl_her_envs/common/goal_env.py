@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, cast
 
+import torch
 from torch import Tensor
-from torchrl.data import Composite
+from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase
 
 Box = tuple[list[float], list[float]]  # the least and the greatest coordinates
+_HAIR = 1e-6  # width of the bounds of a fixed action, relative to its value
 
 
 class GoalEnv(Protocol):
@@ -267,6 +269,20 @@ def choose_indices(count: int, worlds: int | Sequence[int] | None) -> list[int]:
     if not chosen or not all(0 <= world < count for world in chosen):
         raise ValueError(f"worlds must be one or more indices from 0 to {count - 1}, got {worlds}")
     return chosen
+
+
+def bounded_actions(low: Tensor, high: Tensor, count: int) -> Bounded:
+    """The spec of actions [count, entries] of float32 from the bounds of one environment, in any shape.
+
+    An entry that is fixed, with ``low`` = ``high``, gets the width of a hair: scaling actions divides by it.
+
+    Example:
+        >>> bounded_actions(torch.tensor([[-1.0, 3.0]]), torch.tensor([[1.0, 3.0]]), 4).shape
+        torch.Size([4, 2])
+    """
+    low, high = (side.float().reshape(1, -1).expand(count, -1) for side in (low, high))
+    high = torch.where(high > low, high, low + _HAIR * low.abs().clamp(min=1))
+    return Bounded(low=low, high=high, shape=low.shape, dtype=torch.float32)
 
 
 def reward_range(env: GoalEnv) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_her_envs.common.goal_env import TaskTraits, choose_indices, is_goal_env
+from torchrl_her_envs.common.goal_env import TaskTraits, bounded_actions, choose_indices, is_goal_env
 from torchrl_her_envs.common.goal_rules import (
     Ends,
     Termination,
@@ -25,7 +25,7 @@ from torchrl_her_envs.common.goal_rules import (
     choose_ends,
     warn_once,
 )
-from torchrl_her_envs.common.rendering.pictures import captioned, resized
+from torchrl_her_envs.common.rendering.pictures import as_picture, captioned, resized
 from torchrl_her_envs.common.seeding import as_seeds, block_keys
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -323,7 +323,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
             drawn = [everything[index] for index in chosen]
         else:
             drawn = [self._envs[index].render() for index in chosen]
-        pictures = [torch.as_tensor(picture).clone() for picture in drawn]
+        pictures = [as_picture(picture, self._name) for picture in drawn]
         if size is not None:
             pictures = [resized(picture, size) for picture in pictures]
         pictures = [captioned(picture, caption) for picture in pictures]
@@ -359,7 +359,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         return TensorDict({**self._shown(self._latest), **ends}, self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        actions = tensordict.get("action").to(self._envs[0].full_action_spec["action"].dtype)
+        actions = self._own_actions(tensordict.get("action"))
         taken = actions.chunk(len(self._envs)) if self._whole else actions.unbind()
         after = []
         for index, (env, action) in enumerate(zip(self._envs, taken, strict=True)):
@@ -450,10 +450,17 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         (n,) = self.batch_size
         if type(action) is Categorical and not action.shape:
             return Categorical(n=int(action.space.n), shape=(n,), dtype=torch.int64)
-        if isinstance(action, Bounded) and len(action.shape) == 1:
-            low, high = (side.float().expand(n, -1) for side in (action.space.low, action.space.high))
-            return Bounded(low=low, high=high, shape=low.shape, dtype=torch.float32)
-        raise ValueError(f"{self._name}'s actions must be a Bounded vector or Categorical, got {action}")
+        if isinstance(action, Bounded):
+            return bounded_actions(action.space.low, action.space.high, n)
+        raise ValueError(f"{self._name}'s actions must be Bounded or Categorical, got {action}")
+
+    def _own_actions(self, actions: Tensor) -> Tensor:
+        """Actions of all environments in the shape, bounds and type of their own specs."""
+        own = self._envs[0].action_spec_unbatched
+        if not isinstance(own, Bounded):
+            return actions.to(own.dtype)
+        rounded = actions if own.dtype.is_floating_point else actions.round()
+        return rounded.to(own.dtype).reshape(-1, *own.shape).clamp(own.space.low, own.space.high)
 
     def _try_out(self, termination: Termination, achieved_reward: float | None) -> GoalRules:
         """Finds out how the environment rewards and ends, with some steps of random actions."""

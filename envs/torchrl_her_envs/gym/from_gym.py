@@ -14,10 +14,10 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import GymWrapper
 
-from torchrl_her_envs.common.goal_env import TaskTraits, choose_indices
+from torchrl_her_envs.common.goal_env import TaskTraits, bounded_actions, choose_indices
 from torchrl_her_envs.common.goal_rules import (
     Termination,
     check_rewards,
@@ -28,7 +28,7 @@ from torchrl_her_envs.common.goal_rules import (
     say_once,
     warn_once,
 )
-from torchrl_her_envs.common.rendering.pictures import captioned, resized
+from torchrl_her_envs.common.rendering.pictures import as_picture, captioned, resized
 from torchrl_her_envs.common.seeding import as_seeds, block_keys
 from torchrl_her_envs.gym.check import (
     KEYS,
@@ -36,6 +36,7 @@ from torchrl_her_envs.gym.check import (
     SUCCESS,
     TERMINATED,
     check_goal_env,
+    check_methods,
     find_achieved_reward,
     find_limit,
     goals_to_try,
@@ -49,6 +50,7 @@ from torchrl_her_envs.gym.drawing import PICTURES, cannot_draw, choose_renderer,
 from torchrl_her_envs.gym.fetch import fetch_layers, fetch_names
 from torchrl_her_envs.gym.goal_functions import GoalFunction
 from torchrl_her_envs.gym.layout import Layout
+from torchrl_her_envs.gym.quiet import make_quietly
 
 
 def make_gym_env(
@@ -100,6 +102,7 @@ def make_gym_env(
     with ExitStack() as opened:
         reference_env = opened.enter_context(closing(make_one(id, options)))
         check_goal_env(id, reference_env)
+        check_methods(id, reference_env)
         if spec_of(reference_env).max_episode_steps is None:
             options["max_episode_steps"] = limit = find_limit(reference_env)
             say_once(
@@ -112,9 +115,7 @@ def make_gym_env(
             options["render_mode"] = PICTURES
             reference_env = opened.enter_context(closing(make_one(id, options)))
         # By its spec rather than its id: new processes then need neither register it nor load TorchRL.
-        make = partial(
-            gymnasium.make, gymnasium.registry[spec_of(reference_env).id], disable_env_checker=True, **options
-        )
+        make = partial(make_quietly, gymnasium.registry[spec_of(reference_env).id], **options)
         vector = AsyncVectorEnv if parallel else SyncVectorEnv
         envs = opened.enter_context(closing(vector([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)))
         env = GymGoalEnv(
@@ -128,7 +129,9 @@ class GymGoalEnv(TaskTraits, GymWrapper):
     """N environments of gymnasium's with goals, stepped by gymnasium and wrapped by TorchRL.
 
     Keys: ``observation``, ``achieved_goal``, ``desired_goal`` and ``reward`` in float32, ``action``
-    (float32 within the environment's bounds, or whole numbers [N]), ``terminated``, ``truncated``, ``done``.
+    (float32 [N, entries] within the environment's bounds, or whole numbers [N] if its actions are discrete),
+    ``terminated``, ``truncated``, ``done``. Each environment gets its actions in the shape and type of its
+    space, rounded if these are whole numbers.
     The environments are independent: environment k with a given seed does the same in every batch.
     Observations and goals that are dictionaries become vectors, in the order that
     ``torchrl_her_envs.gym.layout.Layout`` tells; the environment's own functions get goals in their
@@ -322,7 +325,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
             drawn = self._drawn(chosen)
         except Exception as error:  # whatever a renderer raises
             raise ValueError(cannot_draw(self.task_name, error)) from error
-        pictures = [torch.from_numpy(np.array(picture)) for picture in drawn]
+        pictures = [as_picture(picture, self.task_name) for picture in drawn]
         if size is not None:
             pictures = [resized(picture, size) for picture in pictures]
         pictures = [captioned(picture, caption) for picture in pictures]
@@ -353,22 +356,24 @@ class GymGoalEnv(TaskTraits, GymWrapper):
     # TorchRL's hooks
 
     def _make_specs(self, env: VectorEnv, batch_size: torch.Size | None = None) -> None:
-        n, space = env.num_envs, env.single_action_space
+        n, space = env.num_envs, cast(spaces.Box | spaces.Discrete, env.single_action_space)
         seen = {key: Unbounded(shape=(n, self._layouts[key].width), dtype=torch.float32) for key in KEYS}
         self.observation_spec = Composite(seen, shape=(n,))
         if isinstance(space, spaces.Discrete):
             self.action_spec = Categorical(n=int(space.n), shape=(n,), dtype=torch.int64)
         else:
-            box = cast(spaces.Box, space)
-            low, high = (torch.as_tensor(side).float().expand(n, *box.shape) for side in (box.low, box.high))
-            self.action_spec = Bounded(low=low, high=high, shape=low.shape, dtype=torch.float32)
+            low, high = map(torch.as_tensor, (space.low, space.high))
+            self.action_spec = bounded_actions(low, high, n)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32)
         self.done_spec = self._make_done_spec()
 
     def read_action(self, action: Tensor) -> np.ndarray:
-        """Actions as gymnasium takes them: its whole numbers need not start at 0."""
-        first = getattr(self._env.single_action_space, "start", 0)
-        return super().read_action(action) + first
+        """Actions as the environments take them, in the shape, bounds and type of their space."""
+        space, rows = self._env.single_action_space, super().read_action(action)
+        if isinstance(space, spaces.Discrete):
+            return rows + space.start
+        space = cast(spaces.Box, space)
+        return np.clip(Layout(space, "action").unflatten(rows), space.low, space.high)
 
     def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
         """Observation and goals, in float32; further keys that the environment may show are left out."""
@@ -380,7 +385,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         if self.ends == "never":
             terminated, truncated = np.zeros_like(terminated), truncated | terminated
         elif self.ends == "success":
-            terminated = terminated | np.asarray(info[SUCCESS]).astype(np.bool_)
+            terminated = terminated | np.asarray(info.get(SUCCESS, False)).astype(np.bool_)
         elif self.ends == "reward":
             terminated = terminated | (np.asarray(reward) >= self.achieved_reward)
         return super()._output_transform((shown, reward, terminated, truncated, info))

@@ -1,4 +1,4 @@
-"""How observations and goals lie in a row of numbers, nested dictionaries included."""
+"""Order of observations, goals and actions in a row of numbers, nested dictionaries included."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class _Leaf:
 class Layout:
     """The order of a space's numbers in a row of ``width`` numbers.
 
-    A vector stays as it is. The entries of a dictionary follow each other in the alphabetical order of
-    their keys, those of a dictionary within it likewise at its place, and each array is written row by row.
+    A vector stays as it is, and a matrix is written row by row. The entries of a dictionary follow each
+    other in the alphabetical order of their keys, those of a dictionary within it likewise at its place.
     The order in which a space or an observation happens to list its keys makes no difference, so that an
     achieved goal and a desired one always agree.
 
     Args:
-        space: a vector, or a dictionary of arrays, whole numbers and further dictionaries.
+        space: an array, a whole number, or a dictionary of these and further dictionaries.
         name: of the space, for messages.
 
     Raises:
@@ -91,11 +91,12 @@ class Layout:
         return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, -1)
 
     def unflatten(self, rows: np.ndarray) -> Any:
-        """Rows [..., width] in the form of the space, in its types; all arrays are copies."""
+        """Rows [..., width] in the form of the space, rounded to its types; all arrays are copies."""
         nested: Any = {}
         first = 0
         for leaf in self._leaves:
-            own = rows[..., first : first + leaf.width].astype(leaf.dtype)
+            own = rows[..., first : first + leaf.width]
+            own = (own if leaf.dtype.kind == "f" else np.rint(own)).astype(leaf.dtype)
             own = own.reshape((*rows.shape[:-1], *leaf.shape))
             first += leaf.width
             if not leaf.path:
@@ -113,8 +114,7 @@ def _leaves(space: spaces.Space, path: tuple[str, ...], name: str) -> list[_Leaf
         if not parts:
             raise ValueError(f"{name} has an empty dictionary")
         return [leaf for key, own in parts for leaf in _leaves(own, (*path, key), name)]
-    numbers = space.shape is not None and space.dtype is not None and space.dtype.kind in "fiub"
-    if not numbers or (not path and len(space.shape or ()) != 1):
+    if space.shape is None or space.dtype is None or space.dtype.kind not in "fiub":
         where = f" in {'.'.join(path)}" if path else ""
-        raise ValueError(f"{name} as a row of numbers or a dictionary of arrays, got {space}{where}")
-    return [_Leaf(path, space.shape or (), np.dtype(space.dtype))]
+        raise ValueError(f"{name} as numbers or a dictionary of arrays, got {space}{where}")
+    return [_Leaf(path, space.shape, np.dtype(space.dtype))]

@@ -41,7 +41,7 @@ def check(options: tuple[str, ...], steps: int) -> int:
 
 def _table(facts: recipes.Facts) -> list[str]:
     bounds = [] if facts.actions is None else sorted(set(facts.actions))
-    actions = ", ".join(f"{low:g} to {high:g}" for low, high in bounds[:4]) or "discrete"
+    actions = ", ".join(f"{low:.5g} to {high:.5g}" for low, high in bounds[:4]) or "discrete"
     rows = {
         "played": f"{facts.steps:,} random steps, {facts.episodes} episodes of up to {facts.max_steps}",
         "a step takes": f"{1e3 * facts.seconds:.2g} ms",

@@ -109,3 +109,20 @@ def make_levers(num_envs: int) -> Levers:
 class Wide(Point):
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         return super().compute_reward(achieved_goal, desired_goal).squeeze(-1)
+
+
+class Buttons(Point):
+    """A point that is moved by a matrix [1, 2] of whole numbers from 0 to 4, or by one that never changes."""
+
+    def __init__(self, fixed: bool = False) -> None:
+        super().__init__()
+        low = torch.tensor([[0, 2 if fixed else 0]])
+        self.action_spec = Bounded(low, torch.tensor([[4, 2 if fixed else 4]]), (1, 2), dtype=torch.int64)
+        self.pressed: list[list[int]] = []
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["action"]
+        assert action.shape == (1, 2)
+        assert action.dtype == torch.int64
+        self.pressed += action.tolist()
+        return super()._step(tensordict.replace(action=(action[0] - 2) / 2))

@@ -99,6 +99,18 @@ def test_batches_that_cannot_be_seeded_in_blocks_serve_several_runs_one_each() -
         make_own_env(f"{HERE}:make_points", num_envs=4, seed=[1, 2, 3])
 
 
+def test_actions_have_the_shape_and_type_of_their_spec_and_fixed_ones_stay() -> None:
+    env = make_own_env(f"{HERE}:Buttons", num_envs=2)
+    actions = torch.tensor([[0.4, 3.6], [2.6, 4.0]])
+    env.step(env.reset().set("action", actions))
+    assert [own.pressed for own in env._envs] == [[[0, 4]], [[3, 4]]]
+    fixed = make_own_env(f"{HERE}:Buttons", fixed=True)
+    assert (fixed.action_spec.space.low < fixed.action_spec.space.high).all()
+    fixed.rollout(4)
+    (seen,) = fixed._envs
+    assert {pressed for _, pressed in seen.pressed} == {2}
+
+
 def test_what_it_does_at_a_goal_does_not_depend_on_how_many_there_are() -> None:
     found = {
         make_own_env(f"{HERE}:Point", num_envs=n, goes_on=goes_on).rules.ends

@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from torchrl_her_envs import make_gym_env
 
-from .walk import WALK, walk
+from .walk import WALK, Walk, walk
 
 TO_TARGET = spaces.Box(-1.0, 1.0, (2,), np.float64)
 
@@ -24,7 +24,7 @@ TO_TARGET = spaces.Box(-1.0, 1.0, (2,), np.float64)
         ({"without": "compute_reward"}, "lacks the method 'compute_reward'"),
         ({"shown": TO_TARGET}, "shows no dict of observation, achieved_goal, desired_goal, but a Box"),
         ({"shown": {"desired_goal": TO_TARGET}}, r"must have one shape, got \(1,\) and \(2,\)"),
-        ({"shown": {"achieved_goal": spaces.Discrete(5)}}, "must show 'achieved_goal' as a row of numbers"),
+        ({"shown": {"achieved_goal": spaces.Text(5)}}, "must show 'achieved_goal' as numbers"),
         ({"actions": spaces.MultiBinary(2)}, r"must be a Box or Discrete, got MultiBinary\(2\)"),
         ({"actions": spaces.Box(-np.inf, np.inf, (2,))}, "actions must have bounds"),
     ],
@@ -79,3 +79,42 @@ def test_environments_that_take_any_option_and_fail_do_so_in_one_line() -> None:
     with pytest.raises(ValueError, match=r"cannot make .* 'tests/Wrong-v0': object of type 'int'") as raised:
         make_gym_env("tests/Wrong-v0", size=3)
     assert "\n" not in str(raised.value)
+
+
+class NoSeed(Walk):
+    def reset(self) -> Any:  # type: ignore[override]
+        return super().reset()
+
+
+class NoInfo(Walk):
+    def reset(self, **options: Any) -> Any:
+        return super().reset(**options)[0]
+
+
+class OneDone(Walk):
+    def step(self, action: Any) -> Any:
+        shown, reward, terminated, truncated, info = super().step(action)
+        return shown, reward, terminated or truncated, info
+
+
+class OldWrapper(gymnasium.Wrapper):
+    def step(self, action: Any) -> Any:
+        shown, reward, terminated, truncated, info = super().step(action)
+        return shown, reward, terminated or truncated, info
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (NoSeed, "reset of NoSeed must take seed and options, as in gymnasium; it lacks 'seed'"),
+        (NoInfo, r"reset of NoInfo must give \(observation, info\), as in gymnasium, got a dict"),
+        (OneDone, r"step of OneDone must give \(.*, terminated, truncated, info\), .* got 4 values"),
+        (lambda: OldWrapper(Walk()), "step of OldWrapper must give .* got 4 values"),
+    ],
+)
+@pytest.mark.parametrize("limit", [6, None])
+def test_methods_of_old_gym_are_named(made: Any, message: str, limit: int | None) -> None:
+    gymnasium.register("tests/Old-v0", made, max_episode_steps=limit)
+    with pytest.raises(ValueError, match=f"^tests/Old-v0: {message}$"):
+        make_gym_env("tests/Old-v0")
+    del gymnasium.registry["tests/Old-v0"]

@@ -14,6 +14,7 @@ from gymnasium import spaces
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import Bounded, Categorical, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import ActionScaling, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 from torchrl_her import EnvReward, HERWriter
@@ -66,6 +67,42 @@ def test_continuous_actions_keep_their_bounds() -> None:
     assert env.action_spec_unbatched.low.tolist() == [-2.0, 0.0]
     assert env.action_spec_unbatched.high.tolist() == [3.0, 0.5]
     assert rollout(env)["action"].shape == (3, 40, 2)
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [
+        spaces.Box(-1.0, 1.0, (2, 3), np.float32),
+        spaces.Box(-1.0, 1.0, (), np.float32),
+        spaces.Box(0, 4, (2,), np.int32),
+        spaces.Box(np.float32([-0.5, 0.3]), np.float32([1.0, 0.3])),  # the second is fixed
+        spaces.Box(np.array([-0.1, 0.0]), np.array([0.1, 0.0]), dtype=np.float64),  # none of it in float32
+    ],
+)
+def test_actions_have_the_shape_type_and_bounds_of_their_space(actions: spaces.Box) -> None:
+    env = walk(3, actions=actions)  # the environment asserts that its space contains each action
+    width = int(np.prod(actions.shape))
+    assert env.action_spec.shape == (3, width)
+    seen = env.read_action(env.action_spec.rand())
+    assert (seen.shape, seen.dtype) == ((3, *actions.shape), actions.dtype)
+    spec = env.action_spec_unbatched
+    assert isinstance(spec, Bounded)
+    assert (spec.space.low < spec.space.high).all()
+    for bound, side in ((actions.low, spec.space.low), (actions.high, spec.space.high)):
+        assert np.array_equal(env.read_action(side.expand(3, -1))[0], bound)
+    assert rollout(TransformedEnv(env, ActionScaling()))["action"].shape == (3, 40, width)
+
+
+def test_a_step_without_success_in_its_info_has_not_achieved_its_goal() -> None:
+    class Rare(Walk):
+        def step(self, action: Any) -> Any:
+            *seen, _ = super().step(action)
+            return *seen, ({"is_success": True} if seen[1] == 0 else {})
+
+    gymnasium.register("tests/Rare-v0", lambda: Rare(ends=False), max_episode_steps=6)
+    after = rollout(make_gym_env("tests/Rare-v0", termination="success"))["next"]
+    assert torch.equal(after["terminated"], after["reward"] == 0)
+    assert after["terminated"].any()
 
 
 def test_further_keys_are_left_out_and_goals_may_be_bits() -> None:
@@ -309,6 +346,30 @@ def test_environments_made_without_pictures_give_none() -> None:
 
 
 @pytest.mark.full
+@pytest.mark.parametrize(
+    ("drawn", "got"), [(None, "None"), (np.zeros((4, 6)), r"\[4, 6\] of float64"), (3, "3")]
+)
+def test_what_is_no_picture_is_said(drawn: Any, got: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = walk(2, pictures=True)
+    env.reset()
+    monkeypatch.setattr(Walk, "render", lambda self: drawn)
+    with pytest.raises(
+        ValueError, match=f"{WALK} must give a picture .height, width, 3. of uint8, got {got}$"
+    ):
+        env.render(0)
+
+
+def test_an_environment_that_only_says_that_it_draws_takes_no_render_mode() -> None:
+    class Drawn(Walk):
+        def __init__(self) -> None:
+            super().__init__()
+
+    gymnasium.register("tests/Drawn-v0", Drawn, max_episode_steps=6)
+    make_gym_env("tests/Drawn-v0").close()
+    with pytest.raises(ValueError, match=r"^tests/Drawn-v0 gives no pictures: .* takes no render_mode$"):
+        make_gym_env("tests/Drawn-v0", pictures=True)
+
+
 def test_pictures_of_other_processes() -> None:
     env, same = (walk(3, render_mode="rgb_array", parallel=parallel) for parallel in (True, False))
     env.reset()

@@ -57,7 +57,7 @@ class Walk(gymnasium.Env):
         return self._show(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        assert self.action_space.contains(action)
+        assert self.action_space.contains(np.asarray(action))
         right = np.ravel(action)[0] > getattr(self.action_space, "start", 0)
         self.place = float(np.clip(self.place + (1 if right else -1), 0, LAST))
         goals = np.array([self.place]), np.array([self.goal])

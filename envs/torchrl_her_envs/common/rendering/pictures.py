@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,24 @@ from torchrl_her_envs.common.rendering.colors import INK, MARGIN, Color
 _BORDER = 1 / 60  # of a picture's height: width of a border
 _TEXT = 0.045  # of a picture's height: height of a caption
 _LINE, _LEAST_LINE, _MOST_LINE = 0.055, 11, 18  # of a line below a picture, of its width, and in pixels
+
+
+def as_picture(drawn: Any, name: str) -> Tensor:
+    """A copy of what the method ``render`` of an environment gave, [height, width, 3] of uint8.
+
+    Raises:
+        ValueError: it is something else.
+
+    Example:
+        >>> as_picture(None, "walk")
+        Traceback (most recent call last):
+        ValueError: render() of walk must give a picture [height, width, 3] of uint8, got None
+    """
+    picture = np.array(drawn)
+    if picture.ndim != 3 or picture.shape[-1] != 3 or picture.dtype != np.uint8:
+        got = f"{list(picture.shape)} of {picture.dtype}" if picture.ndim else drawn
+        raise ValueError(f"render() of {name} must give a picture [height, width, 3] of uint8, got {got}")
+    return torch.from_numpy(picture)
 
 
 def resized(picture: Tensor, size: int) -> Tensor:
