@@ -25,8 +25,6 @@ from .config.spaces import space_for as space_for
 from .config.study import Study as Study
 from .config.study import load_study as load_study
 from .config.study import study_names as study_names
-from .reports.follow import Followed as Followed
-from .reports.follow import follow as follow
 from .reports.page import write_report as write_report
 from .reports.runs import write_runs_report as write_runs_report
 from .reports.tidy import write_results as write_results
@@ -53,8 +51,6 @@ from .runs.run import run as run
 from .runs.score import run_score as run_score
 from .runs.score import score as score
 from .runs.show import show_file as show_file
-from .runs.waste import Waste as Waste
-from .runs.waste import find_waste as find_waste
 from .runs.watch import Seen as Seen
 from .runs.watch import watch as watch
 from .studies.pictures import plot_virtual_goals as plot_virtual_goals

@@ -169,6 +169,7 @@ def test_every_preset_runs(preset: Path) -> None:
         (["train", "folder=/proc/nothing/here"], "cannot use /proc/nothing"),
         (["train", "folder="], "folder needs a value, got 'folder='"),
         (["train", "buffer_size=99999999999999"], "buffer_size=99999999999999 needs 11000000 GB"),
+        (["train", "hidden=10000000"], "there is not enough memory: can't allocate memory: you tried to"),
         (["train", "--resume", "nowhere"], "nowhere is no folder of a run"),
         (["train", "--resume=nowhere"], "nowhere is no folder of a run"),
         (

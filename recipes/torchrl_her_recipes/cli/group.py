@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import click
 
 from torchrl_her_recipes.cli.check import check
-from torchrl_her_recipes.cli.clean import clean
 from torchrl_her_recipes.cli.listing import listing
 from torchrl_her_recipes.cli.play import export, play
 from torchrl_her_recipes.cli.plot import plot
@@ -82,7 +81,7 @@ def group(context: click.Context) -> None:
         context.exit(BAD_INPUT)
 
 
-for _command in (check, train, record, play, export, plot, study, report, tune, clean, listing):
+for _command in (check, train, record, play, export, plot, study, report, tune, listing):
     group.add_command(_command)
 
 
@@ -116,8 +115,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BAD_INPUT_ERRORS as error:
         return fail(one_line(error))
     except RuntimeError as error:
-        if type(error).__name__ != "OutOfMemoryError":  # torch's, which is not imported for every command
+        # Those of torch's allocators, on a GPU and on a processor; torch is not imported for every command.
+        if type(error).__name__ != "OutOfMemoryError" and "Allocator" not in str(error):
             raise
-        return fail(f"there is not enough memory on the device: {one_line(error)}")
+        return fail(f"there is not enough memory: {one_line(error).rpartition('Allocator: ')[2]}")
     finally:
         environments.removeHandler(notices)

@@ -15,7 +15,6 @@ from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.study import load_study, study_names
 
 if TYPE_CHECKING:
-    from torchrl_her_recipes.reports.follow import Followed
     from torchrl_her_recipes.studies.plan import Plan
     from torchrl_her_recipes.studies.study import StudyResult
 
@@ -94,7 +93,14 @@ def _say_study(result: StudyResult) -> int:
     return INTERRUPTED if result.interrupted else FAILED
 
 
-@click.command(short_help="a page about a study or runs: curves, goals, a film; also while they go on")
+def _refuse_follow(_context: click.Context, _parameter: click.Parameter, given: bool) -> None:
+    if given:
+        raise click.UsageError(
+            "no option --follow; choose `tensorboard --logdir runs`, which shows curves while runs go on"
+        )
+
+
+@click.command(short_help="a page about a study or runs: curves, goals, a film")
 @click.argument("names", metavar="NAME|RUN...", nargs=-1, required=True, shell_complete=_complete)
 @click.option("--folder", type=_FOLDER, help="where the study's runs are (default: runs/NAME)")
 @click.option("--out", type=_FOLDER, help="where the page goes (default: FOLDER/report)")
@@ -104,46 +110,20 @@ def _say_study(result: StudyResult) -> int:
     type=_FOLDER,
     help="also write a study's numbers as tidy files into a folder",
 )
-@click.option("--follow", "following", is_flag=True, help="keep the page up to date while training goes on")
-@click.option(
-    "--every",
-    type=click.FloatRange(0.1),
-    default=5.0,
-    show_default=True,
-    help="with --follow, seconds between two looks at the files",
-)
-@click.option(
-    "--film/--no-film",
-    default=True,
-    show_default=True,
-    help="with --follow, film the best policy so far whenever there is a better one",
-)
+@click.option("--follow", is_flag=True, hidden=True, expose_value=False, callback=_refuse_follow)
 @allow_import
-def report(
-    names: tuple[str, ...],
-    folder: Path | None,
-    out: Path | None,
-    tidy: Path | None,
-    following: bool,
-    every: float,
-    film: bool,
-) -> int:
+def report(names: tuple[str, ...], folder: Path | None, out: Path | None, tidy: Path | None) -> int:
     """Write a page about what there is of the study NAME, or of single runs; trains nothing.
 
-    RUN is the folder of a run, or a folder of such folders. With --follow the page renews itself in the
-    browser until training has ended; Ctrl-C ends it before.
+    RUN is the folder of a run, or a folder of such folders.
     """
     home = Path(names[0])
     if home.is_dir() and names[0] not in study_names():
-        return _report_runs([Path(name) for name in names], folder, out, tidy, following, every, film)
+        return _report_runs([Path(name) for name in names], folder, out, tidy)
     if len(names) > 1:
         raise ValueError(f"a page is about one study or about folders of runs, got {', '.join(names)}")
     own = load_study(names[0])
     home = folder or Path("runs") / own.name
-    if following:
-        if tidy is not None:
-            raise click.UsageError("--export and --follow cannot be given together")
-        return _follow(recipes.Followed.study(own, home), out or home / "report", every, film)
     if not home.is_dir():
         raise ValueError(f"there is no folder {home}; `torchrl-her study {own.name}` makes its runs")
     if tidy is not None:
@@ -153,28 +133,12 @@ def report(
     return 0
 
 
-def _report_runs(
-    runs: list[Path],
-    folder: Path | None,
-    out: Path | None,
-    tidy: Path | None,
-    following: bool,
-    every: float,
-    film: bool,
-) -> int:
+def _report_runs(runs: list[Path], folder: Path | None, out: Path | None, tidy: Path | None) -> int:
     for option, value in (("--folder", folder), ("--export", tidy)):
         if value is not None:
             raise click.UsageError(f"{option} goes with the name of a study, not with folders of runs")
     for run in runs:
         if not run.is_dir():
             raise ValueError(f"{run} is no folder of a run")
-    page = out or runs[0] / "report"
-    if following:
-        return _follow(recipes.Followed.runs(runs), page, every, film)
-    click.echo(recipes.write_runs_report(runs, page))
-    return 0
-
-
-def _follow(training: Followed, out: Path, every: float, film: bool) -> int:
-    recipes.follow(training, out, every=every, film=film, say=click.echo)
+    click.echo(recipes.write_runs_report(runs, out or runs[0] / "report"))
     return 0

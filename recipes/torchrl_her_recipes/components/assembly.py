@@ -30,7 +30,6 @@ from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.components.goal_space import goal_space
-from torchrl_her_recipes.components.memory import sizes_named
 from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.recipe import Recipe
@@ -51,12 +50,6 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     if allow_import:
         permit_task(recipe.task.name)
     recipe = resolved(recipe)
-    with sizes_named(recipe):
-        return _assemble(recipe)
-
-
-def _assemble(recipe: Recipe) -> Components:
-    """The components that a recipe asks for."""
     processes = recipe.collection.processes > 0  # then those here only tell what the others are like
     task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
     curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)

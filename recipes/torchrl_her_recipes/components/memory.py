@@ -1,24 +1,15 @@
-"""Sizes that a machine's memory cannot hold: refused by the names of their options."""
+"""Replay buffers that a machine's memory cannot hold: refused by the name of their option."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import torch
 from torchrl.envs import EnvBase
 
 from torchrl_her.replay_buffers.keys import in_root_and_next
 from torchrl_her_recipes.config.recipe import Recipe
-
-_ALLOCATORS_SAY = (
-    "not enough memory",
-    "can't allocate memory",
-    "out of memory",
-    "size calculation overflowed",
-)
-_NO_SIZES = ("seed", "epochs", "epoch_frames", "warmup_frames", "checkpoint_interval", "hard_update_interval")
 
 
 def check_buffer_size(
@@ -54,27 +45,3 @@ def memory_of(device: torch.device) -> float:
     if device.type != "cpu" or not hasattr(os, "sysconf"):
         return torch.inf
     return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-
-
-@contextmanager
-def sizes_named(recipe: Recipe) -> Iterator[None]:
-    """Turns an allocator's error into one that names the largest number of the recipe.
-
-    Raises:
-        ValueError: there is not enough memory.
-    """
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        text = str(error).lower()
-        if not isinstance(error, MemoryError) and not any(word in text for word in _ALLOCATORS_SAY):
-            raise
-        numbers = {
-            name: value
-            for group in recipe.changed().values()
-            for name, value in group.items()
-            if type(value) is int and name not in _NO_SIZES
-        }
-        largest = max(numbers, key=numbers.__getitem__, default="buffer_size")
-        value = numbers.get(largest, recipe.replay.buffer_size)
-        raise ValueError(f"{largest}={value} needs more memory than there is") from error

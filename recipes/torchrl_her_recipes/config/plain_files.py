@@ -182,7 +182,7 @@ def read_json(path: Path) -> dict[str, Any]:
     return values
 
 
-def read_table(path: Path, *, counts: Sequence[str] = (), going_on: bool = False) -> list[dict[str, float]]:
+def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, float]]:
     """The rows of a file of comma-separated numbers, by the names in its first line.
 
     Args:
@@ -190,15 +190,12 @@ def read_table(path: Path, *, counts: Sequence[str] = (), going_on: bool = False
 
     Keyword Args:
         counts: columns that each row must have, of whole numbers of at least 0.
-        going_on: whether somebody may be writing it: then a line without an end is left out.
 
     Raises:
         ValueError: a line is no row of the table.
         OSError: it cannot be read.
     """
     text = read_text(path, largest=LARGEST_TABLE)
-    if going_on:
-        text = text[: text.rfind("\n") + 1]
     try:
         rows = [
             {name: _number(each) for name, each in row.items()}

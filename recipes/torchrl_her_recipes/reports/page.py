@@ -7,7 +7,7 @@ import math
 import statistics
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -48,21 +48,6 @@ def write_report(study: Study, folder: Path, out: Path) -> Path:
     return write_page(read_study(study, folder), out)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Live:
-    """What a page knows that is written again and again.
-
-    Args:
-        version: of the page.
-        every: seconds between two looks for a newer one.
-        going: whether there may be a newer one.
-    """
-
-    version: int
-    every: float
-    going: bool
-
-
 def write_page(results: Results, out: Path, *, back: str | None = None) -> Path:
     """Writes a page about results that were read before.
 
@@ -77,33 +62,14 @@ def write_page(results: Results, out: Path, *, back: str | None = None) -> Path:
     Raises:
         OSError: the page cannot be written.
     """
-    return render(describe(results, out), out, back=back)
-
-
-def render(
-    described: dict[str, Any], out: Path, *, live: Live | None = None, back: str | None = None
-) -> Path:
-    """Writes the page itself, which is replaced as a whole.
-
-    Args:
-        described: what is on it, from :func:`describe`.
-        out: where it goes.
-        live: for a page that renews itself; None for one that stays as it is.
-        back: an address of the pages that it belongs to.
-    """
-    page = _template().render(described, live=live, back=back, written=f"{datetime.now():%Y-%m-%d %H:%M}")
+    page = _template().render(_describe(results, out), back=back, written=f"{datetime.now():%Y-%m-%d %H:%M}")
     path = out / "index.html"
     write_text(path, page)
     return path
 
 
-def describe(results: Results, out: Path) -> dict[str, Any]:
-    """All that is on a page, by the names that its template has for it; writes the tables and pictures.
-
-    Args:
-        results: of a study, or of runs.
-        out: where the tables go, and the pictures into `figures`.
-    """
+def _describe(results: Results, out: Path) -> dict[str, Any]:
+    """Writes a page's tables and pictures, and returns its values by the names in the template."""
     cells, thesis = results.cells, load_thesis(results.name if results.kind == "study" else "")
     measures = list(dict.fromkeys([*_AT_THE_END, *(order.measure for order in thesis.orders)]))
     compared = [compare(cells, measure, thesis) for measure in measures]

@@ -87,24 +87,23 @@ class Combination:
         return bool(self.rows) and all(name in row for row in self.rows)
 
 
-def read_combinations(study: Study, folder: Path, *, nothing_yet: bool = False) -> list[Combination]:
+def read_combinations(study: Study, folder: Path) -> list[Combination]:
     """All combinations of a study, with what a folder holds of them.
 
     Args:
         study: what was to be run.
         folder: with a folder of each combination.
-        nothing_yet: whether there may be no run, and no folder.
 
     Raises:
         ValueError: there is no such folder, it has none of the study's runs, or one cannot be read.
     """
-    if not folder.is_dir() and not nothing_yet:
+    if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; `torchrl-her study {study.name}` makes its runs")
     cells = [
         _read(label, recipe, options, Batches(folder / label))
         for options, (label, recipe) in zip(study.combinations(), study.cells(), strict=True)
     ]
-    if all(cell.missing for cell in cells) and not nothing_yet:
+    if all(cell.missing for cell in cells):
         labels = ", ".join(cell.label for cell in cells)
         raise ValueError(f"{folder} has no run of the study {study.name}; its runs are {labels}")
     return cells

@@ -36,7 +36,6 @@ class Results:
         summary: one line for people.
         cells: its combinations.
         kind: what they are: of a ``"study"``, or single ``"runs"``.
-        over: whether nothing more is to come of it.
         film: the newest film of its policies and what it shows, if there is one.
     """
 
@@ -44,7 +43,6 @@ class Results:
     summary: str
     cells: list[Combination]
     kind: Literal["study", "runs"] = "study"
-    over: bool = True
     film: tuple[Path, str] | None = None
 
 
@@ -53,19 +51,18 @@ def is_results(folder: Path) -> bool:
     return (folder / _ABOUT).is_file()
 
 
-def read_study(study: Study, folder: Path, *, nothing_yet: bool = False) -> Results:
+def read_study(study: Study, folder: Path) -> Results:
     """What there is of a study, from the folders of its runs or from the files made of them.
 
     Args:
         study: which one.
         folder: with a folder of each combination, or with the files of :func:`write_results`.
-        nothing_yet: whether there may be no run, and no folder.
 
     Raises:
         ValueError: the folder has none of the study's runs, or one cannot be read.
     """
     if not is_results(folder):
-        cells = read_combinations(study, folder, nothing_yet=nothing_yet)
+        cells = read_combinations(study, folder)
         return Results(name=study.name, summary=study.summary, cells=cells)
     results = read_results(folder)
     if results.name != study.name:

@@ -61,7 +61,7 @@ class RunFolder:
 
     @contextmanager
     def at_work(self, *, wait: float = 0.0) -> Iterator[None]:
-        """Keeps other processes from training into the folder, which must exist.
+        """Keeps other processes from training into the folder, and removes unfinished files of a killed run.
 
         The end of a process ends this, however it comes. The same process may do so more than once.
 
@@ -77,6 +77,8 @@ class RunFolder:
         except Timeout:
             raise ValueError(f"another process is training in {self.path}") from None
         try:
+            for part in filter(Path.is_file, self._parts):
+                part.unlink()
             yield
         finally:
             lock.release()
@@ -167,8 +169,8 @@ class RunFolder:
         write_text(self.metrics, table.getvalue())
 
     @property
-    def parts(self) -> list[Path]:
-        """The files that there are only while others are written: a killed run leaves them behind."""
+    def _parts(self) -> list[Path]:
+        """The files that are there only while others are written."""
         whole = (self.config, self.about, self.metrics, self.checkpoint, self.policy, self.best)
         pictures = (self.curves, self.goals, self.goal_map, self.video)
         return [part_of(path) for path in (*whole, *pictures)]
@@ -184,26 +186,13 @@ class RunFolder:
         """The checkpoints before the newest one."""
         return sorted(self.path.glob(f"{self.checkpoint.stem}.[0-9]*{self.checkpoint.suffix}"))
 
-    def rows(self, *, going_on: bool = False) -> list[dict[str, float]]:
+    def rows(self) -> list[dict[str, float]]:
         """The table so far.
-
-        Args:
-            going_on: whether somebody may be writing it: then a line without an end is left out, and with it
-                the other rows of its epoch.
 
         Raises:
             ValueError: it is damaged.
         """
         try:
-            rows = read_table(self.metrics, counts=_COUNTED, going_on=going_on)
+            return read_table(self.metrics, counts=_COUNTED)
         except FileNotFoundError:
             return []
-        return _whole_epochs(rows) if going_on else rows
-
-
-def _whole_epochs(rows: list[dict[str, float]]) -> list[dict[str, float]]:
-    """The rows without those of the last epoch, if it has fewer than the first."""
-    if not rows:
-        return rows
-    first, last = (sum(row["epoch"] == end["epoch"] for row in rows) for end in (rows[0], rows[-1]))
-    return rows if last == first else rows[:-last]

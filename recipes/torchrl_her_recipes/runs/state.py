@@ -58,16 +58,6 @@ def run_state(components: Components, trainer: Trainer, *, buffer: bool = True) 
     }
 
 
-def without_buffer(state: dict[str, Any]) -> dict[str, Any]:
-    """What :func:`run_state` gives of the same run without its buffers.
-
-    Example:
-        >>> without_buffer({"loss": {}, "buffer": {"rows": []}, "demonstrations": None})
-        {'loss': {}, 'buffer': None, 'demonstrations': None}
-    """
-    return state | {"buffer": None, "demonstrations": None}
-
-
 def load_run_state(components: Components, trainer: Trainer, state: dict[str, Any]) -> None:
     """Puts freshly built components where :func:`run_state` was taken; their buffer stays empty without one.
 

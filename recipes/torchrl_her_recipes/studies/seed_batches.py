@@ -46,7 +46,7 @@ class Batches:
     @cached_property
     def shown(self) -> list[RunFolder]:
         """Those of them that are read."""
-        return self._done or [home for home in self.homes if home.rows(going_on=True)]
+        return self._done or [home for home in self.homes if home.rows()]
 
     @property
     def is_done(self) -> bool:
@@ -70,7 +70,7 @@ class Batches:
 
     def rows(self) -> list[dict[str, float]]:
         """The tables of the runs as one: a row an epoch and run, in this order; runs are counted anew."""
-        tables = [home.rows(going_on=not self.is_done) for home in self.shown]
+        tables = [home.rows() for home in self.shown]
         if not tables:
             return []
         seeds = sorted({row["seed"] for table in tables for row in table})

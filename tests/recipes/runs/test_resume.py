@@ -336,6 +336,16 @@ def test_the_last_checkpoints_are_kept_until_the_run_has_finished(tmp_path: Path
     assert load_checkpoint(tmp_path / "checkpoint.pt")["trainer"]["epochs"] == 5
 
 
+def test_what_a_killed_run_left_half_written_is_removed(tmp_path: Path) -> None:
+    run(build(small(epochs=2, epoch_frames=400)), tmp_path, callbacks=[Stop(1)], progress=False)
+    killed, mine = tmp_path / "checkpoint.part.pt", tmp_path / "mine.part.pt"
+    killed.write_bytes(b"half of it")
+    mine.touch()
+    resume(tmp_path, progress=False)
+    assert mine.exists()
+    assert not killed.exists()
+
+
 @pytest.mark.filterwarnings("always")
 def test_on_the_command_line_a_warning_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

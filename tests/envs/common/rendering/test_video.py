@@ -96,3 +96,18 @@ def test_frames_that_make_no_video(tmp_path, frames, message):
 def test_a_rate_must_be_positive(tmp_path):
     with pytest.raises(ValueError, match="fps must be above 0, got 0"):
         write_video(squares(2), tmp_path / "film.gif", fps=0)
+
+
+def test_a_film_that_cannot_be_written_leaves_nothing_behind(tmp_path, monkeypatch):
+    def fail(_frames, path, _fps):
+        path.write_bytes(b"half of it")
+        raise OSError("no space left")
+
+    frames = [torch.zeros(8, 8, 3, dtype=torch.uint8)]
+    write_video(frames, tmp_path / "film.gif")
+    before = (tmp_path / "film.gif").read_bytes()
+    monkeypatch.setitem(video._WRITERS, ".gif", fail)
+    with pytest.raises(OSError, match="no space left"):
+        write_video(frames, tmp_path / "film.gif")
+    assert (tmp_path / "film.gif").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["film.gif"]

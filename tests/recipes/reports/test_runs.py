@@ -1,0 +1,94 @@
+"""Pages of single runs, at their end or not."""
+
+from __future__ import annotations
+
+import functools
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrl_her_envs.common.rendering.video import write_video
+from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.reports import compare
+from torchrl_her_recipes.reports import page as page_module
+
+from .small_study import STUDY, write_run
+from .test_page import Checker, text_of
+
+
+@pytest.fixture(autouse=True)
+def _quick_pages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing and intervals take seconds, and are tested with the pages of studies."""
+    monkeypatch.setattr(compare, "bootstrap", functools.partial(compare.bootstrap, repetitions=10))
+    monkeypatch.setattr(page_module, "draw_pictures", lambda cells, finals, figures: {})
+
+
+def write_epochs(folder: Path, epochs: int, *, done: bool = False) -> Path:
+    """The folder of a run that is so far; it has three epochs."""
+    home = folder / "hand_v2_her"
+    shutil.rmtree(home, ignore_errors=True)
+    write_run(folder, STUDY, "hand_v2_her", [0.25, 0.75], epochs=epochs)
+    if not done:
+        (home / "policy.pt").unlink()
+    return home
+
+
+def test_a_run_that_goes_on_and_one_at_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    home = write_epochs(tmp_path, 2)
+    assert main(["report", str(home)]) == 0
+    assert capsys.readouterr().out == f"{home}/report/index.html\n"
+    page = (home / "report" / "index.html").read_text()
+    text = text_of(page)
+    assert text.startswith("Run hand_v2_her hand_v2 hand_v2_her 2 of 3 epoch 2 of 3, 2,000 frames")
+    assert "success 50 %" in text
+    assert "task.name=hand_v2" in text
+    assert "thesis" not in text
+    assert "<script" not in page
+    checker = Checker()
+    checker.feed(page)
+    assert checker.open == []
+    write_epochs(tmp_path, 3, done=True)
+    write_video([torch.zeros(8, 8, 3, dtype=torch.uint8)] * 2, home / "play.gif")
+    assert main(["report", str(home), "--out", str(tmp_path / "page")]) == 0
+    page = (tmp_path / "page" / "index.html").read_text()
+    assert "epoch 3 of 3" in text_of(page)
+    assert '<img src="data:image/gif;base64,' in page
+    assert "The newest film, hand_v2_her/play.gif" in page
+
+
+def test_several_runs_and_folders_of_runs_share_a_page(tmp_path: Path) -> None:
+    for label in ("hand_v2_her", "robot_v2_her"):
+        write_run(tmp_path / "sweep", STUDY, label, [0.5])
+    page = Path(recipes_page(tmp_path / "sweep", out=tmp_path / "a")).read_text()
+    both = Path(recipes_page(*sorted((tmp_path / "sweep").iterdir()), out=tmp_path / "b")).read_text()
+    for own in (page, both):
+        assert "Runs" in own
+        assert re.findall(r'<span class="name">(\w+)</span>', own) == ["hand_v2_her", "robot_v2_her"]
+
+
+def recipes_page(*folders: Path, out: Path) -> str:
+    assert main(["report", *map(str, folders), "--out", str(out)]) == 0
+    return str(out / "index.html")
+
+
+def test_what_was_not_trained_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    home = write_epochs(tmp_path, 1)
+    (tmp_path / "empty").mkdir()
+    for arguments, message in (
+        (
+            [str(tmp_path / "empty")],
+            "empty is no folder of a run: neither it nor a folder",
+        ),
+        ([str(home), str(tmp_path / "none")], "none is no folder of a run"),
+        ([str(home), "--folder", "x"], "--folder goes with the name of a study"),
+        ([str(home), "--export", "x"], "--export goes with the name of a study"),
+        (["bias", str(home)], "a page is about one study or about folders of runs, got bias, "),
+        ([str(home), "--follow"], "no option --follow; choose `tensorboard --logdir runs`"),
+    ):
+        assert main(["report", *arguments]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert said.count("\n") == 1
