@@ -107,15 +107,30 @@ def choose_ends(
     return ends
 
 
+def check_stateless(name: str, before: np.ndarray, after: np.ndarray) -> None:
+    """Raises a ValueError if ``compute_reward`` gives the same goals other rewards in another state.
+
+    Args:
+        name: of the environment, for the message.
+        before, after: rewards [n] of the same pairs of goals, with some steps between them.
+    """
+    differ = ~np.isclose(before, after, rtol=1e-4, atol=1e-5, equal_nan=True)
+    if differ.any():
+        at = int(differ.argmax())
+        raise ValueError(
+            f"{name}: compute_reward gave {before[at] + 0.0:g}, and {after[at] + 0.0:g} some steps later, "
+            "for the same two goals; it must depend on them alone, not on the state of the environment"
+        )
+
+
 def check_rewards(
-    name: str, far: float, equal: float, others: Sequence[float] | np.ndarray, given: float | None
+    name: str, equal: float, others: Sequence[float] | np.ndarray, given: float | None
 ) -> tuple[float, float, bool]:
     """Tells a sparse reward, and one that is dense.
 
     Args:
         name: of the environment, for messages.
-        far: the reward of two goals that are far apart.
-        equal: the reward of two equal goals.
+        equal: the least reward of two equal goals.
         others: rewards of further pairs of goals.
         given: the reward from which on a goal counts as achieved, if the user said so.
 
@@ -124,26 +139,31 @@ def check_rewards(
         one that counts as such), and whether the reward is dense.
 
     Raises:
-        ValueError: equal goals give no more than others, the reward is dense and ``given`` is None, or
-            ``given`` does not separate goals far apart from equal ones.
+        ValueError: equal goals give no more than all others, the reward is dense and ``given`` is None, or
+            ``given`` does not separate equal goals from the least reward.
 
     Example:
-        >>> check_rewards("walk", -1.0, 0.0, [-1.0, 0.0, -1.0], None)
+        >>> check_rewards("walk", 0.0, [-1.0, 0.0, -1.0], None)
         (-1.0, 0.0, False)
-        >>> check_rewards("walk", -3.0, 0.0, [-1.0, -2.5, -0.5], -0.1)
+        >>> check_rewards("walk", 0.0, [-3.0, -1.0, -2.5, -0.5], -0.1)
         (-3.0, -0.1, True)
     """
-    if not far < equal:
+    missed = _missed(equal, others)
+    equal = equal + 0.0  # never -0.0
+    if not len(missed):
+        least, most = min(others) + 0.0, max(others) + 0.0
         raise ValueError(
-            f"{name}: a goal that is met gives {equal}, one far away {far}; that must be less (are all goals "
-            "met from the start?)"
+            f"{name}: equal goals give {equal:g}, and other pairs from {least:g} to {most:g}; equal goals "
+            "must give the most, and compute_reward must depend on its two goals alone"
+            if most > equal or equal < 0
+            else f"{name}: other goals give {equal:g}, as equal goals do; they must give less (are all goals "
+            "achieved from the start?)"
         )
-    far, equal = far + 0.0, equal + 0.0  # never -0.0
-    missed, dense = _missed(far, equal, others), is_dense(far, equal, others)
+    dense = is_dense(equal, others)
     if given is None:
         if dense:
             some = missed[np.linspace(0, len(missed) - 1, _SHOWN).astype(int)]
-            example = f"{equal - 0.05 * (equal - far):.2g}"
+            example = f"{equal - 0.05 * (equal - missed[0]):.2g}"
             raise ValueError(
                 f"{name} has a dense reward: goals that are not achieved give "
                 f"{', '.join(f'{value:g}' for value in some)} and more, equal ones {equal:g}. Say from "
@@ -151,26 +171,27 @@ def check_rewards(
                 "or choose a sparse reward"
             )
         return float(missed[0]), equal, False
-    if isinstance(given, bool) or not isinstance(given, int | float) or not far < given <= equal:
+    if isinstance(given, bool) or not isinstance(given, int | float) or not missed[0] < given <= equal:
         raise ValueError(
-            f"achieved_reward of {name} must be above {far:g}, the reward of goals far apart, and at most "
-            f"{equal:g}, that of equal ones, got {given!r}"
+            f"achieved_reward of {name} must be above {missed[0]:g}, the least reward of a pair of goals, "
+            f"and at most {equal:g}, that of equal ones, got {given!r}"
         )
     return float(missed[0]), float(given), dense
 
 
-def is_dense(far: float, equal: float, others: Sequence[float] | np.ndarray) -> bool:
+def is_dense(equal: float, others: Sequence[float] | np.ndarray) -> bool:
     """Whether goals that are not achieved have different rewards; arguments as for :func:`check_rewards`.
 
     Example:
-        >>> is_dense(-1.0, 0.0, [-1.0, 0.0]), is_dense(-3.0, 0.0, [-1.0, -2.5, -0.5])
+        >>> is_dense(0.0, [-1.0, 0.0]), is_dense(0.0, [-3.0, -1.0, -2.5, -0.5])
         (False, True)
     """
-    return len(_missed(far, equal, others)) > _MOST_VALUES
+    return len(_missed(equal, others)) > _MOST_VALUES
 
 
-def _missed(far: float, equal: float, others: Sequence[float] | np.ndarray) -> np.ndarray:
-    seen = np.unique(np.round([far, *others], _DIGITS) + 0.0)
+def _missed(equal: float, others: Sequence[float] | np.ndarray) -> np.ndarray:
+    """The different rewards of other pairs that are less than those of equal ones, in their order."""
+    seen = np.unique(np.round(others, _DIGITS) + 0.0)
     return seen[seen < equal]
 
 

@@ -21,6 +21,7 @@ from torchrl_her_envs.common.goal_rules import (
     Termination,
     check_rewards,
     check_same_rewards,
+    check_stateless,
     check_termination,
     choose_ends,
     warn_once,
@@ -473,13 +474,13 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         achieved, desired = (after[key] for key in _GOALS)
         chosen = torch.linspace(0, len(achieved) - 1, min(_PAIRED, len(achieved))).long()
         one, other = achieved[chosen], desired[chosen]
-        gap = (one.unsqueeze(1) - other).abs().sum(-1)
-        far = divmod(int(gap.argmax()), len(chosen))
-        rewards = self.compute_reward(one.unsqueeze(1), other).squeeze(-1)
-        equal = float(self.compute_reward(other[far[1]], other[far[1]]))
-        missed, met, dense = check_rewards(
-            self._name, float(rewards[far]), equal, rewards.flatten().numpy(), achieved_reward
-        )
+        rewards = [self.compute_reward(one.unsqueeze(1), other).flatten().numpy()]
+        with torch.random.fork_rng(devices=[]):
+            self.rollout(_PAIRED, break_when_any_done=False)
+        rewards.append(self.compute_reward(one.unsqueeze(1), other).flatten().numpy())
+        check_stateless(self._name, *rewards)
+        equal = float(self.compute_reward(other, other).min())
+        missed, met, dense = check_rewards(self._name, equal, rewards[0], achieved_reward)
         stepped = after["reward"].flatten()
         computed = self.compute_reward(achieved, desired).flatten()
         went_on = ~after["terminated"].flatten() | (computed >= met)  # what a failure costs is kept

@@ -23,7 +23,7 @@ REWARD, TERMINATED = "compute_reward", "compute_terminated"
 SUCCESS = "is_success"
 # Of make_gym_env, for every environment.
 _OUR_OPTIONS = ("max_steps", "parallel", "termination", "achieved_reward", "pictures")
-_EPISODES = 8  # whose goals the environment's functions are tried with
+EPISODES = 8  # whose goals the environment's functions are tried with
 _TRIED_STEPS = 100
 _LIMIT_STEPS = 1_000  # that are played to see where an environment truncates an episode itself
 _LIMIT = 100  # of episodes that it does not truncate
@@ -175,15 +175,14 @@ def has_compute_terminated(env: gymnasium.Env, achieved: Any, desired: Any) -> b
 
 
 def goals_to_try(env: gymnasium.Env, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Achieved and desired goals [M, g] of real episodes: first a pair far apart, then some equal pairs."""
-    shown = [env.reset(seed=seed)[0] for seed in range(_EPISODES)]
+    """Goals [M, g] of the first states of some episodes: equal pairs, then each achieved and desired one."""
+    shown = [env.reset(seed=seed)[0] for seed in range(EPISODES)]
     achieved, desired = (np.stack([layout.flatten(own[key]) for own in shown]) for key in KEYS[1:])
-    gap = np.abs(achieved[:, None].astype(np.float64) - desired).sum(-1)
-    here, there = np.unravel_index(gap.argmax(), gap.shape)
-    # M must be no dimension of a goal, see GoalFunction; there are always enough goals for one of these.
-    met = next(m for m in range(2, 2 + len(layout.sizes) + 1) if m + 1 not in layout.sizes)
-    equal = desired[np.arange(met) % len(desired)]
-    return np.concatenate([achieved[here, None], equal]), np.concatenate([desired[there, None], equal])
+    pairs = np.repeat(achieved, EPISODES, 0), np.tile(desired, (EPISODES, 1))
+    # M must be no dimension of a goal, see GoalFunction.
+    last = max(m for m in range(EPISODES * (EPISODES + 1) + 1) if m not in layout.sizes)
+    achieved, desired = (np.concatenate([desired, goals])[:last] for goals in pairs)
+    return achieved, desired
 
 
 @dataclass(frozen=True)
@@ -205,7 +204,7 @@ class Trial:
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """Up to 8 of the achieved goals [m, g], each with each of up to 8 of the desired ones."""
-        chosen = np.unique(np.linspace(0, len(self.reward) - 1, _EPISODES).astype(int))
+        chosen = np.unique(np.linspace(0, len(self.reward) - 1, EPISODES).astype(int))
         achieved, desired = self.achieved[chosen], self.desired[chosen]
         return np.repeat(achieved, len(chosen), 0), np.tile(desired, (len(chosen), 1))
 

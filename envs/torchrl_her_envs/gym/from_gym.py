@@ -22,6 +22,7 @@ from torchrl_her_envs.common.goal_rules import (
     Termination,
     check_rewards,
     check_same_rewards,
+    check_stateless,
     check_termination,
     choose_ends,
     is_dense,
@@ -31,6 +32,7 @@ from torchrl_her_envs.common.goal_rules import (
 from torchrl_her_envs.common.rendering.pictures import as_picture, captioned, resized
 from torchrl_her_envs.common.seeding import as_seeds, block_keys
 from torchrl_her_envs.gym.check import (
+    EPISODES,
     KEYS,
     REWARD,
     SUCCESS,
@@ -197,9 +199,10 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         goals = goals_to_try(env, layout)
         self._reward_of = self._function(REWARD, goals)
         trial = try_steps(env, layout)
-        far, equal = self._reward_of.tried[:2].tolist()
-        others = self._reward_of(*trial.pairs())
-        if achieved_reward is None and is_dense(far, equal, others):
+        check_stateless(id, self._reward_of.tried, self._reward_of(*goals))
+        equal = float(self._reward_of.tried[:EPISODES].min())
+        others = np.concatenate([self._reward_of.tried[EPISODES:], self._reward_of(*trial.pairs())])
+        if achieved_reward is None and is_dense(equal, others):
             achieved_reward = find_achieved_reward(env, layout, self._reward_of, *trial.pairs())
             if achieved_reward is not None:
                 say_once(
@@ -207,7 +210,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
                     f"(task.options.achieved_reward={achieved_reward:.4g})"
                 )
         self.missed_reward, self.achieved_reward, self.dense_reward = check_rewards(
-            id, far, equal, others, achieved_reward
+            id, equal, others, achieved_reward
         )
         computed = self._reward_of(trial.achieved, trial.desired)
         went_on = ~trial.terminated | (computed >= self.achieved_reward)  # what a failure costs is kept

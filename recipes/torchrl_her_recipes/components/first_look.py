@@ -45,7 +45,7 @@ class Facts:
         scales: the least and the greatest standard deviation of entries of the observation.
         disagree: share of steps whose reward is not that of ``compute_reward``, failures aside.
         achieved: share of the episodes in which the goal was achieved.
-        moved: share of the episodes in which what is achieved changed enough to be another goal.
+        moved: share of the episodes with a goal that the first state had not achieved, by the reward.
         kept: share of transitions for which the filter finds a later goal of the episode.
         fallen: share of the episodes that terminated without the goal.
         constant: entries of the observation that never changed.
@@ -167,7 +167,7 @@ def _facts(
     moved, kept, achieved = [], [], []
     for own in played:
         here, there = own["achieved_goal"], own["next", "achieved_goal"]
-        moved.append(not bool(meets(there, here[:1].expand_as(there)).all()))
+        moved.append(not bool(meets(here[:1].expand_as(there), there).all()))
         kept.append(_kept(here, there, meets))
         achieved.append(bool(meets(there, own["next", "desired_goal"]).any()))
     computed = task.compute_reward(rows["next", "achieved_goal"], rows["next", "desired_goal"])

@@ -12,8 +12,9 @@ _SLOW = 5e-3  # seconds of an environment's step, about those of a gradient step
 _MOSTLY = 0.5
 
 _STILL = (
-    "random actions change what is achieved in {facts.moved:.0%} of the episodes: most virtual goals are "
-    "achieved already, and the filter leaves {facts.kept:.1%} of the transitions with goals."
+    "random actions change what is achieved, by the reward, in {facts.moved:.0%} of the episodes: "
+    "most virtual goals are achieved already, and the filter leaves {facts.kept:.1%} of the transitions with "
+    "goals."
 )
 
 
@@ -39,7 +40,7 @@ def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> li
     if facts.moved < _SELDOM:
         lines.append(f"{_STILL.format(facts=facts)} {_remedy(facts, recipe, layers_file)}")
     if not facts.moved:
-        lines.append("is achieved_goal what the goal is about? It never changed")
+        lines.append("is achieved_goal what the goal is about? By the reward, it never changed")
     if facts.fallen > _MOSTLY and facts.achieved < _MOSTLY:
         lines.append(
             f"{facts.fallen:.0%} of the episodes terminate without the goal: if each step costs a reward of "

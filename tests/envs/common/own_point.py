@@ -126,3 +126,11 @@ class Buttons(Point):
         assert action.dtype == torch.int64
         self.pressed += action.tolist()
         return super()._step(tensordict.replace(action=(action[0] - 2) / 2))
+
+
+class Near(Point):
+    """A point whose reward looks at where it is now, besides the goals."""
+
+    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        near = (achieved_goal - self.at).norm(dim=-1, keepdim=True) < 0.5
+        return super().compute_reward(achieved_goal, desired_goal) - near.float()

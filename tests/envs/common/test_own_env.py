@@ -147,6 +147,11 @@ def test_pictures(name: str) -> None:
         (f"{HERE}:Nothing", {}, "needs a function or class 'Nothing' in the module"),
         (f"{HERE}:NOT_CALLABLE", {}, "needs a function or class 'NOT_CALLABLE'"),
         (f"{HERE}:make_number", {}, "must give a TorchRL EnvBase, got int"),
+        (
+            f"{HERE}:Near",
+            {},
+            "Near: compute_reward gave .* some steps later, for the same two goals; it must",
+        ),
         (f"{HERE}:Bare", {}, "lacks the method 'compute_reward'"),
         (f"{HERE}:Endless", {}, "needs a time limit, .* as in task.options.max_steps=100, got None"),
         (f"{HERE}:Wide", {}, r"compute_reward .* must give a tensor \[.*1\] for goals"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -434,9 +435,85 @@ def test_robots_repeat_and_do_the_same_in_every_batch() -> None:
 
 
 def test_goals_that_are_all_met_from_the_start_tell_nothing() -> None:
-    """What a goal that is far away gives is not known then."""
-    with pytest.raises(ValueError, match=r"is met gives 0.0, one far away 0.0; that must be less"):
+    """The reward of a goal that is far away is not known then."""
+    with pytest.raises(
+        ValueError, match=r"HandReach-v0: other goals give 0, as equal goals do; they must .*"
+    ):
         make_gym_env("torchrl_her_envs:torchrl_her/HandReach-v0", threshold=10.0)
+
+
+class Judged(Walk):
+    """A walk with a reward function of one's own, which may look at the walk itself."""
+
+    def __init__(self, judge: Callable[[Any, np.ndarray, np.ndarray, Any], Any]) -> None:
+        super().__init__(ends=False)
+        self.judge = judge
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        return self.judge(self, achieved, desired, info)
+
+    def step(self, action: Any) -> Any:
+        self.place = float(np.clip(self.place + (1 if action else -1), 0, LAST))
+        return self._show(), 0.0, False, False, {}
+
+
+gymnasium.register("tests/Judged-v0", Judged, max_episode_steps=6)
+
+
+def sparse(met: Any) -> Any:
+    return np.asarray(met, np.float64) - 1
+
+
+@pytest.mark.parametrize(
+    ("judge", "message"),
+    [
+        (lambda own, a, d, _: sparse(own.place == d).max(-1), "some steps later, for the same two goals; it"),
+        (lambda own, a, d, _: sparse(a > d).max(-1), "equal goals give -1, and other pairs from -1 to 0"),
+        (
+            lambda own, a, d, _: sparse(a * 0 > d).max(-1),
+            "equal goals give -1, and other pairs from -1 to -1",
+        ),
+        (lambda own, a, d, _: sparse(a < d + 9).max(-1), "other goals give 0, as equal goals do"),
+    ],
+)
+def test_rewards_that_do_not_tell_goals_apart_are_refused(judge: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^tests/Judged-v0: .*{message}"):
+        make_gym_env("tests/Judged-v0", judge=judge)
+
+
+@pytest.mark.parametrize(
+    ("met", "pairs"),
+    [
+        (
+            lambda a, d: a >= d,
+            [[True, True, True], [False, True, True], [False, False, True]],
+        ),  # more is better
+        (lambda a, d: (a - d) % 4 == 0, [[True, False, True], [False, True, False], [True, False, True]]),
+    ],
+)
+def test_goals_with_the_greatest_difference_may_be_achieved(met: Any, pairs: list[list[bool]]) -> None:
+    env = make_gym_env("tests/Judged-v0", judge=lambda own, a, d, _: sparse(met(a, d)).min(-1))
+    assert (env.missed_reward, env.achieved_reward, env.dense_reward) == (-1.0, 0.0, False)
+    places = torch.tensor([[0.0], [2.0], [4.0]])
+    reward = env.compute_reward(places, places.unsqueeze(1)).squeeze(-1)  # [desired, achieved]
+    assert reward.eq(0).tolist() == pairs
+
+
+@pytest.mark.parametrize(
+    "judge",
+    [
+        lambda own, a, d, info: sparse(np.linalg.norm(a - d, axis=1) < 1),
+        lambda own, a, d, info: np.array([sparse((a[n] == d[n]).all()) for n in range(a.shape[0])])[:, None],
+        lambda own, a, d, info: [sparse((x == y).all()) for x, y, each in zip(a, d, info, strict=True)],
+    ],
+    ids=["axis", "rows", "infos"],
+)
+def test_a_reward_of_batches_alone_is_asked_for_batches(judge: Any) -> None:
+    env = make_gym_env("tests/Judged-v0", judge=judge)
+    assert env._reward_of.answers == "batch"
+    goals = torch.tensor([[0.0], [2.0], [2.0]])
+    assert env.compute_reward(goals, torch.tensor([2.0])).tolist() == [[-1.0], [0.0], [0.0]]
+    assert env.compute_reward(goals[0], goals[0]).tolist() == [0.0]
 
 
 def test_what_a_machine_cannot_draw_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

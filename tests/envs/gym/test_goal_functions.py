@@ -33,6 +33,26 @@ def test_what_a_function_takes_is_found_out(function: Any, answers: str) -> None
     assert found(MET[0][:1], MET[1][:1]).tolist() == alone[:1]
 
 
+@pytest.mark.parametrize(
+    ("function", "form"),
+    [
+        (lambda a, d, info: -np.linalg.norm(a - d, axis=1), "rows"),
+        (lambda a, d, info: [-abs(a[n] - d[n]).sum() for n in range(a.shape[0])], "rows"),
+        (
+            lambda a, d, info: [-abs(x - y).sum() for x, y, _ in zip(a, d, info, strict=True)],
+            "rows and infos",
+        ),
+        (lambda a, d, info: -abs(a - d).sum(-1), "pair"),
+    ],
+)
+def test_functions_may_take_batches_alone(function: Any, form: str) -> None:
+    found = GoalFunction(function, *MET, name="compute_reward")
+    assert (found.form, found.answers) == (form, "batch")
+    assert found(*MET).tolist() == [-9.0, 0.0, 0.0, 0.0]
+    assert found(MET[0][:1], MET[1][:1]).tolist() == [-9.0]
+    assert found(MET[0][:0], MET[1][:0]).tolist() == []
+
+
 def test_functions_that_need_an_info_or_give_no_number_are_refused() -> None:
     with pytest.raises(
         ValueError, match="Env-v0's compute_terminated cannot be called .* KeyError: 'fallen'"

@@ -139,7 +139,7 @@ def test_others_get_none(options: dict[str, Any]) -> None:
 def test_what_never_changes_is_told() -> None:
     facts = look(moves=False)
     assert (facts.moved, facts.kept, facts.layers) == (0.0, 0.0, [])
-    assert "is achieved_goal what the goal is about? It never changed" in said(facts)
+    assert "is achieved_goal what the goal is about? By the reward, it never changed" in said(facts)
 
 
 def test_rewards_that_goals_do_not_explain_are_told() -> None:
