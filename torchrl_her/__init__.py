@@ -32,7 +32,7 @@ from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.checkpoint import load_checkpoint, save_checkpoint
 from torchrl_her.trainers.fused import FusedLearner
 from torchrl_her.trainers.learner import LossLearner
-from torchrl_her.trainers.metrics import success
+from torchrl_her.trainers.metrics import reached, success
 from torchrl_her.trainers.trainer import Trainer, evaluate
 
 __all__ = [
@@ -70,6 +70,7 @@ __all__ = [
     "make_target_updater",
     "make_td3_loss",
     "make_tqc_loss",
+    "reached",
     "register_strategy",
     "sampled_target",
     "save_checkpoint",

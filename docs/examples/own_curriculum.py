@@ -69,7 +69,8 @@ class FetchParcel(gymnasium.Wrapper):
         for _ in range(2):  # two steps of the car for one of ours; they ignore that it reached its flag
             car, _, _, _, info = self.env.step(action)
             state = self._state(car)
-        return state, 0.0, False, False, info  # StateToObs sets reward and terminated, TimeLimit truncated
+        there = bool(abs(state[2] - state[3]) < DELIVER.threshold)
+        return state, float(there) - 1.0, there, False, info  # of the last layer; TimeLimit sets truncated
 
     def _state(self, car: np.ndarray) -> np.ndarray:
         position, speed = (car[0] + 0.3) / 0.9, car[1] / 0.07  # both in [-1, 1]

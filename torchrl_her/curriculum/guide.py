@@ -106,7 +106,8 @@ class GuidedExploration(TensorDictModuleBase):
         self.guided: Tensor | None = None
         # For each layer: its inputs, its achieved and its desired goal, in the state with a zero appended.
         self._columns = torch.tensor([self._columns_of(layer) for layer in curriculum.layers])
-        self._squares = torch.tensor([layer.threshold**2 for layer in curriculum.layers])
+        # An episode is guided up to the layer below its own, so the last one's threshold is not needed.
+        self._squares = torch.tensor([(layer.threshold or 0.0) ** 2 for layer in curriculum.layers])
 
     @property
     def guide(self) -> TensorDictModuleBase:

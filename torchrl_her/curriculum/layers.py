@@ -11,6 +11,7 @@ import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor
 
 from torchrl_her.checks import check_whole
+from torchrl_her.goals.rewards import GoalReward, RewardFunction
 
 Indices = str | Sequence[int | str]
 _LISTS = ("observation", "achieved_goal", "desired_goal")
@@ -33,7 +35,10 @@ class CurriculumLayer:
             :class:`~torchrl_her.Curriculum` is given.
         constant_goal: in place of ``desired_goal`` the same goal for all episodes, as a gap in a wall; in the
             unit of the achieved goal.
-        threshold: the goal is achieved at distances below this, in the unit of the state.
+        threshold: the goal is achieved at distances below this, in the unit of the state. The last layer,
+            which is the environment's own task, needs none: relabeled goals then have the reward function
+            that the writer was made with.
+        rewards: of a missed and of an achieved goal, in layers below the last.
         instructive: whether IBS weights apply in this layer.
 
     Raises:
@@ -52,12 +57,13 @@ class CurriculumLayer:
     observation: Indices
     achieved_goal: Indices
     desired_goal: Indices = ()
-    threshold: float
+    threshold: float | None = None
+    rewards: tuple[float, float] = (-1.0, 0.0)
     constant_goal: Sequence[float] = ()
     instructive: bool = True
 
     def __post_init__(self) -> None:
-        if not 0 < self.threshold < math.inf:
+        if self.threshold is not None and not 0 < self.threshold < math.inf:
             raise ValueError(
                 f"layer {self.name!r}: threshold must be positive and finite, got {self.threshold}"
             )
@@ -72,6 +78,14 @@ class CurriculumLayer:
             )
         if not any(isinstance(entry, str) for key in _LISTS for entry in getattr(self, key)):
             self._check_indices()
+
+    @cached_property  # the same function for all runs in a layer, so that a writer can relabel them at once
+    def reward_fn(self) -> RewardFunction | None:
+        """Reward of the layer's goals; None without a threshold."""
+        if self.threshold is None:
+            return None
+        missed, achieved = self.rewards
+        return GoalReward(self.threshold, missed_reward=missed, achieved_reward=achieved)
 
     def _check_constant_goal(self) -> None:
         object.__setattr__(self, "constant_goal", tuple(map(float, self.constant_goal)))
@@ -131,7 +145,8 @@ class Curriculum:
 
     Raises:
         ValueError: there is no layer, a name is unknown, an index lies outside of the state, goals differ in
-            width, a layer is wider than the last one, or the last one has a constant goal.
+            width, a layer is wider than the last one, one below the last has no threshold, or the last one
+            has a constant goal.
 
     Example:
         >>> parts = {"hand": [0, 1], "ball": [2], "hole": [3]}
@@ -169,6 +184,8 @@ class Curriculum:
         self.goal_width = len(resolved[-1].desired_goal)
         for layer in resolved:
             self._check(layer, resolved[-1])
+            if layer.threshold is None and layer is not resolved[-1]:
+                raise ValueError(f"layer {layer.name!r}: all layers but the last need a threshold")
         self.appended = [0.0, *(number for layer in resolved for number in layer.constant_goal)]
         ends = accumulate((len(layer.constant_goal) for layer in resolved), initial=state_width + 1)
         self.layers = tuple(

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 from torchrl.data import ReplayBuffer, Writer
 
 from torchrl_her.curriculum.layers import CurriculumLayer
 from torchrl_her.goals.instructive import InstructiveWeights
-from torchrl_her.goals.rewards import GoalReward
 from torchrl_her.modules.exploration import DecayingEpsilon
 from torchrl_her.replay_buffers.runs.buffer import empty_run, runs_of
 from torchrl_her.replay_buffers.writer import HERWriter
-
-# The same function for all runs in a layer, so that a writer can relabel them at once.
-_reward = cache(GoalReward)
 
 
 def set_layer_goals(writer: Writer, layer: CurriculumLayer, *, run: int = 0) -> None:
@@ -32,7 +26,7 @@ def set_layer_goals(writer: Writer, layer: CurriculumLayer, *, run: int = 0) -> 
     """
     if not isinstance(writer, HERWriter):
         raise TypeError(f"a curriculum needs a buffer with a HERWriter, got a {type(writer).__name__}")
-    writer.set_reward(_reward(layer.threshold), run=run)
+    writer.set_reward(layer.reward_fn, run=run)
     weights = writer.goal_weights[run] if writer.goal_weights else None
     if isinstance(weights, InstructiveWeights):
         weights.alike = not layer.instructive

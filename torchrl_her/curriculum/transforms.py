@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from functools import reduce
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -14,6 +13,7 @@ from torchrl.envs import Transform
 
 from torchrl_her.curriculum.layers import Curriculum, CurriculumProgress
 from torchrl_her.curriculum.orders import EpisodeLayers
+from torchrl_her.goals.rewards import RewardFunction, is_achieved
 from torchrl_her.replay_buffers.keys import device_of
 
 
@@ -130,15 +130,16 @@ class StateToObs(_LayerTransform):
     """Shows an environment as each run's layer sees it: observation, goals, reward and ends.
 
     ``observation`` always has the width of the last layer: the entries of the present layer, then zeros.
-    ``next`` also gets the layer's reward (0 if the goal is nearer than the layer's threshold, else -1),
-    ``terminated``, and ``done``, which is ``terminated | truncated``. ``truncated`` stays as it was, so the
-    environment must set it at its time limit even if its own goal is achieved.
 
-    Where the environment terminates an episode by itself, the layer's episode goes on if the environment can
-    be stepped further. If it cannot (``continues_after_termination=False``, as with gymnasium's
-    environments), the layer's episode ends there, too: it is ``truncated`` unless the layer's goal was
-    achieved in that step, so that the critic goes on to estimate what would have come. The end says
-    nothing about the layer's goal.
+    The last layer is the environment's own task: its reward and its ends stay as they are. In the layers
+    below, ``next`` gets the reward and ``terminated`` of the layer's ``reward_fn`` (0 and an end where the
+    goal is nearer than the layer's threshold, -1 elsewhere), and ``done``, which is
+    ``terminated | truncated``. ``truncated`` stays as it was, so the environment must set it at its time
+    limit even if its own goal is achieved. Where the environment terminates an episode by itself, the
+    layer's episode goes on if the environment can be stepped further. If it cannot
+    (``continues_after_termination=False``, as with gymnasium's environments), the layer's episode ends
+    there, too: it is ``truncated`` unless the layer's goal was achieved in that step, so that the critic goes
+    on to estimate what would have come. The end says nothing about the layer's goal.
 
     The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
     Put the transform around a ParallelEnv and not inside of its workers: they hold copies of ``progress`` and
@@ -235,28 +236,50 @@ class StateToObs(_LayerTransform):
         if self.progress.by_episode:
             next_tensordict.set(self.layer_key, self._get(tensordict, self.layer_key, 1))
         cut = self._show_again(tensordict)
-        achieved_goal, desired_goal, squares = self._observe(next_tensordict)
-        # Coordinate by coordinate, as in goals.achieved; here each block of rows has its own threshold.
-        pairs = zip(achieved_goal.unbind(-1), desired_goal.unbind(-1), strict=True)
-        distances = reduce(torch.add, [(one - other).square() for one, other in pairs])
-        near = distances.reshape(len(squares), -1) < squares
-        terminated = near.view(*distances.shape, 1)
+        self._observe(next_tensordict)
+        self._judge(next_tensordict)
+        if cut is not None:
+            done = next_tensordict.get(self.done_key)
+            cut = cut.unsqueeze(-1) & ~done
+            next_tensordict.set(self.done_key, done | cut)
+            if self.truncated_key is not None:
+                next_tensordict.set(self.truncated_key, next_tensordict.get(self.truncated_key) | cut)
+        return next_tensordict
+
+    def _judge(self, tensordict: TensorDictBase) -> None:
+        """Sets reward and ends of rows in layers below the last, by the rules of their layers."""
+        *below, last = range(len(self.curriculum))
+        present, achieved = self._layers(), tensordict.get(self.out_keys[1])
+        rows = self._rows_layers(tensordict)
+        if rows is None:
+            below = sorted(set(present) - {last})
+            if len(present) > 1 and below:
+                blocks = torch.tensor(present, device=achieved.device)
+                rows = blocks.repeat_interleave(len(achieved) // len(blocks))
+                rows = rows.view(-1, *[1] * (achieved.ndim - 2)).expand(achieved.shape[:-1])
+        if not below:
+            return
+        reward, ended = tensordict.get(self.reward_key), tensordict.get(self.terminated_key)
+        terminated = ended
+        for layer in below:
+            rule = cast(RewardFunction, self.curriculum.layers[layer].reward_fn)
+            own = rule(achieved, tensordict.get(self.out_keys[2]))
+            if rows is None:
+                reward, terminated = own[0].to(reward.dtype), own[1]
+            else:
+                here = (rows == layer).unsqueeze(-1)
+                reward = torch.where(here, own[0].to(reward.dtype), reward)
+                terminated = torch.where(here, own[1], terminated)
         done = terminated.clone()
         if self.truncated_key is not None:
-            truncated = next_tensordict.get(self.truncated_key)
+            truncated = tensordict.get(self.truncated_key)
             if not self.continues_after_termination:
-                truncated = truncated | (next_tensordict.get(self.terminated_key) & ~terminated)
-                next_tensordict.set(self.truncated_key, truncated)
+                truncated = truncated | (ended & ~terminated)
+                tensordict.set(self.truncated_key, truncated)
             done |= truncated
-        if cut is not None:
-            cut = cut.unsqueeze(-1) & ~done
-            done |= cut
-            if self.truncated_key is not None:
-                next_tensordict.set(self.truncated_key, truncated | cut)
-        next_tensordict.set(self.reward_key, terminated.to(achieved_goal.dtype) - 1.0)
-        next_tensordict.set(self.terminated_key, terminated)
-        next_tensordict.set(self.done_key, done)
-        return next_tensordict
+        tensordict.set(self.reward_key, reward)
+        tensordict.set(self.terminated_key, terminated)
+        tensordict.set(self.done_key, done)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Raises a RuntimeError: sampled transitions would lose their virtual goals."""
@@ -279,14 +302,6 @@ class StateToObs(_LayerTransform):
             )
         return observation_spec
 
-    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        seen = self.parent.full_observation_spec[self.in_keys[0]]
-        shape = (*seen.shape[:-1], 1)
-        reward_spec[self.reward_key] = Bounded(
-            low=-1.0, high=0.0, shape=shape, dtype=seen.dtype, device=seen.device
-        )
-        return reward_spec
-
     def transform_done_spec(self, done_spec: Composite) -> Composite:
         known = list(done_spec.keys(True, True))
         for key in (self.terminated_key, self.truncated_key, self.done_key):
@@ -307,29 +322,21 @@ class StateToObs(_LayerTransform):
         layers = torch.zeros(shape, dtype=torch.int64, device=state.device)
         return layers.masked_scatter(begins, drawn.to(state.device))
 
-    def _observe(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        """Sets what the layers see; returns the goals and the squared thresholds [B, 1]."""
+    def _observe(self, tensordict: TensorDictBase) -> None:
+        """Sets what the layers see."""
         state = self._get(tensordict, self.in_keys[0], self.curriculum.state_width)
-        index, squares = self._lookup(state, self._rows_layers(tensordict))
+        index = self._lookup(state, self._rows_layers(tensordict))
         entries = take_columns(self.curriculum.extend(state), index).split(self._widths, -1)
         for key, entry in zip(self.out_keys, entries, strict=True):
             tensordict.set(key, entry)
-        return entries[1], entries[2], squares
 
-    def _lookup(self, state: Tensor, rows: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Columns [B, n] and squared thresholds [B, 1] of the present layers, of blocks or of rows."""
+    def _lookup(self, state: Tensor, rows: Tensor | None) -> Tensor:
+        """Columns [B, n] of the present layers, of blocks or of rows."""
         layers = self._layers() if rows is None else tuple(range(len(self.curriculum)))
-        made_for = layers, state.device, state.dtype
+        made_for = layers, state.device
         if self._tables[0] != made_for:
-            index = self.curriculum.state_index[list(layers)].to(state.device)
-            # Squared before they are rounded, as in goals.achieved: rewards agree to the last bit.
-            squares = [[self.curriculum.layers[layer].threshold ** 2] for layer in layers]
-            table = torch.tensor(squares, dtype=state.dtype, device=state.device)
-            self._tables = made_for, (index, table)
-        if rows is None:
-            return self._tables[1]
-        index, squares = self._tables[1]
-        return index[rows.flatten()], squares[rows.flatten()]
+            self._tables = made_for, self.curriculum.state_index[list(layers)].to(state.device)
+        return self._tables[1] if rows is None else self._tables[1][rows.flatten()]
 
 
 class LayerOutcomes(Transform):
@@ -342,6 +349,8 @@ class LayerOutcomes(Transform):
         progress: is told.
 
     Keyword Args:
+        reward_fn, achieved_reward: tell which goals are achieved in the last layer, where achieving a goal
+            need not terminate; see :func:`~torchrl_her.goals.is_achieved`.
         layer_key, proposed_key, terminated_key, done_key: read; there need not be a ``proposed_key``.
     """
 
@@ -349,6 +358,8 @@ class LayerOutcomes(Transform):
         self,
         progress: EpisodeLayers,
         *,
+        reward_fn: RewardFunction | None = None,
+        achieved_reward: float = 0.0,
         layer_key: NestedKey = "layer",
         proposed_key: NestedKey = "proposed",
         terminated_key: NestedKey = "terminated",
@@ -356,15 +367,20 @@ class LayerOutcomes(Transform):
     ) -> None:
         super().__init__()
         self.progress, self.layer_key, self.proposed_key = progress, layer_key, proposed_key
+        self.reward_fn, self.achieved_reward = reward_fn, achieved_reward
         self.terminated_key, self.done_key = terminated_key, done_key
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         done, proposed = next_tensordict.get(self.done_key), tensordict.get(self.proposed_key, None)
         ended = done if proposed is None else done & ~proposed
         if bool(ended.any()):
-            achieved = ended & next_tensordict.get(self.terminated_key)
             layer, runs = tensordict.get(self.layer_key), self.progress.runs
             layers = len(self.progress.curriculum)
+            met = is_achieved(next_tensordict, self.reward_fn, achieved_reward=self.achieved_reward)
+            met = torch.where(
+                layer == layers - 1, met.view_as(layer), next_tensordict.get(self.terminated_key)
+            )
+            achieved = ended & met
             place = layer.reshape(runs, -1) + layers * torch.arange(runs, device=layer.device).unsqueeze(1)
             counts = [
                 place[flags.reshape(runs, -1)].bincount(minlength=layers * runs).view(runs, layers)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_her.curriculum.layers import Curriculum
 from torchrl_her.curriculum.transforms import take_columns
 from torchrl_her.demonstrations.dataset import Demonstrations
-from torchrl_her.goals.rewards import GoalReward, RewardFunction
+from torchrl_her.goals.rewards import RewardFunction
 
 
 def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> Demonstrations:
@@ -25,6 +25,7 @@ def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> De
 
     Example:
         >>> from tensordict import TensorDict
+        >>> from torchrl_her import GoalReward
         >>> goal, at = torch.full((3, 1), 2.0), torch.arange(3.0).unsqueeze(-1)
         >>> seen = {"observation": at, "achieved_goal": at, "desired_goal": goal}
         >>> last = torch.tensor([[False], [False], [True]])
@@ -54,16 +55,23 @@ def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> De
     return demonstrations.take(kept, lengths, rows=rows)
 
 
-def in_layer(demonstrations: Demonstrations, curriculum: Curriculum, layer: int) -> Demonstrations:
+def in_layer(
+    demonstrations: Demonstrations,
+    curriculum: Curriculum,
+    layer: int,
+    task_reward: RewardFunction | None = None,
+) -> Demonstrations:
     """Demonstrations of the full task as a layer shows them, like :class:`~torchrl_her.StateToObs`.
 
-    They end where the layer's goal is achieved. What the environment below terminated says nothing about the
-    layer's goal, so others are truncated at their end.
+    In layers below the last, they end where the layer's goal is achieved. What the environment terminated
+    says nothing about that goal, so others are truncated at their end.
 
     Args:
         demonstrations: whose observation with the desired goal behind it is the state of the curriculum.
         curriculum: its layers.
         layer: which one, from 0.
+        task_reward: reward of the last layer, the full task, if the curriculum has none for it; as recorded
+            if None.
 
     Raises:
         ValueError: observation and goal are not as wide as the curriculum's state.
@@ -81,10 +89,11 @@ def in_layer(demonstrations: Demonstrations, curriculum: Curriculum, layer: int)
             )
         shown = take_columns(curriculum.extend(state), index).split(widths, -1)
         own.update(dict(zip(("observation", "achieved_goal", "desired_goal"), shown, strict=True)))
-    after["terminated"] = torch.zeros_like(after["terminated"])
+    if layer < len(curriculum) - 1:
+        after["terminated"] = torch.zeros_like(after["terminated"])
     rows.set("next", after)
-    seen = replace(demonstrations, rows=rows, achieved_reward=0.0)
-    return with_reward(seen, GoalReward(curriculum.layers[layer].threshold))
+    seen, rule = replace(demonstrations, rows=rows), curriculum.layers[layer].reward_fn or task_reward
+    return seen if rule is None else with_reward(seen, rule)
 
 
 def _until_first(end: Tensor, demonstrations: Demonstrations) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ from functools import reduce
 from typing import Protocol
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_her.checks import check_finite
@@ -62,6 +63,9 @@ class GoalReward:
     Args:
         threshold: goals nearer than this count as achieved; in the unit of the goals.
 
+    Keyword Args:
+        missed_reward, achieved_reward: rewards of a missed and of an achieved goal.
+
     Raises:
         ValueError: ``threshold`` is not positive, or not finite.
 
@@ -71,16 +75,18 @@ class GoalReward:
         ([[0.0], [-1.0]], [[True], [False]])
     """
 
-    def __init__(self, threshold: float) -> None:
+    def __init__(
+        self, threshold: float, *, missed_reward: float = -1.0, achieved_reward: float = 0.0
+    ) -> None:
         if not 0 < threshold < torch.inf:
             raise ValueError(f"threshold must be positive and finite, got {threshold}")
-        self.threshold = threshold
+        self.threshold, self.missed_reward, self.achieved_reward = threshold, missed_reward, achieved_reward
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (reward, terminated), each [..., 1], for goals [..., g]."""
         terminated = achieved(achieved_goal, desired_goal, self.threshold).unsqueeze(-1)
         dtype = achieved_goal.dtype if achieved_goal.is_floating_point() else torch.get_default_dtype()
-        return terminated.to(dtype) - 1.0, terminated
+        return torch.where(terminated, self.achieved_reward, self.missed_reward).to(dtype), terminated
 
 
 class EnvReward:
@@ -173,3 +179,36 @@ def missed(
     else:
         value = reward_fn(achieved_goal, desired_goal)[0]
     return _checked(value, _pairs(achieved_goal, desired_goal)) < achieved_reward
+
+
+def is_achieved(
+    after: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
+) -> Tensor:
+    """Whether steps ended with their goal achieved: by the environment's own word, else by a reward function.
+
+    The environment's word is the entry ``is_success``. The reward of a step is the last resort, because it
+    may contain more than the goal, such as a cost of actions.
+
+    Args:
+        after: [...], the entry ``next`` of steps.
+        reward_fn: maps (achieved, desired) goals to (reward, terminated); None for the reward of the step.
+
+    Keyword Args:
+        achieved_reward: the least reward of an achieved goal.
+
+    Returns:
+        [...] of bool.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> goals = {"achieved_goal": torch.tensor([[0.0], [5.0]]), "desired_goal": torch.zeros(2, 1)}
+        >>> after = TensorDict({**goals, "reward": torch.tensor([[-0.01], [-1.01]])}, [2])
+        >>> is_achieved(after, GoalReward(0.1)).tolist(), is_achieved(after).tolist()
+        ([True, False], [False, False])
+    """
+    word = after.get("is_success", None)
+    if word is not None:
+        return word.bool().view(after.shape)
+    if reward_fn is None:
+        return (after.get("reward") >= achieved_reward).view(after.shape)
+    return ~missed(reward_fn, after.get("achieved_goal"), after.get("desired_goal"), achieved_reward)

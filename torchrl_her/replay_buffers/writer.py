@@ -251,18 +251,15 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         """The reward function of a run."""
         return self._own_rewards.get(run, self.reward_fn)
 
-    def set_reward(self, reward_fn: RewardFunction, *, run: int) -> None:
-        """Relabels the next episodes of a run with a reward function of its own.
+    def set_reward(self, reward_fn: RewardFunction | None, *, run: int) -> None:
+        """Relabels the next episodes of a run with a reward function of its own; None for the writer's.
 
         Raises:
             ValueError: layers have rewards here, not runs.
         """
         if self.layers:
             raise ValueError(f"run {run} has no reward of its own: episodes are relabeled by their layers")
-        if self.runs == 1:
-            self.reward_fn = reward_fn
-        else:
-            self._own_rewards[run] = reward_fn
+        self._own_rewards[run] = reward_fn or self.reward_fn
 
     # TorchRL's hooks
 

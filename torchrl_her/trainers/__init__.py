@@ -16,7 +16,14 @@ from torchrl_her.trainers.fused import FusedLearner
 from torchrl_her.trainers.fusing import can_fuse, is_plain_adam, why_not_fused
 from torchrl_her.trainers.graphs import GraphLearner, why_not_recorded
 from torchrl_her.trainers.learner import Learner, LossLearner
-from torchrl_her.trainers.metrics import discounted_return, final_distance, first_episode, q_bias, success
+from torchrl_her.trainers.metrics import (
+    discounted_return,
+    final_distance,
+    first_episode,
+    q_bias,
+    reached,
+    success,
+)
 from torchrl_her.trainers.runs import clip_by_run, keep_runs
 from torchrl_her.trainers.trainer import CollectsAhead, Replay, Schedule, Trainer, evaluate
 
@@ -47,6 +54,7 @@ __all__ = [
     "load_collector_state_dict",
     "load_newest_checkpoint",
     "q_bias",
+    "reached",
     "save_checkpoint",
     "success",
     "why_not_fused",

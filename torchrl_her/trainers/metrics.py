@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_her.goals.rewards import distance
+from torchrl_her.goals.rewards import RewardFunction, distance, is_achieved
 
 
 def first_episode(done: Tensor) -> Tensor:
@@ -28,25 +28,44 @@ def first_episode(done: Tensor) -> Tensor:
     return done.long().cumsum(-1) - done.long() == 0
 
 
-def success(rollout: TensorDictBase, *, achieved_reward: float = 0.0) -> Tensor:
-    """Whether the goal was achieved at some step.
+def at_the_end(rollout: TensorDictBase, values: Tensor) -> Tensor:
+    """Values [N, T] at the last step of the first episode, [N]."""
+    last = first_episode(rollout.get(("next", "done")).squeeze(-1)).sum(-1, keepdim=True) - 1
+    return values.gather(-1, last).squeeze(-1)
+
+
+def success(
+    rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
+) -> Tensor:
+    """Whether the goal is achieved at the last step of the episode, as Fetch's papers measure success.
 
     Args:
         rollout: [N, T].
-        achieved_reward: the reward of an achieved goal.
+        reward_fn: tells which goals are achieved, where the rollout has no entry ``("next", "is_success")``;
+            see :func:`~torchrl_her.goals.is_achieved`.
+
+    Keyword Args:
+        achieved_reward: the least reward of an achieved goal.
 
     Returns:
         [N] of bool.
 
     Example:
         >>> from tensordict import TensorDict
-        >>> reward, done = torch.tensor([[[-1.0], [0.0]]]), torch.tensor([[[False], [True]]])
-        >>> success(TensorDict({"next": {"reward": reward, "done": done}}, [1, 2])).tolist()
-        [True]
+        >>> reward, done = torch.tensor([[[0.0], [-1.0]]]), torch.tensor([[[False], [True]]])
+        >>> left = TensorDict({"next": {"reward": reward, "done": done}}, [1, 2])
+        >>> success(left).tolist(), reached(left).tolist()
+        ([False], [True])
     """
-    reward = rollout.get(("next", "reward")).squeeze(-1)
+    return at_the_end(rollout, is_achieved(rollout["next"], reward_fn, achieved_reward=achieved_reward))
+
+
+def reached(
+    rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
+) -> Tensor:
+    """Whether the goal is achieved at some step of the episode; arguments as for :func:`success`."""
     inside = first_episode(rollout.get(("next", "done")).squeeze(-1))
-    return (inside & (reward >= achieved_reward)).any(-1)
+    return (inside & is_achieved(rollout["next"], reward_fn, achieved_reward=achieved_reward)).any(-1)
 
 
 def final_distance(rollout: TensorDictBase) -> Tensor:
@@ -58,9 +77,8 @@ def final_distance(rollout: TensorDictBase) -> Tensor:
     Returns:
         [N], in the unit of the goals.
     """
-    last = first_episode(rollout.get(("next", "done")).squeeze(-1)).sum(-1, keepdim=True) - 1
     gap = distance(rollout.get(("next", "achieved_goal")), rollout.get(("next", "desired_goal")))
-    return gap.gather(-1, last).squeeze(-1)
+    return at_the_end(rollout, gap)
 
 
 def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: float = -1.0) -> Tensor:

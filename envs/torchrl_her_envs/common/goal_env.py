@@ -124,9 +124,9 @@ class TaskTraits:
 
         Returns:
             For each layer its ``name``; ``observation``, ``achieved_goal`` and ``desired_goal``, which are
-            lists of indices into the state; ``threshold``, how near to the goal is achieved; and
-            ``instructive``, whether IBS weights apply in it. The state is the observation with the desired
-            goal behind it.
+            lists of indices into the state; ``threshold``, how near to the goal is achieved (not in the last
+            layer, whose goals the task judges); and ``instructive``, whether IBS weights apply in it. The
+            state is the observation with the desired goal behind it.
 
         Raises:
             ValueError: the task has no curriculum.

@@ -395,7 +395,8 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         return self._stack(each, key).bool().view(-1, 1)
 
     def _shown(self, each: list[TensorDictBase]) -> dict[str, Tensor]:
-        return {key: self._stack(each, key).float() for key in KEYS}
+        shown = {key: self._stack(each, key).float() for key in KEYS}
+        return shown | ({_SUCCESS: self._flag(each, _SUCCESS)} if _SUCCESS in self.observation_spec else {})
 
     def _ask(self, method: str, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         achieved, desired = torch.broadcast_tensors(achieved_goal, desired_goal)
@@ -443,6 +444,8 @@ class OwnGoalEnv(TaskTraits, EnvBase):
 
         seen = {key: Unbounded(shape=(n, shown[key].shape[-1]), dtype=torch.float32) for key in KEYS}
         self.observation_spec = Composite(seen, shape=(n,))
+        if _SUCCESS in shown:
+            self.observation_spec[_SUCCESS] = flag()
         self.action_spec = self._action_spec(action)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))

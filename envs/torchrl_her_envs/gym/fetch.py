@@ -67,7 +67,7 @@ def fetch_layers(id: str) -> list[dict[str, Any]]:
     if shown is None:
         return []
     gripper = list(_GRIPPER)
-    reach = {"name": "reach", "observation": gripper, "achieved_goal": "grip", "threshold": _THRESHOLD}
+    reach = {"name": "reach", "observation": gripper, "achieved_goal": "grip"}
     if shown is _GRIPPER:
         return [reach | {"desired_goal": "place"}]
     rest = [name for name in shown if name not in (*gripper, "object")]
@@ -76,7 +76,6 @@ def fetch_layers(id: str) -> list[dict[str, Any]]:
         "observation": [*gripper, "object", *rest],
         "achieved_goal": "object",
         "desired_goal": "place",
-        "threshold": _THRESHOLD,
     }
     near = _AROUND if "PickAndPlace" in id else _THRESHOLD
     return [reach | {"desired_goal": "object", "threshold": near, "instructive": False}, move]

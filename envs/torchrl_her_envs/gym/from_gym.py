@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import GymWrapper
 
 from torchrl_her_envs.common.goal_env import TaskTraits, bounded_actions, choose_indices
@@ -132,8 +132,9 @@ class GymGoalEnv(TaskTraits, GymWrapper):
 
     Keys: ``observation``, ``achieved_goal``, ``desired_goal`` and ``reward`` in float32, ``action``
     (float32 [N, entries] within the environment's bounds, or whole numbers [N] if its actions are discrete),
-    ``terminated``, ``truncated``, ``done``. Each environment gets its actions in the shape and type of its
-    space, rounded if these are whole numbers.
+    ``terminated``, ``truncated``, ``done``; and ``is_success``, whether the goal is achieved, if the
+    environment's ``info`` has it. Each environment gets its actions in the shape and type of its space,
+    rounded if these are whole numbers.
     The environments are independent: environment k with a given seed does the same in every batch.
     Observations and goals that are dictionaries become vectors, in the order that
     ``torchrl_her_envs.gym.layout.Layout`` tells; the environment's own functions get goals in their
@@ -225,6 +226,9 @@ class GymGoalEnv(TaskTraits, GymWrapper):
             tells_success=trial.success is not None,
         )
         self._terminated_of = self._function(TERMINATED, goals) if self.ends == "own" else None
+        if trial.success is not None:
+            shape = (*self.batch_size, 1)
+            self.observation_spec[SUCCESS] = Binary(n=1, shape=shape, dtype=torch.bool)
 
     def _function(self, name: str, goals: tuple[np.ndarray, np.ndarray]) -> GoalFunction:
         """A function of the environment, for goals [B, g] that it gets in their original form."""
@@ -379,12 +383,18 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         return np.clip(Layout(space, "action").unflatten(rows), space.low, space.high)
 
     def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """Observation and goals, in float32; further keys that the environment may show are left out."""
-        return super().read_obs({key: self._layouts[key].flatten(observations[key]) for key in KEYS})
+        """Observation and goals in float32, and ``is_success``; further keys are left out."""
+        shown = {key: self._layouts[key].flatten(observations[key]) for key in KEYS}
+        if SUCCESS in self.observation_spec:
+            word = observations.get(SUCCESS, np.zeros(self.batch_size))
+            shown[SUCCESS] = np.asarray(word).astype(np.bool_)[:, None]
+        return super().read_obs(shown)
 
     def _output_transform(self, step_outputs_tuple: tuple[Any, ...]) -> Any:
         """The outputs of a step, with the ends of episodes that goals give."""
         shown, reward, terminated, truncated, info = step_outputs_tuple
+        if SUCCESS in info:
+            shown = {**shown, SUCCESS: info[SUCCESS]}
         if self.ends == "never":
             terminated, truncated = np.zeros_like(terminated), truncated | terminated
         elif self.ends == "success":

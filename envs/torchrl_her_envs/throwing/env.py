@@ -165,7 +165,6 @@ class ThrowingEnv(BatchedEnv):
                 "observation": list(range(seen + 4)),
                 "achieved_goal": ball,
                 "desired_goal": [seen + 4, seen + 5],
-                "threshold": self.threshold,
                 "instructive": True,
             },
         ]

@@ -107,8 +107,8 @@ class Chain(ToyEnv):
                 "observation": list(range(end)),
                 "achieved_goal": list(range(end - links, end)),
                 "desired_goal": list(range(self.length, self.length + links)),
-                "threshold": self.threshold,
                 "instructive": True,
+                **({"threshold": self.threshold} if end < self.length else {}),
             }
             for end in range(links, self.length + 1, links)
         ]

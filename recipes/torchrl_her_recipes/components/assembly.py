@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_her.behavior import BehaviorGoals
 from torchrl_her.demonstrations.starts import DemonstrationStarts
-from torchrl_her_envs.common.goal_env import goal_env, reward_bounds
+from torchrl_her_envs.common.goal_env import goal_env, reward_bounds, reward_range
 from torchrl_her_recipes.components.agents import make_agent
 from torchrl_her_recipes.components.behavior import make_asking, make_behavior, make_factors
 from torchrl_her_recipes.components.buffers import make_buffer
@@ -23,7 +23,6 @@ from torchrl_her_recipes.components.curricula import (
     make_curriculum,
     make_curriculum_state,
     make_played_env,
-    played_rewards,
 )
 from torchrl_her_recipes.components.demonstrations import load_demonstrations, rows_needed
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
@@ -54,14 +53,13 @@ def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
     task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
     curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
     state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
-    rewards = played_rewards(recipe, task)
+    rewards, bounds = reward_range(goal_env(task)), reward_bounds(goal_env(task))
     behavior = make_behavior(recipe, task, rewards=rewards, space=space, state=state)
     shown = load_demonstrations(recipe, task, state)
     env = _shown(recipe, task, state, behavior, None if shown is None else shown.starts)
     devices = devices_of(recipe)
     generators = make_generators(recipe.seeds, devices.replay)
     own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
-    bounds = reward_bounds(goal_env(task)) if curriculum is None else rewards
     agent = make_agent(recipe, env, own, rewards=bounds, curriculum=curriculum, device=devices.learner)
     if behavior is not None:
         behavior.factors += make_factors(recipe, agent, state, rewards)

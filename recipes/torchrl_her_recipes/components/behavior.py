@@ -14,11 +14,10 @@ from torchrl_her.behavior import (
     InverseDensity,
     ValueCutoff,
 )
-from torchrl_her.curriculum.layers import Curriculum
 from torchrl_her.curriculum.transforms import ZeroPad
-from torchrl_her.goals.rewards import EnvReward, GoalReward, RewardFunction
-from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
-from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top, make_curriculum
+from torchrl_her.goals.rewards import EnvReward
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top
 from torchrl_her_recipes.components.envs import evaluation_envs
 from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_instructive
 from torchrl_her_recipes.components.learner import Agent
@@ -70,7 +69,7 @@ def make_behavior(
     if state is not None and state.progress.by_episode:
         top = {"layer_key": "layer", "layer": len(state.curriculum) - 1}
     behavior = BehaviorGoals(
-        _reward_of(task, None if state is None else state.curriculum),
+        EnvReward(task.compute_reward, task.compute_terminated),
         weights=own or None,
         update_on="proposed" if options.name == "ibs" else "achieved",
         greedy=options.name in _GREEDY,
@@ -101,7 +100,7 @@ def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = 
     """
     task = goal_env(env)
     return BehaviorGoals(
-        _reward_of(task, make_curriculum(recipe, env)),
+        EnvReward(task.compute_reward, task.compute_terminated),
         remember=False,
         real_share=0.0,
         candidates=1,
@@ -111,13 +110,6 @@ def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = 
         achieved_reward=rewards[1],
         continues_after_termination=task.continues_after_termination,
     )
-
-
-def _reward_of(env: GoalEnv, curriculum: Curriculum | None) -> RewardFunction:
-    """The reward of the full task."""
-    if curriculum is None:
-        return EnvReward(env.compute_reward, env.compute_terminated)
-    return GoalReward(curriculum.layers[-1].threshold)
 
 
 def make_factors(

@@ -14,7 +14,7 @@ from torchrl.envs import DeviceCastTransform, EnvBase
 from torchrl_her.curriculum.normalization import count_inputs
 from torchrl_her.curriculum.switch import set_layer_goals
 from torchrl_her.curriculum.transforms import ZeroPad
-from torchrl_her.goals.rewards import EnvReward, GoalReward
+from torchrl_her.goals.rewards import EnvReward, RewardFunction
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch
 from torchrl_her.replay_buffers.layer_rules import LayerRule
@@ -30,7 +30,16 @@ from torchrl_her_recipes.config.learners import priority_power
 from torchrl_her_recipes.config.recipe import Recipe
 
 # Entries of a collected batch that no loss reads: not stored.
-_NOT_STORED = ("state", "achieved_goal", "input", "is_init", "collector", "proposed", "proposed_reached")
+_NOT_STORED = (
+    "state",
+    "achieved_goal",
+    "input",
+    "is_init",
+    "is_success",
+    "collector",
+    "proposed",
+    "proposed_reached",
+)
 
 
 def make_buffer(
@@ -66,11 +75,12 @@ def make_buffer(
     check_buffer_size(recipe, env, devices.replay, not_stored=_NOT_STORED)
     size = recipe.replay.buffer_size if capacity is None else capacity
     algorithm, task, runs = get_algorithm(recipe.hindsight.algo), goal_env(env), len(generators)
+    rule = EnvReward(task.compute_reward, task.compute_terminated)
     own = [make_goal_weights(each, task, space) for each in recipe.of_runs() if algorithm.hindsight]
     buffer = TensorDictReplayBuffer(
         storage=PackedStorage(runs * size, device=devices.replay),
         writer=HERWriter(
-            EnvReward(task.compute_reward, task.compute_terminated),
+            rule,
             **_goals(recipe),
             n_steps=recipe.hindsight.n_steps,
             gamma=recipe.learner.gamma,
@@ -81,7 +91,7 @@ def make_buffer(
             exclude=_NOT_STORED,
             runs=runs,
             generators=generators,
-            layers=_rules(state),
+            layers=_rules(state, rule),
             on_write=None if norm is None else _counted_by(norm, state),
         ),
         sampler=_make_sampler(recipe, generators, size, devices.replay),
@@ -99,11 +109,11 @@ def make_buffer(
     return buffer
 
 
-def _rules(state: CurriculumState | None) -> list[LayerRule] | None:
+def _rules(state: CurriculumState | None, task: RewardFunction) -> list[LayerRule] | None:
     """How the episodes of each layer are relabeled, where they have layers of their own."""
     if state is None or not state.progress.by_episode:
         return None
-    return [LayerRule(GoalReward(layer.threshold), layer.instructive) for layer in state.curriculum.layers]
+    return [LayerRule(layer.reward_fn or task, layer.instructive) for layer in state.curriculum.layers]
 
 
 def _goals(recipe: Recipe) -> dict[str, Any]:

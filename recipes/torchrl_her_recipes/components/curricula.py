@@ -14,7 +14,7 @@ from torchrl_her.curriculum.orders import EpisodeLayers, TeacherStudent
 from torchrl_her.curriculum.transforms import LayerOutcomes, StateToObs, ZeroPad
 from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
-from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
+from torchrl_her_recipes.components.envs import evaluation_envs, judging, make_task_envs
 from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
@@ -62,11 +62,12 @@ def read_curriculum(layers: object, env: GoalEnv) -> Curriculum:
     """A curriculum from plain values, for an environment whose state they index.
 
     The state is the observation with the desired goal behind it. Its entries may be given by the names that
-    the environment has for them (``env.state_names()``).
+    the environment has for them (``env.state_names()``). The last layer is the environment's own task; layers
+    below it give the same rewards for missed and achieved goals.
 
     Args:
         layers: a list of mappings with the options of :class:`~torchrl_her.CurriculumLayer`.
-        env: tells how wide the state is.
+        env: its width of the state and its rewards are used.
 
     Raises:
         ValueError: it is no such list, or a layer that cannot work.
@@ -80,13 +81,25 @@ def read_curriculum(layers: object, env: GoalEnv) -> Curriculum:
     if not isinstance(layers, Sequence) or isinstance(layers, str):
         raise ValueError(f"curriculum must be a list of layers, got {type(layers).__name__}")
     width = sum(env.observation_spec[key].shape[-1] for key in _STATE)
-    return Curriculum([_read_layer(layer) for layer in layers], width, names=env.state_names())
+    own = [_read_layer(layer, env, is_last=layer is layers[-1]) for layer in layers]
+    curriculum, goal = Curriculum(own, width, names=env.state_names()), env.state_names()["desired_goal"]
+    if list(last := curriculum.layers[-1].desired_goal) != goal:
+        raise ValueError(
+            f"layer {own[-1].name!r}: the last layer is the task itself, so its desired_goal must be "
+            f"{goal}, got {list(last)}"
+        )
+    return curriculum
 
 
-def _read_layer(options: Any) -> CurriculumLayer:
+def _read_layer(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumLayer:
     try:
-        return CurriculumLayer(**options)
-    except TypeError as error:  # missing or unknown options, or no options at all
+        if is_last and "threshold" in options:
+            raise ValueError(
+                f"layer {options.get('name')!r}: threshold has no effect in the last layer, whose goals the "
+                "environment judges; leave it out"
+            )
+        return CurriculumLayer(**options, rewards=reward_range(env))
+    except TypeError as error:  # missing or unknown options, or none at all
         raise ValueError(f"{options!r} is no layer of a curriculum: {error}") from error
 
 
@@ -187,7 +200,7 @@ def in_layers(
     if begins:
         transforms.append(InitTracker())
     if isinstance(progress, EpisodeLayers):
-        transforms.append(LayerOutcomes(progress))
+        transforms.append(LayerOutcomes(progress, **judging(env)))
     if starts is not None:
         transforms = [starts, *transforms, starts.outcomes()]
     return TransformedEnv(env, Compose(*transforms))
@@ -199,11 +212,3 @@ def at_the_top(curriculum: Curriculum, runs: int) -> CurriculumProgress:
     for run in range(runs):
         progress.set_layer(run, len(curriculum) - 1)
     return progress
-
-
-def played_rewards(recipe: Recipe, env: EnvBase) -> tuple[float, float]:
-    """The rewards of a missed and of an achieved goal in played environments.
-
-    A curriculum gives the rewards of its layers, whatever the environment's own are.
-    """
-    return (-1.0, 0.0) if get_algorithm(recipe.hindsight.algo).curriculum else reward_range(goal_env(env))

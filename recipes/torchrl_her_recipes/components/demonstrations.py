@@ -44,10 +44,11 @@ class RunDemonstrations:
 
     def shown(self, run: int) -> Demonstrations:
         """As a run sees them at the moment."""
-        if self.state is not None:
-            return in_layer(self.recorded, self.state.curriculum, self.state.progress.layers[run])
         task = goal_env(self.env)
-        return with_reward(self.recorded, EnvReward(task.compute_reward, task.compute_terminated))
+        rule = EnvReward(task.compute_reward, task.compute_terminated)
+        if self.state is None:
+            return with_reward(self.recorded, rule)
+        return in_layer(self.recorded, self.state.curriculum, self.state.progress.layers[run], rule)
 
     def fill(self, buffer: TensorDictReplayBuffer, runs: int) -> None:
         """Writes the rows of all runs into an empty buffer."""

@@ -11,7 +11,8 @@ from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs import ActionScaling, EnvBase, TransformedEnv
 
-from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her.goals.rewards import EnvReward
+from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_envs.registry import GYM, get_task_spec, make_env
 from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
@@ -88,3 +89,10 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
         return actions.low, actions.high
     one = torch.ones(actions.shape, device=actions.device)
     return -one, one
+
+
+def judging(env: EnvBase) -> dict[str, Any]:
+    """Options of :func:`~torchrl_her.success` for rollouts of a task that has no entry ``is_success``."""
+    task = goal_env(env)
+    rule = EnvReward(task.compute_reward, task.compute_terminated)
+    return {"reward_fn": rule, "achieved_reward": reward_range(task)[1]}

@@ -266,10 +266,8 @@ def propose_layers(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
         "desired_goal": list(place),
     }
     task = {"observation": others + place, "achieved_goal": list(place), "desired_goal": "desired_goal"}
-    return [
-        {"name": name, **entries, "threshold": float(f"{threshold:.2g}")}
-        for name, entries, threshold in (("reach", reach, max(near[best][0], radius)), ("task", task, radius))
-    ]
+    threshold = float(f"{max(near[best][0], radius):.2g}")
+    return [{"name": "reach", **reach, "threshold": threshold}, {"name": "task", **task}]
 
 
 def _radius(rows: TensorDictBase, meets: Meets) -> float | None:

@@ -11,12 +11,13 @@ from torchrl.envs import EnvBase
 
 from torchrl_her.curriculum.normalization import restart_inputs
 from torchrl_her.curriculum.switch import enter_layer
-from torchrl_her.trainers.metrics import success
+from torchrl_her.trainers.metrics import at_the_end, success
 from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import eval_seeds
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import CurriculumState
+from torchrl_her_recipes.components.envs import judging
 
 
 def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDictBase:
@@ -38,11 +39,12 @@ def layer_success(
 ) -> Tensor:
     """Success [R, n] at the goals of the runs' layers; that of ``rollout`` where it is the full task."""
     runs, last = components.recipe.run.num_runs, len(state.curriculum) - 1
-    full = success(rollout).float().view(runs, -1)
+    full = success(rollout, **judging(components.eval_env)).float().view(runs, -1)
     below = state.progress.layer < last
     if state.layer_env is None or not bool(below.any()):
         return full
-    own = success(play_greedily(components, state.layer_env, epoch)).float().view(runs, -1)
+    played = play_greedily(components, state.layer_env, epoch)
+    own = at_the_end(played, played["next", "terminated"].squeeze(-1)).float().view(runs, -1)
     return torch.where(below.unsqueeze(1), own, full)
 
 

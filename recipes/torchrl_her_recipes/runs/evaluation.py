@@ -13,10 +13,11 @@ from torchrl_her.goals.ibs import GoalHistogram
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.objectives.critics import critic_value
 from torchrl_her.replay_buffers.writer import HERWriter
-from torchrl_her.trainers.metrics import discounted_return, final_distance, q_bias, success
+from torchrl_her.trainers.metrics import discounted_return, final_distance, q_bias, reached, success
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
+from torchrl_her_recipes.components.envs import judging
 from torchrl_her_recipes.runs.notices import saturation
 from torchrl_her_recipes.runs.toy_values import measure_values
 
@@ -41,11 +42,12 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
 @torch.no_grad()
 def measure_rollout(components: Components, rollout: TensorDictBase) -> dict[str, Tensor]:
     """What greedy episodes of each run show of the policy and the critics, [R] each."""
-    recipe = components.recipe
-    missed, achieved = components.rewards
+    recipe, missed = components.recipe, components.rewards[0]
+    judged_by = judging(components.eval_env)
     returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=missed)
     measured = {
-        "success": success(rollout, achieved_reward=achieved).float(),
+        "success": success(rollout, **judged_by).float(),
+        "reached": reached(rollout, **judged_by).float(),
         "distance": final_distance(rollout),
         "return": returns,
     }

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrl_her.trainers.checkpoint import save_checkpoint
 from torchrl_her.trainers.metrics import success
 from torchrl_her.trainers.trainer import evaluate
-from torchrl_her_envs.common.goal_env import goal_env, reward_range
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_recipes.components.envs import judging, make_task_envs
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.shipped import policy_names
 from torchrl_her_recipes.runs.exported.card import KEYS, PolicyCard, present_versions
@@ -95,10 +95,10 @@ def export_policy(
 
 
 def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int = 1 << 41) -> float:
-    """The share of greedy episodes in which a policy achieves its goal."""
+    """The share of greedy episodes at whose last step a policy's goal is achieved."""
     env = make_task_envs(policy.recipe.replace(task=policy.task), episodes, [seed], scaled=False)
     rollout = evaluate(env, policy.actor, max_steps=goal_env(env).max_steps)
-    achieved = success(rollout, achieved_reward=reward_range(goal_env(env))[1])
+    achieved = success(rollout, **judging(env))
     env.close()
     return float(achieved.float().mean())
 

@@ -56,6 +56,5 @@ def _film(components: Components, env: EnvBase, out: Path, first: int, count: in
         env,
         components.player,
         worlds=range(first, first + count),
-        achieved_reward=components.rewards[1],
     )
     write_video(frames, out, fps=FPS)

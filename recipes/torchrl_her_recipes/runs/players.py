@@ -11,11 +11,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_her.modules.networks import take_run
-from torchrl_her_envs.common.goal_env import goal_env, reward_range
+from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_envs.common.rendering.live import LiveEpisodes
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.components.agents import make_player
-from torchrl_her_recipes.components.curricula import make_curriculum, make_played_env, played_rewards
+from torchrl_her_recipes.components.curricula import make_curriculum, make_played_env
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.groups import TaskConfig
 from torchrl_her_recipes.config.imports import permit_task
@@ -33,14 +33,12 @@ class Player:
         task: that is played.
         env: its environments, one for each goal.
         actor: the greedy policy.
-        achieved_reward: the least reward of an achieved goal.
     """
 
     source: str
     task: TaskConfig
     env: EnvBase
     actor: TensorDictModuleBase
-    achieved_reward: float
 
     def episodes(self, *, size: int) -> LiveEpisodes:
         """Its episodes, to be shown.
@@ -53,7 +51,7 @@ class Player:
         """
         if not goal_env(self.env).can_render:
             raise ValueError(f"{self.source} cannot be filmed: its environment gives no pictures")
-        return LiveEpisodes(self.env, self.actor, size=size, achieved_reward=self.achieved_reward)
+        return LiveEpisodes(self.env, self.actor, size=size)
 
     def close(self) -> None:
         """Closes its environments."""
@@ -93,10 +91,7 @@ def find_player(
         recipe = trained.recipe.replace(task=trained.task)
         env = make_task_envs(recipe, goals, [seed], pictures=True, scaled=False)
         trained.card.check_plays(env, trained.task)
-        achieved = reward_range(goal_env(env))[1]
-        return Player(
-            source=str(source), task=recipe.task, env=env, actor=trained.actor, achieved_reward=achieved
-        )
+        return Player(source=str(source), task=recipe.task, env=env, actor=trained.actor)
     if kept is None:
         known = ", ".join(policy_names())
         raise ValueError(
@@ -105,8 +100,7 @@ def find_player(
         )
     recipe, actor = kept.home.recipe(), actor_of(kept, run, allow_import)
     env = make_played_env(recipe, goals, [seed], pictures=True)
-    achieved = played_rewards(recipe, env)[1]
-    return Player(source=str(source), task=recipe.task, env=env, actor=actor, achieved_reward=achieved)
+    return Player(source=str(source), task=recipe.task, env=env, actor=actor)
 
 
 def actor_of(kept: KeptPolicy, run: int, allow_import: bool) -> TensorDictModuleBase:

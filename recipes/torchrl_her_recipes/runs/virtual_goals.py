@@ -28,7 +28,9 @@ def at_virtual_goals(components: Components, epoch: int) -> dict[str, Tensor]:
     if env is None:
         return {}
     found = torch.tensor(ask_for_virtual_goals(components, env, epoch))
-    shown = measure_rollout(components, play_greedily(components, env, epoch))
+    played = play_greedily(components, env, epoch)
+    # The environment's own word is about its own goals.
+    shown = measure_rollout(components, played.exclude(("next", "is_success")))
     return {f"virtual_{name}": shown[name].masked_fill(~found, torch.nan) for name in _NAMES if name in shown}
 
 

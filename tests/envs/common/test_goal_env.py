@@ -75,10 +75,12 @@ KEYS = {"name", "observation", "achieved_goal", "desired_goal", "threshold", "in
 def test_layers_are_plain_data_that_index_the_state(name: str, options: dict[str, int]) -> None:
     env = make_env(name, **options)
     width = env.observation_spec["state"].shape[-1]
-    for layer in env.layers():
-        assert set(layer) == KEYS
+    *below, last = env.layers()
+    assert all(isinstance(layer["threshold"], float) for layer in below)
+    assert set(last) == KEYS - {"threshold"}  # its goals are the task's
+    for layer in (*below, last):
+        assert set(layer) | {"threshold"} == KEYS
         assert isinstance(layer["name"], str)
-        assert isinstance(layer["threshold"], float)
         assert isinstance(layer["instructive"], bool)
         for key in ("observation", "achieved_goal", "desired_goal"):
             assert all(type(index) is int and 0 <= index < width for index in layer[key])

@@ -17,7 +17,8 @@ def test_the_layers_are_the_reach_and_the_throw(name: str) -> None:
     reach, throw = env.layers()
     assert (reach["name"], throw["name"]) == ("reach", "throw")
     assert (reach["instructive"], throw["instructive"]) == (False, True)
-    assert (reach["threshold"], throw["threshold"]) == pytest.approx((0.06, 0.1))
+    assert reach["threshold"] == pytest.approx(0.06)
+    assert "threshold" not in throw
     shown = env.reset()
     state, width = shown["state"], shown["observation"].shape[-1]
     assert torch.equal(state[:, throw["observation"]], shown["observation"])
@@ -30,11 +31,10 @@ def test_the_layers_are_the_reach_and_the_throw(name: str) -> None:
 
 
 def test_the_layer_of_an_arm_of_three_links_follows_its_observation() -> None:
-    env = make_env("robot_v1", num_links=3, threshold=0.3)
+    env = make_env("robot_v1", num_links=3)
     reach, throw = env.layers()
     assert (len(reach["observation"]), len(throw["observation"])) == (14, 18)
     assert reach["achieved_goal"] == [6, 7]
-    assert throw["threshold"] == 0.3
 
 
 @pytest.mark.parametrize("name", REACHES)

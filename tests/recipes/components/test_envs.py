@@ -18,6 +18,8 @@ from torchrl_her_recipes.cli import main
 
 from ..small import overrides, small
 
+FINE = {"name": "fine", "observation": [0], "achieved_goal": [0], "desired_goal": [1]}
+
 
 @pytest.mark.parametrize(
     ("task", "options", "kind"),
@@ -106,6 +108,14 @@ def test_other_learners_train_by_name(learner: str, loss: type, tmp_path: Path) 
         ({"task": "chain", "threshold": 0.1}, "threshold=0.1 has no effect with task=chain"),
         ({"task": "bit_flip", "algo": "cher"}, "bit_flip has no curriculum"),
         ({"task": "treasure_hunt", "algo": "cher", "curriculum": [{"name": "all"}]}, "is no layer"),
+        (
+            {"task": "treasure_hunt", "algo": "cher", "curriculum": [FINE | {"threshold": 0.1}]},
+            "layer 'fine': threshold has no effect in the last layer",
+        ),
+        (
+            {"task": "treasure_hunt", "algo": "cher", "curriculum": [FINE | {"desired_goal": [0]}]},
+            "layer 'fine': desired_goal must share no index",
+        ),
         ({"task": "hand_v1", "algo": "cher", "curriculum": {"layers": {"name": "all"}}}, "must be a list"),
     ],
 )
@@ -138,7 +148,7 @@ def test_a_curriculum_comes_from_a_file(tmp_path: Path) -> None:
             "constant_goal": [0.5],
             "threshold": 0.5,
         },
-        {"name": "fine", "observation": [0], "achieved_goal": [0], "desired_goal": [1], "threshold": 0.1},
+        FINE,
     ]
     path = tmp_path / "layers.yaml"
     path.write_text(yaml.safe_dump(layers))
@@ -156,7 +166,7 @@ def test_a_curriculum_comes_from_a_file(tmp_path: Path) -> None:
 def test_an_environment_of_gymnasium_trains_by_its_id(algo: str, tmp_path: Path) -> None:
     """One of ours, on its way out to gymnasium and in again: its state is [hand, 5 | ball, 2]."""
     layer = {"observation": [0, 1, 2, 3, 4], "achieved_goal": [0, 1], "desired_goal": [5, 6]}
-    curriculum = [layer | {"name": name, "threshold": far} for name, far in (("near", 0.5), ("at", 0.1))]
+    curriculum = [layer | {"name": "near", "threshold": 0.5}, layer | {"name": "at"}]
     recipe = small(
         task="gym:torchrl_her/HandReach-v0",
         algo=algo,

@@ -171,7 +171,7 @@ def test_episodes_with_proposed_goals_do_not_count() -> None:
     outcomes = LayerOutcomes(progress)
     flags = torch.tensor([[True], [True]])
     before = TensorDict({"layer": torch.tensor([[0], [2]]), "proposed": torch.tensor([[True], [False]])}, [2])
-    outcomes._step(before, TensorDict({"done": flags, "terminated": flags}, [2]))
+    outcomes._step(before, TensorDict({"done": flags, "terminated": flags, "reward": 0.0 * flags}, [2]))
     assert progress.told == [([[0, 0, 1]], [[0, 0, 1]])]
 
 
@@ -189,7 +189,7 @@ def test_thresholds_are_those_of_the_rows_layers() -> None:
     progress.curriculum = curriculum
     env = TransformedEnv(TinyEnv((3,)), StateToObs(curriculum, progress))
     step = env.step(env.reset().set("action", torch.zeros(3, 1)))  # each goal is at a distance of 10
-    assert step["next", "reward"].flatten().tolist() == [-1.0, 0.0, -1.0]
+    assert step["next", "reward"].flatten().tolist() == [-1.0, 0.0, 7.0]
     assert step["next", "terminated"].flatten().tolist() == [False, True, False]
 
 

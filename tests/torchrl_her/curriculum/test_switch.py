@@ -57,7 +57,7 @@ def test_transitions_and_q_are_forgotten_and_sigma_and_epsilon_start_anew() -> N
     assert len(buffer) == 0
     assert int(weights.counts.sum()) == 0
     assert weights.sigma == 1.5
-    assert buffer.writer.reward_fn.threshold == 0.2
+    assert buffer.writer.reward_of(0).threshold == 0.2
     assert (buffer.writer.k, weights.alike) == (2, False)
     assert exploration.epsilon.tolist() == [1.0]
 
@@ -76,7 +76,7 @@ def test_a_layer_says_whether_goals_are_weighed() -> None:
     assert writer.weights.alike
     set_layer_goals(writer, make_layer(0.3))
     assert not writer.weights.alike
-    assert writer.reward_fn.threshold == 0.3
+    assert writer.reward_of(0).threshold == 0.3
 
 
 def test_a_buffer_without_hindsight_is_refused() -> None:

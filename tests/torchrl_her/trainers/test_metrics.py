@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_her import success
+from torchrl_her import GoalReward, reached, success
 from torchrl_her.trainers import discounted_return, final_distance, first_episode, q_bias
 
 # How a step ends: "-" goes on, "T" terminates, "U" truncates, "B" does both.
@@ -36,12 +38,31 @@ def test_the_first_episode_ends_at_its_first_done(done: list[int], inside: list[
     assert first_episode(torch.tensor(done).bool()).int().tolist() == inside
 
 
-def test_success_is_an_achieved_goal_at_some_step() -> None:
-    assert success(rollout("---U", "---T", "T---", "---B")).tolist() == [False, True, True, True]
+@pytest.mark.parametrize("measure", [success, reached])
+def test_where_goals_end_episodes_success_is_to_have_reached_one(measure: Callable[..., Tensor]) -> None:
+    assert measure(rollout("---U", "---T", "T---", "---B")).tolist() == [False, True, True, True]
 
 
-def test_success_need_not_be_at_the_end() -> None:
-    assert success(rollout("--U", rewards=[[-1.0, 0.0, -1.0]])).tolist() == [True]
+def test_a_goal_that_was_left_again_was_reached_without_success() -> None:
+    left = rollout("--U", "--U", rewards=[[-1.0, 0.0, -1.0], [-1.0, -1.0, 0.0]])
+    assert reached(left).tolist() == [True, True]
+    assert success(left).tolist() == [False, True]
+
+
+def test_a_cost_of_actions_does_not_hide_success() -> None:
+    data = rollout("--U", "--U", rewards=[[-1.01, -1.01, -0.01], [-1.01, -0.01, -1.01]])
+    data["next", "achieved_goal"] = torch.tensor([[[3.0], [2.0], [1.0]], [[3.0], [1.0], [2.0]]])
+    data["next", "desired_goal"] = torch.ones(2, 3, 1)
+    assert success(data).tolist() == [False, False]  # by the step's reward
+    assert success(data, GoalReward(0.1)).tolist() == [True, False]
+    assert reached(data, GoalReward(0.1)).tolist() == [True, True]
+
+
+def test_the_environments_own_word_comes_first() -> None:
+    data = rollout("--U", "--U", rewards=[[-1.0, -1.0, -1.0], [0.0, 0.0, 0.0]])
+    data["next", "is_success"] = torch.tensor([[0, 0, 1], [1, 1, 0]]).bool().unsqueeze(-1)
+    assert success(data).tolist() == [True, False]
+    assert reached(data).tolist() == [True, True]
 
 
 def test_success_after_a_reset_does_not_count() -> None:
@@ -49,7 +70,7 @@ def test_success_after_a_reset_does_not_count() -> None:
 
 
 def test_another_reward_may_mean_success() -> None:
-    data = rollout("--U", "--U", rewards=[[0.0, 4.9, 0.0], [0.0, 5.0, 0.0]])
+    data = rollout("--U", "--U", rewards=[[0.0, 5.0, 4.9], [0.0, 0.0, 5.0]])
     assert success(data, achieved_reward=5.0).tolist() == [False, True]
 
 

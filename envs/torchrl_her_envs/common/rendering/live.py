@@ -34,7 +34,6 @@ class LiveEpisodes:
         columns: pictures in a row; None for a grid that is at least as wide as high.
         trail: whether to draw where the balls were, in throwing tasks.
         caption: a line of text in each picture.
-        achieved_reward: the least reward of an achieved goal; the environment's own if None.
 
     Attributes:
         frame: the present picture [height, width, 3] of uint8.
@@ -67,7 +66,6 @@ class LiveEpisodes:
         columns: int | None = None,
         trail: bool = True,
         caption: str = "",
-        achieved_reward: float | None = None,
     ) -> None:
         base = goal_env(env)
         if not base.can_render:
@@ -78,13 +76,12 @@ class LiveEpisodes:
         self._worlds = choose_indices(env.batch_size[0], worlds)
         self._size, self._caption, self._keeps_trail = size, caption, trail
         self._columns = math.ceil(math.sqrt(len(self._worlds))) if columns is None else columns
-        self._achieved_reward = reward_range(base)[1] if achieved_reward is None else achieved_reward
         self._pictures: dict[int, Tensor] = {}
         self._trail: list[Tensor] = []
 
     @property
     def achieved(self) -> int:
-        """How many of the environments that are shown have achieved their goals so far."""
+        """How many of the environments that are shown have their goals achieved now, or at their end."""
         return int(self._success[self._worlds].sum())
 
     @property
@@ -126,13 +123,18 @@ class LiveEpisodes:
             after = stepped["next"]
             self.step_count += 1
             out_of_time = self.step_count == self._base.max_steps  # whatever the transforms say
-            reached = after["reward"] >= self._achieved_reward
-            going = torch.zeros_like(reached)
-            going[self.running] = True
-            self._success = self._success | (reached & going)
+            self._success[self.running] = self._achieved(after)[self.running]
             self._shoot(after["done"] | out_of_time)
             if self.running:
                 self._shown = self._env.maybe_reset(self._env.step_mdp(stepped))
+
+    def _achieved(self, after: TensorDictBase) -> Tensor:
+        """Whether goals are achieved after a step, [N, 1]: by the environment's own word, or its reward."""
+        word = after.get("is_success", None)
+        if word is not None:
+            return word
+        reward = self._base.compute_reward(after["achieved_goal"], after["desired_goal"])
+        return reward >= reward_range(self._base)[1]
 
     def _shoot(self, done: Tensor) -> None:
         """Makes the picture, and stops the environments that are ``done`` [N, 1]."""

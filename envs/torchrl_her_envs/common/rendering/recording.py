@@ -20,7 +20,6 @@ def record_episodes(
     trail: bool = True,
     hold: int = 25,
     caption: str = "",
-    achieved_reward: float | None = None,
 ) -> list[Tensor]:
     """Plays one greedy episode in each of several environments and films them side by side.
 
@@ -38,7 +37,6 @@ def record_episodes(
         trail: whether to draw where the balls were, in throwing tasks.
         hold: how many times the last frame is repeated: 25 are one second at 25 frames a second.
         caption: a line of text in each picture.
-        achieved_reward: the least reward of an achieved goal; the environment's own if None.
 
     Returns:
         Frames [height, width, 3] of uint8: the start, one for each step, and the last one repeated.
@@ -63,7 +61,6 @@ def record_episodes(
         columns=columns,
         trail=trail,
         caption=caption,
-        achieved_reward=achieved_reward,
     )
     live.start()
     frames = [live.frame]
