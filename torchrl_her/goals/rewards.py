@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from functools import reduce
 from typing import Protocol
@@ -11,6 +12,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_her.checks import check_finite
+
+_FORM = (
+    "the reward function must take (achieved_goal, desired_goal) and return (reward, terminated), "
+    "tensors [..., 1]"
+)
 
 
 class RewardFunction(Protocol):
@@ -95,6 +101,7 @@ class EnvReward:
     Args:
         compute_reward: (achieved, desired) goals [..., g] to rewards [..., 1].
         compute_terminated: (achieved, desired) goals [..., g] to bool [..., 1]: where the episode terminates.
+            If None, no goal terminates it.
 
     Example:
         >>> rule = EnvReward(lambda a, d: -(a - d).abs(), lambda a, d: a == d)
@@ -105,16 +112,17 @@ class EnvReward:
     def __init__(
         self,
         compute_reward: Callable[[Tensor, Tensor], Tensor],
-        compute_terminated: Callable[[Tensor, Tensor], Tensor],
+        compute_terminated: Callable[[Tensor, Tensor], Tensor] | None = None,
     ) -> None:
         self.compute_reward = compute_reward
         self.compute_terminated = compute_terminated
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (reward, terminated), each [..., 1], for goals [..., g]."""
-        return self.compute_reward(achieved_goal, desired_goal), self.compute_terminated(
-            achieved_goal, desired_goal
-        )
+        reward = self.compute_reward(achieved_goal, desired_goal)
+        if self.compute_terminated is None:
+            return reward, torch.zeros_like(reward, dtype=torch.bool)
+        return reward, self.compute_terminated(achieved_goal, desired_goal)
 
 
 def ask_reward(
@@ -132,7 +140,7 @@ def ask_reward(
         Traceback (most recent call last):
         ValueError: rewards of the reward function must be finite, got inf in it
     """
-    reward, terminated = reward_fn(achieved_goal, desired_goal)
+    reward, terminated = _call(reward_fn, achieved_goal, desired_goal)
     shape = _pairs(achieved_goal, desired_goal)
     if terminated.dtype != torch.bool or terminated.numel() != shape.numel():
         raise ValueError(
@@ -140,6 +148,36 @@ def ask_reward(
             f"{terminated.dtype} of shape {list(terminated.shape)}"
         )
     return _checked(reward, shape).unsqueeze(-1), terminated.reshape(*shape, 1)
+
+
+def _call(reward_fn: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the answer of a reward function; a ValueError names the form that it must have."""
+    try:
+        answer = reward_fn(achieved_goal, desired_goal)
+    except TypeError as error:
+        if _takes_two(reward_fn):
+            raise
+        raise ValueError(f"{_FORM}, got {error}") from error
+    several = answer if isinstance(answer, tuple | list) else [answer]
+    if len(several) == 2 and all(isinstance(own, Tensor) for own in several):
+        reward, terminated = several
+        return reward, terminated
+    kinds = " and ".join(type(own).__name__ for own in several)
+    raise ValueError(
+        f"{_FORM}, got {kinds}; a function of rewards alone comes as EnvReward(function), where no goal ends "
+        "an episode"
+    )
+
+
+def _takes_two(function: Callable[..., object]) -> bool:
+    """Whether a function can be called with two goals; true if that cannot be told."""
+    try:
+        inspect.signature(function).bind(None, None)
+    except TypeError:
+        return False
+    except ValueError:  # as of functions in C
+        return True
+    return True
 
 
 def _pairs(achieved_goal: Tensor, desired_goal: Tensor) -> torch.Size:
@@ -177,7 +215,7 @@ def missed(
     if isinstance(reward_fn, EnvReward):
         value = reward_fn.compute_reward(achieved_goal, desired_goal)
     else:
-        value = reward_fn(achieved_goal, desired_goal)[0]
+        value = _call(reward_fn, achieved_goal, desired_goal)[0]
     return _checked(value, _pairs(achieved_goal, desired_goal)) < achieved_reward
 
 

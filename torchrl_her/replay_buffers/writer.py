@@ -205,7 +205,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._episodes = 0  # copies of episodes ever written, if whole ones are
         self._process = os.getpid()
         # Whether the held ones came with a state, or are over, and nothing was written since.
-        self._loaded = self._all_over = False
+        self._loaded = self._all_over = self._overfull = False
 
     @property
     def held_back(self) -> int:
@@ -294,11 +294,12 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         # Last of all, so that a batch that cannot be written loses nothing that was held back before.
         self._held, self._recent = batch.take(left), recent
         self._loaded = self._all_over = False
-        if self.held_back > self._storage.max_size:
+        if self.held_back > self._storage.max_size and not self._overfull:
+            self._overfull = True
             warnings.warn(
                 f"{self.held_back:,} transitions of open episodes wait for their end, more than the buffer's "
                 f"{self._storage.max_size:,}: do all episodes end, and do batches of several environments "
-                "come as [N, T]?",
+                "come as [N, T]? (this is said once)",
                 stacklevel=2,
             )
         return index.reshape(data.shape)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from torchrl_her import EnvReward, GoalReward
 from torchrl_her.goals import achieved, distance
+from torchrl_her.goals.rewards import ask_reward, missed
 
 
 def goals(*rows: list[float]) -> Tensor:
@@ -110,3 +112,33 @@ def test_whole_numbers_do_not_wrap_around(dtype: torch.dtype) -> None:
     assert achieved(here, there, 0.5).tolist() == [False, True]
     reward, terminated = GoalReward(0.5)(here, there)
     assert (reward.flatten().tolist(), terminated.flatten().tolist()) == ([-1.0, 0.0], [False, True])
+
+
+@pytest.mark.parametrize(
+    ("function", "got"),
+    [
+        (lambda a, d: -(a - d).abs(), "Tensor; a function of rewards alone comes as EnvReward"),
+        (lambda a, d: -(a - d).abs().numpy(), "ndarray; a function"),
+        (lambda a, d: (-(a - d).abs(), True), "Tensor and bool; a function"),
+        (lambda a, d: (a, a, a), "Tensor and Tensor and Tensor; a function"),
+        (lambda rows: rows, "takes 1 positional argument but 2 were given"),
+        (lambda a, d, info: a, "missing 1 required positional argument: 'info'"),
+    ],
+)
+@pytest.mark.parametrize("ask", [ask_reward, lambda *given: missed(*given, 0.0)])
+def test_the_form_of_a_reward_function_is_named(function: Any, got: str, ask: Any) -> None:
+    form = r"must take \(achieved_goal, desired_goal\) and return \(reward, terminated\), tensors"
+    with pytest.raises(ValueError, match=f"^the reward function {form} .*, got .*{got}"):
+        ask(function, torch.zeros(2, 1), torch.ones(2, 1))  # two pairs, which could be unpacked
+
+
+def test_an_error_within_a_reward_function_stays_what_it_is() -> None:
+    with pytest.raises(TypeError, match="len"):
+        ask_reward(lambda a, d: len(3), torch.zeros(2, 1), torch.ones(2, 1))  # type: ignore[arg-type]
+
+
+def test_rewards_alone_are_taken_where_no_goal_ends_an_episode() -> None:
+    rule = EnvReward(lambda a, d: -(a - d).abs().squeeze(-1))  # [...], as other libraries have it
+    reward, terminated = ask_reward(rule, torch.zeros(2, 1), torch.tensor([[0.0], [3.0]]))
+    assert reward.tolist() == [[0.0], [-3.0]]
+    assert terminated.tolist() == [[False], [False]]

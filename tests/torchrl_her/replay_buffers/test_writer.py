@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import pickle
 import re
+import warnings
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -376,6 +377,20 @@ def test_an_environment_reset_from_outside_leaks_nothing(how: str) -> None:
     _, virtual = split(buffer)
     pairs = set(zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True))
     assert pairs == {(0.0, 3.0), (1.0, 3.0), (2.0, 3.0), (100.0, 102.0), (101.0, 102.0)}
+
+
+def test_an_episode_longer_than_the_buffer_is_said_once() -> None:
+    buffer = make_buffer(13)
+    rows = make_batch([[40]])
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        for step in range(40):
+            buffer.extend(rows[:, step : step + 1].clone())
+    said = [str(own.message) for own in seen if "wait for their end" in str(own.message)]
+    assert [line.split(":")[0] for line in said] == [
+        "14 transitions of open episodes wait for their end, more than the buffer's 13"
+    ]
+    assert len(buffer) == 13
 
 
 @pytest.mark.filterwarnings("ignore:.*wait for their end")  # in buffers of 13 rows
