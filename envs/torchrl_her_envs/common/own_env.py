@@ -396,6 +396,12 @@ class OwnGoalEnv(TaskTraits, EnvBase):
 
     def _shown(self, each: list[TensorDictBase]) -> dict[str, Tensor]:
         shown = {key: self._stack(each, key).float() for key in KEYS}
+        for key, rows in shown.items():
+            if not bool((finite := rows.isfinite()).all()):
+                row, at = (~finite).nonzero()[0].tolist()
+                raise ValueError(
+                    f"{self._name}: {key} {at} must be a finite number, got {rows[row, at].item()}"
+                )
         return shown | ({_SUCCESS: self._flag(each, _SUCCESS)} if _SUCCESS in self.observation_spec else {})
 
     def _ask(self, method: str, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:

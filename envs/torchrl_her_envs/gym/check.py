@@ -28,6 +28,7 @@ _TRIED_STEPS = 100
 _LIMIT_STEPS = 1_000  # that are played to see where an environment truncates an episode itself
 _LIMIT = 100  # of episodes that it does not truncate
 _HALVINGS = 30
+_COARSE = 0.05  # steps of float32, relative to the standard deviation of a goal
 
 
 def spec_of(env: gymnasium.Env) -> EnvSpec:
@@ -207,6 +208,20 @@ class Trial:
         chosen = np.unique(np.linspace(0, len(self.reward) - 1, EPISODES).astype(int))
         achieved, desired = self.achieved[chosen], self.desired[chosen]
         return np.repeat(achieved, len(chosen), 0), np.tile(desired, (len(chosen), 1))
+
+
+def coarse_goals(id: str, achieved: np.ndarray) -> str:
+    """A warning for achieved goals [n, g] so far from 0 that float32 rounds their changes, or nothing."""
+    size, spread = np.abs(achieved).max(0), achieved.std(0, dtype=np.float64)
+    steps = np.spacing(size.astype(np.float32))
+    coarse = (spread > 0) & (steps > _COARSE * spread)
+    if not coarse.any():
+        return ""
+    at = int(coarse.argmax())
+    return (
+        f"{id}: achieved_goal {at} is about {size[at]:,.0f}, where float32 has steps of {steps[at]:g}, and "
+        f"changes by {spread[at]:.2g}: subtract a constant from it in the environment"
+    )
 
 
 def find_limit(env: gymnasium.Env) -> int:

@@ -39,6 +39,7 @@ from torchrl_her_envs.gym.check import (
     TERMINATED,
     check_goal_env,
     check_methods,
+    coarse_goals,
     find_achieved_reward,
     find_limit,
     goals_to_try,
@@ -187,7 +188,8 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         **kwargs: Any,
     ) -> None:
         shown = shown_of(reference_env.observation_space)
-        self._layouts = {key: Layout(shown[key], key) for key in KEYS}
+        id = spec_of(reference_env).id
+        self._layouts = {key: Layout(shown[key], f"{id}: {key}") for key in KEYS}
         super().__init__(envs, device="cpu", **kwargs)  # TorchRL's metaclass adds some
         self._reference_env = reference_env
         self._limit = spec_of(reference_env).max_episode_steps or 0
@@ -200,6 +202,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         goals = goals_to_try(env, layout)
         self._reward_of = self._function(REWARD, goals)
         trial = try_steps(env, layout)
+        warn_once(coarse_goals(id, trial.achieved))
         check_stateless(id, self._reward_of.tried, self._reward_of(*goals))
         equal = float(self._reward_of.tried[:EPISODES].min())
         others = np.concatenate([self._reward_of.tried[EPISODES:], self._reward_of(*trial.pairs())])

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+_LARGEST = float(np.finfo(np.float32).max)
+
 
 @dataclass(frozen=True)
 class _Leaf:
@@ -51,7 +53,7 @@ class Layout:
     """
 
     def __init__(self, space: spaces.Space, name: str) -> None:
-        self._leaves = _leaves(space, (), name)
+        self._leaves, self._name = _leaves(space, (), name), name
         self.width = sum(leaf.width for leaf in self._leaves)
 
     @property
@@ -80,14 +82,23 @@ class Layout:
         return [(leaf.path, leaf.shape) for leaf in self._leaves]
 
     def flatten(self, values: Any) -> np.ndarray:
-        """Values of the space, each with the same leading dimensions [...], as rows [..., width]."""
+        """Values of the space, each with the same leading dimensions [...], as rows [..., width].
+
+        Raises:
+            ValueError: a value is not a finite number of float32; the message names it.
+        """
         arrays = []
         for leaf in self._leaves:
             own = values
             for key in leaf.path:
                 own = own[key]
             own = np.asarray(own)
-            arrays.append(own.reshape(*own.shape[: own.ndim - len(leaf.shape)], leaf.width))
+            rows = own.reshape(*own.shape[: own.ndim - len(leaf.shape)], leaf.width)
+            finite = np.abs(rows) <= _LARGEST
+            if not finite.all():
+                name, at = ".".join([self._name, *leaf.path]), np.argwhere(~finite)[0]
+                raise ValueError(f"{name} {at[-1]} must be a finite number, got {rows[tuple(at)]}")
+            arrays.append(rows)
         return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, -1)
 
     def unflatten(self, rows: np.ndarray) -> Any:

@@ -134,3 +134,12 @@ class Near(Point):
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         near = (achieved_goal - self.at).norm(dim=-1, keepdim=True) < 0.5
         return super().compute_reward(achieved_goal, desired_goal) - near.float()
+
+
+class Lost(Point):
+    """A point whose second coordinate cannot be seen at the right."""
+
+    def _shown(self) -> dict[str, Tensor]:
+        seen = super()._shown()
+        at = seen["observation"]
+        return {**seen, "observation": torch.where(at[..., :1] > 0, at / torch.tensor([1.0, 0.0]), at)}

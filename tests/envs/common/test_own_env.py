@@ -152,6 +152,7 @@ def test_pictures(name: str) -> None:
             {},
             "Near: compute_reward gave .* some steps later, for the same two goals; it must",
         ),
+        (f"{HERE}:Lost", {}, "Lost: observation 1 must be a finite number, got (-?inf|nan)"),
         (f"{HERE}:Bare", {}, "lacks the method 'compute_reward'"),
         (f"{HERE}:Endless", {}, "needs a time limit, .* as in task.options.max_steps=100, got None"),
         (f"{HERE}:Wide", {}, r"compute_reward .* must give a tensor \[.*1\] for goals"),

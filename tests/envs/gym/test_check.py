@@ -11,6 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from torchrl_her_envs import make_gym_env
+from torchrl_her_envs.gym.check import coarse_goals
 
 from .walk import WALK, Walk, walk
 
@@ -118,3 +119,11 @@ def test_methods_of_old_gym_are_named(made: Any, message: str, limit: int | None
     with pytest.raises(ValueError, match=f"^tests/Old-v0: {message}$"):
         make_gym_env("tests/Old-v0")
     del gymnasium.registry["tests/Old-v0"]
+
+
+def test_goals_that_float32_rounds_are_said() -> None:
+    near = np.random.default_rng(0).uniform(-4.0, 4.0, (100, 2))
+    assert coarse_goals("Boat-v0", near) == ""
+    assert coarse_goals("Boat-v0", near * 0 + 5_334_760.5) == ""  # they never change
+    said = coarse_goals("Boat-v0", near + np.array([0.0, 5_334_760.5]))
+    assert said.startswith("Boat-v0: achieved_goal 1 is about 5,334,764, where float32 has steps of 0.5, and")

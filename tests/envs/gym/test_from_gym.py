@@ -94,6 +94,18 @@ def test_actions_have_the_shape_type_and_bounds_of_their_space(actions: spaces.B
     assert rollout(TransformedEnv(env, ActionScaling()))["action"].shape == (3, 40, width)
 
 
+def test_an_observation_that_is_not_finite_is_named_before_it_is_passed_on() -> None:
+    class Lidar(Walk):
+        def _show(self) -> dict[str, np.ndarray]:
+            seen = super()._show()
+            return seen | {"observation": np.where(seen["observation"] == LAST, np.inf, 0.0)}
+
+    gymnasium.register("tests/Lidar-v0", Lidar, max_episode_steps=6)
+    env = make_gym_env("tests/Lidar-v0")
+    with pytest.raises(ValueError, match=r"^tests/Lidar-v0: observation 0 must be a finite number, got inf$"):
+        rollout(env, 100)
+
+
 def test_a_step_without_success_in_its_info_has_not_achieved_its_goal() -> None:
     class Rare(Walk):
         def step(self, action: Any) -> Any:

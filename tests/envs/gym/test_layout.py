@@ -72,6 +72,17 @@ def test_whole_numbers_are_rounded() -> None:
     assert (whole.tolist(), whole.dtype) == ([0, 1, 3, -2], np.int32)
 
 
+@pytest.mark.parametrize(("value", "got"), [(np.nan, "nan"), (-np.inf, "-inf"), (1e300, r"1e\+300")])
+def test_a_number_that_float32_cannot_hold_is_named(value: float, got: str) -> None:
+    with pytest.raises(ValueError, match=f"^Env-v0: observation 2 must be a finite number, got {got}$"):
+        Layout(spaces.Box(-np.inf, np.inf, (3,)), "Env-v0: observation").flatten(
+            np.array([[0.0, 1.0, value]])
+        )
+    turned = {"arm": np.zeros(2), "hand": {"grip": 0, "turn": np.array([[0.0, 0.0], [value, 0.0]])}}
+    with pytest.raises(ValueError, match=f"^goal.hand.turn 2 must be a finite number, got {got}$"):
+        Layout(nested(), "goal").flatten(turned)
+
+
 @pytest.mark.parametrize(
     ("space", "message"),
     [
