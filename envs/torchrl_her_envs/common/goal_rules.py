@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
-Termination = Literal["auto", "success", "reward", "never"]
-Ends = Literal["own", "success", "reward", "never"]
+Termination = Literal["auto", "own", "success", "reward", "never", "watch"]
+Ends = Literal["own", "success", "reward", "never", "watch"]
 
 _LOGGER = logging.getLogger("torchrl_her_envs")
 _MOST_VALUES = 2  # different rewards of goals that are not achieved, in a sparse reward
@@ -19,8 +19,8 @@ _said: set[str] = set()
 
 
 def say_once(line: str) -> None:
-    """Logs a line, the first time that it is said in this process."""
-    if line not in _said:
+    """Logs a line, the first time that it is said in this process; nothing if it is empty."""
+    if line and line not in _said:
         _said.add(line)
         _LOGGER.info(line)
 
@@ -44,7 +44,7 @@ def check_termination(word: str) -> Termination:
     Example:
         >>> check_termination("sucess")
         Traceback (most recent call last):
-        ValueError: termination must be one of auto, success, reward, never, got 'sucess'
+        ValueError: termination must be one of auto, own, success, reward, never, watch, got 'sucess'
     """
     allowed = get_args(Termination)
     if word not in allowed:
@@ -52,59 +52,131 @@ def check_termination(word: str) -> Termination:
     return cast(Termination, word)
 
 
-def choose_ends(
-    name: str,
-    termination: Termination,
-    *,
-    has_own: bool,
-    achieved: np.ndarray,
-    terminated: np.ndarray,
-    tells_success: bool,
-) -> Ends:
-    """What ends an episode at its goal, by what the user said or by what some steps showed.
-
-    The environment's own function decides if it has one. If it has none, ``auto`` looks at steps in which
-    the goal was achieved: an environment that went on in one of them never ends there. If it ended, or if
-    no step achieved the goal, episodes end at their goals, as ``info["is_success"]`` tells, or else the
-    reward. That is a rule which can be held for real and virtual goals alike, whatever the environment does.
+class GoalEnds:
+    """What ends an episode at its goal: the rule, and what the environment itself was seen to do there.
 
     Args:
-        name: of the environment, for the line that is logged.
-        termination: what the user said.
+        name: of the environment, for messages.
+        own: whether any goal ends an episode by the environment's ``compute_terminated``; None if it has no
+            such function.
+        tells_success: whether steps say ``is_success``.
 
-    Keyword Args:
-        has_own: whether the environment has a function that tells whether a goal ends an episode.
-        achieved: [n] of bool, steps that achieved their goals.
-        terminated: [n] of bool, whether these steps ended the episode.
-        tells_success: whether the environment's ``info`` has ``is_success``.
+    Attributes:
+        rule: which of the environment's own function (``"own"``), its ``is_success`` (``"success"``) or the
+            reward of a goal (``"reward"``) ends episodes; ``"never"`` if goals end none; ``"watch"`` while
+            the environment ends episodes as it does by itself, and nobody has decided.
+        steps: that were seen.
+        ended, went_on: steps at achieved goals in which the environment itself ended the episode, or went on.
 
-    Raises:
-        ValueError: ``"success"`` was asked for, and ``info`` has no such entry.
+    Example:
+        >>> ends = GoalEnds("walk", own=None, tells_success=True)
+        >>> ends.found() is None  # no goal was met so far
+        True
+        >>> met, stops = np.array([True, False]), np.array([False, True])
+        >>> _ = ends.apply(met, stops, np.array([False, False]))
+        >>> ends.decide("auto")
+        >>> ends.rule, ends.went_on
+        ('never', 1)
+        >>> ends.apply(np.array([True, False]), np.array([True, True]), np.array([False, False]))
+        (array([False,  True]), array([ True, False]))
     """
-    if termination == "success" and not tells_success:
-        raise ValueError(
-            f"task.options.termination=success needs info['is_success'], which {name} does not give: "
-            "choose task.options.termination=reward or never"
+
+    def __init__(self, name: str, *, own: bool | None, tells_success: bool) -> None:
+        self.name, self.own, self.tells_success = name, own, tells_success
+        self.rule: Ends = "watch"
+        self.steps = self.ended = self.went_on = 0
+
+    @property
+    def asks_success(self) -> bool:
+        """Whether ``is_success`` tells which steps achieve their goals, and not the reward of their goals."""
+        return self.tells_success and self.rule != "reward"
+
+    def decide(self, termination: Termination) -> None:
+        """Sets the rule to what the user said, or by what was found.
+
+        Raises:
+            ValueError: the environment lacks what is asked for.
+        """
+        lacks = {"success": not self.tells_success and "info['is_success']"}
+        lacks["own"] = self.own is None and "compute_terminated"
+        if lack := lacks.get(termination):
+            others = ", ".join(own for own in ("success", "reward", "never") if not lacks.get(own))
+            raise ValueError(
+                f"task.options.termination={termination} needs {lack}, which {self.name} does not give; "
+                f"choose {others}"
+            )
+        found = self.found()
+        if termination == "watch":
+            self.rule = "watch" if self.own is None else found or "own"
+        elif termination == "auto":
+            self.rule = found or "never"
+            say_once(self.line())
+        else:
+            self.rule = termination
+
+    def found(self) -> Ends | None:
+        """The rule that fits what the environment was seen to do; None while it has met no goal.
+
+        Its own function decides if it has one. If not, and it went on at a goal, goals never end an episode.
+        """
+        if self.own is not None:
+            return "own" if self.own else "never"
+        if self.went_on:
+            return "never"
+        return ("success" if self.tells_success else "reward") if self.ended else None
+
+    def line(self) -> str:
+        """Why the rule is what was found; empty if the environment's own function decides."""
+        if self.own is not None:
+            return ""
+        by, where = "reward", "the reward is that of an achieved goal"
+        if self.tells_success:
+            by, where = "success", "info['is_success'] is true"
+        seen = f"in {self.steps:,} random steps it"
+        if self.went_on:
+            why = f"{seen} went on after a goal was achieved, so goals never end an episode"
+        elif self.ended:
+            why = f"{seen} ended where a goal was achieved, so goals end an episode, where {where}"
+        else:
+            why = (
+                f"no goal was achieved in {self.steps:,} random steps, so goals are taken to end no episode; "
+                f"if they do, choose task.options.termination={by}"
+            )
+        rule = self.found() or "never"
+        return f"{self.name} has no compute_terminated: {why} (task.options.termination={rule})"
+
+    def apply(self, met: Any, terminated: Any, truncated: Any) -> tuple[Any, Any]:
+        """The ends of some steps by the rule, after it was noted what the environment did at achieved goals.
+
+        Args:
+            met: of bool, steps that achieved their goals.
+            terminated, truncated: what the environment said, likewise.
+
+        Returns:
+            ``(terminated, truncated)``. Where goals never end an episode, one that the environment ended at
+            its goal was cut off; ends without the goal are the environment's own.
+        """
+        at_goal = terminated & met
+        ended, went_on = int(at_goal.sum()), int((met & ~terminated & ~truncated).sum())
+        self.steps, self.ended = self.steps + len(met), self.ended + ended
+        self.went_on += went_on
+        if self.rule == "never":
+            if ended:
+                by = "success" if self.tells_success else "reward"
+                self._say_contrary("ended an episode where its goal was achieved", by)
+            return terminated & ~met, truncated | at_goal
+        if self.rule in ("success", "reward"):
+            if went_on:
+                self._say_contrary("went on where a goal was achieved", "never")
+            return terminated | met, truncated
+        return terminated, truncated
+
+    def _say_contrary(self, what: str, instead: str) -> None:
+        instead = instead if self.own is None else "own"
+        say_once(
+            f"{self.name} {what}, against task.options.termination={self.rule}: "
+            f"task.options.termination={instead} does as the environment"
         )
-    if termination != "auto":
-        return termination
-    if has_own:
-        return "own"
-    by: Ends = "success" if tells_success else "reward"
-    where = "info['is_success'] is true" if tells_success else "the reward is that of an achieved goal"
-    ends: Ends = by
-    if bool((achieved & ~terminated).any()):
-        ends = "never"
-        why = "in a trial it went on after a goal was achieved, so goals never end an episode"
-    elif bool(achieved.any()):
-        why = f"in a trial it ended where a goal was achieved, so goals end an episode, where {where}"
-    else:
-        why = (
-            f"goals are taken to end an episode, where {where}; if it goes on, choose "
-            "task.options.termination=never"
-        )
-    say_once(f"{name} has no compute_terminated: {why} (task.options.termination={ends})")
-    return ends
 
 
 def check_stateless(name: str, before: np.ndarray, after: np.ndarray) -> None:

@@ -18,12 +18,12 @@ from torchrl.envs import EnvBase
 from torchrl_her_envs.common.goal_env import TaskTraits, bounded_actions, choose_indices, is_goal_env
 from torchrl_her_envs.common.goal_rules import (
     Ends,
+    GoalEnds,
     Termination,
     check_rewards,
     check_same_rewards,
     check_stateless,
     check_termination,
-    choose_ends,
     warn_once,
 )
 from torchrl_her_envs.common.rendering.pictures import as_picture, captioned, resized
@@ -108,7 +108,7 @@ def make_own_env(
 
     envs = make_many(num_envs, seed)
     if isinstance(envs[0], TaskTraits) and is_goal_env(envs[0]):
-        if termination != "auto" or achieved_reward is not None:
+        if termination not in ("auto", "watch") or achieved_reward is not None:
             raise ValueError(f"{path} says itself how it ends and rewards: leave out {', '.join(_OURS[1:])}")
         return envs[0]
     # A single one is tried, so that what is found out does not depend on how many are asked for.
@@ -169,14 +169,13 @@ class GoalRules:
     """How an environment rewards goals and ends episodes.
 
     Args:
-        ends: what ends an episode at its goal: ``"own"`` for ``compute_terminated``, ``"success"``,
-            ``"reward"`` or ``"never"``.
+        ends: what ends an episode at its goal, and what the environment was seen to do there.
         missed_reward: the least reward that was seen.
         achieved_reward: the least reward of an achieved goal.
         dense: whether there are many rewards besides these two.
     """
 
-    ends: Ends
+    ends: GoalEnds
     missed_reward: float
     achieved_reward: float
     dense: bool
@@ -240,7 +239,8 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         self._make_specs(first)
         self._latest: list[TensorDictBase] = []
         self._steps = torch.zeros(count, 1, dtype=torch.int64)
-        self.rules = rules or GoalRules(ends="own", missed_reward=-1.0, achieved_reward=0.0, dense=False)
+        untried = GoalEnds(name, own=None, tells_success=True)
+        self.rules = rules or GoalRules(ends=untried, missed_reward=-1.0, achieved_reward=0.0, dense=False)
         if rules is None:
             self.rules = self._try_out(check_termination(termination), achieved_reward)
         self.set_seeds(as_seeds(seed))
@@ -255,6 +255,16 @@ class OwnGoalEnv(TaskTraits, EnvBase):
     def can_render(self) -> bool:
         """Whether the environment has a method ``render``."""
         return callable(getattr(self._envs[0], "render", None))
+
+    @property
+    def goal_ends(self) -> GoalEnds:
+        """What ends an episode at its goal, and what the environment was seen to do there."""
+        return self.rules.ends
+
+    @property
+    def ends(self) -> Ends:
+        """What ends an episode at its goal, see :class:`~torchrl_her_envs.common.goal_rules.GoalEnds`."""
+        return self.rules.ends.rule
 
     @property
     def missed_reward(self) -> float:
@@ -281,10 +291,9 @@ class OwnGoalEnv(TaskTraits, EnvBase):
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """Whether an episode ends there: [..., 1] of bool."""
-        if self.rules.ends == "own":
+        if self.ends == "own":
             return self._ask("compute_terminated", achieved_goal, desired_goal).bool()
-        reward = self.compute_reward(achieved_goal, desired_goal)
-        return (reward >= self.achieved_reward) & (self.rules.ends != "never")
+        return self._meets(achieved_goal, desired_goal) & (self.ends in ("success", "reward"))
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
         """Seeds R equal blocks of environments.
@@ -371,16 +380,13 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         reward = self._stack(after, "reward").float().view(-1, 1)
         terminated = self._flag(after, "done" if after[0].get("terminated", None) is None else "terminated")
         truncated = self._flag(after, "truncated") | (self._steps >= self.max_steps)
-        if self.rules.ends == "never":
-            terminated, truncated = torch.zeros_like(terminated), truncated | terminated
-        elif self.rules.ends == "success":
-            terminated = terminated | self._flag(after, _SUCCESS)
-        elif self.rules.ends == "reward":
-            terminated = terminated | (reward >= self.achieved_reward)
+        shown = self._shown(after)
+        if self.ends != "own":
+            asks = self.goal_ends.asks_success
+            met = self._flag(after, _SUCCESS) if asks else self._meets(*(shown[key] for key in _GOALS))
+            terminated, truncated = self.goal_ends.apply(met, terminated, truncated)
         ends = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
-        return TensorDict(
-            {**self._shown(after), "reward": reward, **ends}, self.batch_size, device=self.device
-        )
+        return TensorDict({**shown, "reward": reward, **ends}, self.batch_size, device=self.device)
 
     # Helpers
 
@@ -403,6 +409,9 @@ class OwnGoalEnv(TaskTraits, EnvBase):
                     f"{self._name}: {key} {at} must be a finite number, got {rows[row, at].item()}"
                 )
         return shown | ({_SUCCESS: self._flag(each, _SUCCESS)} if _SUCCESS in self.observation_spec else {})
+
+    def _meets(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        return self.compute_reward(achieved_goal, desired_goal) >= self.achieved_reward
 
     def _ask(self, method: str, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         achieved, desired = torch.broadcast_tensors(achieved_goal, desired_goal)
@@ -492,14 +501,16 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         missed, met, dense = check_rewards(self._name, equal, rewards[0], achieved_reward)
         stepped = after["reward"].flatten()
         computed = self.compute_reward(achieved, desired).flatten()
-        went_on = ~after["terminated"].flatten() | (computed >= met)  # what a failure costs is kept
+        reached = computed >= met
+        went_on = ~after["terminated"].flatten() | reached  # what a failure costs is kept
         warn_once(check_same_rewards(self._name, stepped[went_on].numpy(), computed[went_on].numpy()))
-        ends = choose_ends(
-            self._name,
-            termination,
-            has_own=callable(getattr(self._envs[0], "compute_terminated", None)),
-            achieved=(stepped >= met).numpy(),
-            terminated=after["terminated"].flatten().numpy(),
-            tells_success=_SUCCESS in self._envs[0].full_observation_spec,
-        )
+        first, own = self._envs[0], None
+        if callable(getattr(first, "compute_terminated", None)):
+            pairs = torch.cat((one, other)).unsqueeze(1), torch.cat((one, other))
+            own = bool(self._ask("compute_terminated", *pairs).any())
+        ends = GoalEnds(self._name, own=own, tells_success=_SUCCESS in self.observation_spec)
+        if ends.tells_success:
+            reached = after[_SUCCESS].flatten()
+        ends.apply(reached, after["terminated"].flatten(), after["truncated"].flatten())
+        ends.decide(termination)
         return GoalRules(ends=ends, missed_reward=missed, achieved_reward=met, dense=dense)

@@ -193,7 +193,7 @@ class Trial:
     Attributes:
         achieved, desired: [n, g] goals after each step.
         reward: [n] of each step.
-        terminated: [n] of bool, whether the environment ended the episode there.
+        terminated, truncated: [n] of bool, whether the environment ended the episode there.
         success: [n] of bool, what ``info["is_success"]`` said; None if it was missing in all steps.
     """
 
@@ -201,6 +201,7 @@ class Trial:
     desired: np.ndarray
     reward: np.ndarray
     terminated: np.ndarray
+    truncated: np.ndarray
     success: np.ndarray | None
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
@@ -291,13 +292,14 @@ def try_steps(env: gymnasium.Env, layout: Layout) -> Trial:
         shown, reward, terminated, truncated, info = env.step(env.action_space.sample())
         done = terminated or truncated
         goals = (layout.flatten(shown[key]) for key in KEYS[1:])
-        rows.append((*goals, float(reward), bool(terminated), info.get(SUCCESS)))
-    achieved, desired, rewards, ends, success = zip(*rows, strict=True)
+        rows.append((*goals, float(reward), bool(terminated), bool(truncated), info.get(SUCCESS)))
+    achieved, desired, rewards, terminations, truncations, success = zip(*rows, strict=True)
     known = any(own is not None for own in success)
     return Trial(
         achieved=np.stack(achieved),
         desired=np.stack(desired),
         reward=np.array(rewards),
-        terminated=np.array(ends),
+        terminated=np.array(terminations),
+        truncated=np.array(truncations),
         success=np.array([bool(own) for own in success]) if known else None,
     )

@@ -19,12 +19,13 @@ from torchrl.envs import GymWrapper
 
 from torchrl_her_envs.common.goal_env import TaskTraits, bounded_actions, choose_indices
 from torchrl_her_envs.common.goal_rules import (
+    Ends,
+    GoalEnds,
     Termination,
     check_rewards,
     check_same_rewards,
     check_stateless,
     check_termination,
-    choose_ends,
     is_dense,
     say_once,
     warn_once,
@@ -147,12 +148,15 @@ class GymGoalEnv(TaskTraits, GymWrapper):
     - ``"success"``: a step whose ``info["is_success"]`` is true, and virtual goals whose reward is that of
       an achieved goal, since they have no ``info``.
     - ``"reward"``: a real or virtual goal whose reward is that of an achieved goal.
-    - ``"never"``: no goal. Where the environment ends an episode by itself, it is ``truncated``.
-    - ``"auto"``: what some steps of random actions show. If the environment went on after a goal was
-      achieved, ``"never"``; otherwise ``"success"``, or ``"reward"`` if it has no ``is_success``. The choice
-      is logged.
+    - ``"never"``: no goal. An episode that the environment ends at its goal is ``truncated``.
+    - ``"auto"``: what 100 steps of random actions show. If the environment ended where a goal was achieved,
+      ``"success"``, or ``"reward"`` if it has no ``is_success``; if it went on, or if no goal was met,
+      ``"never"``. The choice is logged.
+    - ``"watch"``: the environment ends episodes as it does by itself, and ``goal_ends`` tells after any
+      number of steps what it did at goals.
 
-    Given explicitly, they take the place of ``compute_terminated``.
+    The first three take the place of ``compute_terminated``, which ``"own"`` asks for. Where the environment
+    ends an episode for another reason, as by a fall, it is ``terminated`` whatever the rule.
 
     :func:`make_gym_env` makes them.
 
@@ -164,8 +168,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         achieved_reward: the reward from which on a goal counts as achieved; that of equal goals if None.
 
     Attributes:
-        ends: what ends an episode at its goal: ``"own"`` for ``compute_terminated``, ``"success"``,
-            ``"reward"`` or ``"never"``.
+        goal_ends: what ends an episode at its goal, and what the environment was seen to do there.
         achieved_reward: the least reward of an achieved goal.
         missed_reward: the least reward that was seen when the environment was tried; a sparse reward is
             always one of these two.
@@ -217,21 +220,28 @@ class GymGoalEnv(TaskTraits, GymWrapper):
             id, equal, others, achieved_reward
         )
         computed = self._reward_of(trial.achieved, trial.desired)
-        went_on = ~trial.terminated | (computed >= self.achieved_reward)  # what a failure costs is kept
+        met = computed >= self.achieved_reward
+        went_on = ~trial.terminated | met  # what a failure costs is kept
         warn_once(check_same_rewards(id, trial.reward[went_on], computed[went_on]))
-        has_own = has_compute_terminated(env, *(layout.unflatten(own[0]) for own in goals))
-        self.ends = choose_ends(
-            id,
-            termination,
-            has_own=has_own,
-            achieved=trial.reward >= self.achieved_reward if trial.success is None else trial.success,
-            terminated=trial.terminated,
-            tells_success=trial.success is not None,
+        own = None
+        if termination in ("auto", "own", "watch") and has_compute_terminated(
+            env, *(layout.unflatten(goal[0]) for goal in goals)
+        ):
+            self._terminated_of = self._function(TERMINATED, goals)
+            own = bool(self._terminated_of.tried.any())
+        self.goal_ends = GoalEnds(id, own=own, tells_success=trial.success is not None)
+        self.goal_ends.apply(
+            met if trial.success is None else trial.success, trial.terminated, trial.truncated
         )
-        self._terminated_of = self._function(TERMINATED, goals) if self.ends == "own" else None
+        self.goal_ends.decide(termination)
         if trial.success is not None:
             shape = (*self.batch_size, 1)
             self.observation_spec[SUCCESS] = Binary(n=1, shape=shape, dtype=torch.bool)
+
+    @property
+    def ends(self) -> Ends:
+        """What ends an episode at its goal, see :class:`~torchrl_her_envs.common.goal_rules.GoalEnds`."""
+        return self.goal_ends.rule
 
     def _function(self, name: str, goals: tuple[np.ndarray, np.ndarray]) -> GoalFunction:
         """A function of the environment, for goals [B, g] that it gets in their original form."""
@@ -287,10 +297,10 @@ class GymGoalEnv(TaskTraits, GymWrapper):
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """Whether an episode ends there: [..., 1] of bool."""
-        if self._terminated_of is not None:
+        if self.ends == "own":
             return self._ask(self._terminated_of, achieved_goal, desired_goal).bool()
         reward = self.compute_reward(achieved_goal, desired_goal)
-        return (reward >= self.achieved_reward) & (self.ends != "never")
+        return (reward >= self.achieved_reward) & (self.ends in ("success", "reward"))
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
         """Seeds R equal blocks of environments, each as if it were alone; from their next reset on.
@@ -398,13 +408,17 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         shown, reward, terminated, truncated, info = step_outputs_tuple
         if SUCCESS in info:
             shown = {**shown, SUCCESS: info[SUCCESS]}
-        if self.ends == "never":
-            terminated, truncated = np.zeros_like(terminated), truncated | terminated
-        elif self.ends == "success":
-            terminated = terminated | np.asarray(info.get(SUCCESS, False)).astype(np.bool_)
-        elif self.ends == "reward":
-            terminated = terminated | (np.asarray(reward) >= self.achieved_reward)
+        if self.ends != "own":
+            met = self._met(shown)
+            terminated, truncated = self.goal_ends.apply(met, terminated, truncated)
         return super()._output_transform((shown, reward, terminated, truncated, info))
+
+    def _met(self, shown: dict[str, Any]) -> np.ndarray:
+        """Which environments achieve their goals, [N] of bool: by their own word, or by the goals' reward."""
+        if self.goal_ends.asks_success:
+            return np.asarray(shown.get(SUCCESS, np.zeros(self.batch_size))).astype(np.bool_)
+        goals = (self._layouts[key].flatten(shown[key]) for key in KEYS[1:])
+        return self._reward_of(*goals) >= self.achieved_reward
 
     def _set_seed(self, seed: int | None) -> None:
         self.set_seeds([seed or 0])

@@ -13,10 +13,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
+from torchrl_her_envs.common.goal_rules import GoalEnds, say_once
 from torchrl_her_recipes.components.envs import action_bounds, make_task_envs
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.resolve import EnvFacts, auto_options, resolve
+from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_options, ends_open, resolve
 
 _AT_ONCE = 8
 _STEPS = 3_000
@@ -52,6 +53,8 @@ class Facts:
         goal_inside: entries of the observation that are the desired goal.
         own_layers: whether the task has a curriculum of its own.
         layers: of a curriculum, as :func:`propose_layers` gives them; empty if none is proposed.
+        ends: what ends an episode at its goal, and what the environment was seen to do there; None if the
+            environment itself says so for all goals.
     """
 
     steps: int
@@ -69,37 +72,50 @@ class Facts:
     goal_inside: list[int]
     own_layers: bool
     layers: list[dict[str, Any]]
+    ends: GoalEnds | None
 
 
 def resolved(recipe: Recipe) -> Recipe:
     """The recipe with a value for each option that is ``auto``, from what its environment is.
 
-    Where environments are stepped one by one and ``algo`` is ``auto``, random actions are played in one.
+    Where environments are stepped one by one, random actions are played in some: if ``algo`` is ``auto``, or
+    if it is open what ends an episode at its goal. What is found then is in the recipe, so that nobody who
+    has it looks again.
 
     Raises:
         ValueError: see :func:`~torchrl_her_recipes.components.envs.make_task_envs`.
     """
-    if not auto_options(recipe):
+    if not auto_options(recipe) and not ends_open(recipe):
         return recipe
-    looks = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
-    known = f"{recipe.task} {looks}"
+    needs_layers = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
+    known = f"{recipe.task} {needs_layers}"
     if (facts := _FACTS.get(known)) is None:
-        with closing(make_task_envs(recipe, 1, [0])) as env:
+        with closing(make_task_envs(_watched(recipe), 1, [0])) as env:
             task = goal_env(env)
             facts = EnvFacts(max_steps=task.max_steps, batched=task.batched)
-        if looks and not facts.batched:
-            facts = replace(facts, layers=_needed_layers(recipe))
+            ends: GoalEnds | None = getattr(task, "goal_ends", None)
+        open_ends = ends is not None and ends.own is None and ends_open(recipe)
+        if (needs_layers or open_ends) and not facts.batched:
+            look = look_at(recipe.replace(seed=0), seconds=None)
+            facts, ends = replace(facts, layers=_needed_layers(look) if needs_layers else None), look.ends
+        if ends is not None and ends_open(recipe):
+            facts = replace(facts, ends=ends.found() or "never")
+            say_once(ends.line())
         _FACTS[known] = facts
     return resolve(recipe, facts)
 
 
-def _needed_layers(recipe: Recipe) -> list[dict[str, Any]] | None:
+def _watched(recipe: Recipe) -> Recipe:
+    """The recipe with an environment that ends episodes as it does by itself, if that is still open."""
+    return recipe.replace(**{f"task.options.{TERMINATION}": "watch"}) if ends_open(recipe) else recipe
+
+
+def _needed_layers(facts: Facts) -> list[dict[str, Any]] | None:
     """Layers for a task whose achieved goal seldom changes by chance; None if it needs none, or has none.
 
     They are the same for each seed. A curriculum has rewards of its own, so the task's must be equal to them:
     there are no failures, and no costs of actions.
     """
-    facts = look_at(recipe.replace(seed=0), seconds=None)
     differs = facts.fallen > 0 or facts.disagree > 0
     return None if differs or facts.moved >= _SELDOM else facts.layers or None
 
@@ -123,7 +139,7 @@ def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SEC
         True
     """
     with (
-        closing(make_task_envs(recipe, _AT_ONCE, [recipe.run.seed])) as env,
+        closing(make_task_envs(_watched(recipe), _AT_ONCE, [recipe.run.seed])) as env,
         torch.random.fork_rng(devices=[]),
     ):
         torch.manual_seed(recipe.run.seed)
@@ -195,6 +211,7 @@ def _facts(
         goal_inside=_columns(seen, rows["desired_goal"].double()),
         own_layers=_has_layers(task),
         layers=propose_layers(rows, meets),
+        ends=getattr(task, "goal_ends", None),
     )
 
 

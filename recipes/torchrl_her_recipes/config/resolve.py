@@ -7,10 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
+from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.without_effect import without_effect
 
+TERMINATION = "termination"  # the option of a task that says what ends an episode at its goal
 _GAMMA = (0.9, 0.99)  # least and greatest
 _WARMUP = 1_000  # environment steps, at least
 _EPISODES = 100  # in an epoch, where environments are stepped one by one
@@ -25,11 +27,14 @@ class EnvFacts:
         max_steps: steps of an episode, at most.
         batched: whether the environments of a batch are stepped together, at little cost for each of them.
         layers: of a curriculum, if what is achieved seldom changes without one.
+        ends: what ends an episode at its goal, as ``task.options.termination`` takes it; None if the task has
+            no such option.
     """
 
     max_steps: int
     batched: bool = False
     layers: Any = None
+    ends: str | None = None
 
 
 def _algo(_recipe: Recipe, facts: EnvFacts) -> str:
@@ -83,6 +88,19 @@ def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
     return [own for own in names if getattr(getattr(recipe, own[0]), own[1]) == AUTO and own not in idle]
 
 
+def ends_open(recipe: Recipe) -> bool:
+    """Whether it depends on the environment what ends an episode at its goal.
+
+    Example:
+        >>> task = "gym:FetchPush-v4"
+        >>> own = {"task.options": {"termination": "never"}}
+        >>> [ends_open(Recipe().replace(task=task, **options)) for options in ({}, own)], ends_open(Recipe())
+        ([True, False], False)
+    """
+    known = get_task_spec(recipe.task.name).options
+    return TERMINATION in known and (recipe.task.options or {}).get(TERMINATION, AUTO) == AUTO
+
+
 def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
     """The same recipe with a value for each option that was ``auto``.
 
@@ -91,6 +109,8 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
         >>> recipe.learner.gamma, recipe.collection.num_envs, recipe.collection.epoch_frames
         (0.96, 8, 5000)
     """
+    if facts.ends is not None and ends_open(recipe):
+        recipe = recipe.replace(**{f"task.options.{TERMINATION}": facts.ends})
     for group, name in auto_options(recipe):
         values = {f"{group}.{name}": _VALUES[name](recipe, facts)}
         if name == "algo" and facts.layers:

@@ -113,7 +113,7 @@ def test_actions_have_the_shape_and_type_of_their_spec_and_fixed_ones_stay() -> 
 
 def test_what_it_does_at_a_goal_does_not_depend_on_how_many_there_are() -> None:
     found = {
-        make_own_env(f"{HERE}:Point", num_envs=n, goes_on=goes_on).rules.ends
+        make_own_env(f"{HERE}:Point", num_envs=n, goes_on=goes_on).ends
         for n in (1, 5, 40)
         for goes_on in (True,)
     }

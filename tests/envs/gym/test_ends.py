@@ -27,6 +27,7 @@ class Plain(Walk):
         far: how far goals are away: from 10 on, no random walk gets there.
         falls: whether the episode terminates in place 0.
         dense: whether the reward is the distance.
+        cost: of each step, which compute_reward does not know.
     """
 
     def __init__(
@@ -37,11 +38,13 @@ class Plain(Walk):
         unseen: bool = False,
         falls: bool = False,
         dense: bool = False,
+        cost: float = 0.0,
         form: str = "batch",
         render_mode: str | None = None,
     ) -> None:
         super().__init__(without="compute_terminated", form=form, render_mode=render_mode)
         self.stops, self.tells, self.falls, self.dense, self.unseen = stops, tells, falls, dense, unseen
+        self.cost = cost
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
@@ -56,7 +59,7 @@ class Plain(Walk):
         met = self.place == self.goal
         reward = self.compute_reward(np.array([self.place]), np.array([self.goal]), {})
         ends = (self.stops and met) or (self.falls and self.place == 0)
-        return self._show(), float(reward), ends, False, {"is_success": met} if self.tells else {}
+        return self._show(), float(reward) - self.cost, ends, False, {"is_success": met} if self.tells else {}
 
     def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
         if self.dense:
@@ -89,12 +92,14 @@ def steps(env: GymGoalEnv, count: int = 60) -> Any:
         ({}, "success", r"ended where a goal was achieved, .* where info\['is_success'\] is true"),
         ({"tells": False}, "reward", "ended where .* where the reward is that of an achieved goal"),
         ({"stops": False}, "never", "it went on after a goal was achieved, so goals never end an episode"),
+        ({"tells": False, "cost": 0.25}, "reward", "ended where a goal was achieved"),
+        ({"tells": False, "cost": 0.25, "stops": False}, "never", "it went on after a goal was achieved"),
         (
             {"unseen": True},
-            "success",
-            "goals are taken to end .*; if it goes on, choose task.options.termination=never",
+            "never",
+            "no goal was achieved in 100 random steps, .* choose task.options.termination=success",
         ),
-        ({"unseen": True, "tells": False}, "reward", "goals are taken to end an episode"),
+        ({"unseen": True, "tells": False}, "never", "if they do, choose task.options.termination=reward"),
     ],
 )
 def test_what_ends_an_episode_is_found_by_trying_and_said_once(
@@ -102,7 +107,8 @@ def test_what_ends_an_episode_is_found_by_trying_and_said_once(
 ) -> None:
     for _ in range(2):
         assert plain(**options).ends == ends
-    (record,) = said.records
+    lines = [record for record in said.records if record.levelno == logging.INFO]
+    (record,) = lines  # a warning says that steps have another reward
     assert record.getMessage().startswith("tests/Plain-v0 has no compute_terminated: ")
     assert record.getMessage().endswith(f"(task.options.termination={ends})")
     assert re.search(why, record.getMessage()), record.getMessage()
@@ -127,14 +133,60 @@ def test_real_and_virtual_goals_end_by_one_rule(ends: str, stops: bool, form: st
         assert torch.equal(after["truncated"] & met, met)  # it cannot go on there
 
 
-def test_an_end_of_another_reason_terminates_or_is_cut_off_where_nothing_terminates() -> None:
-    after = steps(plain(4, falls=True, termination="success"))
+@pytest.mark.parametrize("ends", ["success", "reward", "never", "watch"])
+def test_an_end_of_another_reason_is_the_environments_own_whatever_the_rule(ends: str) -> None:
+    after = steps(plain(4, falls=True, termination=ends))
     fallen = after["achieved_goal"] == 0
     assert fallen.any()
     assert after["terminated"][fallen].all()
-    after = steps(plain(4, falls=True, termination="never"))
-    assert not after["terminated"].any()
-    assert after["truncated"][after["achieved_goal"] == 0].all()
+
+
+def test_a_cost_in_the_reward_of_a_step_does_not_hide_that_its_goal_was_achieved() -> None:
+    after = steps(plain(4, tells=False, stops=False, cost=0.25, termination="reward"))
+    met = after["achieved_goal"] == after["desired_goal"]
+    assert met.any()
+    assert torch.equal(after["terminated"], met)
+    assert after["reward"][met].unique().tolist() == [-0.25]
+
+
+@pytest.mark.parametrize(
+    ("stops", "ends", "line"),
+    [
+        (
+            True,
+            "never",
+            "ended an episode where its goal was achieved, against task.options.termination=never: "
+            "task.options.termination=success does as the environment",
+        ),
+        (
+            False,
+            "success",
+            "went on where a goal was achieved, against task.options.termination=success: "
+            "task.options.termination=never does as the environment",
+        ),
+        (True, "success", None),
+        (False, "never", None),
+    ],
+)
+def test_what_contradicts_the_rule_is_said_once(
+    stops: bool, ends: str, line: str | None, said: pytest.LogCaptureFixture
+) -> None:
+    steps(plain(4, termination=ends, stops=stops))
+    expected = [] if line is None else [f"tests/Plain-v0 {line}"]
+    assert [record.getMessage() for record in said.records] == expected
+
+
+def test_watching_leaves_the_ends_to_the_environment_and_counts_them(said: pytest.LogCaptureFixture) -> None:
+    env = plain(4, falls=True, termination="watch")
+    before = env.goal_ends.ended
+    after = steps(env)
+    met = after["achieved_goal"] == after["desired_goal"]
+    assert env.ends == "watch"
+    assert env.goal_ends.steps == 100 + 4 * 60
+    assert env.goal_ends.ended - before == met.sum() > 0
+    assert env.goal_ends.found() == "success"
+    assert plain(unseen=True, termination="watch").goal_ends.found() is None
+    assert not said.records
 
 
 def test_a_base_class_that_has_the_mere_name_of_the_method_lacks_it() -> None:
@@ -154,6 +206,7 @@ def test_a_base_class_that_has_the_mere_name_of_the_method_lacks_it() -> None:
 def test_what_was_asked_for_takes_the_place_of_the_method() -> None:
     env = make_gym_env("tests/Walk-v0", num_envs=4, termination="never")
     assert make_gym_env("tests/Walk-v0").ends == "own"
+    assert make_gym_env("tests/Walk-v0", ends=False).ends == "never"  # its method says so of all goals
     after = steps(env)
     assert (after["reward"] == 0).any()
     assert not after["terminated"].any()
@@ -162,11 +215,12 @@ def test_what_was_asked_for_takes_the_place_of_the_method() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"termination": "sometimes"}, "must be one of auto, success, reward, never, got 'sometimes'"),
+        ({"termination": "sometimes"}, "one of auto, own, success, reward, never, watch, got 'sometimes'"),
         (
             {"termination": "success", "tells": False},
             r"task.options.termination=success needs info\['is_success'\]",
         ),
+        ({"termination": "own"}, "own needs compute_terminated, .*; choose success, reward, never"),
         (
             {"dense": True},
             "Plain-v0 has a dense reward: .* give -4, .*, -1 and more, equal ones 0",

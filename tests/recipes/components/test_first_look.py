@@ -1,0 +1,137 @@
+"""What ends episodes at their goals is found once, before anything is made of a recipe."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import yaml
+from gymnasium import spaces
+
+from torchrl_her_envs import make_env
+from torchrl_her_envs.common import goal_rules
+from torchrl_her_recipes import RunFolder, build, make_recipe, run
+from torchrl_her_recipes.components import first_look
+from torchrl_her_recipes.components.first_look import resolved
+
+TASK = "gym:tests/Seldom-v0"
+SIZES = {"hidden": 8, "num_envs": 2, "epoch_frames": 40, "epochs": 1, "episodes": 2, "pictures": False}
+
+
+class Seldom(gymnasium.Env):
+    """A walk along a line, whose goal is within reach in a few episodes only.
+
+    Args:
+        near: the share of these episodes.
+        stops: whether the goal ends an episode.
+        own: what compute_terminated says of an achieved goal; None without the method.
+        cost: of each step, which compute_reward does not know.
+    """
+
+    def __init__(
+        self, *, near: float = 0.03, stops: bool = True, own: bool | None = None, cost: float = 0.0
+    ) -> None:
+        line = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+        self.observation_space = spaces.Dict(observation=line, achieved_goal=line, desired_goal=line)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.near, self.stops, self.cost = near, stops, cost
+        if own is not None:
+            self.compute_terminated = lambda achieved, desired, info: own & (self._gap(achieved, desired) < 1)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        super().reset(seed=seed)
+        self.place, self.goal = 0.0, 1.0 if self.np_random.random() < self.near else 50.0
+        return self._show(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.place += float(action[0])
+        shown = self._show()
+        goals = shown["achieved_goal"], shown["desired_goal"]
+        met = bool(self._gap(*goals) < 1)
+        return shown, float(self.compute_reward(*goals, {})) - self.cost, self.stops and met, False, {}
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        return (self._gap(achieved, desired) < 1) - 1.0
+
+    def _gap(self, achieved: np.ndarray, desired: np.ndarray) -> Any:
+        return np.abs(achieved - desired)[..., 0]
+
+    def _show(self) -> dict[str, np.ndarray]:
+        values = {"observation": self.place, "achieved_goal": self.place, "desired_goal": self.goal}
+        return {key: np.array([value], np.float32) for key, value in values.items()}
+
+
+gymnasium.register("tests/Seldom-v0", Seldom, max_episode_steps=10)
+
+
+@pytest.fixture
+def said(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> pytest.LogCaptureFixture:
+    monkeypatch.setattr(goal_rules, "_said", set())
+    monkeypatch.setattr(first_look, "_FACTS", {})
+    caplog.set_level(logging.INFO, "torchrl_her_envs")
+    return caplog
+
+
+def never_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    def look(*_: Any, **__: Any) -> None:
+        raise AssertionError("it was looked at again")
+
+    monkeypatch.setattr(first_look, "look_at", look)
+    monkeypatch.setattr(first_look, "_FACTS", {})
+
+
+@pytest.mark.parametrize(
+    ("options", "ends", "line"),
+    [
+        ({}, "reward", "random steps it ended where a goal was achieved"),
+        ({"cost": 0.25}, "reward", "ended where a goal was achieved"),
+        ({"stops": False}, "never", "it went on after a goal was achieved"),
+        ({"near": 0.0}, "never", "no goal was achieved in 3,140 random steps"),
+        ({"own": True}, "own", None),
+        ({"own": False, "stops": False}, "never", None),
+    ],
+)
+def test_what_ends_episodes_is_found_by_many_steps_and_said_once(
+    options: dict[str, Any], ends: str, line: str | None, said: pytest.LogCaptureFixture
+) -> None:
+    for seed in (0, 1):
+        recipe = resolved(make_recipe(task=TASK, seed=seed, **{"task.options": options}))
+        assert recipe.task.options == {**options, "termination": ends}
+    lines = [own.getMessage() for own in said.records if own.levelno == logging.INFO]
+    assert len(lines) == (line is not None)
+    assert line is None or line in lines[0]
+
+
+def test_a_hundred_steps_show_too_little(said: pytest.LogCaptureFixture) -> None:
+    env = make_env(TASK)
+    assert env.ends == "never"
+    assert "no goal was achieved in 100 random steps" in said.records[0].getMessage()
+
+
+def test_a_run_keeps_what_was_found_and_nobody_looks_again(
+    tmp_path: Path, said: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(build(make_recipe(task=TASK, **SIZES)), tmp_path / "run", progress=False)
+    assert len(said.records) == 1
+    options = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["task"]["options"]
+    assert options == {"termination": "reward"}
+    never_looks(monkeypatch)
+    build(RunFolder(tmp_path / "run").recipe(), allow_import=True).close()
+    assert len(said.records) == 1
+
+
+def test_what_is_given_and_what_environments_say_themselves_is_not_looked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    never_looks(monkeypatch)
+    given = make_recipe(task=TASK, algo="her", **{"task.options": {"termination": "reward"}})
+    assert resolved(given).task == given.task
+    assert resolved(make_recipe(task="hand_v0")).task.options is None
+    own = make_recipe(task=TASK, algo="her", **{"task.options": {"own": True}})
+    assert (resolved(own).task.options or {})["termination"] == "own"
+    complete = make_recipe(task="torchrl_her_envs:BitFlip", **{"task.options": {"bits": 4}})
+    assert resolved(complete).task.options == {"bits": 4}
