@@ -1,7 +1,10 @@
-"""Draws estimated values of actions in bit flipping or in the treasure hunt, a panel for each folder.
+"""Measures and draws estimated values of actions in bit flipping or in the treasure hunt.
 
-torchrl-her study treasure_hunt --folder runs/treasure_hunt
-python docs/make_toy_values.py runs/treasure_hunt/her runs/treasure_hunt/filtered_her --out values.png
+    python docs/make_toy_values.py --study treasure_hunt    # trains into runs/treasure_hunt
+    python docs/make_toy_values.py runs/treasure_hunt/her runs/treasure_hunt/filtered_her --out values.png
+
+The first command trains a study with :class:`ToyValues` and draws its columns over environment steps. The
+second draws the values after training, a panel for each folder.
 """
 
 from __future__ import annotations
@@ -14,19 +17,126 @@ from pathlib import Path
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_envs.toy.bit_flip import BitFlip
 from torchrl_her_envs.toy.treasure_hunt import TreasureHunt
+from torchrl_her_recipes import Callback, RunView, Study, build, load_study, run
+from torchrl_her_recipes.components.devices import place_of
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.runs.play import load_actor
-from torchrl_her_recipes.runs.plots import save_figure
-from torchrl_her_recipes.runs.toy_values import STATES, action_values, all_pairs, some_wrong
+from torchrl_her_recipes.runs.plots import colors, count_frames, draw_curve, save_figure
 from torchrl_her_recipes.studies.seed_batches import Batches
 
+STATES = 256  # for each number of wrong bits
+LABELS = {
+    "success": "success rate",
+    "useless_share": "the useless action is best",
+    "useless_margin": "useless action minus needed flip",
+    "right_way": "pairs with the right way",
+}
 _KINDS = {"needed": "a needed flip", "needless": "a needless flip", "useless": "the useless action"}
+
+
+class ToyValues(Callback):
+    """Adds what the critic's values are worth to the table of metrics, after each epoch.
+
+    In bit flipping with a useless action, over 1 to n wrong bits alike: ``useless_share``, how often that
+    action has the highest value, and ``useless_margin``, its value minus the mean of needed flips. In the
+    treasure hunt: ``right_way``, the share of pairs of place and treasure whose best action goes towards the
+    treasure.
+    """
+
+    def on_epoch(self, run: RunView) -> None:
+        """Measures the values of all runs, and completes their last rows."""
+        runs = run.components.recipe.run.num_runs
+        measured = measure_values(goal_env(run.components.eval_env), run.components.actor, runs)
+        for name, values in measured.items():
+            for row, value in zip(run.rows[-runs:], values.tolist(), strict=True):
+                row[name] = value
+
+
+@torch.no_grad()
+def action_values(actor: TensorDictModuleBase, place: Tensor, goal: Tensor) -> Tensor:
+    """The values [..., actions] of all actions in places [..., g] when goals [..., g] are desired."""
+    seen = TensorDict({"observation": place, "desired_goal": goal}, place.shape[:-1])
+    return actor(seen.to(place_of(actor)))["action_value"].to(place.device)
+
+
+def some_wrong(
+    bits: int, wrong: int, states: int, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Random places [states, bits] that differ from their goals in ``wrong`` bits, and these goals."""
+    place = torch.randint(2, (states, bits), generator=generator).float()
+    differs = torch.rand(states, bits, generator=generator).argsort(-1) < wrong
+    return place, torch.where(differs, 1.0 - place, place)
+
+
+def all_pairs(env: TreasureHunt) -> tuple[Tensor, Tensor]:
+    """All places along the first dimension, all treasures along the second: [places, treasures, 1] both."""
+    goals = env.goal_distribution
+    points = goals.from_uniform((torch.arange(goals.count)[:, None] + 0.5) / goals.count).float()
+    count = len(points)
+    return points[:, None].expand(count, count, 1), points[None].expand(count, count, 1)
+
+
+@singledispatch
+def measure_values(env: GoalEnv, _actor: TensorDictModuleBase, _runs: int) -> dict[str, Tensor]:
+    """Returns the columns of :class:`ToyValues` for R runs of DQN, [R] each."""
+    raise ValueError(f"values of {env.task_name} cannot be measured; choose bit_flip or treasure_hunt")
+
+
+@measure_values.register
+def _measure_useless(env: BitFlip, actor: TensorDictModuleBase, runs: int) -> dict[str, Tensor]:
+    if not env.useless_action:
+        return {}
+    bits = env.bits
+    generator = torch.Generator().manual_seed(0)
+    each = [some_wrong(bits, wrong, STATES, generator) for wrong in range(1, bits + 1)]
+    place, goal = (torch.cat(own) for own in zip(*each, strict=True))
+    values = action_values(actor, place.repeat(runs, 1), goal.repeat(runs, 1)).view(runs, len(place), -1)
+    needed = (place != goal).float()
+    flips, useless = values[..., :bits], values[..., bits]
+    margin = useless - (flips * needed).sum(-1) / needed.sum(-1)
+    return {
+        "useless_share": (values.argmax(-1) == bits).float().mean(1),
+        "useless_margin": margin.mean(1),
+    }
+
+
+@measure_values.register
+def _measure_way(env: TreasureHunt, actor: TensorDictModuleBase, runs: int) -> dict[str, Tensor]:
+    place, goal = (points.reshape(-1, 1) for points in all_pairs(env))
+    apart = (place != goal).squeeze(-1)
+    place, goal = place[apart], goal[apart]
+    values = action_values(actor, place.repeat(runs, 1), goal.repeat(runs, 1)).view(runs, len(place), 2)
+    right = values.argmax(-1) == (goal > place).squeeze(-1).long()
+    return {"right_way": right.float().mean(1)}
+
+
+def train(study: Study, folder: Path) -> None:
+    """Trains each combination of a study in a folder of its own, one after the other."""
+    for label, recipe in study.cells():
+        run(build(recipe), folder / label, callbacks=[ToyValues()])
+
+
+def plot_training(study: Study, folder: Path, path: Path) -> None:
+    """Draws success and the columns of :class:`ToyValues` over environment steps, a panel for each."""
+    curves = {label: Batches(folder / label).rows() for label, _ in study.cells()}
+    measured = [name for name in LABELS if all(name in row for rows in curves.values() for row in rows)]
+    palette = colors(list(curves))
+    figure = Figure(figsize=(1.0 + 4.2 * len(measured), 3.8), layout="constrained")
+    for axes, name in zip(figure.subplots(1, len(measured), squeeze=False)[0], measured, strict=True):
+        for label, rows in curves.items():
+            draw_curve(axes, rows, name, color=palette[label], label=label)
+        count_frames(axes)
+        axes.set(xlabel="environment steps of each run", ylabel=LABELS[name])
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    save_figure(figure, path)
 
 
 def values_by_wrong_bits(
@@ -132,10 +242,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("runs", nargs="+", type=Path, help="folders of runs, or of a study's combinations")
+    parser.add_argument("runs", nargs="*", type=Path, help="folders of runs, or of a study's combinations")
+    parser.add_argument("--study", help="train it, and draw what was measured: treasure_hunt, useless_action")
+    parser.add_argument("--frames", type=int, help="with --study, environment steps of each run")
+    parser.add_argument("--folder", type=Path, help="with --study, where the runs go (default: runs/STUDY)")
     parser.add_argument("--out", type=Path, default=Path("values.png"))
     options = parser.parse_args()
-    plot_values([Batches(folder) for folder in options.runs], options.out)
+    if options.study is None:
+        plot_values([Batches(folder) for folder in options.runs], options.out)
+        return
+    study = load_study(options.study, frames=options.frames)
+    folder = options.folder or Path("runs") / study.name
+    train(study, folder)
+    plot_training(study, folder, options.out)
 
 
 if __name__ == "__main__":

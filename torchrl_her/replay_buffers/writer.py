@@ -364,13 +364,10 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         super().load_state_dict(state_dict)
         self._rings.cursors, self._rings.sizes = list(state_dict["cursors"]), list(state_dict["sizes"])
         self._held = Batch.from_state(state_dict, runs=self.runs)
-        recent = state_dict.get("recent")  # states from before there were goals of other episodes have none
-        recent = [recent] if isinstance(recent, dict) else recent  # those from before there were layers
-        if recent is not None and len(recent) != max(1, len(self.layers)):
+        recent = state_dict["recent"]
+        if len(recent) != max(1, len(self.layers)):
             raise ValueError(f"the state is that of {len(recent)} layers, not of {max(1, len(self.layers))}")
-        self._recent = (
-            self._no_goals(self.runs) if recent is None else [RecentGoals.from_state(own) for own in recent]
-        )
+        self._recent = [RecentGoals.from_state(own) for own in recent]
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
         self._counts.load_state_dict(state_dict)

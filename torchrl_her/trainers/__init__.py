@@ -13,7 +13,7 @@ from torchrl_her.trainers.checkpoint import (
 )
 from torchrl_her.trainers.cut import cut_episodes
 from torchrl_her.trainers.fused import FusedLearner
-from torchrl_her.trainers.fusing import can_fuse, is_plain_adam, why_not_fused
+from torchrl_her.trainers.fusing import is_plain_adam, why_not_fused
 from torchrl_her.trainers.graphs import GraphLearner, why_not_recorded
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.metrics import (
@@ -39,7 +39,6 @@ __all__ = [
     "Schedule",
     "Trainer",
     "buffer_state_dict",
-    "can_fuse",
     "clip_by_run",
     "collector_state_dict",
     "cut_episodes",

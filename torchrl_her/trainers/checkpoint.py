@@ -204,7 +204,7 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
         state: the state.
     """
     own = {name: value for name, value in state.items() if name != "carrier"}
-    if state.get("carrier") is None:
+    if state["carrier"] is None:
         collector.load_state_dict(own)
         return
     collector.load_state_dict(own, strict=False)  # its policy stays

@@ -103,16 +103,6 @@ FUSED: dict[type[LossModule], FusedLoss] = {
 }
 
 
-def can_fuse(loss: nn.Module, target: TargetNetUpdater | None) -> bool:
-    """Whether :class:`~torchrl_her.FusedLearner` does what a loss and its target update are set to do.
-
-    Args:
-        loss: any loss module.
-        target: what moves its target networks.
-    """
-    return why_not_fused(loss, target) is None
-
-
 def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | None:
     """What :class:`~torchrl_her.FusedLearner` would get wrong, for messages; None if nothing.
 

@@ -287,7 +287,7 @@ class Trainer:
         """Puts back what :meth:`state_dict` gave."""
         self.frames, self.updates, self.epochs = state["frames"], state["updates"], state["epochs"]
         self._credit, self._outside = state["credit"], state["outside"]
-        measured = state.get("measured")
+        measured = state["measured"]
         self._measured = None if measured is None else [measured] if measured else []
 
 

@@ -384,7 +384,7 @@ class RunConfig(Group):
     )
     log: Any = option(
         ("tensorboard",),
-        "loggers, as [csv,wandb]: csv, tensorboard, wandb, mlflow, or registered ones; [] for none besides "
+        "loggers, as [tensorboard,wandb]: tensorboard, wandb, or registered ones; [] for none besides "
         "the table of metrics, which is always written",
     )
     threads: int = option(1, "threads of torch: small networks are fastest with one", at_least=1)

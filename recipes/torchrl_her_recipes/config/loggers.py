@@ -43,10 +43,8 @@ def register_logger(spec: LoggerSpec) -> None:
 
 
 for _spec in (
-    LoggerSpec(name="csv", factory=f"{_HERE}.csv_files:open_csv"),
     LoggerSpec(name="tensorboard", factory=f"{_HERE}.tensorboard:open_tensorboard"),
     LoggerSpec(name="wandb", factory=f"{_HERE}.wandb_run:open_wandb", needs="wandb"),
-    LoggerSpec(name="mlflow", factory=f"{_HERE}.mlflow_run:open_mlflow", needs="mlflow"),
 ):
     register_logger(_spec)
 
@@ -61,8 +59,8 @@ def check_loggers(value: Any) -> tuple[str, ...]:
         ValueError: there is no such logger, or it is named twice.
 
     Example:
-        >>> check_loggers("csv"), check_loggers(["tensorboard", "csv"]), check_loggers(None)
-        (('csv',), ('tensorboard', 'csv'), ())
+        >>> check_loggers("wandb"), check_loggers(["tensorboard", "wandb"]), check_loggers(None)
+        (('wandb',), ('tensorboard', 'wandb'), ())
     """
     names = [value] if isinstance(value, str) else [] if value is None else value
     known = ", ".join(LOGGERS)
@@ -70,10 +68,19 @@ def check_loggers(value: Any) -> tuple[str, ...]:
         raise ValueError(f"log must be a list of {known}, got {value!r}")
     for name in names:
         if not isinstance(name, str) or name not in LOGGERS:
-            raise ValueError(f"log must be some of {known}, got {name!r}{nearest(name, LOGGERS)}")
+            raise ValueError(f"log must be some of {known}, got {name!r}{_instead(name)}")
     if len(set(names)) < len(names):
         raise ValueError(f"log names a logger twice: {', '.join(names)}")
     return tuple(names)
+
+
+def _instead(name: object) -> str:
+    """Returns what to choose in place of an unknown logger, as the end of a message."""
+    if name == "csv":
+        return "; metrics.csv has the same numbers, or choose LogTo(CSVLogger(...)) in Python"
+    if name == "mlflow":
+        return "; choose LogTo(MLFlowLogger(...)) in Python"
+    return nearest(name, LOGGERS)
 
 
 def check_installed(names: tuple[str, ...]) -> None:

@@ -15,9 +15,6 @@ AXES = {name: (label, limits) for name, label, limits in PANELS} | {
     "rows_virtual_positive": ("positive rewards, virtual rows", None),
     "virtual_success": ("success rate at virtual goals", (-0.02, 1.02)),
     "virtual_q_bias": ("Q of the start minus return, virtual goals", None),
-    "useless_share": ("the useless action is best", None),
-    "useless_margin": ("useless action minus needed flip", None),
-    "right_way": ("pairs with the right way", None),
 }
 
 

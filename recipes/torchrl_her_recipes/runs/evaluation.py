@@ -14,12 +14,10 @@ from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.objectives.critics import critic_value
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.metrics import discounted_return, final_distance, q_bias, reached, success
-from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
 from torchrl_her_recipes.components.envs import judging
 from torchrl_her_recipes.runs.notices import saturation
-from torchrl_her_recipes.runs.toy_values import measure_values
 
 
 @torch.no_grad()
@@ -31,9 +29,6 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     played: the average of the actor, if there is one. Both are missing if the loss has no such critics.
     """
     means = measure_rollout(components, rollout)
-    if components.curriculum is None:
-        env, runs = goal_env(components.eval_env), components.recipe.run.num_runs
-        means |= measure_values(components.actor, env, runs)
     if components.behavior is not None:
         means["proposed_success"] = components.behavior.success()
     return means | {"epsilon": components.exploration.epsilon}

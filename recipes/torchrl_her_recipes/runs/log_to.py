@@ -164,8 +164,8 @@ def flat(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, bool | int | floa
     """Options by their long names; what is neither a number nor text is written as JSON.
 
     Example:
-        >>> flat({"run": {"seed": 3, "log": ("csv",)}, "task": {"name": "hand_v0", "options": None}})
-        {'run.seed': 3, 'run.log': '["csv"]', 'task.name': 'hand_v0', 'task.options': 'null'}
+        >>> flat({"run": {"seed": 3, "log": ("wandb",)}, "task": {"name": "hand_v0", "options": None}})
+        {'run.seed': 3, 'run.log': '["wandb"]', 'task.name': 'hand_v0', 'task.options': 'null'}
     """
     return {
         f"{group}.{name}": value if isinstance(value, bool | int | float | str) else json.dumps(value)

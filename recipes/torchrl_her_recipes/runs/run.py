@@ -168,7 +168,7 @@ def _resume(
         permit_task(recipe.task.name)
     wanted = recipe.extended(**options) if options else recipe
     check_installed(wanted.run.log)
-    has_buffer = bool(state.get("buffer"))
+    has_buffer = bool(state["buffer"])
     if not has_buffer:
         _check_needs_no_buffer(home, wanted if components is None else components.recipe, state)
     components = components or build(wanted)
@@ -187,7 +187,7 @@ def _resume(
         rows = home.rows()[
             : trainer.epochs * components.recipe.run.num_runs
         ]  # without those that are newer than the checkpoint
-        best = BestPolicy(state.get("best"))  # older runs have none
+        best = BestPolicy(state["best"])
         if best.state is None:
             home.best.unlink(missing_ok=True)  # newer than the checkpoint
         else:

@@ -65,7 +65,7 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
         ValueError: the components are of other types or have other settings than those of the run.
     """
     for name, value in _made_of(components).items():
-        if value != (was := state["made_of"].get(name, value)):  # older runs did not say everything
+        if value != (was := state["made_of"][name]):
             raise ValueError(
                 f"the run's {name} was {was}, not {value}: give resume() components made as its were"
             )
@@ -77,10 +77,7 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
     if components.norm is not None:
         components.norm.load_state_dict(state["norm"])
     if components.average is not None:
-        if state.get("average") is None:  # of a run from before there were averages
-            components.average.restart()
-        else:
-            components.average.load_state_dict(state["average"])
+        components.average.load_state_dict(state["average"])
     if components.guide is not None:
         components.guide.load_state_dict(state["guide"])
         components.guide.guided = state["guided"]
@@ -89,7 +86,7 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
     for generator, own in zip(components.generators, state["generators"], strict=True):
         generator.set_state(own)
     torch.set_rng_state(state["torch_generator"])
-    gpu, own = _gpu_of(components), state.get("cuda_generator")
+    gpu, own = _gpu_of(components), state["cuda_generator"]
     if gpu is not None and own is not None:
         torch.cuda.set_rng_state(own, gpu)
     if components.curriculum is not None:

@@ -12,7 +12,6 @@ from torchrl_her.trainers.checkpoint import load_checkpoint
 from torchrl_her_recipes import Components, build, run
 from torchrl_her_recipes.runs.curriculum import play_greedily
 from torchrl_her_recipes.runs.evaluation import measure
-from torchrl_her_recipes.runs.state import load_run_state, run_state
 
 from ..small import small
 
@@ -76,15 +75,3 @@ def test_each_run_has_the_average_that_it_would_have_alone() -> None:
     state = take_run(together.module.state_dict(), 1, 2)
     for name, value in alone.module.state_dict().items():
         torch.testing.assert_close(state[name], value, rtol=1e-7, atol=1e-9)
-
-
-def test_a_run_from_before_there_were_averages_begins_one() -> None:
-    components, _ = trained()
-    trainer = components.trainer()
-    state = run_state(components, trainer)
-    del state["average"]
-    other = build(components.recipe)
-    load_run_state(other, other.trainer(), state)
-    assert other.average is not None
-    for one, learned in zip(other.average.module.parameters(), components.actor.parameters(), strict=True):
-        assert torch.equal(one, learned)

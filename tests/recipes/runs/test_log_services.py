@@ -1,4 +1,4 @@
-"""The loggers ``wandb`` and ``mlflow``, both without a network."""
+"""The logger ``wandb``, and one of MLflow's, both without a network."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from torchrl.record.loggers import MLFlowLogger
 
-from torchrl_her_recipes import build, resume, run
+from torchrl_her_recipes import LogTo, build, resume, run
 from torchrl_her_recipes.runs.callbacks import RunView
 from torchrl_her_recipes.runs.folder import RunFolder
 
@@ -22,25 +23,23 @@ from .killed import server
 from .test_log_to import SHORT, STEPS, DiesAt
 
 wandb = pytest.importorskip("wandb", reason="needs the extra wandb")
-mlflow = pytest.importorskip("mlflow", reason="needs the extra mlflow")
+mlflow = pytest.importorskip("mlflow", reason="needs the extra test")
 
 ALONE = {"WANDB_MODE": "offline", "WANDB_ERROR_REPORTING": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
-TO_NOBODY = ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME", "WANDB_PROJECT")
 
 
 @pytest.fixture(autouse=True)
 def _alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for name, value in ALONE.items():
         monkeypatch.setenv(name, value)
-    for name in TO_NOBODY:
-        monkeypatch.delenv(name, raising=False)
+    monkeypatch.delenv("WANDB_PROJECT", raising=False)
     yield
     wandb.teardown()  # its process
 
 
 def _die(folder: Path) -> None:
     os.environ.update(ALONE)
-    recipe = small(**SHORT, log=["wandb", "mlflow"])
+    recipe = small(**SHORT, log="wandb")
     run(build(recipe), folder, callbacks=[DiesAt(3)], progress=False)
 
 
@@ -79,38 +78,16 @@ def wandb_history(folder: Path) -> dict[int, dict[str, Any]]:
     return rows
 
 
-def mlflow_run(folder: Path) -> tuple[Any, Any]:
-    client = mlflow.MlflowClient(f"sqlite:///{folder}/mlflow/mlflow.db")
-    (experiment,) = client.search_experiments(filter_string="name = 'torchrl-her'")
-    (own,) = client.search_runs([experiment.experiment_id])
-    return client, own
-
-
 @pytest.mark.long
 def test_after_a_kill_and_a_resumption_each_step_is_there_once(tmp_path: Path) -> None:
     process = server().Process(target=_die, args=(tmp_path,))
     process.start()
     process.join(180)
     assert process.exitcode == -signal.SIGKILL
-    client, own = mlflow_run(tmp_path)
-    told = client.get_metric_history(own.info.run_id, "success/run_0")
-    assert [metric.step for metric in told] == STEPS[:3]  # behind the last checkpoint, too
     wandb_id = (tmp_path / "wandb" / "run_id.txt").read_text()
 
     rows = resume(tmp_path, options={"keep_checkpoints": 1, "pictures": True}, progress=False).rows
     success = {step: row["success"] for step, row in zip(STEPS, rows, strict=True)}
-
-    told = client.get_metric_history(own.info.run_id, "success/run_0")
-    assert [(metric.step, metric.value) for metric in told] == list(success.items())
-    _, own = mlflow_run(tmp_path)
-    assert own.info.status == "FINISHED"
-    assert own.info.run_name == tmp_path.name
-    assert own.data.params["learner.gamma"] == "0.98"
-    assert own.data.params["run.keep_checkpoints"] == "2"  # parameters cannot be changed
-    assert own.data.tags["run.keep_checkpoints"] == "1"
-    pictures = [file.path for file in client.list_artifacts(own.info.run_id, "pictures")]
-    assert pictures == [f"pictures/{name}" for name in ("curves.png", "policy.gif", "virtual_goals.png")]
-    assert (tmp_path / "mlflow" / "artifacts").is_dir()
 
     history = wandb_history(tmp_path)
     assert {step: row["success/run_0"] for step, row in history.items()} == success
@@ -129,21 +106,19 @@ def test_after_a_kill_and_a_resumption_each_step_is_there_once(tmp_path: Path) -
     assert config["task.name"] == "hand_v0"
 
 
-@pytest.mark.full
-def test_the_service_of_the_environment_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/shared.db")
-    monkeypatch.setenv("MLFLOW_EXPERIMENT_NAME", "throwing")
-    monkeypatch.chdir(tmp_path)
-    for name in ("one", "two"):
-        recipe = small(epochs=1, epoch_frames=480, log="mlflow")
-        run(build(recipe), tmp_path / name, progress=False)
-    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/shared.db")
-    experiment = client.get_experiment_by_name("throwing")
-    assert sorted(own.info.run_name for own in client.search_runs([experiment.experiment_id])) == [
-        "one",
-        "two",
-    ]
-    assert not (tmp_path / "one" / "mlflow" / "mlflow.db").exists()
+def test_mlflow_has_rows_options_and_pictures(tmp_path: Path) -> None:
+    recipe = small(epochs=2, epoch_frames=480, log=[], pictures=True)
+    address, artifacts = f"sqlite:///{tmp_path}/mlflow.db", (tmp_path / "artifacts").as_uri()
+    logger = MLFlowLogger("throwing", address, artifact_location=artifacts)
+    run(build(recipe), tmp_path / "run", callbacks=[LogTo(logger)], progress=False)
+    mlflow.end_run()
+    client = mlflow.MlflowClient(address)
+    (own,) = client.search_runs([client.get_experiment_by_name("throwing").experiment_id])
+    told = client.get_metric_history(own.info.run_id, "success/run_0")
+    assert [metric.step for metric in told] == [480, 960]
+    assert own.data.params["learner.gamma"] == "0.98"
+    pictures = [file.path for file in client.list_artifacts(own.info.run_id, "pictures")]
+    assert pictures == [f"pictures/{name}" for name in ("curves.png", "policy.gif", "virtual_goals.png")]
 
 
 def view(folder: Path) -> RunView:

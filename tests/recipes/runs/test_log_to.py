@@ -63,8 +63,8 @@ def csv_steps(path: Path) -> list[int]:
 def _finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with two loggers."""
     folder = tmp_path_factory.mktemp("finished")
-    recipe = small(epochs=2, epoch_frames=480, num_runs=2, log=["csv", "tensorboard"], pictures=True)
-    run(build(recipe), folder, progress=False)
+    recipe = small(epochs=2, epoch_frames=480, num_runs=2, log=["tensorboard"], pictures=True)
+    run(build(recipe), folder, callbacks=[LogTo(CSVLogger("csv", str(folder)))], progress=False)
     return folder
 
 
@@ -98,15 +98,14 @@ def test_pictures_and_the_film_are_shown_to_those_that_can(finished: Path) -> No
 
 @pytest.mark.parametrize("after", [pytest.param(1, marks=pytest.mark.full), 3])
 def test_after_a_kill_and_a_resumption_each_step_is_there_once(after: int, tmp_path: Path) -> None:
-    killed_run(tmp_path, ["csv", "tensorboard"], after=after)
-    before = csv_steps(tmp_path / "csv" / "scalars" / "success" / "run_0.csv")
+    killed_run(tmp_path, ["tensorboard"], after=after)
+    before = [event.step for event in events(tmp_path / "tensorboard").Scalars("success/run_0")]
     assert before == STEPS[:after]  # behind the last checkpoint, too
     rows = resume(tmp_path, progress=False).rows
     own, success = events(tmp_path / "tensorboard"), [row["success"] for row in rows]
     assert [(event.step, event.value) for event in own.Scalars("success/run_0")] == [
         (step, pytest.approx(value)) for step, value in zip(STEPS, success, strict=True)
     ]
-    assert csv_steps(tmp_path / "csv" / "scalars" / "success" / "run_0.csv") == STEPS
 
 
 def test_a_logger_that_joins_later_is_told_the_whole_table(tmp_path: Path) -> None:
@@ -185,11 +184,13 @@ def test_a_logger_that_cannot_begin_ends_the_run_in_one_line(tmp_path: Path) -> 
     [
         (
             ["tensorbord"],
-            "log must be some of csv, tensorboard.*, got 'tensorbord'; did you mean tensorboard?",
+            "log must be some of tensorboard, wandb.*, got 'tensorbord'; did you mean tensorboard?",
         ),
-        (["csv", "csv"], "log names a logger twice: csv, csv"),
-        (3, "log must be a list of csv, tensorboard.*, got 3"),
-        ([3], "log must be some of csv, tensorboard.*, got 3"),
+        (["wandb", "wandb"], "log names a logger twice: wandb, wandb"),
+        (3, "log must be a list of tensorboard, wandb.*, got 3"),
+        ([3], "log must be some of tensorboard, wandb.*, got 3"),
+        ("csv", "got 'csv'; metrics.csv has the same numbers"),
+        ("mlflow", r"got 'mlflow'; choose LogTo\(MLFlowLogger\(...\)\) in Python"),
     ],
 )
 def test_mistakes_in_log_are_named(log: Any, message: str) -> None:
@@ -201,9 +202,9 @@ def test_a_logger_whose_package_is_missing_names_the_extra(monkeypatch: pytest.M
     spec = LoggerSpec(name="other", factory="x:y", needs="not_there")
     monkeypatch.setitem(known.LOGGERS, "other", spec)
     with pytest.raises(ImportError, match=r"^log=other needs not_there: pip install '.\[not_there\]'$"):
-        check_installed(("csv", "other"))
-    with pytest.raises(ValueError, match="there is a logger 'csv' already"):
-        register_logger(LoggerSpec(name="csv", factory="x:y"))
+        check_installed(("tensorboard", "other"))
+    with pytest.raises(ValueError, match="there is a logger 'tensorboard' already"):
+        register_logger(LoggerSpec(name="tensorboard", factory="x:y"))
 
 
 @pytest.mark.parametrize("name", ["runs/plots.py", "reports/plots.py"])

@@ -104,7 +104,7 @@ def test_a_study_draws_the_metrics_asked_for(tmp_path: Path) -> None:
         name="metrics",
         recipe={**SMALL, "task": "treasure_hunt", "options": {"step": 25}, "epochs": 1},
         vary={"algo": ["her"]},
-        figure=["success", "right_way"],
+        figure=["success", "distance"],
     )
     run_study(metrics, tmp_path / "b", workers=Here(), progress=False)
     with Image.open(tmp_path / "b" / "metrics.png") as picture:
@@ -112,8 +112,8 @@ def test_a_study_draws_the_metrics_asked_for(tmp_path: Path) -> None:
     draw_study(replace(metrics, figure="success"), tmp_path / "b")
     with Image.open(tmp_path / "b" / "metrics.png") as picture:
         assert picture.size[0] < 2 * picture.size[1]
-    with pytest.raises(ValueError, match="these runs did not measure useless_share; they have run, seed"):
-        draw_study(replace(metrics, figure="useless_share"), tmp_path / "b")
+    with pytest.raises(ValueError, match="these runs did not measure virtual_success; they have run, seed"):
+        draw_study(replace(metrics, figure="virtual_success"), tmp_path / "b")
 
 
 def test_the_guide_s_study_is_planned_as_it_says(

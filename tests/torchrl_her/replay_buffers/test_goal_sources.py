@@ -404,18 +404,8 @@ def test_a_writer_goes_on_with_the_goals_that_it_remembers(by_file: bool, tmp_pa
     assert (virtual(first)["desired_goal"][:, 0] == wanted_by(1, 0)).any()
 
 
-def test_a_state_of_a_writer_without_a_memory_can_be_loaded() -> None:
-    state = make_buffer(HERWriter).writer.state_dict()
-    del state["recent"]  # as it was before there were goals of other episodes
-    buffer = make_buffer(HERWriter, goal_sources={"actual": 4})
-    buffer.writer.load_state_dict(state)
-    buffer.extend(tagged([[2]]))
-    assert goals_of(virtual(buffer)) == {wanted_by(0, 0)}
-
-
 def test_a_state_without_a_memory_makes_a_writer_forget_its_own() -> None:
     state = make_buffer(HERWriter).writer.state_dict()
-    del state["recent"]
     buffer = make_buffer(HERWriter, goal_sources={"actual": 50})
     buffer.extend(tagged([[3], [2]]))
     buffer.writer.load_state_dict(state)
