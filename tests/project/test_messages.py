@@ -72,7 +72,7 @@ ARGUMENTS = sorted(own for own in _arguments() if own[0] not in _PYTHON)
 
 def test_messages_are_found() -> None:
     assert len(ARGUMENTS) > 50
-    assert {("algo", "cher"), ("task.options.termination", "never"), ("order", "threshold")} <= set(ARGUMENTS)
+    assert {("algo", "cher"), ("failure", "never_pays"), ("order", "threshold")} <= set(ARGUMENTS)
 
 
 @pytest.mark.parametrize("name", sorted({name for name, _ in ARGUMENTS}))

@@ -249,7 +249,9 @@ class BehaviorGoals(Transform):
         ended = self._get(next_tensordict, self.terminated_key)
         fell = ended & (before < self.achieved_reward)
         if bool(fell.any()):  # it ends so for any goal, unless the task's own goal has ended it
-            fell = fell & ~self.reward_fn(achieved, real)[1]
+            own_reward, own_end = self.reward_fn(achieved, real)
+            fell = fell & ~own_end
+            reward = reward + (before - own_reward).clamp(max=0.0) * fell  # and costs so much for any goal
         reached = self._get(tensordict, reached_key) | (proposed & (reward >= self.achieved_reward))
         terminated = torch.where(proposed, terminated | fell, ended)
         done = terminated

@@ -49,6 +49,7 @@ def _table(facts: recipes.Facts) -> list[str]:
         "observation": f"entries with standard deviations from {facts.scales[0]:.2g} to {facts.scales[1]:.2g}"
         + (f", {len(facts.constant)} that never change" if facts.constant else ""),
         "goals achieved": f"in {facts.achieved:.0%} of the episodes",
+        "ends without goals": f"as by a fall: {facts.fallen:.1%} of the episodes",
         "what is achieved": f"changes, by the reward, in {facts.moved:.0%} of the episodes",
         "the filter": f"leaves later goals of the episode to {facts.kept:.1%} of the transitions",
     }

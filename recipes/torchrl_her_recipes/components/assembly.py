@@ -119,7 +119,7 @@ def _shown(
         begins = is_guided(recipe, state.curriculum)
         return in_layers(task, state.progress, begins=begins, behavior=behavior, starts=starts)
     own = behavior if starts is None else starts  # a recipe has one of them at most
-    return task if own is None else TransformedEnv(task, own)
+    return task if own is None else TransformedEnv(task, own, auto_unwrap=True)
 
 
 def make_collector(

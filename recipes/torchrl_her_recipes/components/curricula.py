@@ -162,7 +162,7 @@ def make_played_env(
     curriculum = make_curriculum(recipe, env)
     if curriculum is not None:
         return in_layers(env, at_the_top(curriculum, len(seeds)), behavior=behavior)
-    return env if behavior is None else TransformedEnv(env, behavior)
+    return env if behavior is None else TransformedEnv(env, behavior, auto_unwrap=True)
 
 
 def is_guided(recipe: Recipe, curriculum: Curriculum) -> bool:
@@ -203,7 +203,7 @@ def in_layers(
         transforms.append(LayerOutcomes(progress, **judging(env)))
     if starts is not None:
         transforms = [starts, *transforms, starts.outcomes()]
-    return TransformedEnv(env, Compose(*transforms))
+    return TransformedEnv(env, Compose(*transforms), auto_unwrap=True)
 
 
 def at_the_top(curriculum: Curriculum, runs: int) -> CurriculumProgress:

@@ -9,11 +9,12 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 from torchrl.data import Bounded
-from torchrl.envs import ActionScaling, EnvBase, TransformedEnv
+from torchrl.envs import ActionScaling, Compose, EnvBase, Transform, TransformedEnv
 
 from torchrl_her.goals.rewards import EnvReward
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_envs.registry import GYM, get_task_spec, make_env
+from torchrl_her_recipes.components.failures import Failures
 from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -55,8 +56,9 @@ def make_task_envs(
 
     Keyword Args:
         pictures: whether they are to give pictures, if they can.
-        scaled: whether continuous actions are from -1 to 1, whatever the task's own bounds are, as learners
-            take them. Exported policies and recorded demonstrations have the task's own.
+        scaled: whether continuous actions are from -1 to 1, whatever the task's own bounds are, and failures
+            are worth what the recipe says, as learners take them. Exported policies and recorded
+            demonstrations have the task's own.
 
     Raises:
         ValueError: options that the task does not take, or a module that must not be imported.
@@ -73,10 +75,17 @@ def make_task_envs(
     if pictures:
         options = {**get_task_spec(task.name).for_pictures, **options}
     env = make_env(task.name, num_envs=num_envs * len(seeds), seed=seeds, **options)
+    if not scaled:
+        return env
+    transforms: list[Transform] = []
+    if "termination" in get_task_spec(task.name).options and task.failure != "environment":
+        missed = reward_range(goal_env(env))[0]
+        worth = missed / (1 - recipe.learner.gamma) if task.failure == "never_pays" else None
+        transforms.append(Failures(worth, judging(env)))
     low, high = action_bounds(env)
-    if scaled and not (low.eq(-1).all() and high.eq(1).all()):
-        return TransformedEnv(env, ActionScaling())
-    return env
+    if not (low.eq(-1).all() and high.eq(1).all()):
+        transforms.append(ActionScaling())
+    return TransformedEnv(env, Compose(*transforms)) if transforms else env
 
 
 def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:

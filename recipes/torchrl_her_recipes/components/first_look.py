@@ -11,10 +11,13 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
+from torchrl_her.goals.rewards import is_achieved
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_envs.common.goal_rules import GoalEnds, say_once
-from torchrl_her_recipes.components.envs import action_bounds, make_task_envs
+from torchrl_her_envs.registry import get_task_spec
+from torchrl_her_recipes.components.envs import action_bounds, judging, make_task_envs
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_options, ends_open, resolve
@@ -39,7 +42,7 @@ class Facts:
     """What random actions showed of a task.
 
     Attributes:
-        steps, episodes: how many were played.
+        steps, episodes: how many were played; episodes that were still open at the end do not count.
         seconds: that one step takes.
         max_steps: length of an episode.
         actions: the least and the greatest value of each entry; None if actions are discrete.
@@ -48,7 +51,7 @@ class Facts:
         achieved: share of the episodes in which the goal was achieved.
         moved: share of the episodes with a goal that the first state had not achieved, by the reward.
         kept: share of transitions for which the filter finds a later goal of the episode.
-        fallen: share of the episodes that terminated without the goal.
+        fallen: share of the episodes that terminated without the goal, as by a fall.
         constant: entries of the observation that never changed.
         goal_inside: entries of the observation that are the desired goal.
         own_layers: whether the task has a curriculum of its own.
@@ -106,8 +109,11 @@ def resolved(recipe: Recipe) -> Recipe:
 
 
 def _watched(recipe: Recipe) -> Recipe:
-    """The recipe with an environment that ends episodes as it does by itself, if that is still open."""
-    return recipe.replace(**{f"task.options.{TERMINATION}": "watch"}) if ends_open(recipe) else recipe
+    """The recipe with its environment as it is: what failures give, and all ends if they are still open."""
+    values = {f"task.options.{TERMINATION}": "watch"} if ends_open(recipe) else {}
+    if TERMINATION in get_task_spec(recipe.task.name).options:
+        values["failure"] = "environment"
+    return recipe.replace(**values)
 
 
 def _needed_layers(facts: Facts) -> list[dict[str, Any]] | None:
@@ -180,21 +186,25 @@ def _facts(
         """[...] of bool."""
         return task.compute_reward(achieved, desired).squeeze(-1) >= achieved_reward
 
-    moved, kept, achieved = [], [], []
+    moved, kept, achieved, fallen = [], [], [], []
+    judged_by = judging(cast(EnvBase, task))
     for own in played:
         here, there = own["achieved_goal"], own["next", "achieved_goal"]
-        moved.append(not bool(meets(here[:1].expand_as(there), there).all()))
         kept.append(_kept(here, there, meets))
+        if not own["next", "done"][-1]:
+            continue  # it was cut off by the end of the look
+        moved.append(not bool(meets(here[:1].expand_as(there), there).all()))
         achieved.append(bool(meets(there, own["next", "desired_goal"]).any()))
+        last = own["next"][-1:]
+        fallen.append(bool(last["terminated"].all() and not is_achieved(last, **judged_by).all()))
     computed = task.compute_reward(rows["next", "achieved_goal"], rows["next", "desired_goal"])
     reward = rows["next", "reward"]
     went_on = ~rows["next", "terminated"] | (computed >= achieved_reward)  # what a failure costs is kept
     differ = went_on & ((reward - computed).abs() > _DIGITS * (1 + computed.abs()))
-    ended = [bool(own["next", "terminated"].any()) for own in played]
     seen = rows["observation"].double()
     spread = seen.std(0)
     moving = spread[spread > 0]
-    count = len(played)
+    count = len(moved)
     return Facts(
         steps=len(rows),
         episodes=count,
@@ -206,7 +216,7 @@ def _facts(
         achieved=sum(achieved) / count,
         moved=sum(moved) / count,
         kept=float(torch.cat(kept).float().mean()),
-        fallen=sum(end and not met for end, met in zip(ended, achieved, strict=True)) / count,
+        fallen=sum(fallen) / count,
         constant=(spread == 0).nonzero().flatten().tolist(),
         goal_inside=_columns(seen, rows["desired_goal"].double()),
         own_layers=_has_layers(task),

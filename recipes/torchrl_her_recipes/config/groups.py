@@ -37,6 +37,12 @@ class TaskConfig(Group):
     threshold: float | None = option(
         None, "distance to the goal that counts as achieved, in the coordinates that the agent sees", above=0
     )
+    failure: str = option(
+        "never_pays",
+        "what an end without the goal, as by a fall, is worth: never_pays (as if the goal was never "
+        "achieved), environment (the reward that it gives) or truncate (the episode is cut off there)",
+        choices=("never_pays", "environment", "truncate"),
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

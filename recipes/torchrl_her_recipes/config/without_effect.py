@@ -27,8 +27,12 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
                 idle[group, own.name] = why
 
     task = groups.task.name
-    for group, name in (("task", "threshold"), ("run", "dtype")):
-        if name not in get_task_spec(task).options:
+    for group, name, taken in (
+        ("task", "threshold", "threshold"),
+        ("task", "failure", "termination"),  # tasks of this package end at their goals alone
+        ("run", "dtype", "dtype"),
+    ):
+        if taken not in get_task_spec(task).options:
             idle[group, name] = f"with task={task}"
     with_algo = f"with algo={algorithm.name}"
     if not algorithm.hindsight:

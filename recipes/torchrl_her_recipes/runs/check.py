@@ -41,10 +41,10 @@ def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> li
         lines.append(f"{_STILL.format(facts=facts)} {_remedy(facts, recipe, layers_file)}")
     if not facts.moved:
         lines.append("is achieved_goal what the goal is about? By the reward, it never changed")
-    if facts.fallen > _MOSTLY and facts.achieved < _MOSTLY:
+    if facts.fallen and recipe.task.failure == "environment":
         lines.append(
-            f"{facts.fallen:.0%} of the episodes terminate without the goal: if each step costs a reward of "
-            "-1, ending soon is the best. task.options.termination=never cuts them off instead"
+            f"{facts.fallen:.1%} of the episodes terminate without the goal: if each step costs a reward of "
+            "-1, ending soon is the best. With failure=never_pays it is not"
         )
     if not recipe.learner.normalize and facts.scales[1] > _UNLIKE * facts.scales[0]:
         lines.append("entries of the observation are of very different scales: normalize=true")

@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from torchrl_her_envs import make_env
 from torchrl_her_envs.common import goal_rules
-from torchrl_her_recipes import RunFolder, build, make_recipe, run
+from torchrl_her_recipes import RunFolder, build, look_at, make_recipe, run
 from torchrl_her_recipes.components import first_look
 from torchrl_her_recipes.components.first_look import resolved
 
@@ -30,29 +30,38 @@ class Seldom(gymnasium.Env):
         stops: whether the goal ends an episode.
         own: what compute_terminated says of an achieved goal; None without the method.
         cost: of each step, which compute_reward does not know.
+        lasts: steps after which the environment ends an episode by itself.
     """
 
     def __init__(
-        self, *, near: float = 0.03, stops: bool = True, own: bool | None = None, cost: float = 0.0
+        self,
+        *,
+        near: float = 0.03,
+        stops: bool = True,
+        own: bool | None = None,
+        cost: float = 0.0,
+        lasts: int = 99,
     ) -> None:
         line = spaces.Box(-np.inf, np.inf, (1,), np.float32)
         self.observation_space = spaces.Dict(observation=line, achieved_goal=line, desired_goal=line)
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-        self.near, self.stops, self.cost = near, stops, cost
+        self.near, self.stops, self.cost, self.lasts = near, stops, cost, lasts
         if own is not None:
             self.compute_terminated = lambda achieved, desired, info: own & (self._gap(achieved, desired) < 1)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
         super().reset(seed=seed)
+        self.steps = 0
         self.place, self.goal = 0.0, 1.0 if self.np_random.random() < self.near else 50.0
         return self._show(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.place += float(action[0])
+        self.steps, self.place = self.steps + 1, self.place + float(action[0])
         shown = self._show()
         goals = shown["achieved_goal"], shown["desired_goal"]
         met = bool(self._gap(*goals) < 1)
-        return shown, float(self.compute_reward(*goals, {})) - self.cost, self.stops and met, False, {}
+        ends = (self.stops and met) or self.steps == self.lasts
+        return shown, float(self.compute_reward(*goals, {})) - self.cost, ends, False, {}
 
     def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
         return (self._gap(achieved, desired) < 1) - 1.0
@@ -135,3 +144,14 @@ def test_what_is_given_and_what_environments_say_themselves_is_not_looked_for(
     assert (resolved(own).task.options or {})["termination"] == "own"
     complete = make_recipe(task="torchrl_her_envs:BitFlip", **{"task.options": {"bits": 4}})
     assert resolved(complete).task.options == {"bits": 4}
+
+
+@pytest.mark.parametrize(
+    ("options", "failed"), [({"near": 0.0, "lasts": 4}, 1.0), ({"near": 0.0}, 0.0), ({"near": 1.0}, 0.0)]
+)
+def test_ends_without_goals_are_counted_in_whole_episodes(options: dict[str, Any], failed: float) -> None:
+    """Eight environments are played for ten steps, ten times; of each, two steps are no episode."""
+    facts = look_at(make_recipe(task=TASK, **{"task.options": options}), steps=800)
+    assert facts.fallen == failed
+    if "lasts" in options:
+        assert (facts.steps, facts.episodes) == (800, 160)

@@ -157,7 +157,10 @@ def test_a_goal_inside_of_the_observation_is_told() -> None:
 def test_episodes_that_end_without_the_goal_are_told() -> None:
     facts = look(wall=True)
     assert facts.fallen > 0.3
-    assert "task.options.termination=never" in said(replace(facts, fallen=0.6))
+    assert "without the goal" not in said(facts)  # it does not pay
+    asked = said(replace(facts, fallen=0.012), failure="environment")
+    assert "1.2% of the episodes terminate without the goal" in asked
+    assert "failure=never_pays" in asked
 
 
 def test_what_is_slow_or_easy_or_of_many_scales_is_told() -> None:
