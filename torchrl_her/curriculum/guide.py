@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -24,6 +25,9 @@ class GuidedExploration(TensorDictModuleBase):
     achieved, and then the present policy. That is the self-guided exploration of Luo et al., Relay Hindsight
     Experience Replay, 2022 (arXiv 2208.00843), here with the layers one after another.
 
+    With ``per="step"`` it is drawn anew in each step whether that copy acts, wherever that layer's goal is
+    not achieved: it also goes back to what it has lost. That is how the paper does it.
+
     Where each episode has a layer of its own (``layer_key``), it is as in that paper: the policy itself
     acts, as it would in the first layer, until that layer's goal is achieved, then as in the next one, up to
     the episode's own layer.
@@ -38,6 +42,7 @@ class GuidedExploration(TensorDictModuleBase):
 
     Keyword Args:
         share: of the episodes that are begun so; of those above the first layer, if episodes have layers.
+        per: whether guidance is drawn for each ``"episode"`` or for each ``"step"``.
         runs: R; the weights of R runs are stacked, along the first dimension of each parameter.
         generators: sources of the random numbers, one for each run, or None for torch's own.
         layer_key: of the layer [..., 1] that each episode is played in; None if runs have layers.
@@ -51,7 +56,7 @@ class GuidedExploration(TensorDictModuleBase):
             None before the first step.
 
     Raises:
-        ValueError: the share is outside of [0, 1].
+        ValueError: the share is outside of [0, 1], or ``per`` is neither of the two.
 
     Example:
         >>> from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -82,6 +87,7 @@ class GuidedExploration(TensorDictModuleBase):
         curriculum: Curriculum,
         *,
         share: float = 0.5,
+        per: Literal["episode", "step"] = "episode",
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
         layer_key: NestedKey | None = None,
@@ -92,6 +98,8 @@ class GuidedExploration(TensorDictModuleBase):
     ) -> None:
         if not 0.0 <= share <= 1.0:
             raise ValueError(f"share must be in [0, 1], got {share}")
+        if per not in ("episode", "step"):
+            raise ValueError(f"per must be episode or step, got {per!r}")
         super().__init__()
         self.in_keys, self.out_keys = [action_key, state_key, init_key], [action_key]
         self.layer_key, self.input_key = layer_key, input_key
@@ -100,7 +108,7 @@ class GuidedExploration(TensorDictModuleBase):
         else:
             self.in_keys.append(layer_key)
             self._policy = (policy,)  # not a module of this one: its weights are those of the policy before
-        self.curriculum, self.share = curriculum, share
+        self.curriculum, self.share, self.per = curriculum, share, per
         self.generators = [None] * runs if generators is None else list(generators)
         self.register_buffer("layer", torch.full((runs,), -1))
         self.guided: Tensor | None = None
@@ -150,7 +158,7 @@ class GuidedExploration(TensorDictModuleBase):
         if len(state) % runs:
             raise ValueError(f"{len(state)} rows cannot be shared out among {runs} runs")
         top = None if by_run else tensordict.get(self.layer_key).view(begun.shape)
-        guided = self._begin(begun, top)
+        guided = self._begin(torch.ones_like(begun) if self.per == "step" else begun, top)
         if not bool((guided >= 0).any()):
             return tensordict
         seen, achieved, desired = self._look(state, guided)

@@ -81,7 +81,7 @@ def final_distance(rollout: TensorDictBase) -> Tensor:
     return at_the_end(rollout, gap)
 
 
-def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: float = -1.0) -> Tensor:
+def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: float | Tensor = -1.0) -> Tensor:
     """The return of the first episode, from its first state, [N].
 
     After a truncation, ``tail_reward`` is counted forever, because a critic bootstraps there and so
@@ -90,7 +90,7 @@ def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: flo
     Args:
         rollout: [N, T].
         gamma: discount.
-        tail_reward: reward of every step after a truncation.
+        tail_reward: reward of every step after a truncation, of all episodes or of each [N].
 
     Returns:
         [N]

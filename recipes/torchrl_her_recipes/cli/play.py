@@ -147,7 +147,10 @@ def export(
     """
     file = out or _file_of(source, task, ".onnx" if form == "onnx" else ".pt")
     policy = recipes.export_policy(source, file, run=index, task=task, best=best, format=form, card=card)
-    click.echo(f"seed {policy.recipe.run.seed}, success {policy.success:.0%} on {policy.task}: {file}")
+    click.echo(
+        f"seed {policy.recipe.run.seed}, success {policy.success:.0%} (reached at some step "
+        f"{policy.card.reached:.0%}) on {policy.task}: {file}"
+    )
     return 0
 
 

@@ -138,7 +138,8 @@ def _say_end(result: recipes.RunResult) -> int:
         allowed = " --allow-import" if foreign and foreign not in imported_modules() else ""
         click.echo(f"go on with: torchrl-her {imports}train --resume {result.folder}{allowed}")
         return INTERRUPTED
-    click.echo(f"{success_line(result.successes)} in the last evaluation")
+    left = "" if result.reached == result.success else f", reached at some step {result.reached:.0%}"
+    click.echo(f"{success_line(result.successes)}{left} in the last evaluation")
     home = recipes.RunFolder(result.folder)
     files = [path.name for path in (home.curves, home.video, home.metrics, home.checkpoint) if path.exists()]
     click.echo(f"run: {home.path} ({', '.join(files)})")

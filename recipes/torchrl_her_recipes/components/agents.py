@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
+from typing import Literal, cast
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -143,6 +144,7 @@ def _guide_of(
         policy,
         curriculum,
         share=recipe.curriculum.guided_share,
+        per=cast(Literal["episode", "step"], recipe.curriculum.guided_per),
         layer_key=None if recipe.curriculum.order == "threshold" else "layer",
         runs=recipe.run.num_runs,
         generators=generators,

@@ -242,6 +242,12 @@ class CurriculumConfig(Group):
         at_least=0,
         at_most=1,
     )
+    guided_per: str = option(
+        "episode",
+        "whether guided_share is of episodes, or of the steps in which the goal of the layer below is not "
+        "achieved",
+        choices=("episode", "step"),
+    )
     alpha_actor: float = option(
         0.0, "scale of the actor's initial weights for inputs that the first layer hides", at_least=0
     )

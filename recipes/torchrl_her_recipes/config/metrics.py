@@ -11,6 +11,7 @@ PANELS = (
     ("rows_useful_virtual_positive", "positive rewards, virtual rows that count", None),
 )
 AXES = {name: (label, limits) for name, label, limits in PANELS} | {
+    "reached": ("goal reached at some step", (-0.02, 1.02)),
     "q": ("Q of the start, return", None),
     "rows_virtual_positive": ("positive rewards, virtual rows", None),
     "virtual_success": ("success rate at virtual goals", (-0.02, 1.02)),

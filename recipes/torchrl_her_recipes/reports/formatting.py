@@ -8,6 +8,7 @@ from torchrl_her_recipes.reports.compare import Difference, Final, Judged, Verdi
 
 MEASURES = {  # metric to its name on the page
     "success": "success",
+    "reached": "goal reached at some step",
     "distance": "distance to goal",
     "kl": "KL(q, q*)",
     "q_bias": "bias of Q",
@@ -34,7 +35,7 @@ def show(value: float | None, measure: str) -> str:
     """
     if value is None or math.isnan(value):
         return "—"
-    if measure in ("success", "share"):
+    if measure in ("success", "reached", "share"):
         return f"{value:.0%}".replace("%", " %")
     return f"{value:,.0f}" if measure.startswith("rows_") else f"{value:.2f}"
 

@@ -37,11 +37,13 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
 @torch.no_grad()
 def measure_rollout(components: Components, rollout: TensorDictBase) -> dict[str, Tensor]:
     """What greedy episodes of each run show of the policy and the critics, [R] each."""
-    recipe, missed = components.recipe, components.rewards[0]
-    judged_by = judging(components.eval_env)
-    returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=missed)
+    recipe, judged_by = components.recipe, judging(components.eval_env)
+    there = success(rollout, **judged_by)
+    # An episode that is cut off at its goal is taken to stay there.
+    tail = torch.where(there, *reversed(components.rewards)).to(rollout["next", "reward"].dtype)
+    returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=tail)
     measured = {
-        "success": success(rollout, **judged_by).float(),
+        "success": there.float(),
         "reached": reached(rollout, **judged_by).float(),
         "distance": final_distance(rollout),
         "return": returns,

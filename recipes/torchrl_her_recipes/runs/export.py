@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_her.trainers.checkpoint import save_checkpoint
-from torchrl_her.trainers.metrics import success
+from torchrl_her.trainers.metrics import reached, success
 from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.envs import judging, make_task_envs
@@ -94,13 +94,15 @@ def export_policy(
     return policy
 
 
-def measure_success(policy: TrainedPolicy, *, episodes: int = 1_000, seed: int = 1 << 41) -> float:
-    """The share of greedy episodes at whose last step a policy's goal is achieved."""
+def measure_success(
+    policy: TrainedPolicy, *, episodes: int = 1_000, seed: int = 1 << 41
+) -> tuple[float, float]:
+    """Shares of greedy episodes in which a policy's goal is achieved at the last step, and at some step."""
     env = make_task_envs(policy.recipe.replace(task=policy.task), episodes, [seed], scaled=False)
     rollout = evaluate(env, policy.actor, max_steps=goal_env(env).max_steps)
-    achieved = success(rollout, **judging(env))
+    at_last, at_some = (measure(rollout, **judging(env)).float().mean() for measure in (success, reached))
     env.close()
-    return float(achieved.float().mean())
+    return float(at_last), float(at_some)
 
 
 def played_states(policy: TrainedPolicy, *, episodes: int = 16, seed: int = 1 << 42) -> TensorDictBase:
@@ -165,7 +167,8 @@ def _for_task(policy: TrainedPolicy, task: str) -> TrainedPolicy:
     if task != policy.task:
         policy.card.check_plays(make_task_envs(policy.recipe.replace(task=task), 1, [0], scaled=False), task)
     policy = replace(policy, card=replace(policy.card, task=task))
-    return replace(policy, card=replace(policy.card, success=measure_success(policy)))
+    at_last, at_some = measure_success(policy)
+    return replace(policy, card=replace(policy.card, success=at_last, reached=at_some))
 
 
 def _plain(card: PolicyCard) -> dict[str, Any]:

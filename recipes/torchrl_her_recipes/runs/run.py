@@ -60,6 +60,12 @@ class RunResult:
         return last_success(self.rows) if self.rows else []
 
     @property
+    def reached(self) -> float:
+        """Share of goals achieved at some step in the last evaluation, the median of the runs."""
+        last = self.rows[-len(self.successes) :]
+        return statistics.median(row["reached"] for row in last) if last else 0.0
+
+    @property
     def success(self) -> float:
         """Success rate in the last evaluation, the median of the runs; 0 if there was none."""
         return statistics.median(self.successes) if self.rows else 0.0

@@ -81,6 +81,17 @@ def test_it_acts_until_the_goal_below_is_achieved_and_not_again(guide: GuidedExp
     assert acts(guide, [[0.0, 5.0, 7.0], [0.0, 1.0, 0.0]], begun=[True, False]) == [100.0, 20.0]
 
 
+def test_by_the_step_it_acts_wherever_the_goal_below_is_not_achieved() -> None:
+    guide = GuidedExploration(policy(1.0), CURRICULUM, share=1.0, per="step")
+    guide.follow(policy(2.0), 0)
+    assert acts(guide, [[3.0, 5.0, 7.0], [0.0, 0.4, 0.0]], begun=False) == [106.0, -1.0]
+    assert acts(guide, [[4.6, 5.0, 7.0], [0.0, 1.0, 0.0]], begun=False) == [-1.0, 20.0]
+    guide.share = 0.5
+    acted = torch.tensor([acts(guide, [[3.0, 5.0, 7.0]] * 40, begun=False) for _ in range(10)]) > 0
+    assert 0.4 < acted.double().mean() < 0.6
+    assert not acted.all(0).any()  # in no environment always
+
+
 def test_without_a_layer_below_it_does_nothing() -> None:
     guide = GuidedExploration(policy(1.0), CURRICULUM, share=1.0)
     assert acts(guide, [[3.0, 5.0, 7.0]]) == [-1.0]

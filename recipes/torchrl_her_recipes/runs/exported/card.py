@@ -34,7 +34,9 @@ class PolicyCard:
         normalize_clip: normalized inputs are clipped to plus and minus this; None if the policy does not
             normalize. It normalizes by itself: what it reads is what the task shows.
         algorithm, learner, seed, frames: what trained it, for so many environment steps.
-        success: in 1,000 greedy episodes of the task, with starts and goals that no training has seen.
+        success: share of 1,000 greedy episodes of the task at whose last step the goal is achieved, with
+            starts and goals that no training has seen.
+        reached: share of them in which it is achieved at some step; NaN in files that are older.
         versions: of the packages that exported it; empty in files that are older than this card.
 
     Raises:
@@ -60,6 +62,7 @@ class PolicyCard:
     seed: int
     frames: int
     success: float = math.nan
+    reached: float = math.nan
     versions: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -85,7 +88,8 @@ class PolicyCard:
         if self.discrete:
             fits = self.low == (0,) and 1 <= self.high[0] < _WIDEST
             _check("high", fits, f"be the last of the actions from 0, below {_WIDEST}", self.high)
-        _check("success", _is_number(self.success), "be a number", self.success)
+        for name in ("success", "reached"):
+            _check(name, _is_number(getattr(self, name)), "be a number", getattr(self, name))
         clip = self.normalize_clip
         _check("normalize_clip", clip is None or (_is_number(clip) and clip > 0), "be above 0 or None", clip)
         words = isinstance(self.versions, dict) and all(
