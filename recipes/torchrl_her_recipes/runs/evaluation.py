@@ -40,7 +40,8 @@ def measure_rollout(components: Components, rollout: TensorDictBase) -> dict[str
     recipe, judged_by = components.recipe, judging(components.eval_env)
     there = success(rollout, **judged_by)
     # An episode that is cut off at its goal is taken to stay there.
-    tail = torch.where(there, *reversed(components.rewards)).to(rollout["next", "reward"].dtype)
+    missed, achieved = components.rewards
+    tail = torch.where(there, achieved, missed).to(rollout["next", "reward"].dtype)
     returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=tail)
     measured = {
         "success": there.float(),
