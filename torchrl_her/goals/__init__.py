@@ -7,7 +7,15 @@ from torchrl_her.goals.ibs import GoalHistogram, Instructiveness
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.kernel_ibs import KernelInstructiveness
 from torchrl_her.goals.rare import RareGoals
-from torchrl_her.goals.rewards import EnvReward, GoalReward, RewardFunction, achieved, distance, is_achieved
+from torchrl_her.goals.rewards import (
+    EnvReward,
+    GoalReward,
+    RewardFunction,
+    achieved,
+    distance,
+    ends_at_goals,
+    is_achieved,
+)
 from torchrl_her.goals.rnd import NetworkNovelty
 from torchrl_her.goals.strategies import (
     STRATEGIES,
@@ -45,6 +53,7 @@ __all__ = [
     "draw",
     "draw_alike",
     "draw_weighted",
+    "ends_at_goals",
     "get_strategy",
     "is_achieved",
     "kl_divergence",

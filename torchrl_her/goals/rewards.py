@@ -219,6 +219,21 @@ def missed(
     return _checked(value, _pairs(achieved_goal, desired_goal)) < achieved_reward
 
 
+def ends_at_goals(reward_fn: RewardFunction, goals: Tensor) -> bool:
+    """Whether an episode ends where its goal is achieved.
+
+    Args:
+        reward_fn: maps (achieved, desired) goals to (reward, terminated).
+        goals: [n, g], at least one.
+
+    Example:
+        >>> stay = EnvReward(lambda a, d: -(a - d).abs(), lambda a, d: a != a)
+        >>> ends_at_goals(GoalReward(0.1), torch.zeros(1, 2)), ends_at_goals(stay, torch.zeros(1, 1))
+        (True, False)
+    """
+    return bool(reward_fn(goals[:1], goals[:1])[1].all())
+
+
 def is_achieved(
     after: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
 ) -> Tensor:

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_her.goals.choose import TRIES, Candidates, Index, choose_goals
-from torchrl_her.goals.rewards import RewardFunction, missed
+from torchrl_her.goals.rewards import RewardFunction, ends_at_goals, missed
 from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 from torchrl_her.replay_buffers.episodes import Episodes
@@ -132,7 +132,9 @@ def draw_for_runs(
     before, after = entry_of(rows, keys.achieved), entry_of(rows, keys.next_achieved)
     keep = None
     if options.filter_achieved:
-        keep = drawn.filter(before, partial(missed, reward_fn, achieved_reward=options.achieved_reward))
+        rule = partial(missed, reward_fn, achieved_reward=options.achieved_reward)
+        starts = None if ends_at_goals(reward_fn, after) else before[episodes.rows[:, 0]]
+        keep = drawn.filter(before, rule, starts)
     draws = drawn.draws(generators, piece.position)
     pools: list[Tensor] = []
     parts: list[tuple[Tensor, Tensor]] = []
@@ -200,12 +202,23 @@ class _Transitions(NamedTuple):
         line = torch.zeros_like(self.episode) if position is None else position[self.episode]
         return Candidates(goals, lines.rows, line, torch.zeros_like(line), lines.lengths[line])
 
-    def filter(self, before: Tensor, keep: Keep | None) -> Callable[[Index, Tensor], Tensor] | None:
-        """The filter, for goals achieved before [n, g], as :func:`choose_goals` asks it."""
+    def filter(
+        self, before: Tensor, keep: Keep | None, starts: Tensor | None = None
+    ) -> Callable[[Index, Tensor], Tensor] | None:
+        """The filter, for goals achieved before [n, g], as :func:`choose_goals` asks it.
+
+        Where episodes go on at their goals, it also keeps goals that were not achieved at their ``starts``
+        [E, g].
+        """
         if keep is None:
             return None
         own = before[self.row]
-        return lambda which, goals: keep(own[which].unsqueeze(1), goals)
+        if starts is None:
+            return lambda which, goals: keep(own[which].unsqueeze(1), goals)
+        start = starts[self.episode]
+        return lambda which, goals: (
+            keep(own[which].unsqueeze(1), goals) | keep(start[which].unsqueeze(1), goals)
+        )
 
     def draws(self, generators: Generators, position: Tensor | None) -> RunDraws:
         """Random numbers, from the generator of the run that each transition is of."""

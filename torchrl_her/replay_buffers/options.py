@@ -13,7 +13,7 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor
 
 from torchrl_her.checks import check_whole
-from torchrl_her.goals.rewards import RewardFunction, missed
+from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.sources import GoalSources, check_goal_sources, sources_name
 from torchrl_her.goals.strategies import RECENT, Strategy, get_strategy
 from torchrl_her.goals.weights import GoalWeights
@@ -58,7 +58,9 @@ class HindsightOptions:
         gamma: the discount of these sums; needed with ``n_steps`` above 1, and the same as the loss's.
         filter_achieved: take no goal that was already achieved in the state before the action
             (Filtered-HER). This asks the reward and not ``terminated``, since many environments never
-            terminate.
+            terminate. Where episodes go on at their goals, such transitions teach to stay there. Then only
+            goals are left out that were achieved at the start of the episode as well, because nothing has
+            moved yet.
         achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved. A
             transition that terminated with a lower reward failed, as by a fall: it terminates for virtual
             goals, too, and costs as much.
@@ -290,7 +292,3 @@ class HindsightBase:
                 stacklevel=5,
             )
         self._time_seen = several or suspicious
-
-    def _keep(self, before: Tensor, goals: Tensor) -> Tensor:
-        """The filter, [...]: False where a goal [..., g] was already achieved before the action."""
-        return missed(self.reward_fn, before, goals, self.achieved_reward)

@@ -15,6 +15,7 @@ index and priorities are those of the real transitions, and reading (``buffer[:]
 
 from __future__ import annotations
 
+from functools import partial
 from threading import get_ident
 from typing import Any, ClassVar, NamedTuple
 from uuid import uuid4
@@ -28,7 +29,7 @@ from torchrl.data.replay_buffers.storages import StorageEnsemble
 
 from torchrl_her.goals.choose import LIKELIHOODS, TRIES, Candidates, Index, choose_goals
 from torchrl_her.goals.factors import combine, draw, draw_alike
-from torchrl_her.goals.rewards import RewardFunction, ask_reward
+from torchrl_her.goals.rewards import RewardFunction, ask_reward, ends_at_goals, missed
 from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
@@ -414,7 +415,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         if not self.filter_achieved:
             return stored.after[lent], None
         # Goals are proposed without the filter; only where it rejects one are all candidates looked at.
-        kept = self._keep(stored.before[group], stored.after[lent].unsqueeze(1)).all(-1)
+        kept = self._kept(stored, group, stored.after[lent].unsqueeze(1)).squeeze(1)
         again = (~kept).nonzero().squeeze(-1)
         valid = torch.ones_like(row, dtype=torch.bool)
         lent[again], valid[again] = self._draw_by_likelihood(
@@ -435,8 +436,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         line, table = torch.zeros_like(group[:, 0]), stored.recent[which].unsqueeze(0)
 
         def keep(which: Index, goals: Tensor) -> Tensor:
-            before = stored.before[group[which]]  # [m, L, g]
-            return self._keep(before.unsqueeze(1), goals.unsqueeze(2)).all(-1)
+            return self._kept(stored, group[which], goals)
 
         index, valid = choose_goals(
             Candidates(goals, table, line, line, torch.full_like(line, table.shape[1])),
@@ -447,6 +447,16 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             tries=TRIES,
         )
         return goals[index.squeeze(-1)], valid
+
+    def _kept(self, stored: _Stored, group: Tensor, goals: Tensor) -> Tensor:
+        """The filter: which of the goals [V, c, g] groups [V, L] may take, [V, c] of bool."""
+        rule = partial(missed, self.reward_fn, achieved_reward=self.achieved_reward)
+        kept = rule(stored.before[group].unsqueeze(1), goals.unsqueeze(2)).all(-1)
+        if ends_at_goals(self.reward_fn, stored.after):
+            return kept
+        episodes = stored.episodes
+        start = stored.before[episodes.row(episodes.episode(episodes.place(group[:, -1]))[0])]
+        return kept | rule(start.unsqueeze(1), goals)
 
     def _draw_by_likelihood(
         self, stored: _Stored, group: Tensor, first: Tensor, end: Tensor, generator: torch.Generator | None
@@ -466,7 +476,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             if self.weights is not None and not self.weights.alike:
                 weight = checked_weights(self.weights(goals), goals)
             if self.filter_achieved:
-                keep = self._keep(stored.before[group[part]].unsqueeze(2), goals.unsqueeze(1)).all(1)
+                keep = self._kept(stored, group[part], goals)
             drawn, valid[part] = draw(combine(steps < width, weight, keep), 1, generator=generator)
             source[part] = candidate.gather(1, drawn).squeeze(-1)
         return source, valid

@@ -119,6 +119,7 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
                 "layer_epochs": _LAYER_EPOCHS,
                 "layer_epsilon": 0.5,
                 "guided_share": 0.5,
+                "guided_per": "step",
             }
         recipe = recipe.replace(**values)
     return recipe

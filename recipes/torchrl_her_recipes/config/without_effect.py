@@ -68,6 +68,8 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         all_of("curriculum", with_algo)
     elif not groups.learner.has_epsilon:
         idle["curriculum", "layer_epsilon"] = f"with learner={groups.learner.name}"
+    if algorithm.curriculum and groups.curriculum.guided_share == 0:
+        idle["curriculum", "guided_per"] = "with guided_share=0"
     if algorithm.curriculum and groups.curriculum.order != "threshold":
         for name in ("window", "success_threshold", "layer_epsilon"):
             idle["curriculum", name] = f"with order={groups.curriculum.order}"

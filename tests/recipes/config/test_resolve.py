@@ -35,7 +35,8 @@ def test_a_curriculum_comes_with_its_options() -> None:
     layers = [{"name": "near"}, {"name": "all"}]
     recipe = resolve(make_recipe(), EnvFacts(max_steps=50, layers=layers))
     assert (recipe.hindsight.algo, recipe.curriculum.layers) == ("cher", layers)
-    assert (recipe.curriculum.layer_epochs, recipe.curriculum.guided_share) == (10, 0.5)
+    curriculum = recipe.curriculum
+    assert (curriculum.layer_epochs, curriculum.guided_share, curriculum.guided_per) == (10, 0.5, "step")
     assert resolve(make_recipe(), EnvFacts(max_steps=50)).hindsight.algo == "filtered_her"
     assert make_recipe(curriculum=layers).hindsight.algo == "cher"
 

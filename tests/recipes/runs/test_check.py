@@ -121,11 +121,15 @@ def test_a_block_that_lies_still_gets_a_curriculum() -> None:
     components.close()
 
 
+def test_a_cost_of_actions_is_no_obstacle_to_a_curriculum() -> None:
+    recipe = resolved(make_recipe(task=f"{HERE}:Push", **{"task.options": {"cost": 0.5}}))
+    assert recipe.hindsight.algo == "cher"
+
+
 @pytest.mark.parametrize(
     "options",
     [
         {"task.options": {"moves": False}},
-        {"task.options": {"cost": 0.5}},
         {"task.options": {"wall": True}},  # what a failure costs is no reward of a curriculum
         {"algo": "filtered_her"},
         {"demonstrations.file": "some.pt", "demonstrations.episodes": 1},

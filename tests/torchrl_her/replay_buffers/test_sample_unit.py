@@ -399,6 +399,16 @@ def test_the_filter_asks_the_reward_even_where_nothing_ever_terminates() -> None
     assert not buffer.sample(100)["virtual"].any()
 
 
+def test_where_episodes_go_on_at_goals_the_filter_keeps_what_teaches_to_stay() -> None:
+    endless = EnvReward(lambda a, d: REWARD(a, d)[0], lambda a, d: torch.zeros_like(a[..., :1]).bool())
+    stays = along([0, 9, 9])  # the last transition had its goal before, but not at the start
+    for reward, steps in ((REWARD, {0.0}), (endless, {0.0, 9.0})):
+        buffer = make_buffer(reward=reward, filter_achieved=True, k=NEVER_REAL)
+        buffer.extend(stays)
+        rows = buffer.sample(100)
+        assert set(rows["achieved_goal"][..., 0][rows["virtual"].squeeze(-1)].tolist()) == steps
+
+
 class PreferFar(GoalWeights):
     """A goal is as useful as it is far away."""
 

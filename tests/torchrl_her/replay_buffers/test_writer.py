@@ -265,6 +265,24 @@ def test_the_filter_asks_the_reward_even_where_nothing_ever_terminates() -> None
     assert len(split(buffer)[1]) == 0
 
 
+@pytest.mark.parametrize("ends", [True, False])
+def test_where_episodes_go_on_at_goals_the_filter_keeps_what_teaches_to_stay(ends: bool) -> None:
+    """From 0 to 1, and staying there: the last transition had its goal before, but not at the start."""
+    reward = GoalReward(0.5)
+    rule = EnvReward(lambda a, d: reward(a, d)[0], lambda a, d: reward(a, d)[1] & ends)
+    batch, path = make_batch([[4]]), torch.tensor([0.0, 0.0, 1.0, 1.0, 0.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    batch["observation"][..., 0] = torch.arange(4.0)
+    buffer = make_buffer(reward=rule, filter_achieved=True, strategy="episode", k=8)
+    buffer.extend(batch)
+    virtual = split(buffer)[1]
+    goals = {
+        step: set(virtual["desired_goal"][..., 0][virtual["observation"][..., 0] == step].tolist())
+        for step in range(4)
+    }
+    assert goals == {0: {1.0}, 1: {1.0}, 2: {0.0} if ends else {0.0, 1.0}, 3: {0.0} if ends else {0.0, 1.0}}
+
+
 # Episodes, environments, batches
 
 

@@ -117,7 +117,7 @@ class PolicyCard:
         if not isinstance(values, Mapping) or (unknown := [name for name in values if name not in known]):
             got = type(values).__name__ if not isinstance(values, Mapping) else ", ".join(map(str, unknown))
             raise ValueError(f"a policy's card must have {', '.join(known)}, got {got}")
-        own = dict(values)
+        own = {"reached": math.nan, **values}  # older files have none
         for name in ("action_shape", "low", "high"):
             _check(name, isinstance(own.get(name), list | tuple), "be a list", own.get(name))
             own[name] = tuple(own[name])
