@@ -147,9 +147,9 @@ def export(
     """
     file = out or _file_of(source, task, ".onnx" if form == "onnx" else ".pt")
     policy = recipes.export_policy(source, file, run=index, task=task, best=best, format=form, card=card)
-    card = policy.card
-    touched = f" (reached at some step {card.reached:.0%})" if card.reached > card.success else ""
-    click.echo(f"seed {policy.recipe.run.seed}, success {card.success:.0%}{touched} on {policy.task}: {file}")
+    own = policy.card
+    touched = f" (reached at some step {own.reached:.0%})" if own.reached > own.success else ""
+    click.echo(f"seed {policy.recipe.run.seed}, success {own.success:.0%}{touched} on {policy.task}: {file}")
     return 0
 
 
