@@ -63,7 +63,7 @@ class RunResult:
     def reached(self) -> float:
         """Share of goals achieved at some step in the last evaluation, the median of the runs."""
         last = self.rows[-len(self.successes) :]
-        return statistics.median(row["reached"] for row in last) if last else 0.0
+        return statistics.median(row.get("reached", row["success"]) for row in last) if last else 0.0
 
     @property
     def success(self) -> float:

@@ -27,7 +27,7 @@ def card(**values: Any) -> PolicyCard:
 
 
 def test_a_card_survives_plain_data() -> None:
-    own = card(success=0.25, versions={"torch": "2.14.1"}, normalize_clip=5.0)
+    own = card(success=0.25, reached=0.5, versions={"torch": "2.14.1"}, normalize_clip=5.0)
     assert PolicyCard.from_dict(own.to_dict()) == own
     discrete = card(action_shape=(), action_dtype="int64", low=(0.0,), high=(3.0,))
     assert PolicyCard.from_dict({**discrete.to_dict(), "action_shape": [], "high": [3]}) == discrete

@@ -62,7 +62,8 @@ def test_the_code_of_a_card_runs(
     for block in blocks:
         exec(compile(block, "card", "exec"), {})
     assert "torchrl-her play 'my policy.onnx'" in text
-    assert "| success | 50.0 % of 1,000 episodes |" in text
+    assert "| success | 50.0 % of 1,000 episodes have their goal achieved at the last step |" in text
+    assert "| reached | 75.0 % at some step |" in text
     assert f"`{policy.card.task}`" in text
     for part in ("How it was trained", "What it expects", "Limits", "License"):
         assert f"\n## {part}\n" in text

@@ -51,6 +51,7 @@ def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, **options: Any) ->
         seed=0,
         frames=100,
         success=0.5,
+        reached=0.75,
         versions={"torchrl-her": "0.1.0"},
     )
     if scale != 1.0:
