@@ -15,10 +15,9 @@ from torchrl_her.behavior import (
     ValueCutoff,
 )
 from torchrl_her.curriculum.transforms import ZeroPad
-from torchrl_her.goals.rewards import EnvReward
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top
-from torchrl_her_recipes.components.envs import evaluation_envs
+from torchrl_her_recipes.components.envs import evaluation_envs, task_reward
 from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_instructive
 from torchrl_her_recipes.components.learner import Agent
 from torchrl_her_recipes.components.streams import Stream, generators_of
@@ -69,7 +68,7 @@ def make_behavior(
     if state is not None and state.progress.by_episode:
         top = {"layer_key": "layer", "layer": len(state.curriculum) - 1}
     behavior = BehaviorGoals(
-        EnvReward(task.compute_reward, task.compute_terminated),
+        task_reward(env),
         weights=own or None,
         update_on="proposed" if options.name == "ibs" else "achieved",
         greedy=options.name in _GREEDY,
@@ -100,7 +99,7 @@ def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = 
     """
     task = goal_env(env)
     return BehaviorGoals(
-        EnvReward(task.compute_reward, task.compute_terminated),
+        task_reward(env),
         remember=False,
         real_share=0.0,
         candidates=1,

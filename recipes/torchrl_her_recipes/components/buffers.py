@@ -14,7 +14,7 @@ from torchrl.envs import DeviceCastTransform, EnvBase
 from torchrl_her.curriculum.normalization import count_inputs
 from torchrl_her.curriculum.switch import set_layer_goals
 from torchrl_her.curriculum.transforms import ZeroPad
-from torchrl_her.goals.rewards import EnvReward, RewardFunction
+from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch
 from torchrl_her.replay_buffers.layer_rules import LayerRule
@@ -23,6 +23,7 @@ from torchrl_her.replay_buffers.writer import HERWriter, OnWrite
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
+from torchrl_her_recipes.components.envs import task_reward
 from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_goal_weights
 from torchrl_her_recipes.components.memory import check_buffer_size
 from torchrl_her_recipes.config.algorithms import get_algorithm
@@ -75,7 +76,7 @@ def make_buffer(
     check_buffer_size(recipe, env, devices.replay, not_stored=_NOT_STORED)
     size = recipe.replay.buffer_size if capacity is None else capacity
     algorithm, task, runs = get_algorithm(recipe.hindsight.algo), goal_env(env), len(generators)
-    rule = EnvReward(task.compute_reward, task.compute_terminated)
+    rule = task_reward(env)
     own = [make_goal_weights(each, task, space) for each in recipe.of_runs() if algorithm.hindsight]
     buffer = TensorDictReplayBuffer(
         storage=PackedStorage(runs * size, device=devices.replay),

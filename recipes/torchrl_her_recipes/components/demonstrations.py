@@ -14,11 +14,10 @@ from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.demonstrations.replay import MixedReplay, write_demonstrations
 from torchrl_her.demonstrations.shown import in_layer, with_reward
 from torchrl_her.demonstrations.starts import DemonstrationStarts
-from torchrl_her.goals.rewards import EnvReward
 from torchrl_her.trainers.checkpoint import buffer_state_dict, load_buffer_state_dict
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
-from torchrl_her_recipes.components.envs import action_bounds
+from torchrl_her_recipes.components.envs import action_bounds, task_reward
 from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
@@ -44,8 +43,7 @@ class RunDemonstrations:
 
     def shown(self, run: int) -> Demonstrations:
         """As a run sees them at the moment."""
-        task = goal_env(self.env)
-        rule = EnvReward(task.compute_reward, task.compute_terminated)
+        rule = task_reward(self.env)
         if self.state is None:
             return with_reward(self.recorded, rule)
         return in_layer(self.recorded, self.state.curriculum, self.state.progress.layers[run], rule)

@@ -100,8 +100,12 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
     return -one, one
 
 
+def task_reward(env: EnvBase) -> EnvReward:
+    """The reward function of a task, below any transforms."""
+    task = goal_env(env)
+    return EnvReward(task.compute_reward, task.compute_terminated)
+
+
 def judging(env: EnvBase) -> dict[str, Any]:
     """Options of :func:`~torchrl_her.success` for rollouts of a task that has no entry ``is_success``."""
-    task = goal_env(env)
-    rule = EnvReward(task.compute_reward, task.compute_terminated)
-    return {"reward_fn": rule, "achieved_reward": reward_range(task)[1]}
+    return {"reward_fn": task_reward(env), "achieved_reward": reward_range(goal_env(env))[1]}

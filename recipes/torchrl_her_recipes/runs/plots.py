@@ -54,10 +54,11 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
         if all(name in row for row in rows):
             draw_curve(axes, rows, name)
         if name == "success" and any(row.get("reached", row[name]) != row[name] for row in rows):
-            axes.plot(*_median(rows, "reached"), "--", color="#dd6b20", label="reached at some step")
+            frames, _, middle, _ = band(rows, "reached")
+            axes.plot(frames, middle, "--", color="#dd6b20", label="reached at some step")
             axes.legend(fontsize=8)
-        for frames in layer_changes(rows):
-            axes.axvline(frames, color="#a0aec0", linewidth=0.8, linestyle=":")
+        for change in layer_changes(rows):
+            axes.axvline(change, color="#a0aec0", linewidth=0.8, linestyle=":")
         axes.set(xlabel="environment steps", ylabel=label)
         count_frames(axes)
         axes.grid(alpha=0.3)
@@ -176,12 +177,6 @@ def band(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     frames, values = by_frames(rows, name)
     low, middle, high = np.percentile(values, [33, 50, 67], axis=1)
     return frames, low, middle, high
-
-
-def _median(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Frames and the median of one metric there, [n] each."""
-    frames, _, middle, _ = band(rows, name)
-    return frames, middle
 
 
 def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
