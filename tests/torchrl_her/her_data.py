@@ -6,6 +6,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_her import EnvReward, GoalReward
+
 # The goal of state t of episode e of environment n is (1000 n + 100 e + t, 0): never equal to another.
 WANTED = -7.0
 
@@ -73,3 +75,18 @@ def tag_of(env: Tensor, episode: Tensor, state: Tensor) -> Tensor:
 
 def _point(x: Tensor) -> Tensor:
     return torch.stack((x, torch.zeros_like(x)), -1)
+
+
+def costly(lengths: list[list[int]]) -> tuple[EnvReward, TensorDict]:
+    """A reward that costs a quarter for each step that an episode has lasted, and a batch with that cost."""
+    batch, near = make_batch(lengths), GoalReward(0.5)
+    for part in (batch, batch["next"]):
+        part["info"] = TensorDict({"cost": part["achieved_goal"][..., :1] % 100 / 4}, batch.batch_size)
+    rule = EnvReward(
+        lambda a, d, info: near(a, d)[0] - info["info", "cost"],
+        lambda a, d, info: near(a, d)[1] & (info["info", "cost"] > 0),
+        info_keys=[("info", "cost")],
+    )
+    after = batch["next"]
+    after["reward"] = rule(after["achieved_goal"], after["desired_goal"], after)[0]
+    return rule, batch

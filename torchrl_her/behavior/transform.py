@@ -16,7 +16,7 @@ from torchrl_her.behavior.memory import AchievedGoals
 from torchrl_her.checks import check_whole
 from torchrl_her.goals.factors import draw
 from torchrl_her.goals.instructive import InstructiveWeights
-from torchrl_her.goals.rewards import RewardFunction
+from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights, weights_by_run
 from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
 
@@ -244,12 +244,13 @@ class BehaviorGoals(Transform):
         if not bool(proposed.any()):
             return next_tensordict
         wanted = torch.where(proposed, tensordict.get(goal_key), real)
-        reward, terminated = self.reward_fn(achieved, wanted)
+        outcome = outcomes(self.reward_fn, achieved, next_tensordict, tensordict)
+        reward, terminated = call_reward(self.reward_fn, outcome, wanted)
         before = self._get(next_tensordict, self.reward_key)
         ended = self._get(next_tensordict, self.terminated_key)
         fell = ended & (before < self.achieved_reward)
         if bool(fell.any()):  # it ends so for any goal, unless the task's own goal has ended it
-            own_reward, own_end = self.reward_fn(achieved, real)
+            own_reward, own_end = call_reward(self.reward_fn, outcome, real)
             fell = fell & ~own_end
             reward = reward + (before - own_reward).clamp(max=0.0) * fell  # and costs so much for any goal
         reached = self._get(tensordict, reached_key) | (proposed & (reward >= self.achieved_reward))

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_her.curriculum.layers import Curriculum
 from torchrl_her.curriculum.transforms import take_columns
 from torchrl_her.demonstrations.dataset import Demonstrations
-from torchrl_her.goals.rewards import RewardFunction
+from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
 
 
 def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> Demonstrations:
@@ -40,7 +40,8 @@ def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> De
     """
     after = demonstrations.rows["next"]
     recorded = after["terminated"] & (after["reward"] < demonstrations.achieved_reward)
-    reward, terminated = reward_fn(after["achieved_goal"], after["desired_goal"])
+    reached = outcomes(reward_fn, after["achieved_goal"], after, demonstrations.rows)
+    reward, terminated = call_reward(reward_fn, reached, after["desired_goal"])
     terminated = terminated.view_as(recorded) | recorded
     kept, lengths = _until_first(terminated.flatten(), demonstrations)
     last = torch.zeros_like(terminated)

@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Protocol
+from typing import Any, Protocol, TypeAlias
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torchrl_her.checks import check_finite
 
 _FORM = (
     "the reward function must take (achieved_goal, desired_goal) and return (reward, terminated), "
-    "tensors [..., 1]"
+    "tensors [..., 1]; one that reads further entries comes as EnvReward(function, info_keys=[...])"
 )
+# Achieved goals [..., g]; or goals and info, for a reward function that reads further entries.
+Outcome: TypeAlias = Tensor | TensorDictBase
+_LOOKED_AT = 100  # infos, to see whether goals end episodes
 
 
 class RewardFunction(Protocol):
     """Maps achieved and desired goals [..., g] to (reward, terminated), each [..., 1].
 
-    The achieved goal comes first, as in gymnasium's ``compute_reward``.
+    The achieved goal comes first, as in gymnasium's ``compute_reward``. A function that has an attribute
+    ``info_keys`` gets a third argument, the info: a tensordict of these entries of the transition, whose
+    dimensions [...] are broadcast against those of the goals. Entries are read under ``next``, or in the root
+    if ``next`` lacks them, as ``action``. The filter, which asks about the state before the action, looks in
+    the root first.
     """
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor, /) -> tuple[Tensor, Tensor]: ...
@@ -103,31 +110,85 @@ class EnvReward:
         compute_terminated: (achieved, desired) goals [..., g] to bool [..., 1]: where the episode terminates.
             If None, no goal terminates it.
 
+    Keyword Args:
+        info_keys: further entries of the transition that both functions read. They get them as a third
+            argument, see :class:`~torchrl_her.goals.RewardFunction`.
+
     Example:
         >>> rule = EnvReward(lambda a, d: -(a - d).abs(), lambda a, d: a == d)
         >>> rule(torch.tensor([1.0]), torch.tensor([3.0]))
         (tensor([-2.]), tensor([False]))
+        >>> costly = EnvReward(lambda a, d, info: -(a - d).abs() - info["cost"], info_keys=["cost"])
+        >>> costly(torch.tensor([1.0]), torch.tensor([3.0]), TensorDict({"cost": torch.tensor([0.5])}))[0]
+        tensor([-2.5000])
     """
 
     def __init__(
         self,
-        compute_reward: Callable[[Tensor, Tensor], Tensor],
-        compute_terminated: Callable[[Tensor, Tensor], Tensor] | None = None,
+        compute_reward: Callable[..., Tensor],
+        compute_terminated: Callable[..., Tensor] | None = None,
+        *,
+        info_keys: Sequence[NestedKey] = (),
     ) -> None:
+        if isinstance(info_keys, str):  # a sequence of letters
+            raise TypeError(f"info_keys must be a list, got {info_keys!r}: write [{info_keys!r}]")
         self.compute_reward = compute_reward
         self.compute_terminated = compute_terminated
+        self.info_keys = [unravel_key(key) for key in info_keys]
 
-    def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns (reward, terminated), each [..., 1], for goals [..., g]."""
-        reward = self.compute_reward(achieved_goal, desired_goal)
+    def __call__(
+        self, achieved_goal: Tensor, desired_goal: Tensor, *info: TensorDictBase
+    ) -> tuple[Tensor, Tensor]:
+        """Returns (reward, terminated), each [..., 1], for goals [..., g], and their info if it is read."""
+        reward = self.compute_reward(achieved_goal, desired_goal, *info)
         if self.compute_terminated is None:
             return reward, torch.zeros_like(reward, dtype=torch.bool)
-        return reward, self.compute_terminated(achieved_goal, desired_goal)
+        return reward, self.compute_terminated(achieved_goal, desired_goal, *info)
 
 
-def ask_reward(
-    reward_fn: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor
-) -> tuple[Tensor, Tensor]:
+def outcomes(reward_fn: RewardFunction | None, achieved_goal: Tensor, *parts: TensorDictBase) -> Outcome:
+    """Achieved goals [..., g] with the info that a reward function reads, if it does.
+
+    Args:
+        reward_fn: whose ``info_keys`` name the entries.
+        achieved_goal: [..., g].
+        *parts: [...], of the same transitions. Each entry is taken from the first part that has it.
+
+    Raises:
+        KeyError: no part has an entry.
+
+    Example:
+        >>> rule = EnvReward(lambda a, d, info: info["cost"], info_keys=["cost"])
+        >>> after = TensorDict({"cost": torch.ones(2, 1)}, [2])
+        >>> outcomes(rule, torch.zeros(2, 3), after)["info", "cost"].tolist()
+        [[1.0], [1.0]]
+    """
+    keys: Sequence[NestedKey] = getattr(reward_fn, "info_keys", ())
+    if not keys:
+        return achieved_goal
+    out = TensorDict({"achieved_goal": achieved_goal, "info": {}}, achieved_goal.shape[:-1])
+    for key in keys:
+        entries = [entry for part in parts if (entry := part.get(key, None)) is not None]
+        if not entries:
+            raise KeyError(
+                f"the reward function reads the entry {key!r}, got {list(parts[0].keys(True, True))}"
+            )
+        out.set(unravel_key(("info", key)), entries[0])
+    return out
+
+
+def call_reward(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
+    """The answer of a reward function to goals [..., g], unchecked."""
+    return reward_fn(*_arguments(achieved, desired_goal))
+
+
+def _arguments(achieved: Outcome, desired_goal: Tensor) -> Any:
+    if isinstance(achieved, Tensor):
+        return achieved, desired_goal
+    return achieved.get("achieved_goal"), desired_goal, achieved.get("info")
+
+
+def ask_reward(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
     """What a reward function says of goals [..., g]: (reward, terminated), each [..., 1], checked.
 
     Raises:
@@ -140,8 +201,8 @@ def ask_reward(
         Traceback (most recent call last):
         ValueError: rewards of the reward function must be finite, got inf in it
     """
-    reward, terminated = _call(reward_fn, achieved_goal, desired_goal)
-    shape = _pairs(achieved_goal, desired_goal)
+    reward, terminated = _call(reward_fn, achieved, desired_goal)
+    shape = _pairs(achieved, desired_goal)
     if terminated.dtype != torch.bool or terminated.numel() != shape.numel():
         raise ValueError(
             f"the reward function must give one bool for each of {shape.numel()} pairs of goals, got "
@@ -150,12 +211,12 @@ def ask_reward(
     return _checked(reward, shape).unsqueeze(-1), terminated.reshape(*shape, 1)
 
 
-def _call(reward_fn: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
+def _call(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the answer of a reward function; a ValueError names the form that it must have."""
     try:
-        answer = reward_fn(achieved_goal, desired_goal)
+        answer = call_reward(reward_fn, achieved, desired_goal)
     except TypeError as error:
-        if _takes_two(reward_fn):
+        if _takes(reward_fn, _arguments(achieved, desired_goal)):
             raise
         raise ValueError(f"{_FORM}, got {error}") from error
     several = answer if isinstance(answer, tuple | list) else [answer]
@@ -169,10 +230,10 @@ def _call(reward_fn: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor
     )
 
 
-def _takes_two(function: Callable[..., object]) -> bool:
-    """Whether a function can be called with two goals; true if that cannot be told."""
+def _takes(function: Callable[..., object], arguments: Sequence[object]) -> bool:
+    """Whether a function can be called with some arguments; true if that cannot be told."""
     try:
-        inspect.signature(function).bind(None, None)
+        inspect.signature(function).bind(*arguments)
     except TypeError:
         return False
     except ValueError:  # as of functions in C
@@ -180,9 +241,9 @@ def _takes_two(function: Callable[..., object]) -> bool:
     return True
 
 
-def _pairs(achieved_goal: Tensor, desired_goal: Tensor) -> torch.Size:
+def _pairs(achieved: Outcome, desired_goal: Tensor) -> torch.Size:
     """The shape [...] of goals [..., g] that are broadcast against each other."""
-    return torch.broadcast_shapes(achieved_goal.shape, desired_goal.shape)[:-1]
+    return torch.broadcast_shapes(*(goals.shape for goals in _arguments(achieved, desired_goal)[:2]))[:-1]
 
 
 def _checked(reward: Tensor, shape: torch.Size) -> Tensor:
@@ -197,7 +258,7 @@ def _checked(reward: Tensor, shape: torch.Size) -> Tensor:
 
 
 def missed(
-    reward_fn: RewardFunction, achieved_goal: Tensor, desired_goal: Tensor, achieved_reward: float
+    reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor, achieved_reward: float
 ) -> Tensor:
     """Where a goal is not achieved, as the reward tells: [...] of bool, for goals [..., g].
 
@@ -205,33 +266,34 @@ def missed(
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
-        achieved_goal: [..., g].
-        desired_goal: [..., g], broadcast against ``achieved_goal``.
+        achieved: goals [..., g], with the info that the function reads (:func:`outcomes`).
+        desired_goal: [..., g], broadcast against them.
         achieved_reward: the reward of an achieved goal.
 
     Raises:
         ValueError: there is not one finite reward for each pair of goals.
     """
     if isinstance(reward_fn, EnvReward):
-        value = reward_fn.compute_reward(achieved_goal, desired_goal)
+        value = reward_fn.compute_reward(*_arguments(achieved, desired_goal))
     else:
-        value = _call(reward_fn, achieved_goal, desired_goal)[0]
-    return _checked(value, _pairs(achieved_goal, desired_goal)) < achieved_reward
+        value = _call(reward_fn, achieved, desired_goal)[0]
+    return _checked(value, _pairs(achieved, desired_goal)) < achieved_reward
 
 
-def ends_at_goals(reward_fn: RewardFunction, goals: Tensor) -> bool:
-    """Whether an episode ends where its goal is achieved.
+def ends_at_goals(reward_fn: RewardFunction, goals: Outcome) -> bool:
+    """Whether an episode ends where its goal is achieved; with some info at least, if that is read.
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
-        goals: [n, g], at least one.
+        goals: [n, g], at least one; with the info that the function reads (:func:`outcomes`).
 
     Example:
         >>> stay = EnvReward(lambda a, d: -(a - d).abs(), lambda a, d: a != a)
         >>> ends_at_goals(GoalReward(0.1), torch.zeros(1, 2)), ends_at_goals(stay, torch.zeros(1, 1))
         (True, False)
     """
-    return bool(reward_fn(goals[:1], goals[:1])[1].all())
+    some = goals[:1] if isinstance(goals, Tensor) else goals[:: max(1, len(goals) // _LOOKED_AT)]
+    return bool(call_reward(reward_fn, some, _arguments(some, torch.empty(0))[0])[1].any())
 
 
 def is_achieved(
@@ -264,4 +326,5 @@ def is_achieved(
         return word.bool().view(after.shape)
     if reward_fn is None:
         return (after.get("reward") >= achieved_reward).view(after.shape)
-    return ~missed(reward_fn, after.get("achieved_goal"), after.get("desired_goal"), achieved_reward)
+    reached = outcomes(reward_fn, after.get("achieved_goal"), after)
+    return ~missed(reward_fn, reached, after.get("desired_goal"), achieved_reward)

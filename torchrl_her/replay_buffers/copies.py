@@ -101,10 +101,10 @@ def virtual_copies(
         achieved_reward: the reward of an achieved goal.
         keys, n_steps, gamma: as for :func:`real_copies`.
     """
-    achieved = entry_of(rows, keys.next_achieved)
+    achieved = keys.after(rows, reward_fn)
     failed, cost = failures(rows, keys, reward_fn, achieved_reward)
     if n_steps == 1 or gamma is None:
-        reward, terminated = ask_reward(reward_fn, achieved.index_select(0, source), goals)
+        reward, terminated = ask_reward(reward_fn, achieved[source], goals)
         reward, terminated = reward + cost[source], terminated | failed[source]
         truncated = entry_of(rows, keys.truncated).index_select(0, source)
         return Copies(source, source, keys.changes(goals, reward, terminated, truncated), reward.flatten())
@@ -146,7 +146,7 @@ def virtual_episodes(
     number = _episode_of(rows, episodes)[source]
     table, inside = episodes.rows[number], episodes.inside[number]
     wanted = goals.unsqueeze(1).expand(-1, table.shape[1], -1)
-    reward, terminated = ask_reward(reward_fn, entry_of(rows, keys.next_achieved)[table], wanted)
+    reward, terminated = ask_reward(reward_fn, keys.after(rows, reward_fn)[table], wanted)
     failed, cost = failures(rows, keys, reward_fn, achieved_reward)
     reward, terminated = reward + cost[table], terminated | failed[table]
     ended = terminated.squeeze(-1).cumsum(-1) - terminated.squeeze(-1).to(torch.int64)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_her.goals.choose import TRIES, Candidates, Index, choose_goals
-from torchrl_her.goals.rewards import RewardFunction, ends_at_goals, missed
+from torchrl_her.goals.rewards import Outcome, RewardFunction, ends_at_goals, missed
 from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 from torchrl_her.replay_buffers.episodes import Episodes
@@ -21,7 +21,7 @@ from torchrl_her.replay_buffers.runs.pieces import Piece
 from torchrl_her.replay_buffers.runs.recent import RecentGoals
 from torchrl_her.replay_buffers.runs.streams import Generators, RunDraws
 
-Keep = Callable[[Tensor, Tensor], Tensor]
+Keep = Callable[[Any, Tensor], Tensor]
 
 
 def draw_goals(
@@ -129,11 +129,12 @@ def draw_for_runs(
     if options.k == 0:  # then the batch may be without goals
         return episodes.lengths[:0], episodes.lengths[:0], [0] * len(piece.runs)
     drawn = _Transitions.of(episodes, options.per)
-    before, after = entry_of(rows, keys.achieved), entry_of(rows, keys.next_achieved)
+    after = entry_of(rows, keys.next_achieved)
     keep = None
     if options.filter_achieved:
         rule = partial(missed, reward_fn, achieved_reward=options.achieved_reward)
-        starts = None if ends_at_goals(reward_fn, after) else before[episodes.rows[:, 0]]
+        before, ends = keys.before(rows, reward_fn), ends_at_goals(reward_fn, keys.after(rows, reward_fn))
+        starts = None if ends else before[episodes.rows[:, 0]]
         keep = drawn.filter(before, rule, starts)
     draws = drawn.draws(generators, piece.position)
     pools: list[Tensor] = []
@@ -203,7 +204,7 @@ class _Transitions(NamedTuple):
         return Candidates(goals, lines.rows, line, torch.zeros_like(line), lines.lengths[line])
 
     def filter(
-        self, before: Tensor, keep: Keep | None, starts: Tensor | None = None
+        self, before: Outcome, keep: Keep | None, starts: Outcome | None = None
     ) -> Callable[[Index, Tensor], Tensor] | None:
         """The filter, for goals achieved before [n, g], as :func:`choose_goals` asks it.
 

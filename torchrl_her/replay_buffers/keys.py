@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torchrl_her.checks import check_finite
-from torchrl_her.goals.rewards import RewardFunction, ask_reward
+from torchrl_her.goals.rewards import Outcome, RewardFunction, ask_reward, outcomes
 
 _LEAST_COST = 1e-4  # relative: what is less is an error of rounding
 
@@ -44,6 +44,14 @@ class TransitionKeys:
         """The goals [..., g] that the task itself has asked for."""
         real = rows.get(self.real_goal, None)
         return entry_of(rows, self.goals[0]) if real is None else real
+
+    def before(self, rows: TensorDictBase, reward_fn: RewardFunction) -> Outcome:
+        """The goals [n, g] that were achieved before the actions, with the info that is read."""
+        return outcomes(reward_fn, entry_of(rows, self.achieved), rows, rows.get("next"))
+
+    def after(self, rows: TensorDictBase, reward_fn: RewardFunction) -> Outcome:
+        """The goals [n, g] that the actions achieved, with the info that is read."""
+        return outcomes(reward_fn, entry_of(rows, self.next_achieved), rows.get("next"), rows)
 
     def check(self, rows: TensorDictBase, what: str, *, k: int) -> None:
         """Refuses transitions with goals or rewards that cannot be stored, or that cannot be relabeled.
@@ -117,8 +125,8 @@ def failures(
     failed, cost = terminated & (reward < achieved_reward), torch.zeros_like(reward)
     at = failed.nonzero().squeeze(-1)
     if len(at) > 0:  # what the reward function terminates was a success, though with another reward
-        goals = (entry_of(transitions, key)[at] for key in (keys.next_achieved, keys.goals[1]))
-        own_reward, own_end = (answer.flatten() for answer in ask_reward(reward_fn, *goals))
+        reached, wanted = keys.after(transitions, reward_fn)[at], entry_of(transitions, keys.goals[1])[at]
+        own_reward, own_end = (answer.flatten() for answer in ask_reward(reward_fn, reached, wanted))
         failed[at] = ~own_end
         less = (reward[at] - own_reward).to(cost.dtype)
         cost[at] = less.where(

@@ -56,7 +56,6 @@ class _Stored(NamedTuple):
     storage: Storage
     state: tuple[int, int]
     rows: TensorDictBase  # [n], a view
-    before: Tensor  # [n, g], goals achieved before the action
     after: Tensor  # [n, g], those that the action achieved: the candidates
     wanted: Tensor  # [n, g], those that were really wanted; of their type, if goals are drawn from them
     episodes: EpisodeIndex
@@ -254,7 +253,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         if chosen.ahead is not None:
             reward, terminated = chosen.ahead.returns.reward[rows], chosen.ahead.returns.terminated[rows]
         else:
-            achieved = entry_of(data, self._keys.next_achieved)[rows]
+            achieved = self._keys.after(data, self.reward_fn)[rows]
             reward, terminated = ask_reward(self.reward_fn, achieved, chosen.goals)
             failed, cost = failures(data, self._keys, self.reward_fn, self.achieved_reward)
             reward, terminated = reward + cost[rows], terminated | failed[rows]
@@ -334,7 +333,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         end = entry_of(stored.rows, self._keys.done).reshape(-1, 1)[window]
         if len(virtual) > 0:
             wanted = goals.unsqueeze(1).expand(-1, window.shape[1], -1)
-            own_reward, own_end = ask_reward(self.reward_fn, stored.after[window[virtual]], wanted)
+            reached = self._keys.after(stored.rows, self.reward_fn)[window[virtual]]
+            own_reward, own_end = ask_reward(self.reward_fn, reached, wanted)
             failed, cost = failures(stored.rows, self._keys, self.reward_fn, self.achieved_reward)
             own_reward = own_reward + cost[window[virtual]]
             reward[virtual] = stored_as(own_reward, reward[0], self._keys.reward).view_as(own_reward)
@@ -390,7 +390,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             self._look_at_time(episodes.first.diff())
             if "actual" in self.options.sources:
                 wanted = stored_as(self._keys.asked_for(rows), after, self._keys.next_achieved)
-            self._stored = stored = _Stored(storage, state, rows, before, after, wanted, episodes, {})
+            self._stored = stored = _Stored(storage, state, rows, after, wanted, episodes, {})
         return stored
 
     def _draw(
@@ -451,11 +451,12 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _kept(self, stored: _Stored, group: Tensor, goals: Tensor) -> Tensor:
         """The filter: which of the goals [V, c, g] groups [V, L] may take, [V, c] of bool."""
         rule = partial(missed, self.reward_fn, achieved_reward=self.achieved_reward)
-        kept = rule(stored.before[group].unsqueeze(1), goals.unsqueeze(2)).all(-1)
-        if ends_at_goals(self.reward_fn, stored.after):
+        before = self._keys.before(stored.rows, self.reward_fn)
+        kept = rule(before[group].unsqueeze(1), goals.unsqueeze(2)).all(-1)
+        if ends_at_goals(self.reward_fn, self._keys.after(stored.rows, self.reward_fn)):
             return kept
         episodes = stored.episodes
-        start = stored.before[episodes.row(episodes.episode(episodes.place(group[:, -1]))[0])]
+        start = before[episodes.row(episodes.episode(episodes.place(group[:, -1]))[0])]
         return kept | rule(start.unsqueeze(1), goals)
 
     def _draw_by_likelihood(

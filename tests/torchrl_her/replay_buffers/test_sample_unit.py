@@ -41,7 +41,7 @@ from torchrl.envs.transforms import MultiStepTransform
 from torchrl_her import EnvReward, GoalReward, GoalWeights, HERSampleUnit, HERWriter
 from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
 
-from ..her_data import WANTED, make_batch, tag
+from ..her_data import WANTED, costly, make_batch, tag
 
 REWARD = GoalReward(0.5)  # tags differ by at least 1
 
@@ -1045,3 +1045,27 @@ def test_excluding_a_nested_entry_excludes_no_other_one() -> None:
     keys = set(buffer.sample(4).keys(True, True))
     assert ("next", "observation") in keys
     assert not {("agent", "observation"), ("next", "agent", "observation")} & keys
+
+
+@pytest.mark.parametrize("ndim", [1, 2])
+@pytest.mark.parametrize("filtered", [False, True])
+def test_virtual_transitions_are_rewarded_with_their_own_info(ndim: int, filtered: bool) -> None:
+    rule, batch = costly([[3], [3]])
+    options = {"strategy": "final", "k": NEVER_REAL, "achieved_reward": -0.9, "filter_achieved": filtered}
+    buffer = make_buffer(reward=rule, ndim=ndim, **options)
+    buffer.extend(batch.reshape(-1) if ndim == 1 else batch)
+    rows = buffer.sample(200)
+    after = rows["next"]
+    steps = [step % 1000 for step in tags(rows["observation"])]
+    seen = set(zip(steps, tags(after["reward"]), tags(after["terminated"]), strict=True))
+    assert seen == {(0.0, -1.25, False), (1.0, -1.5, False), (2.0, -0.75, True)}
+
+
+def test_returns_over_several_steps_have_the_info_of_each() -> None:
+    rule, batch = costly([[3]])
+    options = {"strategy": "final", "k": NEVER_REAL, "achieved_reward": -0.9, "n_steps": 2, "gamma": 0.5}
+    buffer = make_buffer(reward=rule, **options)
+    buffer.extend(batch.reshape(-1))
+    rows = buffer.sample(100)
+    returns = set(zip(tags(rows["observation"]), tags(rows["next", "reward"]), strict=True))
+    assert returns == {(0.0, -1.25 - 0.5 * 1.5), (1.0, -1.5 - 0.5 * 0.75), (2.0, -0.75)}

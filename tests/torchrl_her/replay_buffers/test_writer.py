@@ -19,7 +19,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyStackStorage, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.sample_units import Sequence
@@ -29,7 +29,7 @@ from torchrl.envs.transforms import MultiStepTransform
 from torchrl_her import EnvReward, GoalReward, GoalWeights, HERSampleUnit, HERWriter
 from torchrl_her.replay_buffers.runs import RunsSampler
 
-from ..her_data import WANTED, make_batch, tag
+from ..her_data import WANTED, costly, make_batch, tag
 
 REWARD = GoalReward(0.5)  # tags differ by at least 1
 
@@ -281,6 +281,65 @@ def test_where_episodes_go_on_at_goals_the_filter_keeps_what_teaches_to_stay(end
         for step in range(4)
     }
     assert goals == {0: {1.0}, 1: {1.0}, 2: {0.0} if ends else {0.0, 1.0}, 3: {0.0} if ends else {0.0, 1.0}}
+
+
+# Rewards that read more than goals
+
+
+@pytest.mark.parametrize("per", ["transition", "episode"])
+def test_virtual_transitions_are_rewarded_with_their_own_info(per: str) -> None:
+    rule, batch = costly([[3, 2]])
+    buffer = make_buffer(reward=rule, strategy="final", k=1, per=per, achieved_reward=-0.9)
+    buffer.extend(batch)
+    real, virtual = split(buffer)
+    assert real["next", "reward"].flatten().tolist() == [-1.25, -1.5, -1.75, -1.25, -1.5]
+    assert virtual["next", "reward"].flatten().tolist() == [-1.25, -1.5, -0.75, -1.25, -0.5]
+    assert virtual["next", "terminated"].flatten().tolist() == [False, False, True, False, True]
+    assert buffer.writer.counts.virtual_positive == 2
+
+
+def test_returns_over_several_steps_have_the_info_of_each() -> None:
+    rule, batch = costly([[3]])
+    buffer = make_buffer(reward=rule, strategy="final", k=1, n_steps=2, gamma=0.5, achieved_reward=-0.9)
+    buffer.extend(batch)
+    reward = split(buffer)[1]["next", "reward"].flatten().tolist()
+    assert reward == [-1.25 - 0.5 * 1.5, -1.5 - 0.5 * 0.75, -0.75]
+
+
+def test_the_filter_reads_the_info_of_the_state_before_the_action() -> None:
+    """A goal counts while the lamp is on: nothing moves, and the lamp goes on in the second step."""
+    batch, near = make_batch([[3]]), GoalReward(0.5)
+    for part in (batch, batch["next"]):
+        part["achieved_goal"].zero_()
+    batch["lamp"] = torch.tensor([[[0.0], [0.0], [1.0]]])
+    batch["next", "lamp"] = torch.tensor([[[0.0], [1.0], [1.0]]])
+
+    def lit(a: Tensor, d: Tensor, info: TensorDictBase) -> Tensor:
+        return torch.where(info["lamp"] > 0, near(a, d)[0], -1.0)
+
+    rule = EnvReward(lit, lambda a, d, info: lit(a, d, info) == 0, info_keys=["lamp"])
+    buffer = make_buffer(reward=rule, strategy="final", k=1, filter_achieved=True)
+    buffer.extend(batch)
+    virtual = split(buffer)[1]
+    assert virtual["lamp"].flatten().tolist() == [0.0, 0.0]  # in the third step the goal is achieved already
+    assert virtual["next", "reward"].flatten().tolist() == [-1.0, 0.0]
+
+
+def test_entries_of_the_root_are_read_where_next_lacks_them() -> None:
+    batch, near = make_batch([[2]]), GoalReward(0.5)
+    batch["action"] = torch.tensor([[[0.5], [0.25]]])
+    rule = EnvReward(lambda a, d, info: near(a, d)[0] - info["action"].abs(), info_keys=["action"])
+    buffer = make_buffer(reward=rule, strategy="final", k=1, achieved_reward=-0.9)
+    buffer.extend(batch)
+    assert split(buffer)[1]["next", "reward"].flatten().tolist() == [-1.5, -0.25]
+
+
+def test_an_entry_that_a_reward_reads_must_be_there() -> None:
+    rule = EnvReward(lambda a, d, info: info["cost"], info_keys=["cost"])
+    with pytest.raises(KeyError, match="the reward function reads the entry 'cost', got"):
+        make_buffer(reward=rule).extend(make_batch([[2]]))
+    with pytest.raises(TypeError, match=r"info_keys must be a list, got 'cost': write \['cost'\]"):
+        EnvReward(lambda a, d, info: info["cost"], info_keys="cost")
 
 
 # Episodes, environments, batches

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_her.goals.rewards import RewardFunction, missed
 from torchrl_her.replay_buffers.copies import Copies
-from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
+from torchrl_her.replay_buffers.keys import TransitionKeys
 
 
 @dataclass
@@ -123,7 +123,7 @@ def virtual_positives(
     """
     positive = useful = virtual.reward >= achieved_reward
     if not filtered:
-        before = entry_of(rows, keys.achieved).index_select(0, virtual.root)
+        before = keys.before(rows, reward_fn)[virtual.root]
         useful = positive & missed(reward_fn, before, virtual.changes[keys.goals[0]], achieved_reward)
     return {"virtual_positive": _set(positive, counts), "useful_virtual_positive": _set(useful, counts)}
 
