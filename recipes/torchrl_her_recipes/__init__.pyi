@@ -7,6 +7,7 @@ from .config.algorithms import ALGORITHMS as ALGORITHMS
 from .config.algorithms import Algorithm as Algorithm
 from .config.algorithms import get_algorithm as get_algorithm
 from .config.algorithms import register_algorithm as register_algorithm
+from .config.imports import allow_imports as allow_imports
 from .config.learners import LEARNERS as LEARNERS
 from .config.learners import LearnerConfig as LearnerConfig
 from .config.learners import LearnerSpec as LearnerSpec

@@ -19,7 +19,6 @@ ROOT = Path(__file__).parents[2]
 _ARGUMENT = re.compile(r"(?<![\w.\[])([a-z_]+(?:\.[a-z_]+)*)=([^\s,;()`:]+)")
 # Arguments of functions, in messages that only those who write Python meet.
 _PYTHON = {
-    "allow_import",
     "at_least",
     "at_most",
     "card",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +13,28 @@ import pytest
 import yaml
 
 from torchrl_her_recipes import (
+    RunFolder,
+    Search,
+    Study,
+    allow_imports,
     build,
     export_policy,
+    load_actor,
     load_policy,
+    load_space,
     load_trained,
     make_recipe,
     play,
+    play_beside,
     resume,
     run,
+    run_study,
+    tune,
 )
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config import imports
-from torchrl_her_recipes.config.imports import check_permitted, permit_everything, permit_task
-from torchrl_her_recipes.runs.trust import is_own, remember
+from torchrl_her_recipes.config.imports import check_permitted, permit_task
+from torchrl_her_recipes.runs.folder import is_own, remember
 
 from .foreign_task import write_module
 from .small import overrides, small
@@ -80,24 +90,33 @@ def test_an_environment_of_one_s_own_end_to_end(
         assert main(command) == 2
         assert refused in capsys.readouterr().err
         assert module not in sys.modules
-    for call in (play, export_policy):
+    recipe = RunFolder("run").recipe()
+    for call in (
+        partial(build, recipe),
+        partial(resume, "run", progress=False),
+        partial(load_actor, "run"),
+        partial(load_policy, "run"),
+        partial(export_policy, "run", "out.pt"),
+        partial(play, "run", "out.gif"),
+        partial(play_beside, ["run", "run"], "out.gif"),
+        partial(run_study, Study(name="theirs", vary={"task": [stranger]}), Path("study"), progress=False),
+        partial(tune, Search(recipe=recipe, space=load_space("ddpg")), "search", trials=1),
+    ):
         with pytest.raises(ValueError, match=refused):
-            call("run", "out.gif")
-    with pytest.raises(ValueError, match=refused):
-        resume("run", progress=False)
+            call()
+        assert module not in sys.modules
     assert main(["play", "run", "--goals", "2", "--allow-import"]) == 0
     said = capsys.readouterr().out
     assert "of 2 goals achieved: run/play.gif" in said
     with pytest.raises(ValueError, match=refused):  # the permission ended with its command
         check_permitted(stranger)
-    policy = export_policy("run", "maze.pt", allow_import=True)
+    with allow_imports():
+        policy = export_policy("run", "maze.pt")
     assert 0.0 <= policy.success < 1.0  # goals that are missed give 0, which is no success
     forget(monkeypatch)
     assert load_policy("maze.pt").in_keys == ["observation", "desired_goal"]
     assert load_trained("maze.pt").task == stranger
     assert imports._permitted == set()
-    assert load_trained("maze.pt", allow_import=True).task == stranger
-    check_permitted(stranger)
 
 
 def test_a_run_that_was_moved_or_changed_is_nobody_s_own(tmp_path: Path) -> None:
@@ -145,7 +164,7 @@ def test_import_on_the_command_line_permits_a_module_and_what_is_in_it(
         with pytest.raises(ValueError, match="would import the module"):
             check_permitted(task)
     check_permitted("gym:gymnasium_robotics:FetchReach-v4")
-    with permit_everything():
+    with allow_imports():
         check_permitted("mined:make")
     permit_task("mined:make")
     check_permitted("mined:make")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import click
 
-from torchrl_her_recipes.config.imports import permit_everything
+from torchrl_her_recipes.config.imports import allow_imports
 
 
 def _permit(context: click.Context, _parameter: click.Parameter, given: bool) -> None:
     if given:
-        context.with_resource(permit_everything())  # until the command ends
+        context.with_resource(allow_imports())  # until the command ends
 
 
 allow_import = click.option(

@@ -11,7 +11,6 @@ from click.shell_completion import CompletionItem
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
 from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, success_line
-from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.study import load_study, study_names
 
 if TYPE_CHECKING:
@@ -59,8 +58,6 @@ def study(
     if gpus_per_job and ray is None:
         raise click.UsageError("--gpus-per-job needs --ray: on one machine, jobs share its GPUs as they are")
     own = load_study(name, seeds=seeds, frames=frames, quick=quick)
-    for _, recipe in own.cells():  # each combination is checked before torch is imported
-        check_permitted(recipe.task.name)
     home = folder or Path("runs") / (own.name + ("_quick" if quick else ""))
     to_do = recipes.plan_study(own, home)
     workers: Any = recipes.make_workers(jobs=jobs, ray=ray, gpus_per_job=gpus_per_job)

@@ -14,7 +14,6 @@ from torchrl_her_recipes.cli.overrides import ARGUMENTS
 from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail
 from torchrl_her_recipes.cli.train_options import complete, folder_option, label, single, with_folder
-from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.config.search import PRUNERS, SAMPLERS, Search
 from torchrl_her_recipes.config.shipped import load_preset
@@ -71,7 +70,6 @@ def tune(
     folder, preset = (given.pop(name, None) for name in ARGUMENTS[::-1])
     base = merge({"num_runs": _SEEDS}, load_preset(preset) if preset else {})
     recipe = make_recipe(base, **given)
-    check_permitted(recipe.task.name)
     space = load_space(space_name) if space_name else space_for(recipe)
     search = Search(recipe=recipe, space=space.without(given), sampler=sampler, pruner=pruner)
     home = Path(folder or f"runs/tune_{label(recipe)}")

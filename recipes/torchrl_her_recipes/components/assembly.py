@@ -30,24 +30,20 @@ from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.components.goal_space import goal_space
 from torchrl_her_recipes.components.streams import Stream
-from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.recipe import Recipe
 
 
-def build(recipe: Recipe, *, allow_import: bool = False) -> Components:
+def build(recipe: Recipe) -> Components:
     """Makes the components that a recipe asks for.
 
     Args:
         recipe: of the run.
-        allow_import: whether a module that the recipe's task names may be imported although only a file, and
             not a call of :func:`make_recipe`, named it.
 
     Raises:
         ValueError: something in the recipe cannot work or does not fit into memory, or it names a module that
             must not be imported.
     """
-    if allow_import:
-        permit_task(recipe.task.name)
     recipe = resolved(recipe)
     processes = recipe.collection.processes > 0  # then those here only tell what the others are like
     task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)

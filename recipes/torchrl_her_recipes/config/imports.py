@@ -3,7 +3,7 @@
 A recipe can name code, as ``task=module:function`` or ``task=gym:module:ID``. Such a module is imported if
 the user named it (in :func:`~torchrl_her_recipes.make_recipe`, on the command line, by ``--import``), but not
 because a file says so: a run's folder, a policy, a preset or a study may come from somebody else. There it
-needs a permission, ``allow_import=True`` or ``--allow-import``.
+needs a permission: ``with allow_imports():``, or ``--allow-import`` on the command line.
 """
 
 from __future__ import annotations
@@ -85,8 +85,13 @@ def permit_task(task: str) -> None:
 
 
 @contextmanager
-def permit_everything() -> Iterator[None]:
-    """Allows all modules to be imported, as long as it lasts."""
+def allow_imports() -> Iterator[None]:
+    """Allows modules that only a file names to be imported, within this block.
+
+    Example:
+        >>> with allow_imports():
+        ...     check_permitted("downloaded:make_env")
+    """
     _everything.append(True)
     try:
         yield
@@ -104,7 +109,7 @@ def check_permitted(task: str) -> None:
         >>> check_permitted("downloaded:make_env")
         Traceback (most recent call last):
         ValueError: task=downloaded:make_env would import the module 'downloaded', which a file names and not
-        you: if you trust it, give --allow-import (in Python allow_import=True)
+        you: if you trust it, give --allow-import (in Python: with allow_imports():)
     """
     module = foreign_module(task)
     parts = module.split(".")
@@ -112,5 +117,5 @@ def check_permitted(task: str) -> None:
     if module and not _everything and not known & (_permitted | set(_imported)):
         raise ValueError(
             f"task={task} would import the module {module!r}, which a file names and not you: "
-            "if you trust it, give --allow-import (in Python allow_import=True)"
+            "if you trust it, give --allow-import (in Python: with allow_imports():)"
         )

@@ -42,7 +42,6 @@ def export_policy(
     best: bool = False,
     format: Format | None = None,
     card: bool = True,
-    allow_import: bool = False,
 ) -> TrainedPolicy:
     """Writes the policy of a finished run as a small file of its own, and a page about it.
 
@@ -59,7 +58,6 @@ def export_policy(
             says. An ONNX file is only left behind if onnxruntime gives the same actions to 1e-5 on states of
             the task.
         card: whether a model card is written beside the file, with the suffix .md.
-        allow_import: whether the module that the run's task may name may be imported.
 
     Returns:
         What was written.
@@ -80,9 +78,9 @@ def export_policy(
         check_free(page)
     kept = KeptPolicy.of(source, best=best)
     if kept is not None:
-        policy, weights = _policy_of_run(kept, run, task, allow_import=allow_import)
+        policy, weights = _policy_of_run(kept, run, task)
     else:
-        policy, weights = _policy_of_file(source, run, task, allow_import=allow_import)
+        policy, weights = _policy_of_file(source, run, task)
     own = policy.card
     if as_onnx:
         write_onnx(policy.actor, own, policy.recipe, out, states=played_states(policy))
@@ -129,17 +127,17 @@ def _format_of(out: Path, format: Format | None) -> Format:
 
 
 def _policy_of_run(
-    kept: KeptPolicy, run: int | None, task: str | None, *, allow_import: bool
+    kept: KeptPolicy, run: int | None, task: str | None
 ) -> tuple[TrainedPolicy, dict[str, Tensor]]:
     """A policy of a run's folder, measured, and its weights."""
     if task is not None:
         permit_task(task)
-    policy, weights = policy_of_run(kept, run, allow_import=allow_import)
+    policy, weights = policy_of_run(kept, run)
     return _for_task(policy, task or policy.task), weights
 
 
 def _policy_of_file(
-    name: str | Path, run: int | None, task: str | None, *, allow_import: bool
+    name: str | Path, run: int | None, task: str | None
 ) -> tuple[TrainedPolicy, dict[str, Tensor]]:
     """An exported policy, and its weights."""
     if not (str(name) in policy_names() or Path(name).is_file()):
@@ -150,7 +148,7 @@ def _policy_of_file(
         raise ValueError(
             f"{name} cannot be exported again: its weights are part of a graph; export the .pt file"
         )
-    policy = load_trained(name, allow_import=allow_import)
+    policy = load_trained(name)
     policy = replace(policy, card=replace(policy.card, versions=present_versions()))
     if task is not None and task != policy.task:
         permit_task(task)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
+import os
 import platform
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,10 +17,9 @@ import yaml
 from filelock import FileLock, Timeout
 
 from torchrl_her.files.writing import part_of, write_text
-from torchrl_her_recipes.config.imports import permit_task
+from torchrl_her_recipes.config.imports import foreign_module, permit_task
 from torchrl_her_recipes.config.plain_files import naming, read_json, read_mapping, read_table
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.runs.trust import is_own, remember
 
 _COUNTED = ("run", "seed", "epoch", "frames")  # columns of the table
 _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict", "gymnasium", "pymunk", "numpy")
@@ -196,3 +197,42 @@ class RunFolder:
             return read_table(self.metrics, counts=_COUNTED)
         except FileNotFoundError:
             return []
+
+
+def remember(config: Path, task: str) -> None:
+    """Notes that this user has trained the run of a ``config.yaml``; only needed if its task names a module.
+
+    Nothing is noted where the user's state directory cannot be written.
+    """
+    if not foreign_module(task):
+        return
+    known = {path: own for path, own in _known().items() if Path(path).is_file()}
+    known[str(config.resolve())] = _digest(config)
+    try:
+        _state_file().parent.mkdir(parents=True, exist_ok=True)
+        write_text(_state_file(), json.dumps(known, indent=1) + "\n")
+    except OSError:
+        pass
+
+
+def is_own(config: Path) -> bool:
+    """Whether this user has trained the run of a ``config.yaml``, at this place and with this content."""
+    return _known().get(str(config.resolve())) == _digest(config)
+
+
+def _state_file() -> Path:
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(home) / "torchrl-her" / "runs.json"
+
+
+def _known() -> dict[str, str]:
+    """Digests by path."""
+    try:
+        found = json.loads(_state_file().read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _digest(config: Path) -> str:
+    return hashlib.sha256(config.read_bytes()).hexdigest()

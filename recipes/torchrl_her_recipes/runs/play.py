@@ -19,9 +19,7 @@ from torchrl_her_recipes.runs.side_by_side import SideBySide
 _HOLD = 25  # times that the last frame is repeated
 
 
-def load_actor(
-    folder: str | Path, *, run: int = 0, best: bool = False, allow_import: bool = False
-) -> TensorDictModuleBase:
+def load_actor(folder: str | Path, *, run: int = 0, best: bool = False) -> TensorDictModuleBase:
     """The greedy policy that a run ended with, or its best one, as the run's own environments take it.
 
     Its continuous actions are from -1 to 1, and in a curriculum it reads the padded inputs of a layer.
@@ -31,7 +29,6 @@ def load_actor(
         folder: of the run, or ``policy.pt`` or ``best.pt`` in it.
         run: which one, if there are several side by side.
         best: whether to take the policy of the evaluation with the best median success.
-        allow_import: whether the module that the run's task may name may be imported.
 
     Raises:
         ValueError: this is no folder of a run, there is no such run, its policy is damaged, it has no best
@@ -42,7 +39,7 @@ def load_actor(
     if kept is None:
         home = RunFolder(folder)
         kept = KeptPolicy(home, home.policy)  # whose recipe says what is missing
-    return actor_of(kept, run, allow_import)
+    return actor_of(kept, run)
 
 
 def play(
@@ -54,7 +51,6 @@ def play(
     goals: int = 6,
     seed: int = 0,
     size: int = 240,
-    allow_import: bool = False,
 ) -> int:
     """Writes a video of a policy, for several goals side by side.
 
@@ -68,7 +64,6 @@ def play(
         goals: how many.
         seed: of the goals and starts.
         size: pixels of one environment.
-        allow_import: whether the module that the task may name may be imported.
 
     Returns:
         How many of the goals were achieved.
@@ -78,9 +73,7 @@ def play(
             nothing of it can be drawn, or its task names a module that must not be imported.
         OSError: the run has not saved a policy yet.
     """
-    with shown(
-        [source], goals=goals, seed=seed, size=size, run=run, best=best, allow_import=allow_import
-    ) as episodes:
+    with shown([source], goals=goals, seed=seed, size=size, run=run, best=best) as episodes:
         write_video(_film(episodes, seed), out, fps=FPS)
         return episodes.achieved[0]
 
@@ -94,7 +87,6 @@ def play_beside(
     goals: int = 6,
     seed: int = 0,
     size: int = 240,
-    allow_import: bool = False,
 ) -> list[int]:
     """Writes a video of several policies beside each other, each with the same starts and goals.
 
@@ -106,7 +98,6 @@ def play_beside(
         goals: how many.
         seed: of the goals and starts.
         size: pixels of one environment.
-        allow_import: whether the modules that the tasks may name may be imported.
 
     Returns:
         How many of the goals each of them achieved.
@@ -122,7 +113,6 @@ def play_beside(
         size=size,
         run=run,
         best=best,
-        allow_import=allow_import,
         named=True,
     ) as episodes:
         write_video(_film(episodes, seed), out, fps=FPS)
@@ -138,7 +128,6 @@ def shown(
     size: int,
     run: int,
     best: bool,
-    allow_import: bool,
     named: bool = False,
 ) -> Iterator[SideBySide]:
     """Policies that are to be seen beside each other; their environments are closed in the end.
@@ -152,7 +141,6 @@ def shown(
         size: pixels of one environment.
         run: which one of the first folder, if there are several side by side in it.
         best: whether to take the best policy of the first folder.
-        allow_import: whether the modules that the tasks may name may be imported.
         named: whether names and successes stand below the pictures.
 
     Raises:
@@ -163,9 +151,7 @@ def shown(
         players: list[Player] = []
         for source in sources:
             own = (0, False) if players else (run, best)
-            player = find_player(
-                source, goals=goals, seed=seed, run=own[0], best=own[1], allow_import=allow_import
-            )
+            player = find_player(source, goals=goals, seed=seed, run=own[0], best=own[1])
             opened.callback(player.close)
             players.append(player)
         check_comparable(players)

@@ -18,7 +18,6 @@ from torchrl_her_recipes.components.agents import make_player
 from torchrl_her_recipes.components.curricula import make_curriculum, make_played_env
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.groups import TaskConfig
-from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.shipped import policy_names
 from torchrl_her_recipes.runs.kept import KeptPolicy
 from torchrl_her_recipes.runs.policies import load_trained
@@ -65,7 +64,6 @@ def find_player(
     seed: int,
     run: int = 0,
     best: bool = False,
-    allow_import: bool = False,
 ) -> Player:
     """A policy, and environments that give pictures if they can.
 
@@ -78,7 +76,6 @@ def find_player(
         seed: of their starts and goals.
         run: which one, if there are several side by side in the folder.
         best: whether to take the best policy of the folder.
-        allow_import: whether the module that the task may name may be imported.
 
     Raises:
         ValueError: there is neither such a run nor such a policy, ``best`` without the folder of a run, or
@@ -87,7 +84,7 @@ def find_player(
     """
     kept = KeptPolicy.of(source, best=best)
     if kept is None and (str(source) in policy_names() or Path(source).is_file()):
-        trained = load_trained(source, allow_import=allow_import)
+        trained = load_trained(source)
         recipe = trained.recipe.replace(task=trained.task)
         env = make_task_envs(recipe, goals, [seed], pictures=True, scaled=False)
         trained.card.check_plays(env, trained.task)
@@ -98,12 +95,12 @@ def find_player(
             f"{source} is neither the folder of a run, nor the file of an exported policy, nor one of the "
             f"trained policies: {known}"
         )
-    recipe, actor = kept.home.recipe(), actor_of(kept, run, allow_import)
+    recipe, actor = kept.home.recipe(), actor_of(kept, run)
     env = make_played_env(recipe, goals, [seed], pictures=True)
     return Player(source=str(source), task=recipe.task, env=env, actor=actor)
 
 
-def actor_of(kept: KeptPolicy, run: int, allow_import: bool) -> TensorDictModuleBase:
+def actor_of(kept: KeptPolicy, run: int) -> TensorDictModuleBase:
     """The greedy policy of one of the runs in a folder.
 
     Raises:
@@ -115,8 +112,6 @@ def actor_of(kept: KeptPolicy, run: int, allow_import: bool) -> TensorDictModule
     if not 0 <= run < recipe.run.num_runs:
         runs = recipe.run.num_runs
         raise ValueError(f"there is no run {run} in {kept.home.path}; it has runs 0 to {runs - 1}")
-    if allow_import:
-        permit_task(recipe.task.name)
     env = make_played_env(recipe, 1, [0])
     actor = make_player(recipe.replace(num_runs=1), env, curriculum=make_curriculum(recipe, env))
     actor.load_state_dict(take_run(kept.load()["actor"], run, recipe.run.num_runs))

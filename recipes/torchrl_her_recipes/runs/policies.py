@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_her.trainers.checkpoint import load_checkpoint
-from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import reason
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.shipped import TRAINED, policy_names
@@ -55,7 +54,7 @@ class TrainedPolicy:
         return self.card.frames
 
 
-def load_trained(name: str | Path, *, allow_import: bool = False) -> TrainedPolicy:
+def load_trained(name: str | Path) -> TrainedPolicy:
     """A policy that comes with the package, or one that was exported, with what made it.
 
     Nothing is imported here, and nothing of the file is executed. A policy's task may name a module, however,
@@ -63,7 +62,6 @@ def load_trained(name: str | Path, *, allow_import: bool = False) -> TrainedPoli
 
     Args:
         name: of a task, or the path of a .pt or .onnx file.
-        allow_import: whether the module that the task may name may be imported, from now on.
 
     Raises:
         ValueError: there is no such policy, or the file is damaged or holds something else.
@@ -75,8 +73,6 @@ def load_trained(name: str | Path, *, allow_import: bool = False) -> TrainedPoli
         policy = TrainedPolicy(file.card, _named(path, OnnxPolicy, file), file.recipe)
     else:
         policy = _named(path, _policy_of, _read(path))
-    if allow_import:
-        permit_task(policy.task)
     return policy
 
 
@@ -98,9 +94,7 @@ def read_card(name: str | Path) -> PolicyCard:
     return read_onnx(path).card if path.suffix == SUFFIX else _named(path, _card_of, _read(path))
 
 
-def load_policy(
-    name: str | Path, *, run: int | None = None, best: bool = False, allow_import: bool = False
-) -> TensorDictModuleBase:
+def load_policy(name: str | Path, *, run: int | None = None, best: bool = False) -> TensorDictModuleBase:
     """The greedy policy of a task, trained: reads ``observation`` and ``desired_goal``, writes ``action``.
 
     Nothing is imported for a file, whatever module its task names: it is weights alone. For a run,
@@ -115,7 +109,6 @@ def load_policy(
         run: which one, of several side by side in a folder; the median of them if None.
         best: whether to take the best policy of the folder: that of the evaluation with the best median
             success.
-        allow_import: whether the module that the task of a run may name may be imported.
 
     Raises:
         ValueError: there is no such policy, the file is damaged, ``best`` without the folder of a run, or the
@@ -125,25 +118,22 @@ def load_policy(
     """
     kept = KeptPolicy.of(name, best=best)
     if kept is not None:
-        return policy_of_run(kept, run, allow_import=allow_import)[0].actor
+        return policy_of_run(kept, run)[0].actor
     return load_trained(name).actor
 
 
-def policy_of_run(
-    kept: KeptPolicy, run: int | None, *, allow_import: bool
-) -> tuple[TrainedPolicy, dict[str, Tensor]]:
+def policy_of_run(kept: KeptPolicy, run: int | None) -> tuple[TrainedPolicy, dict[str, Tensor]]:
     """A policy that a run kept, and its weights; its success is not measured.
 
     Args:
         kept: the file in the folder of the run.
         run: which one, of several side by side; the median of them if None.
-        allow_import: whether the module that the run's task may name may be imported.
 
     Raises:
         ValueError: as for :func:`load_policy`.
         OSError: the run has not saved a policy yet.
     """
-    found = read_run(kept, run, allow_import=allow_import)
+    found = read_run(kept, run)
     try:
         network = load_network(found.card, found.recipe, found.weights)
     except ValueError as error:

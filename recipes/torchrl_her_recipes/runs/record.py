@@ -52,7 +52,6 @@ def record_demonstrations(
     seed: int = 0,
     keep_all: bool = False,
     force: bool = False,
-    allow_import: bool = False,
 ) -> Recorded:
     """Plays episodes of a task and writes those that achieve their goal into a file.
 
@@ -70,7 +69,6 @@ def record_demonstrations(
         seed: of starts and goals.
         keep_all: whether episodes that fail are written, too; then no more than ``episodes`` are played.
         force: whether a file that is there is replaced.
-        allow_import: whether the module that the task of the policy's file may name may be imported.
 
     Raises:
         ValueError: there is no such task or policy, the policy is for another kind of task, the file exists,
@@ -83,16 +81,14 @@ def record_demonstrations(
     recipe = make_recipe(task=task, seed=seed)
     most = _OF_GYM_AT_ONCE if task.startswith(GYM) else _AT_ONCE
     with closing(make_task_envs(recipe, min(episodes, most), [seed], scaled=False)) as env:
-        player, who = _find_policy(recipe, env, policy, allow_import=allow_import)
+        player, who = _find_policy(recipe, env, policy)
         facts = {"policy": who, "seed": seed, "torchrl_her": __version__}
         recorded = _play(env, player, task, episodes, keep_all=keep_all, facts=facts)
     recorded.demonstrations.save(out, force=force)
     return recorded
 
 
-def _find_policy(
-    recipe: Recipe, env: EnvBase, policy: str | Path | None, *, allow_import: bool
-) -> tuple[Policy, str]:
+def _find_policy(recipe: Recipe, env: EnvBase, policy: str | Path | None) -> tuple[Policy, str]:
     """A policy that plays in some environments, and its name."""
     task = recipe.task.name
     if policy is None or str(policy) == EXPERT:
@@ -103,7 +99,7 @@ def _find_policy(
                 f"{task} has no scripted controller: give --policy (policy=...), a file that `torchrl-her "
                 "export` wrote or the name of a trained policy"
             ) from None
-    trained = load_trained(policy, allow_import=allow_import)
+    trained = load_trained(policy)
     trained.card.check_plays(env, task)
     return trained.actor, f"{policy}, a policy of {trained.task}"
 

@@ -18,7 +18,6 @@ from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import build
 from torchrl_her_recipes.components.components import Components
-from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.loggers import check_installed
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe
@@ -124,7 +123,6 @@ def resume(
     options: Mapping[str, Any] | None = None,
     callbacks: Sequence[Callback] = (),
     progress: bool = True,
-    allow_import: bool = False,
 ) -> RunResult:
     """Continues a run from its newest complete checkpoint, or extends one that has ended.
 
@@ -142,7 +140,6 @@ def resume(
             ``pictures`` or ``log``, which are written into the folder's configuration.
         callbacks: called on the way; they may stop the run. Those of its beginning are not remembered.
         progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
-        allow_import: whether the module that the run's task may name may be imported.
 
     Raises:
         ValueError: there is no run in the folder, no checkpoint is complete, there is no replay buffer to go
@@ -154,9 +151,7 @@ def resume(
     if options and components is not None:
         raise ValueError("give resume() options, or components that were made with them, not both")
     with home.at_work():
-        return _resume(
-            home, components, options or {}, callbacks, progress=progress, allow_import=allow_import
-        )
+        return _resume(home, components, options or {}, callbacks, progress=progress)
 
 
 def _resume(
@@ -166,12 +161,9 @@ def _resume(
     callbacks: Sequence[Callback],
     *,
     progress: bool,
-    allow_import: bool,
 ) -> RunResult:
     recipe = home.recipe()
     state = _newest_state(home, keep=recipe.run.keep_checkpoints)
-    if allow_import:
-        permit_task(recipe.task.name)
     wanted = recipe.extended(**options) if options else recipe
     check_installed(wanted.run.log)
     has_buffer = bool(state["buffer"])

@@ -45,7 +45,6 @@ def watch(
     goals: int = 1,
     seed: int = 0,
     size: int = 480,
-    allow_import: bool = False,
 ) -> list[Seen]:
     """Shows policies in a window, with the same starts and goals, until somebody closes it.
 
@@ -59,7 +58,6 @@ def watch(
         goals: how many at a time.
         seed: of the first goals and starts; the next ones have the next seed.
         size: pixels of one environment.
-        allow_import: whether the modules that the tasks may name may be imported.
 
     Returns:
         What was seen of each policy.
@@ -79,7 +77,6 @@ def watch(
             size=size,
             run=run,
             best=best,
-            allow_import=allow_import,
             named=True,
         ) as episodes:
             show(Viewing(episodes, seed=seed), window)

@@ -6,18 +6,16 @@ from pathlib import Path
 
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.envs import make_task_envs
-from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.runs.plots import plot_goals
 from torchrl_her_recipes.studies.seed_batches import Batches
 
 
-def plot_virtual_goals(folder: Path, out: Path, *, allow_import: bool = False) -> None:
+def plot_virtual_goals(folder: Path, out: Path) -> None:
     """Draws a heat map of virtual goals beside the target q*.
 
     Args:
         folder: of a run, or of the batches of a study's combination.
         out: path of the figure.
-        allow_import: whether the module that the run's task may name may be imported.
 
     Raises:
         ValueError: a folder without a run, a run without a map of goals, or a task that names a module that
@@ -27,8 +25,6 @@ def plot_virtual_goals(folder: Path, out: Path, *, allow_import: bool = False) -
     if not runs.homes:
         raise ValueError(f"{folder} is no folder of a run")
     recipe = runs.homes[0].recipe()
-    if allow_import:
-        permit_task(recipe.task.name)
     goals = runs.goal_map()
     if goals is None:
         raise ValueError(f"{folder} has no map of goals: its runs have written no virtual goals")

@@ -8,7 +8,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from torchrl_her_recipes.components.first_look import resolved
-from torchrl_her_recipes.config.imports import check_permitted, permit_task
+from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.study import Study, curve_label
 from torchrl_her_recipes.runs.plots import plot_comparison
 from torchrl_her_recipes.runs.run import last_success
@@ -56,7 +56,6 @@ def run_study(
     *,
     workers: Workers | None = None,
     progress: bool = True,
-    allow_import: bool = False,
 ) -> StudyResult:
     """Runs what is not done yet, several at once, and draws the figure.
 
@@ -67,7 +66,6 @@ def run_study(
         folder: a folder of each combination goes into it.
         workers: who does it; by default a process for each core. They are closed in the end.
         progress: whether to show a progress bar over all of it.
-        allow_import: whether modules that the study's tasks may name may be imported.
 
     Raises:
         ValueError: the folder has a run of other options under the same name, somebody is at work in it, or
@@ -75,8 +73,6 @@ def run_study(
         KeyboardInterrupt: by a second Ctrl-C.
     """
     for _, recipe in study.cells():
-        if allow_import:
-            permit_task(recipe.task.name)
         check_permitted(recipe.task.name)
     workers = workers or LocalWorkers()
     folder.mkdir(parents=True, exist_ok=True)

@@ -17,6 +17,7 @@ from torchrl_her_envs.common import goal_rules
 from torchrl_her_recipes import RunFolder, build, look_at, make_recipe, run
 from torchrl_her_recipes.components import first_look
 from torchrl_her_recipes.components.first_look import resolved
+from torchrl_her_recipes.config.imports import allow_imports
 
 TASK = "gym:tests/Seldom-v0"
 SIZES = {"hidden": 8, "num_envs": 2, "epoch_frames": 40, "epochs": 1, "episodes": 2, "pictures": False}
@@ -129,7 +130,8 @@ def test_a_run_keeps_what_was_found_and_nobody_looks_again(
     options = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["task"]["options"]
     assert options == {"termination": "reward"}
     never_looks(monkeypatch)
-    build(RunFolder(tmp_path / "run").recipe(), allow_import=True).close()
+    with allow_imports():
+        build(RunFolder(tmp_path / "run").recipe()).close()
     assert len(said.records) == 1
 
 

@@ -14,7 +14,6 @@ from torchrl_her.modules.networks import take_run
 from torchrl_her_recipes.components.agents import find_learner
 from torchrl_her_recipes.components.curricula import make_curriculum
 from torchrl_her_recipes.components.envs import make_task_envs
-from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.exported.card import PolicyCard, describe_env, present_versions
 from torchrl_her_recipes.runs.kept import KeptPolicy
@@ -36,13 +35,12 @@ class PolicyOfRun:
     weights: dict[str, Tensor]
 
 
-def read_run(kept: KeptPolicy, run: int | None, *, allow_import: bool = False) -> PolicyOfRun:
+def read_run(kept: KeptPolicy, run: int | None) -> PolicyOfRun:
     """One of the policies that runs side by side have kept.
 
     Args:
         kept: the file in their folder.
         run: which one; the median of them if None.
-        allow_import: whether the module that their task may name may be imported.
 
     Raises:
         ValueError: there is no such run, the file is damaged, or the task names a module that must not be
@@ -58,8 +56,6 @@ def read_run(kept: KeptPolicy, run: int | None, *, allow_import: bool = False) -
     runs = recipe.run.num_runs
     if chosen not in range(runs):
         raise ValueError(f"there is no run {chosen} in {kept.home.path}; it has runs 0 to {runs - 1}")
-    if allow_import:
-        permit_task(recipe.task.name)
     env = make_task_envs(recipe, 1, [0], scaled=False)
     shown: dict[str, Any] = describe_env(env)
     card = PolicyCard(
