@@ -194,7 +194,13 @@ def _gym_spec(id: str) -> TaskSpec:
         family="gym",
         make="torchrl_her_envs.gym.from_gym:make_gym_env",
         arguments={"id": id},
-        options={"max_steps": None, "parallel": False, "termination": "auto", "achieved_reward": None},
+        options={
+            "max_steps": None,
+            "parallel": False,
+            "termination": "auto",
+            "achieved_reward": None,
+            "info_keys": (),
+        },
         takes_others=True,
         for_pictures={"pictures": True},
     )
@@ -207,7 +213,7 @@ def _own_spec(path: str) -> TaskSpec:
         family="own",
         make="torchrl_her_envs.common.own_env:make_own_env",
         arguments={"path": path},
-        options={"max_steps": None, "termination": "auto", "achieved_reward": None},
+        options={"max_steps": None, "termination": "auto", "achieved_reward": None, "info_keys": ()},
         takes_others=True,
     )
 

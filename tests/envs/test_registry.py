@@ -125,7 +125,7 @@ def test_options_reach_the_environment() -> None:
         (
             f"gym:{WALK}",
             "speed",
-            "max_steps, parallel, termination, achieved_reward, pictures, "
+            "max_steps, parallel, termination, achieved_reward, info_keys, pictures, "
             "ends, form, without, actions, shown, render_mode",
         ),
     ],

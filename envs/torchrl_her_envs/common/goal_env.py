@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, cast
 
 import torch
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase
 
 Box = tuple[list[float], list[float]]  # the least and the greatest coordinates
+INFO = "info"  # the entry of transitions that holds what rewards read besides goals
 _HAIR = 1e-6  # width of the bounds of a fixed action, relative to its value
 
 
@@ -38,6 +40,9 @@ class GoalEnv(Protocol):
 
     @property
     def task_name(self) -> str: ...
+
+    @property
+    def info_keys(self) -> Sequence[NestedKey]: ...
 
     @property
     def goal_sigma(self) -> float: ...
@@ -83,6 +88,14 @@ class TaskTraits:
     def task_name(self) -> str:
         """The name of the task, for messages."""
         return type(self).__name__
+
+    @property
+    def info_keys(self) -> Sequence[NestedKey]:
+        """Entries of a step that rewards depend on besides the goals.
+
+        ``compute_reward`` and ``compute_terminated`` get them as a third argument, a tensordict.
+        """
+        return ()
 
     @property
     def goal_sigma(self) -> float:
@@ -283,6 +296,27 @@ def bounded_actions(low: Tensor, high: Tensor, count: int) -> Bounded:
     low, high = (side.float().reshape(1, -1).expand(count, -1) for side in (low, high))
     high = torch.where(high > low, high, low + _HAIR * low.abs().clamp(min=1))
     return Bounded(low=low, high=high, shape=low.shape, dtype=torch.float32)
+
+
+def info_rows(transitions: TensorDictBase, names: Iterable[str], shape: torch.Size) -> dict[str, Tensor]:
+    """Entries of transitions that rewards read, [..., w] each, broadcast to a shape [...] of pairs of goals.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> steps = TensorDict({"info": {"cost": torch.ones(2, 1, 3)}}, [2, 1])
+        >>> info_rows(steps, ["cost"], torch.Size([2, 5]))["cost"].shape
+        torch.Size([2, 5, 3])
+    """
+    entries = {name: transitions.get((INFO, name)) for name in names}
+    return {name: own.expand(*shape, *own.shape[transitions.ndim :]) for name, own in entries.items()}
+
+
+def needs_info(env: TaskTraits) -> str:
+    """The message about an environment whose rewards read more than the goals, where only goals are given."""
+    return (
+        f"compute_reward of {env.task_name} reads {env.info_keys} of transitions: pass them, as in "
+        "EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)"
+    )
 
 
 def reward_range(env: GoalEnv) -> tuple[float, float]:

@@ -251,6 +251,35 @@ def check_rewards(
     return float(missed[0]), float(given), dense
 
 
+def equal_with_info(name: str, equal: np.ndarray, others: np.ndarray, given: float | None) -> float:
+    """The reward of equal goals for :func:`check_rewards`, where rewards depend on infos as well.
+
+    Equal goals are achieved with some infos at least, which random steps may not have met.
+
+    Args:
+        name: of the environment, for the message.
+        equal: rewards [n] of equal goals, with different infos.
+        others: rewards of other pairs.
+        given: the reward from which on a goal counts as achieved, if the user said so.
+
+    Raises:
+        ValueError: equal goals give no more than others, and ``given`` is None.
+
+    Example:
+        >>> equal_with_info("walk", np.array([-1.0, 0.0]), np.array([-1.0]), None)
+        0.0
+        >>> equal_with_info("walk", np.array([-1.0, -1.0]), np.array([-1.0]), 0.0)
+        0.0
+    """
+    most = float(equal.max())
+    if given is None and most <= others.min():
+        raise ValueError(
+            f"{name}: equal goals give {most:g} with the infos of {len(equal)} random steps, as others do; "
+            "say from which reward on a goal counts as achieved, as in task.options.achieved_reward=0"
+        )
+    return most if given is None else max(most, given)
+
+
 def is_dense(equal: float, others: Sequence[float] | np.ndarray) -> bool:
     """Whether goals that are not achieved have different rewards; arguments as for :func:`check_rewards`.
 
@@ -282,5 +311,6 @@ def check_same_rewards(name: str, stepped: np.ndarray, computed: np.ndarray) -> 
     at = int(differ.argmax())
     return (
         f"{name}: a step gave the reward {stepped[at]:g}, and compute_reward {computed[at] + 0.0:g} for the "
-        "same goals, so virtual transitions have other rewards than real ones"
+        "same goals, so virtual transitions have other rewards than real ones; if compute_reward reads "
+        "info, name its keys: task.options.info_keys=[KEY]"
     )

@@ -15,7 +15,15 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_her_envs.common.goal_env import TaskTraits, bounded_actions, choose_indices, is_goal_env
+from torchrl_her_envs.common.goal_env import (
+    INFO,
+    TaskTraits,
+    bounded_actions,
+    choose_indices,
+    info_rows,
+    is_goal_env,
+    needs_info,
+)
 from torchrl_her_envs.common.goal_rules import (
     Ends,
     GoalEnds,
@@ -24,6 +32,7 @@ from torchrl_her_envs.common.goal_rules import (
     check_same_rewards,
     check_stateless,
     check_termination,
+    equal_with_info,
     warn_once,
 )
 from torchrl_her_envs.common.rendering.pictures import as_picture, captioned, resized
@@ -32,7 +41,12 @@ from torchrl_her_envs.common.seeding import as_seeds, block_keys
 KEYS = ("observation", "achieved_goal", "desired_goal")
 _GOALS = KEYS[1:]
 _SUCCESS = "is_success"
-_OURS = ("max_steps", "termination", "achieved_reward")  # options that every such environment takes
+_OURS = (
+    "max_steps",
+    "termination",
+    "achieved_reward",
+    "info_keys",
+)  # options that every such environment takes
 _TRIED_STEPS = 100
 _PAIRED = 8  # goals of each kind whose pairs are tried
 
@@ -45,6 +59,7 @@ def make_own_env(
     max_steps: int | None = None,
     termination: str = "auto",
     achieved_reward: float | None = None,
+    info_keys: Sequence[str] = (),
     **options: Any,
 ) -> EnvBase:
     """Makes a batch of an environment of the user's own.
@@ -60,6 +75,7 @@ def make_own_env(
         max_steps: length of an episode; the environment's attribute ``max_steps`` if None.
         termination: what ends an episode at its goal, see :class:`OwnGoalEnv`.
         achieved_reward: the reward from which on a goal counts as achieved, for dense rewards.
+        info_keys: entries of a step that rewards read besides goals, see :class:`OwnGoalEnv`.
         options: for the function.
 
     Returns:
@@ -108,7 +124,7 @@ def make_own_env(
 
     envs = make_many(num_envs, seed)
     if isinstance(envs[0], TaskTraits) and is_goal_env(envs[0]):
-        if termination not in ("auto", "watch") or achieved_reward is not None:
+        if termination not in ("auto", "watch") or achieved_reward is not None or len(info_keys) > 0:
             raise ValueError(f"{path} says itself how it ends and rewards: leave out {', '.join(_OURS[1:])}")
         return envs[0]
     # A single one is tried, so that what is found out does not depend on how many are asked for.
@@ -118,9 +134,10 @@ def make_own_env(
         max_steps=max_steps,
         termination=termination,
         achieved_reward=achieved_reward,
+        info_keys=info_keys,
     )
     tried.close()
-    return OwnGoalEnv(envs, name=path, seed=seed, max_steps=max_steps, rules=tried.rules)
+    return OwnGoalEnv(envs, name=path, seed=seed, max_steps=max_steps, rules=tried.rules, info_keys=info_keys)
 
 
 def _check_made(path: str, env: object, batch_size: list[int]) -> None:
@@ -191,6 +208,9 @@ class OwnGoalEnv(TaskTraits, EnvBase):
     - ``compute_terminated(achieved_goal, desired_goal)``, which maps goals [..., g] to bool [..., 1]. If it
       is missing, ``termination`` says what ends an episode at its goal, as for
       :class:`~torchrl_her_envs.GymGoalEnv`; an entry ``is_success`` of a step takes the place of its info.
+    - Further entries that rewards depend on, if ``info_keys`` names them. Both functions then get a third
+      argument, a dictionary of these entries [..., w] of the same step; for a virtual goal, too. Transitions
+      have them as ``("info", KEY)``.
     - ``max_steps``, the length of an episode; the option of that name is needed if it is missing.
     - ``layers()``, see :class:`~torchrl_her_envs.TaskTraits`.
     - ``render()``, a picture [height, width, 3] of uint8, or [N, height, width, 3] of a batch.
@@ -204,6 +224,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         termination: what ends an episode at its goal.
         achieved_reward: the reward from which on a goal counts as achieved; that of equal goals if None.
         rules: what another such environment was found to do; some steps are tried if None.
+        info_keys: entries of a step that rewards read besides goals.
 
     Attributes:
         rules: how it rewards and ends.
@@ -222,6 +243,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         termination: str = "auto",
         achieved_reward: float | None = None,
         rules: GoalRules | None = None,
+        info_keys: Sequence[str] = (),
     ) -> None:
         first = envs[0]
         self._whole = len(first.batch_size) == 1  # each environment is a batch
@@ -234,7 +256,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
                 f"{name} needs a time limit, a whole number of steps, as in task.options.max_steps=100, "
                 f"got {limit!r}"
             )
-        self.max_steps = limit
+        self.max_steps, self._info = limit, list(info_keys)
         self._check(first)
         self._make_specs(first)
         self._latest: list[TensorDictBase] = []
@@ -250,6 +272,11 @@ class OwnGoalEnv(TaskTraits, EnvBase):
     @property
     def task_name(self) -> str:
         return self._name
+
+    @property
+    def info_keys(self) -> list[tuple[str, str]]:
+        """Entries of transitions that ``compute_reward`` reads besides goals."""
+        return [(INFO, name) for name in self._info]
 
     @property
     def can_render(self) -> bool:
@@ -285,15 +312,19 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         own = getattr(self._envs[0], "layers", None)
         return own() if callable(own) else super().layers()
 
-    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    def compute_reward(
+        self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
+    ) -> Tensor:
         """The reward of having achieved one goal when another was desired: [..., 1] of float32."""
-        return self._ask("compute_reward", achieved_goal, desired_goal).float()
+        return self._ask("compute_reward", achieved_goal, desired_goal, info).float()
 
-    def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    def compute_terminated(
+        self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
+    ) -> Tensor:
         """Whether an episode ends there: [..., 1] of bool."""
         if self.ends == "own":
-            return self._ask("compute_terminated", achieved_goal, desired_goal).bool()
-        return self._meets(achieved_goal, desired_goal) & (self.ends in ("success", "reward"))
+            return self._ask("compute_terminated", achieved_goal, desired_goal, info).bool()
+        return self._meets(achieved_goal, desired_goal, info) & (self.ends in ("success", "reward"))
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
         """Seeds R equal blocks of environments.
@@ -382,8 +413,11 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         truncated = self._flag(after, "truncated") | (self._steps >= self.max_steps)
         shown = self._shown(after)
         if self.ends != "own":
-            asks = self.goal_ends.asks_success
-            met = self._flag(after, _SUCCESS) if asks else self._meets(*(shown[key] for key in _GOALS))
+            if self.goal_ends.asks_success:
+                met = self._flag(after, _SUCCESS)
+            else:
+                achieved, desired = (shown[key] for key in _GOALS)
+                met = self._meets(achieved, desired, TensorDict(shown, self.batch_size))
             terminated, truncated = self.goal_ends.apply(met, terminated, truncated)
         ends = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
         return TensorDict({**shown, "reward": reward, **ends}, self.batch_size, device=self.device)
@@ -400,22 +434,34 @@ class OwnGoalEnv(TaskTraits, EnvBase):
             return torch.zeros(*self.batch_size, 1, dtype=torch.bool)
         return self._stack(each, key).bool().view(-1, 1)
 
-    def _shown(self, each: list[TensorDictBase]) -> dict[str, Tensor]:
-        shown = {key: self._stack(each, key).float() for key in KEYS}
+    def _shown(self, each: list[TensorDictBase]) -> dict[str, Any]:
+        shown: dict[str, Any] = {key: self._stack(each, key).float() for key in KEYS}
         for key, rows in shown.items():
             if not bool((finite := rows.isfinite()).all()):
                 row, at = (~finite).nonzero()[0].tolist()
                 raise ValueError(
                     f"{self._name}: {key} {at} must be a finite number, got {rows[row, at].item()}"
                 )
-        return shown | ({_SUCCESS: self._flag(each, _SUCCESS)} if _SUCCESS in self.observation_spec else {})
+        if _SUCCESS in self.observation_spec:
+            shown[_SUCCESS] = self._flag(each, _SUCCESS)
+        if self._info:
+            info = {name: self._stack(each, name) for name in self._info}
+            shown[INFO] = TensorDict(info, self.batch_size)
+        return shown
 
-    def _meets(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        return self.compute_reward(achieved_goal, desired_goal) >= self.achieved_reward
+    def _meets(self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None) -> Tensor:
+        return self.compute_reward(achieved_goal, desired_goal, info) >= self.achieved_reward
 
-    def _ask(self, method: str, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    def _ask(
+        self, method: str, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None
+    ) -> Tensor:
         achieved, desired = torch.broadcast_tensors(achieved_goal, desired_goal)
-        answer = getattr(self._envs[0], method)(achieved, desired)
+        given: list[dict[str, Tensor]] = []
+        if self._info:
+            if info is None:
+                raise ValueError(needs_info(self))
+            given.append(info_rows(info, self._info, achieved.shape[:-1]))
+        answer = getattr(self._envs[0], method)(achieved, desired, *given)
         shape = (*achieved.shape[:-1], 1)
         if not isinstance(answer, Tensor) or answer.shape != shape:
             got = list(answer.shape) if isinstance(answer, Tensor) else type(answer).__name__
@@ -439,6 +485,10 @@ class OwnGoalEnv(TaskTraits, EnvBase):
                 f"{self._name}'s achieved and desired goals must have one shape, got {list(achieved)} and "
                 f"{list(desired)}"
             )
+        for name in self._info:
+            if name not in shown:
+                known = ", ".join(map(str, shown))
+                raise ValueError(f"{self._name}: info_keys names {name!r}, which is not shown: {known}")
         if not callable(getattr(env, "compute_reward", None)):
             raise ValueError(
                 f"{self._name} lacks the method 'compute_reward', which tells what other goals would have "
@@ -461,6 +511,12 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         self.observation_spec = Composite(seen, shape=(n,))
         if _SUCCESS in shown:
             self.observation_spec[_SUCCESS] = flag()
+        if self._info:
+            own = {
+                name: Unbounded((n, *shown[name].shape[self._whole :]), dtype=shown[name].dtype)
+                for name in self._info
+            }
+            self.observation_spec[INFO] = Composite(own, shape=(n,))
         self.action_spec = self._action_spec(action)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
@@ -491,23 +547,26 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         after = steps["next"].reshape(-1)
         achieved, desired = (after[key] for key in _GOALS)
         chosen = torch.linspace(0, len(achieved) - 1, min(_PAIRED, len(achieved))).long()
-        one, other = achieved[chosen], desired[chosen]
-        rewards = [self.compute_reward(one.unsqueeze(1), other).flatten().numpy()]
+        one, other, info = achieved[chosen], desired[chosen], after[chosen].unsqueeze(1)
+        rewards = [self.compute_reward(one.unsqueeze(1), other, info).flatten().numpy()]
         with torch.random.fork_rng(devices=[]):
             self.rollout(_PAIRED, break_when_any_done=False)
-        rewards.append(self.compute_reward(one.unsqueeze(1), other).flatten().numpy())
+        rewards.append(self.compute_reward(one.unsqueeze(1), other, info).flatten().numpy())
         check_stateless(self._name, *rewards)
-        equal = float(self.compute_reward(other, other).min())
+        equal = float(self.compute_reward(other, other, after[chosen]).min())
+        if self._info:
+            alike = self.compute_reward(desired, desired, after).flatten().numpy()
+            equal = equal_with_info(self._name, alike, rewards[0], achieved_reward)
         missed, met, dense = check_rewards(self._name, equal, rewards[0], achieved_reward)
         stepped = after["reward"].flatten()
-        computed = self.compute_reward(achieved, desired).flatten()
+        computed = self.compute_reward(achieved, desired, after).flatten()
         reached = computed >= met
         went_on = ~after["terminated"].flatten() | reached  # what a failure costs is kept
         warn_once(check_same_rewards(self._name, stepped[went_on].numpy(), computed[went_on].numpy()))
         first, own = self._envs[0], None
         if callable(getattr(first, "compute_terminated", None)):
             pairs = torch.cat((one, other)).unsqueeze(1), torch.cat((one, other))
-            own = bool(self._ask("compute_terminated", *pairs).any())
+            own = bool(self._ask("compute_terminated", *pairs, torch.cat((info, info))).any())
         ends = GoalEnds(self._name, own=own, tells_success=_SUCCESS in self.observation_spec)
         if ends.tells_success:
             reached = after[_SUCCESS].flatten()

@@ -22,7 +22,7 @@ KEYS = ("observation", "achieved_goal", "desired_goal")
 REWARD, TERMINATED = "compute_reward", "compute_terminated"
 SUCCESS = "is_success"
 # Of make_gym_env, for every environment.
-_OUR_OPTIONS = ("max_steps", "parallel", "termination", "achieved_reward", "pictures")
+_OUR_OPTIONS = ("max_steps", "parallel", "termination", "achieved_reward", "info_keys", "pictures")
 EPISODES = 8  # whose goals the environment's functions are tried with
 _TRIED_STEPS = 100
 _LIMIT_STEPS = 1_000  # that are played to see where an environment truncates an episode itself
@@ -195,6 +195,7 @@ class Trial:
         reward: [n] of each step.
         terminated, truncated: [n] of bool, whether the environment ended the episode there.
         success: [n] of bool, what ``info["is_success"]`` said; None if it was missing in all steps.
+        infos: n of them, as the environment gave them.
     """
 
     achieved: np.ndarray
@@ -203,12 +204,12 @@ class Trial:
     terminated: np.ndarray
     truncated: np.ndarray
     success: np.ndarray | None
+    infos: list[dict[str, Any]]
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Up to 8 of the achieved goals [m, g], each with each of up to 8 of the desired ones."""
+        """The steps [m] of up to 8 achieved goals, each with each of up to 8 desired ones."""
         chosen = np.unique(np.linspace(0, len(self.reward) - 1, EPISODES).astype(int))
-        achieved, desired = self.achieved[chosen], self.desired[chosen]
-        return np.repeat(achieved, len(chosen), 0), np.tile(desired, (len(chosen), 1))
+        return np.repeat(chosen, len(chosen)), np.tile(chosen, len(chosen))
 
 
 def coarse_goals(id: str, achieved: np.ndarray) -> str:
@@ -292,8 +293,8 @@ def try_steps(env: gymnasium.Env, layout: Layout) -> Trial:
         shown, reward, terminated, truncated, info = env.step(env.action_space.sample())
         done = terminated or truncated
         goals = (layout.flatten(shown[key]) for key in KEYS[1:])
-        rows.append((*goals, float(reward), bool(terminated), bool(truncated), info.get(SUCCESS)))
-    achieved, desired, rewards, terminations, truncations, success = zip(*rows, strict=True)
+        rows.append((*goals, float(reward), bool(terminated), bool(truncated), info.get(SUCCESS), info))
+    achieved, desired, rewards, terminations, truncations, success, infos = zip(*rows, strict=True)
     known = any(own is not None for own in success)
     return Trial(
         achieved=np.stack(achieved),
@@ -302,4 +303,5 @@ def try_steps(env: gymnasium.Env, layout: Layout) -> Trial:
         terminated=np.array(terminations),
         truncated=np.array(truncations),
         success=np.array([bool(own) for own in success]) if known else None,
+        infos=list(infos),
     )

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import GymWrapper
 
-from torchrl_her_envs.common.goal_env import TaskTraits, bounded_actions, choose_indices
+from torchrl_her_envs.common.goal_env import INFO, TaskTraits, bounded_actions, choose_indices, needs_info
 from torchrl_her_envs.common.goal_rules import (
     Ends,
     GoalEnds,
@@ -26,6 +26,7 @@ from torchrl_her_envs.common.goal_rules import (
     check_same_rewards,
     check_stateless,
     check_termination,
+    equal_with_info,
     is_dense,
     say_once,
     warn_once,
@@ -53,6 +54,7 @@ from torchrl_her_envs.gym.check import (
 from torchrl_her_envs.gym.drawing import PICTURES, cannot_draw, choose_renderer, draws
 from torchrl_her_envs.gym.fetch import fetch_layers, fetch_names
 from torchrl_her_envs.gym.goal_functions import GoalFunction
+from torchrl_her_envs.gym.infos import Infos
 from torchrl_her_envs.gym.layout import Layout
 from torchrl_her_envs.gym.quiet import make_quietly
 
@@ -66,6 +68,7 @@ def make_gym_env(
     parallel: bool = False,
     termination: str = "auto",
     achieved_reward: float | None = None,
+    info_keys: Sequence[str] = (),
     pictures: bool = False,
     **options: Any,
 ) -> GymGoalEnv:
@@ -83,6 +86,7 @@ def make_gym_env(
         termination: what ends an episode at its goal, see :class:`GymGoalEnv`.
         achieved_reward: the reward from which on a goal counts as achieved, for dense rewards; if None, that
             from which on the environment's method ``_is_success`` says so.
+        info_keys: keys of ``info`` that ``compute_reward`` reads, see :class:`GymGoalEnv`.
         pictures: whether to make it with ``render_mode="rgb_array"``, if it has that mode.
         options: for the environment, as ``gymnasium.make`` takes them (``render_mode``, for instance).
 
@@ -123,7 +127,12 @@ def make_gym_env(
         vector = AsyncVectorEnv if parallel else SyncVectorEnv
         envs = opened.enter_context(closing(vector([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)))
         env = GymGoalEnv(
-            envs, reference_env, seed=seed, termination=termination, achieved_reward=achieved_reward
+            envs,
+            reference_env,
+            seed=seed,
+            termination=termination,
+            achieved_reward=achieved_reward,
+            info_keys=info_keys,
         )
         opened.pop_all()  # from here on GymGoalEnv.close closes them
     return env
@@ -158,6 +167,10 @@ class GymGoalEnv(TaskTraits, GymWrapper):
     The first three take the place of ``compute_terminated``, which ``"own"`` asks for. Where the environment
     ends an episode for another reason, as by a fall, it is ``terminated`` whatever the rule.
 
+    If the environment's functions read more than the goals, ``info_keys`` names the entries of ``info``. They
+    become entries of transitions, ``("info", KEY)``, so that virtual ones are rewarded with the info of
+    their own step: ``EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)``.
+
     :func:`make_gym_env` makes them.
 
     Args:
@@ -166,6 +179,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         seed: of all environments; R seeds for R equal blocks of them, each as if alone.
         termination: what ends an episode at its goal.
         achieved_reward: the reward from which on a goal counts as achieved; that of equal goals if None.
+        info_keys: keys of ``info`` that its functions read: numbers, or arrays of numbers, in every step.
 
     Attributes:
         goal_ends: what ends an episode at its goal, and what the environment was seen to do there.
@@ -188,6 +202,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         seed: int | Sequence[int] = 0,
         termination: str = "auto",
         achieved_reward: float | None = None,
+        info_keys: Sequence[str] = (),
         **kwargs: Any,
     ) -> None:
         shown = shown_of(reference_env.observation_space)
@@ -196,21 +211,32 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         super().__init__(envs, device="cpu", **kwargs)  # TorchRL's metaclass adds some
         self._reference_env = reference_env
         self._limit = spec_of(reference_env).max_episode_steps or 0
-        self._try_out(check_termination(termination), achieved_reward)
+        self._try_out(check_termination(termination), achieved_reward, info_keys)
         self.set_seeds(as_seeds(seed))
 
-    def _try_out(self, termination: Termination, achieved_reward: float | None) -> None:
+    def _try_out(
+        self, termination: Termination, achieved_reward: float | None, info_keys: Sequence[str]
+    ) -> None:
         """Finds out how the environment rewards and ends, with a few of its own goals and steps."""
         env, layout, id = self._reference_env, self._layouts["achieved_goal"], spec_of(self._reference_env).id
+        seen = try_steps(env, layout).infos if len(info_keys) > 0 else []
+        self._infos = infos = Infos(info_keys, seen, id)
         goals = goals_to_try(env, layout)
-        self._reward_of = self._function(REWARD, goals)
+        info = infos.stack([seen[row % len(seen)] for row in range(len(goals[0]) if seen else 0)])
+        self._reward_of = self._function(REWARD, goals, info)
         trial = try_steps(env, layout)
         warn_once(coarse_goals(id, trial.achieved))
-        check_stateless(id, self._reward_of.tried, self._reward_of(*goals))
+        check_stateless(id, self._reward_of.tried, self._reward_of(*goals, info))
+        one, other = trial.pairs()
+        pairs, stepped = (trial.achieved[one], trial.desired[other]), infos.stack(trial.infos)
+        paired = {key: entries[one] for key, entries in stepped.items()}
+        others = np.concatenate([self._reward_of.tried[EPISODES:], self._reward_of(*pairs, paired)])
         equal = float(self._reward_of.tried[:EPISODES].min())
-        others = np.concatenate([self._reward_of.tried[EPISODES:], self._reward_of(*trial.pairs())])
-        if achieved_reward is None and is_dense(equal, others):
-            achieved_reward = find_achieved_reward(env, layout, self._reward_of, *trial.pairs())
+        if info:
+            alike = self._reward_of(trial.desired, trial.desired, stepped)
+            equal = equal_with_info(id, alike, others, achieved_reward)
+        elif achieved_reward is None and is_dense(equal, others):
+            achieved_reward = find_achieved_reward(env, layout, self._reward_of, *pairs)
             if achieved_reward is not None:
                 say_once(
                     f"{id} has a dense reward: goals count as achieved where _is_success becomes true "
@@ -219,15 +245,17 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         self.missed_reward, self.achieved_reward, self.dense_reward = check_rewards(
             id, equal, others, achieved_reward
         )
-        computed = self._reward_of(trial.achieved, trial.desired)
+        computed = self._reward_of(trial.achieved, trial.desired, stepped)
         met = computed >= self.achieved_reward
         went_on = ~trial.terminated | met  # what a failure costs is kept
-        warn_once(check_same_rewards(id, trial.reward[went_on], computed[went_on]))
+        warn_once(
+            self._reward_of.hint(info) or check_same_rewards(id, trial.reward[went_on], computed[went_on])
+        )
         own = None
         if termination in ("auto", "own", "watch") and has_compute_terminated(
             env, *(layout.unflatten(goal[0]) for goal in goals)
         ):
-            self._terminated_of = self._function(TERMINATED, goals)
+            self._terminated_of = self._function(TERMINATED, goals, info)
             own = bool(self._terminated_of.tried.any())
         self.goal_ends = GoalEnds(id, own=own, tells_success=trial.success is not None)
         self.goal_ends.apply(
@@ -237,20 +265,29 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         if trial.success is not None:
             shape = (*self.batch_size, 1)
             self.observation_spec[SUCCESS] = Binary(n=1, shape=shape, dtype=torch.bool)
+        if info:
+            self.observation_spec[INFO] = infos.spec(self.batch_size[0])
 
     @property
     def ends(self) -> Ends:
         """What ends an episode at its goal, see :class:`~torchrl_her_envs.common.goal_rules.GoalEnds`."""
         return self.goal_ends.rule
 
-    def _function(self, name: str, goals: tuple[np.ndarray, np.ndarray]) -> GoalFunction:
+    @property
+    def info_keys(self) -> list[tuple[str, str]]:
+        """Entries of transitions that ``compute_reward`` reads besides goals."""
+        return self._infos.keys
+
+    def _function(
+        self, name: str, goals: tuple[np.ndarray, np.ndarray], info: dict[str, np.ndarray]
+    ) -> GoalFunction:
         """A function of the environment, for goals [B, g] that it gets in their original form."""
         own, layout = self._reference_env.get_wrapper_attr(name), self._layouts["achieved_goal"]
 
-        def function(achieved: np.ndarray, desired: np.ndarray, info: dict[str, Any]) -> Any:
+        def function(achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
             return own(layout.unflatten(achieved), layout.unflatten(desired), info)
 
-        return GoalFunction(function, *goals, name=f"{spec_of(self._reference_env).id}'s {name}")
+        return GoalFunction(function, *goals, name=f"{spec_of(self._reference_env).id}'s {name}", info=info)
 
     @property
     def task_name(self) -> str:
@@ -283,23 +320,31 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         """Steps after which an episode is truncated."""
         return self._limit
 
-    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    def compute_reward(
+        self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
+    ) -> Tensor:
         """The reward of having achieved one goal when another was desired, by the environment's own rule.
 
         Args:
             achieved_goal: [..., g].
             desired_goal: [..., g], broadcast against it.
+            info: [...], with the entries ``info_keys`` if there are any, broadcast against the goals.
 
         Returns:
             [..., 1] of float32.
-        """
-        return self._ask(self._reward_of, achieved_goal, desired_goal).float()
 
-    def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        Raises:
+            ValueError: there are ``info_keys``, and no info is given.
+        """
+        return self._ask(self._reward_of, achieved_goal, desired_goal, info).float()
+
+    def compute_terminated(
+        self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
+    ) -> Tensor:
         """Whether an episode ends there: [..., 1] of bool."""
         if self.ends == "own":
-            return self._ask(self._terminated_of, achieved_goal, desired_goal).bool()
-        reward = self.compute_reward(achieved_goal, desired_goal)
+            return self._ask(self._terminated_of, achieved_goal, desired_goal, info).bool()
+        reward = self.compute_reward(achieved_goal, desired_goal, info)
         return (reward >= self.achieved_reward) & (self.ends in ("success", "reward"))
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
@@ -362,11 +407,20 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         self._reference_env.close()
         super().close(raise_if_closed=raise_if_closed)
 
-    def _ask(self, function: GoalFunction, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    def _ask(
+        self,
+        function: GoalFunction,
+        achieved_goal: Tensor,
+        desired_goal: Tensor,
+        info: TensorDictBase | None,
+    ) -> Tensor:
         """A function's answers [..., 1]."""
+        if info is None and self.info_keys:
+            raise ValueError(needs_info(self))
         pair = torch.broadcast_tensors(achieved_goal, desired_goal)
         achieved, desired = (self._rows(goals) for goals in pair)
-        answers = torch.from_numpy(function(achieved, desired))
+        given = {} if info is None else self._infos.read(info, pair[0].shape[:-1])
+        answers = torch.from_numpy(function(achieved, desired, given))
         return answers.to(pair[0].device).view(*pair[0].shape[:-1], 1)
 
     def _rows(self, goals: Tensor) -> np.ndarray:
@@ -401,13 +455,15 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         if SUCCESS in self.observation_spec:
             word = observations.get(SUCCESS, np.zeros(self.batch_size))
             shown[SUCCESS] = np.asarray(word).astype(np.bool_)[:, None]
-        return super().read_obs(shown)
+        info = {INFO: self._infos.rows(observations[INFO])} if self.info_keys else {}
+        return {**super().read_obs(shown), **info}
 
     def _output_transform(self, step_outputs_tuple: tuple[Any, ...]) -> Any:
         """The outputs of a step, with the ends of episodes that goals give."""
         shown, reward, terminated, truncated, info = step_outputs_tuple
         if SUCCESS in info:
             shown = {**shown, SUCCESS: info[SUCCESS]}
+        shown = {**shown, INFO: self._infos.of_batch(info, len(reward))}
         if self.ends != "own":
             met = self._met(shown)
             terminated, truncated = self.goal_ends.apply(met, terminated, truncated)
@@ -417,8 +473,8 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         """Which environments achieve their goals, [N] of bool: by their own word, or by the goals' reward."""
         if self.goal_ends.asks_success:
             return np.asarray(shown.get(SUCCESS, np.zeros(self.batch_size))).astype(np.bool_)
-        goals = (self._layouts[key].flatten(shown[key]) for key in KEYS[1:])
-        return self._reward_of(*goals) >= self.achieved_reward
+        achieved, desired = (self._layouts[key].flatten(shown[key]) for key in KEYS[1:])
+        return self._reward_of(achieved, desired, shown[INFO]) >= self.achieved_reward
 
     def _set_seed(self, seed: int | None) -> None:
         self.set_seeds([seed or 0])
@@ -427,8 +483,9 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         which = np.ones(self.batch_size, np.bool_) if mask is None else mask.view(-1).numpy()
         options = {"options": {"reset_mask": which}} if not which.all() else {}
-        observations, _ = self._env.reset(seed=self._next_seeds, **options)
+        observations, info = self._env.reset(seed=self._next_seeds, **options)
         self._next_seeds = [
             None if reset else seed for reset, seed in zip(which, self._next_seeds, strict=True)
         ]
-        return TensorDict(self.read_obs(observations), batch_size=self.batch_size, device=self.device)
+        shown = {**observations, INFO: self._infos.of_batch(info, len(which), reset=True)}
+        return TensorDict(self.read_obs(shown), batch_size=self.batch_size, device=self.device)

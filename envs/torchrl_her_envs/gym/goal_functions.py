@@ -2,14 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 Answers = Literal["batch", "one", "loop"]
 Form = Literal["pair", "rows", "rows and infos"]
-Function = Callable[[np.ndarray, np.ndarray, dict[str, Any]], Any]
+Function = Callable[[np.ndarray, np.ndarray, Any], Any]
+Info = Mapping[str, np.ndarray]  # entries [B, ...] of B infos
+_NOTHING: Info = {}
+
+
+class _OneInfo(dict[str, Any]):
+    """An info that notes which entries were asked for in vain."""
+
+    def __init__(self, entries: Mapping[str, Any], lacking: set[str]) -> None:
+        super().__init__(entries)
+        self._lacking = lacking
+
+    def __contains__(self, key: object) -> bool:
+        there = super().__contains__(key)
+        if not there and isinstance(key, str):  # and no row of a batch
+            self._lacking.add(key)
+        return there
+
+    def __missing__(self, key: str) -> Any:
+        _ = key in self
+        raise KeyError(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        return super().get(key, default) if key in self else default
 
 
 class GoalFunction:
@@ -18,8 +41,9 @@ class GoalFunction:
     Such functions are written for one pair of goals. Many also take batches, and some nothing else, with an
     info for each row or without. Some answer a batch with one value, which is right only if the answer is
     always the same. Others fail, or mix up the goals of a batch. The constructor finds out which kind a
-    function is: it compares the answer to a batch of a few pairs with the answers to each of these pairs. The
-    functions get empty infos, since there is none for virtual goals.
+    function is: it compares the answer to a batch of a few pairs with the answers to each of these pairs.
+    Infos have the entries that are given. Those of a batch are one dictionary of arrays, or an array of
+    dictionaries.
 
     Args:
         function: (achieved goal, desired goal, info) to a number or truth value.
@@ -27,16 +51,18 @@ class GoalFunction:
             not, and M should not be g, so that the two dimensions cannot be mistaken for each other.
         desired: [M, g].
         name: of the function, for messages.
+        info: entries [M, ...] of the infos to try it with.
 
     Attributes:
         form: what it takes for one pair of goals: the two goals (``"pair"``), a batch of one (``"rows"``), or
-            a batch of one with a list of infos.
+            a batch of one with an array of infos.
         answers: ``"batch"`` if it takes batches, ``"one"`` if one value answers for all, ``"loop"`` if it
             has to be called pair by pair.
         tried: [M], its answers to the goals that it was tried with.
+        lacking: keys of infos that it asked for in vain.
 
     Raises:
-        ValueError: it cannot be called with an empty info, or does not answer with one number.
+        ValueError: it cannot be called with such infos, or does not answer with one number.
 
     Example:
         >>> here, there = np.array([[0.0, 0.0], [3.0, 4.0], [1.0, 1.0]]), np.array([[0.0, 0.0]] * 3)
@@ -46,50 +72,70 @@ class GoalFunction:
         ('loop', [1.0, 0.0, 0.0])
     """
 
-    def __init__(self, function: Function, achieved: np.ndarray, desired: np.ndarray, *, name: str) -> None:
+    def __init__(
+        self,
+        function: Function,
+        achieved: np.ndarray,
+        desired: np.ndarray,
+        *,
+        name: str,
+        info: Info = _NOTHING,
+    ) -> None:
         self._function = function
         self._name = name
-        self.tried = self._try_forms(achieved, desired)
-        self.answers: Answers = self._find_out(achieved, desired)
+        self.lacking: set[str] = set()
+        self.tried = self._try_forms(achieved, desired, info)
+        self.answers: Answers = self._find_out(achieved, desired, info)
 
-    def __call__(self, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
-        """The answers [B] of float64 to goals [B, g]."""
+    def __call__(self, achieved: np.ndarray, desired: np.ndarray, info: Info = _NOTHING) -> np.ndarray:
+        """The answers [B] of float64 to goals [B, g], with the entries [B, ...] of their infos."""
         if self.answers == "loop" or not len(achieved):
-            return self._loop(achieved, desired)
-        answer = self._batch(achieved, desired)
+            return self._loop(achieved, desired, info)
+        answer = self._batch(achieved, desired, info, self._batched)
         shape = (len(achieved),)
         return np.full(shape, answer.item()) if self.answers == "one" else answer.reshape(shape)
 
-    def _batch(self, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
-        info: Any = [{} for _ in achieved] if self.form == "rows and infos" else {}
-        return np.asarray(self._function(achieved, desired, info), np.float64)
+    def _batch(self, achieved: np.ndarray, desired: np.ndarray, info: Info, form: Form) -> np.ndarray:
+        infos: Any = _OneInfo(info, self.lacking)
+        if form == "rows and infos":
+            infos = np.array([self._one(info, row) for row in range(len(achieved))], object)
+        return np.asarray(self._function(achieved, desired, infos), np.float64)
 
-    def _try_forms(self, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    def _one(self, info: Info, row: int) -> _OneInfo:
+        return _OneInfo({key: entries[row] for key, entries in info.items()}, self.lacking)
+
+    def _try_forms(self, achieved: np.ndarray, desired: np.ndarray, info: Info) -> np.ndarray:
         """The answers [M] in the first form that the function takes; the error of a pair if it takes none."""
         errors: list[ValueError] = []
         for form in get_args(Form):
             self.form: Form = form
             try:
-                return self._loop(achieved, desired)
+                return self._loop(achieved, desired, info)
             except ValueError as error:
                 errors.append(error)
         raise errors[0]
 
-    def _loop(self, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
-        pairs = zip(achieved, desired, strict=True)
-        return np.array([self._ask(one, other) for one, other in pairs], np.float64)
+    def _loop(self, achieved: np.ndarray, desired: np.ndarray, info: Info) -> np.ndarray:
+        rows = range(len(achieved))
+        return np.array([self._ask(achieved, desired, info, row) for row in rows], np.float64)
 
-    def _ask(self, achieved: np.ndarray, desired: np.ndarray) -> float:
+    def _ask(self, achieved: np.ndarray, desired: np.ndarray, info: Info, row: int) -> float:
         """The answer to one pair of goals."""
         try:
             if self.form == "pair":
-                answer = np.asarray(self._function(achieved, desired, {}), np.float64)
+                own = self._function(achieved[row], desired[row], self._one(info, row))
+                answer = np.asarray(own, np.float64)
             else:
-                answer = self._batch(achieved[None], desired[None])
+                at = slice(row, row + 1)
+                own_info = {key: entries[at] for key, entries in info.items()}
+                answer = self._batch(achieved[at], desired[at], own_info, self.form)
         except Exception as error:
+            if self.lacking:
+                raise ValueError(self.hint(info)) from error
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            with_info = f"the info {', '.join(info)}" if info else "an empty info"
             raise ValueError(
-                f"{self._name} cannot be called with two goals and an empty info: {reason}"
+                f"{self._name} cannot be called with two goals and {with_info}: {reason}"
             ) from error
         if answer.size != 1:
             raise ValueError(
@@ -97,11 +143,23 @@ class GoalFunction:
             )
         return answer.item()
 
-    def _find_out(self, achieved: np.ndarray, desired: np.ndarray) -> Answers:
-        try:
-            answer = self._batch(achieved, desired)
-        except Exception:  # whatever it is that a function for single goals stumbles over
-            return "loop"
-        if answer.size not in (1, len(achieved)) or not np.allclose(answer.reshape(-1), self.tried):
-            return "loop"
-        return "one" if answer.size == 1 else "batch"
+    def hint(self, info: Collection[str]) -> str:
+        """What to say of infos that lack what the function reads besides the keys that are named."""
+        if not self.lacking:
+            return ""
+        keys = sorted(self.lacking)
+        return (
+            f"{self._name} reads {' and '.join(f'info[{key!r}]' for key in keys)}, which virtual transitions "
+            f"have only if it is named: task.options.info_keys=[{','.join([*info, *keys])}]"
+        )
+
+    def _find_out(self, achieved: np.ndarray, desired: np.ndarray, info: Info) -> Answers:
+        forms: tuple[Form, ...] = ("rows", "rows and infos") if self.form == "pair" else (self.form,)
+        for self._batched in forms:
+            try:
+                answer = self._batch(achieved, desired, info, self._batched)
+            except Exception:  # whatever it is that a function for single goals stumbles over
+                continue
+            if answer.size in (1, len(achieved)) and np.allclose(answer.reshape(-1), self.tried):
+                return "one" if answer.size == 1 else "batch"
+        return "loop"

@@ -37,6 +37,7 @@ _NOT_STORED = (
     "input",
     "is_init",
     "is_success",
+    "info",
     "collector",
     "proposed",
     "proposed_reached",

@@ -143,6 +143,11 @@ def _check(every: Demonstrations, recipe: Recipe, env: EnvBase) -> None:
     if every.task != task:
         raise ValueError(f"{options.file} holds demonstrations of {every.task}, not of {task}")
     base: Any = goal_env(env)
+    if base.info_keys:
+        raise ValueError(
+            f"demonstrations hold no info, and rewards of {task} read it (task.options.info_keys): leave one "
+            "of them out"
+        )
     for key in ("observation", "achieved_goal", "desired_goal"):
         width, own = base.observation_spec[key].shape[-1], every.rows[key].shape[-1]
         if width != own:

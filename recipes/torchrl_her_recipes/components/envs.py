@@ -103,7 +103,7 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
 def task_reward(env: EnvBase) -> EnvReward:
     """The reward function of a task, below any transforms."""
     task = goal_env(env)
-    return EnvReward(task.compute_reward, task.compute_terminated)
+    return EnvReward(task.compute_reward, task.compute_terminated, info_keys=task.info_keys)
 
 
 def judging(env: EnvBase) -> dict[str, Any]:

@@ -13,11 +13,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_her.goals.rewards import is_achieved
+from torchrl_her.goals.rewards import Outcome, ask_reward, is_achieved, missed, outcomes
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_envs.common.goal_rules import GoalEnds, say_once
 from torchrl_her_envs.registry import get_task_spec
-from torchrl_her_recipes.components.envs import action_bounds, judging, make_task_envs
+from torchrl_her_recipes.components.envs import action_bounds, judging, make_task_envs, task_reward
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_options, ends_open, resolve
@@ -34,7 +34,7 @@ _NEAR = 0.5  # of the usual distance: how near positions come where the achieved
 _PAIRS = 32  # of goals, whose distance is looked at
 _HALVINGS = 20
 
-Meets = Callable[[Tensor, Tensor], Tensor]
+Meets = Callable[[Outcome, Tensor], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,8 @@ class Facts:
         constant: entries of the observation that never changed.
         goal_inside: entries of the observation that are the desired goal.
         own_layers: whether the task has a curriculum of its own.
-        layers: of a curriculum, as :func:`propose_layers` gives them; empty if none is proposed.
+        layers: of a curriculum, as :func:`propose_layers` gives them; empty if none is proposed, as where
+            rewards depend on more than goals.
         ends: what ends an episode at its goal, and what the environment was seen to do there; None if the
             environment itself says so for all goals.
     """
@@ -180,24 +181,26 @@ def _facts(
 ) -> Facts:
     rows = cast(TensorDictBase, torch.cat(cast(list[Tensor], played)))
     achieved_reward = float(getattr(task, "achieved_reward", 0.0))
+    rule = task_reward(cast(EnvBase, task))
 
-    def meets(achieved: Tensor, desired: Tensor) -> Tensor:
+    def meets(achieved: Outcome, desired: Tensor) -> Tensor:
         """[...] of bool."""
-        return task.compute_reward(achieved, desired).squeeze(-1) >= achieved_reward
+        return ~missed(rule, achieved, desired, achieved_reward)
 
     moved, kept, achieved, fallen = [], [], [], []
     judged_by = judging(cast(EnvBase, task))
     for own in played:
-        here, there = own["achieved_goal"], own["next", "achieved_goal"]
-        kept.append(_kept(here, there, meets))
+        goals = own["next", "achieved_goal"]
+        here, there = outcomes(rule, own["achieved_goal"], own), outcomes(rule, goals, own["next"])
+        kept.append(_kept(here, goals, meets))
         if not own["next", "done"][-1]:
             continue  # it was cut off by the end of the look
-        moved.append(not bool(meets(here[:1].expand_as(there), there).all()))
+        moved.append(not bool(meets(here[:1], goals).all()))
         achieved.append(bool(meets(there, own["next", "desired_goal"]).any()))
         last = own["next"][-1:]
         fallen.append(bool(last["terminated"].all() and not is_achieved(last, **judged_by).all()))
-    computed = task.compute_reward(rows["next", "achieved_goal"], rows["next", "desired_goal"])
-    reward = rows["next", "reward"]
+    reached = outcomes(rule, rows["next", "achieved_goal"], rows["next"])
+    computed, reward = ask_reward(rule, reached, rows["next", "desired_goal"])[0], rows["next", "reward"]
     went_on = ~rows["next", "terminated"] | (computed >= achieved_reward)  # what a failure costs is kept
     differ = went_on & ((reward - computed).abs() > _DIGITS * (1 + computed.abs()))
     seen = rows["observation"].double()
@@ -219,7 +222,7 @@ def _facts(
         constant=(spread == 0).nonzero().flatten().tolist(),
         goal_inside=_columns(seen, rows["desired_goal"].double()),
         own_layers=_has_layers(task),
-        layers=propose_layers(rows, meets),
+        layers=[] if task.info_keys else propose_layers(rows, meets),
         ends=getattr(task, "goal_ends", None),
     )
 
@@ -231,15 +234,15 @@ def _has_layers(task: GoalEnv) -> bool:
         return False
 
 
-def _kept(here: Tensor, there: Tensor, meets: Meets) -> Tensor:
+def _kept(here: Outcome, there: Tensor, meets: Meets) -> Tensor:
     """Whether some later goal of an episode was not achieved before each transition, [T] of bool."""
-    steps = len(here)
+    steps = len(there)
     later = torch.linspace(0, 1, min(_FUTURE, steps))
     chosen = (
         torch.arange(steps)[:, None] + (later * (steps - 1 - torch.arange(steps))[:, None]).round().long()
     )
     goals = there[chosen]  # [T, later, g]
-    return ~meets(here[:, None].expand_as(goals), goals).all(-1)
+    return ~meets(here.unsqueeze(1), goals).all(-1)
 
 
 def _columns(seen: Tensor, goal: Tensor) -> list[int]:

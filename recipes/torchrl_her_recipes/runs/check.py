@@ -10,9 +10,10 @@ _SELDOM = 0.5  # of the episodes
 _UNLIKE = 100  # times as large
 _SLOW = 5e-3  # seconds of an environment's step, about those of a gradient step
 _MOSTLY = 0.5
+_ROUNDED = 0.005
 
 _STILL = (
-    "random actions change what is achieved, by the reward, in {facts.moved:.0%} of the episodes: "
+    "random actions change what is achieved, by the reward, in {moved} of the episodes: "
     "most virtual goals are achieved already, and the filter leaves {facts.kept:.1%} of the transitions with "
     "goals."
 )
@@ -29,8 +30,9 @@ def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> li
     recipe, lines = resolved(recipe), []
     if facts.disagree:
         lines.append(
-            f"{facts.disagree:.0%} of the steps have another reward than compute_reward gives: "
-            "virtual transitions lack what is added there, such as a cost of actions"
+            f"{_percent(facts.disagree)} of the steps have another reward than compute_reward gives, and "
+            "virtual transitions lack the difference: if compute_reward reads info, name its keys "
+            "(task.options.info_keys=[KEY])"
         )
     if facts.goal_inside:
         lines.append(
@@ -38,7 +40,9 @@ def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> li
             "goal, which relabeling cannot change there: leave them out of the observation"
         )
     if facts.moved < _SELDOM:
-        lines.append(f"{_STILL.format(facts=facts)} {_remedy(facts, recipe, layers_file)}")
+        lines.append(
+            f"{_STILL.format(facts=facts, moved=_percent(facts.moved))} {_remedy(facts, recipe, layers_file)}"
+        )
     if not facts.moved:
         lines.append("is achieved_goal what the goal is about? By the reward, it never changed")
     if facts.fallen and recipe.task.failure == "environment":
@@ -58,6 +62,11 @@ def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> li
             f"random actions achieve {facts.achieved:.0%} of the goals: such a success rate shows no learning"
         )
     return lines
+
+
+def _percent(share: float) -> str:
+    """A share that is above 0 is never 0%."""
+    return "less than 1%" if 0 < share < _ROUNDED else f"{share:.0%}"
 
 
 def _remedy(facts: Facts, recipe: Recipe, layers_file: str) -> str:

@@ -136,6 +136,32 @@ class Near(Point):
         return super().compute_reward(achieved_goal, desired_goal) - near.float()
 
 
+class Costly(Point):
+    """A point whose steps cost a quarter of their length, which they show."""
+
+    def __init__(self, size: int = 0) -> None:
+        super().__init__(size)
+        self.observation_spec["cost"] = Unbounded(shape=(*self.batch_size, 1))
+        self.cost = torch.zeros(*self.batch_size, 1)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.cost = tensordict["action"].norm(dim=-1, keepdim=True) / 4
+        return super()._step(tensordict)
+
+    def _shown(self) -> dict[str, Tensor]:
+        return {**super()._shown(), "cost": self.cost}
+
+    def compute_reward(
+        self, achieved_goal: Tensor, desired_goal: Tensor, info: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        cost = self.cost if info is None else info["cost"]
+        return super().compute_reward(achieved_goal, desired_goal) - cost
+
+
+def make_costly(num_envs: int) -> Costly:
+    return Costly(num_envs)
+
+
 class Lost(Point):
     """A point whose second coordinate cannot be seen at the right."""
 

@@ -7,8 +7,10 @@ from typing import Any
 
 import pytest
 import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs.utils import check_env_specs
 
+from torchrl_her import EnvReward, HERWriter
 from torchrl_her_envs import BitFlip, OwnGoalEnv, goal_env, make_env, make_own_env, reward_range
 
 HERE = "tests.envs.common.own_point"
@@ -166,3 +168,29 @@ def test_what_cannot_be_is_said_in_one_line(path: str, options: dict[str, Any], 
     with pytest.raises(ValueError, match=message) as raised:
         make_own_env(path, **options)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["Costly", "make_costly"])
+def test_rewards_that_read_further_entries_get_those_of_the_step(name: str) -> None:
+    env = make_env(f"{HERE}:{name}", num_envs=3, seed=5, info_keys=["cost"], achieved_reward=-0.5)
+    check_env_specs(env)
+    steps = rollout(env)
+    rule = EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)
+    writer = HERWriter(rule, k=4, filter_achieved=True, achieved_reward=env.achieved_reward)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), writer=writer)
+    buffer.extend(steps)
+    rows = buffer[:]
+    after, virtual = rows["next"], rows["virtual"].flatten()
+    far = (after["achieved_goal"] - after["desired_goal"]).norm(dim=-1, keepdim=True) >= 0.5
+    expected = -far.float() - rows["action"].norm(dim=-1, keepdim=True) / 4
+    assert int(virtual.sum()) > 100
+    assert (~far[virtual]).any()
+    torch.testing.assert_close(after["reward"], expected)
+
+
+def test_further_entries_must_be_shown_and_given() -> None:
+    with pytest.raises(ValueError, match=r"own_point:Costly: info_keys names 'wind', which is not shown: "):
+        make_env(f"{HERE}:Costly", info_keys=["wind"])
+    env = make_env(f"{HERE}:Costly", info_keys=["cost"], achieved_reward=-0.5)
+    with pytest.raises(ValueError, match="info_keys=env.info_keys"):
+        env.compute_reward(torch.zeros(1, 2), torch.zeros(1, 2))

@@ -54,9 +54,57 @@ def test_functions_may_take_batches_alone(function: Any, form: str) -> None:
 
 
 def test_functions_that_need_an_info_or_give_no_number_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"Env-v0's reward reads info\['fallen'\], .*info_keys=\[fallen\]$"):
+        GoalFunction(lambda a, d, info: info["fallen"], *MET, name="Env-v0's reward")
     with pytest.raises(
-        ValueError, match="Env-v0's compute_terminated cannot be called .* KeyError: 'fallen'"
+        ValueError, match="reward cannot be called with two goals and an empty info: TypeError"
     ):
-        GoalFunction(lambda a, d, info: info["fallen"], *MET, name="Env-v0's compute_terminated")
+        GoalFunction(lambda a, d, info: a + None, *MET, name="reward")
     with pytest.raises(ValueError, match=r"compute_reward must give one number .* of shape \(3,\)"):
         GoalFunction(lambda a, d, info: a - d, *MET, name="compute_reward")
+
+
+@pytest.mark.parametrize(
+    ("function", "form", "answers"),
+    [
+        (lambda a, d, info: -abs(a - d).sum(-1) - info["cost"], "pair", "batch"),
+        (lambda a, d, info: -float(abs(a - d).sum()) - info["cost"], "pair", "loop"),
+        (
+            lambda a, d, info: [-abs(a[n] - d[n]).sum() - info["cost"][n] for n in range(len(a))],
+            "rows",
+            "batch",
+        ),
+        (
+            lambda a, d, info: -abs(a - d).sum(1) - np.array([own["cost"] for own in info]),
+            "rows and infos",
+            "batch",
+        ),
+        (
+            lambda a, d, info: (
+                -abs(a - d).sum(-1)
+                - (info["cost"] if isinstance(info, dict) and a.ndim == 1 else [own["cost"] for own in info])
+            ),
+            "pair",
+            "batch",
+        ),
+    ],
+)
+def test_infos_come_in_the_form_that_a_function_takes(function: Any, form: str, answers: str) -> None:
+    cost = np.array([0.5, 0.25, 2.0, 0.0])
+    found = GoalFunction(function, *MET, name="compute_reward", info={"cost": cost})
+    assert (found.form, found.answers, found.lacking) == (form, answers, set())
+    assert found.tried.tolist() == [-9.5, -0.25, -2.0, 0.0]
+    assert found(MET[0], MET[1], {"cost": cost[::-1]}).tolist() == [-9.0, -2.0, -0.25, -0.5]
+    assert found(MET[0][:1], MET[1][:1], {"cost": cost[2:3]}).tolist() == [-11.0]
+
+
+def test_keys_that_are_asked_for_in_vain_are_noticed() -> None:
+    found = GoalFunction(
+        lambda a, d, info: -abs(a - d).sum(-1) * info.get("wear", 1.0) - ("rain" in info), *MET, name="reward"
+    )
+    assert found.lacking == {"rain", "wear"}
+    assert found.hint(["cost"]).endswith("task.options.info_keys=[cost,rain,wear]")
+    rows = GoalFunction(
+        lambda a, d, info: [0.0 if info[0] is None else -1.0] if a.ndim > 1 else 0.0, *MET, name=""
+    )
+    assert (rows.lacking, rows.hint([])) == (set(), "")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import pytest
+import torch
 
-from torchrl_her_recipes import build
+from torchrl_her_recipes import build, look_at
 
 from ..small import small
 
@@ -42,3 +43,20 @@ def test_goals_are_drawn_from_where_the_recipe_says() -> None:
         ({"algo": "no_hindsight"}, {}),
     ):
         assert build(small(**values)).buffer.writer.options.sources == expected
+
+
+def test_virtual_transitions_of_a_recipe_get_the_info_of_their_own_step() -> None:
+    task = {"task": "gym:tests.envs.gym.costly:tests/Costly-v0", "task.options.info_keys": ["cost"]}
+    recipe = small(**task, **{"task.options.achieved_reward": -0.5, "normalize": False})
+    assert look_at(recipe, steps=100).disagree == 0
+    components = build(recipe)
+    for _ in range(6):  # until episodes end
+        components.buffer.extend(components.collector.next())
+    rows = components.buffer[:]
+    after, virtual = rows["next"], rows["virtual"].flatten()
+    far = (after["observation"] - after["desired_goal"]).abs() > 0.5
+    assert int(virtual.sum()) > 50
+    assert (~far[virtual]).any()
+    torch.testing.assert_close(after["reward"], -far.float() - rows["action"].abs() / 4)
+    assert "info" not in rows.keys()
+    components.close()

@@ -253,6 +253,14 @@ def test_demonstrations_of_a_task_with_other_options_are_refused(file: str, tmp_
         build(small(**asked(str(tmp_path / "wide.pt"))))
 
 
+def test_demonstrations_lack_the_info_that_rewards_may_read(file: str, tmp_path: Path) -> None:
+    task = "gym:tests.envs.gym.costly:tests/Costly-v0"
+    replace(Demonstrations.load(file), task=task).save(tmp_path / "costly.pt")
+    options = {"task": task, "task.options": {"info_keys": ["cost"], "achieved_reward": -0.5}}
+    with pytest.raises(ValueError, match=r"demonstrations hold no info, .* \(task.options.info_keys\)"):
+        build(small(**asked(str(tmp_path / "costly.pt")) | options))
+
+
 def test_environments_that_cannot_be_started_anywhere_are_refused_by_name(tmp_path: Path) -> None:
     task, path = "gym:torchrl_her/HandThrow-v1", tmp_path / "gym.pt"
     record_demonstrations(task, path, episodes=2, policy="hand_v1", keep_all=True)

@@ -150,6 +150,10 @@ def test_rewards_that_goals_do_not_explain_are_told() -> None:
     facts = look(cost=0.5)
     assert facts.disagree == 1.0
     assert said(facts).startswith("100% of the steps have another reward than compute_reward gives")
+    seldom = said(replace(facts, disagree=0.001, moved=0.002))
+    assert seldom.startswith("less than 1% of the steps have another reward")
+    assert "in less than 1% of the episodes" in seldom
+    assert "task.options.info_keys=[KEY]" in seldom
 
 
 def test_a_goal_inside_of_the_observation_is_told() -> None:

@@ -133,7 +133,8 @@ class LiveEpisodes:
         word = after.get("is_success", None)
         if word is not None:
             return word
-        reward = self._base.compute_reward(after["achieved_goal"], after["desired_goal"])
+        info = [after] if self._base.info_keys else []
+        reward = self._base.compute_reward(after["achieved_goal"], after["desired_goal"], *info)
         return reward >= reward_range(self._base)[1]
 
     def _shoot(self, done: Tensor) -> None:
