@@ -26,6 +26,7 @@ _PYTHON = {
     "format",
     "gpus_per_job",
     "high",
+    "info_keys",
     "length",
 }
 _PYTHON |= {"low", "name", "num_links", "policy", "preset", "render_mode", "run"}
@@ -97,7 +98,7 @@ def test_values_in_messages_are_allowed(name: str, value: str) -> None:
     pytest.fail("; ".join(dict.fromkeys(refusals)))
 
 
-@pytest.mark.parametrize("name", ["max_steps", "termination", "achieved_reward", "parallel"])
+@pytest.mark.parametrize("name", ["max_steps", "termination", "achieved_reward", "parallel", "info_keys"])
 def test_options_of_gymnasium_tasks_are_named_in_full(name: str) -> None:
     with pytest.raises(ValueError, match=rf"write task\.options\.{name}="):
         locate(name)

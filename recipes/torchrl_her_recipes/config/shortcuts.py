@@ -45,7 +45,7 @@ LONG_ONLY = ("demonstrations",)  # its options are always named with it: of what
 
 
 # what tasks of gymnasium and of one's own take, whatever else they take
-TASK_OPTIONS = ("max_steps", "termination", "achieved_reward", "parallel")
+TASK_OPTIONS = ("max_steps", "termination", "achieved_reward", "parallel", "info_keys")
 
 
 class Entries(dict[str, Any]):
