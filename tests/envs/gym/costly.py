@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-COSTLY = "tests/Costly-v0"  # episodes of 6 steps
+COSTLY = "tests/InfoCost-v0"  # episodes of 6 steps
 
 
 class Costly(gymnasium.Env):

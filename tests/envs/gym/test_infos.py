@@ -69,7 +69,7 @@ def test_infos_of_the_step_before_are_in_the_root() -> None:
 
 def test_a_reward_that_reads_an_info_that_nobody_named_is_said(caplog: pytest.LogCaptureFixture) -> None:
     reads = (
-        "tests/Costly-v0's compute_reward reads info['cost'], which virtual transitions have only if it is "
+        "tests/InfoCost-v0's compute_reward reads info['cost'], which virtual transitions have only if it is "
         "named: task.options.info_keys=[cost]"
     )
     with pytest.raises(ValueError, match=f"^{re.escape(reads)}$"):
@@ -83,9 +83,9 @@ def test_a_reward_that_reads_an_info_that_nobody_named_is_said(caplog: pytest.Lo
     ("options", "message"),
     [
         ({"info_keys": "cost"}, r"info_keys must be a list of keys of info, as in \[cost\], got 'cost'"),
-        ({"info_keys": ["cost", "wind"]}, "tests/Costly-v0: info_keys names 'wind', .* it has cost"),
-        ({"cost": "dear"}, r"tests/Costly-v0: info\['cost'\] must be a number, .* got 'dear'"),
-        ({"achieved_reward": None}, "tests/Costly-v0 has a dense reward: .*"),
+        ({"info_keys": ["cost", "wind"]}, "tests/InfoCost-v0: info_keys names 'wind', .* it has cost"),
+        ({"cost": "dear"}, r"tests/InfoCost-v0: info\['cost'\] must be a number, .* got 'dear'"),
+        ({"achieved_reward": None}, "tests/InfoCost-v0 has a dense reward: .*"),
     ],
 )
 def test_what_cannot_be_is_named(options: dict[str, Any], message: str) -> None:

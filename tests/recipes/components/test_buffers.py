@@ -46,7 +46,7 @@ def test_goals_are_drawn_from_where_the_recipe_says() -> None:
 
 
 def test_virtual_transitions_of_a_recipe_get_the_info_of_their_own_step() -> None:
-    task = {"task": "gym:tests.envs.gym.costly:tests/Costly-v0", "task.options.info_keys": ["cost"]}
+    task = {"task": "gym:tests.envs.gym.costly:tests/InfoCost-v0", "task.options.info_keys": ["cost"]}
     recipe = small(**task, **{"task.options.achieved_reward": -0.5, "normalize": False})
     assert look_at(recipe, steps=100).disagree == 0
     components = build(recipe)
