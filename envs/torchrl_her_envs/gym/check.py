@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import io
+from collections.abc import Mapping
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from typing import Any, cast
@@ -17,12 +18,17 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 from torchrl_her_envs.gym.goal_functions import GoalFunction
 from torchrl_her_envs.gym.layout import Layout
 from torchrl_her_envs.gym.quiet import make_quietly
+from torchrl_her_envs.gym.renamed import Names
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
 REWARD, TERMINATED = "compute_reward", "compute_terminated"
 SUCCESS = "is_success"
 # Of make_gym_env, for every environment.
-_OUR_OPTIONS = ("max_steps", "parallel", "termination", "achieved_reward", "info_keys", "pictures")
+_OUR_OPTIONS = (
+    *("max_steps", "parallel", "termination", "achieved_reward", "info_keys"),
+    *(f"{key}_key" for key in KEYS),
+    "pictures",
+)
 EPISODES = 8  # whose goals the environment's functions are tried with
 _TRIED_STEPS = 100
 _LIMIT_STEPS = 1_000  # that are played to see where an environment truncates an episode itself
@@ -41,8 +47,13 @@ def shown_of(space: spaces.Space) -> spaces.Dict:
     return cast(spaces.Dict, space)
 
 
-def make_one(id: str, options: dict[str, Any]) -> gymnasium.Env:
+def make_one(id: str, names: Mapping[str, Names] | None, options: dict[str, Any]) -> gymnasium.Env:
     """Makes one environment; where that fails, the message has one line and names what is wrong.
+
+    Args:
+        id: of the environment.
+        names: of its entries, see :func:`~torchrl_her_envs.gym.quiet.make_quietly`.
+        options: for it.
 
     Raises:
         ValueError: there is no such environment, or it does not take an option.
@@ -50,7 +61,7 @@ def make_one(id: str, options: dict[str, Any]) -> gymnasium.Env:
     """
     hint = _register_robotics(id)
     try:
-        return make_quietly(id, **options)
+        return make_quietly(id, names, **options)
     except ModuleNotFoundError as error:
         module, cause = id.partition(":")[0], error.__cause__
         if ":" in id and isinstance(cause, ModuleNotFoundError) and cause.name == module:

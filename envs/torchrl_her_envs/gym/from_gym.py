@@ -57,6 +57,7 @@ from torchrl_her_envs.gym.goal_functions import GoalFunction
 from torchrl_her_envs.gym.infos import Infos
 from torchrl_her_envs.gym.layout import Layout
 from torchrl_her_envs.gym.quiet import make_quietly
+from torchrl_her_envs.gym.renamed import Names
 
 
 def make_gym_env(
@@ -69,6 +70,9 @@ def make_gym_env(
     termination: str = "auto",
     achieved_reward: float | None = None,
     info_keys: Sequence[str] = (),
+    observation_key: Names = "observation",
+    achieved_goal_key: Names = "achieved_goal",
+    desired_goal_key: Names = "desired_goal",
     pictures: bool = False,
     **options: Any,
 ) -> GymGoalEnv:
@@ -87,6 +91,8 @@ def make_gym_env(
         achieved_reward: the reward from which on a goal counts as achieved, for dense rewards; if None, that
             from which on the environment's method ``_is_success`` says so.
         info_keys: keys of ``info`` that ``compute_reward`` reads, see :class:`GymGoalEnv`.
+        observation_key, achieved_goal_key, desired_goal_key: what it calls these entries; lists of several
+            entries follow each other in their order, and ``compute_reward`` gets dictionaries of them.
         pictures: whether to make it with ``render_mode="rgb_array"``, if it has that mode.
         options: for the environment, as ``gymnasium.make`` takes them (``render_mode``, for instance).
 
@@ -107,8 +113,10 @@ def make_gym_env(
     if max_steps is not None:
         options["max_episode_steps"] = max_steps
     check_termination(termination)
+    own = dict(zip(KEYS, (observation_key, achieved_goal_key, desired_goal_key), strict=True))
+    names = None if all(key == name for key, name in own.items()) else own
     with ExitStack() as opened:
-        reference_env = opened.enter_context(closing(make_one(id, options)))
+        reference_env = opened.enter_context(closing(make_one(id, names, options)))
         check_goal_env(id, reference_env)
         check_methods(id, reference_env)
         if spec_of(reference_env).max_episode_steps is None:
@@ -117,13 +125,13 @@ def make_gym_env(
                 f"{id} has no registered time limit: episodes are cut off after {limit} steps "
                 f"(task.options.max_steps={limit})"
             )
-            reference_env = opened.enter_context(closing(make_one(id, options)))
+            reference_env = opened.enter_context(closing(make_one(id, names, options)))
         if pictures and draws(reference_env) and "render_mode" not in options:
             choose_renderer()
             options["render_mode"] = PICTURES
-            reference_env = opened.enter_context(closing(make_one(id, options)))
+            reference_env = opened.enter_context(closing(make_one(id, names, options)))
         # By its spec rather than its id: new processes then need neither register it nor load TorchRL.
-        make = partial(make_quietly, gymnasium.registry[spec_of(reference_env).id], **options)
+        make = partial(make_quietly, gymnasium.registry[spec_of(reference_env).id], names, **options)
         vector = AsyncVectorEnv if parallel else SyncVectorEnv
         envs = opened.enter_context(closing(vector([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)))
         env = GymGoalEnv(

@@ -4,18 +4,29 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
+from torchrl_her_envs.gym.renamed import Names, RenamedKeys
 
-def make_quietly(id: str | EnvSpec, **options: Any) -> gymnasium.Env:
-    """Calls ``gymnasium.make``; PyBullet prints its arguments for each environment, which is left out."""
+
+def make_quietly(
+    id: str | EnvSpec, names: Mapping[str, Names] | None = None, /, **options: Any
+) -> gymnasium.Env:
+    """Calls ``gymnasium.make``; PyBullet prints its arguments for each environment, which is left out.
+
+    Args:
+        id: of the environment.
+        names: its entries, see :class:`~torchrl_her_envs.gym.renamed.RenamedKeys`; None for GoalEnv's.
+        options: for the environment.
+    """
     with _python_alone():
-        return gymnasium.make(id, disable_env_checker=True, **options)
+        env = gymnasium.make(id, disable_env_checker=True, **options)
+    return env if names is None else RenamedKeys(env, names)
 
 
 @contextmanager

@@ -1,0 +1,59 @@
+"""Gymnasium environments whose observation and goals have names of their own, or are several entries each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium
+from gymnasium import spaces
+
+Names = str | Sequence[str]
+
+
+class RenamedKeys(gymnasium.ObservationWrapper):
+    """Shows entries of an environment as ``observation``, ``achieved_goal`` and ``desired_goal``.
+
+    Several entries become a dictionary in the order given. The environment's functions get goals as it shows
+    them: an entry as it is, several as a dictionary under their own names.
+
+    Args:
+        env: whose observations are a dictionary.
+        names: its entry, or entries, for each of the three.
+
+    Raises:
+        ValueError: an entry is not shown.
+    """
+
+    def __init__(self, env: gymnasium.Env, names: Mapping[str, Names]) -> None:
+        super().__init__(env)
+        self._names = names
+        known = list(env.observation_space) if isinstance(env.observation_space, spaces.Dict) else []
+        for own in names.values():
+            for name in [own] if isinstance(own, str) else own:
+                if name not in known:
+                    env.close()
+                    id = env.spec.id if env.spec else type(env).__name__
+                    raise ValueError(f"{id} lacks {name!r} in what it shows: {', '.join(known) or 'no dict'}")
+        taken = self.observation(env.observation_space)
+        inner = {key: spaces.Dict(own) if isinstance(own, dict) else own for key, own in taken.items()}
+        self.observation_space = spaces.Dict(inner)
+        for method in ("compute_reward", "compute_terminated", "_is_success"):
+            if env.has_wrapper_attr(method):
+                setattr(self, method, partial(self._ask, env.get_wrapper_attr(method)))
+
+    def observation(self, observation: Any) -> dict[str, Any]:
+        return {
+            key: observation[own]
+            if isinstance(own, str)
+            else {f"{place:03}": observation[name] for place, name in enumerate(own)}
+            for key, own in self._names.items()
+        }
+
+    def _ask(self, function: Any, achieved: Any, desired: Any, *info: Any) -> Any:
+        return function(self._named("achieved_goal", achieved), self._named("desired_goal", desired), *info)
+
+    def _named(self, key: str, goal: Any) -> Any:
+        own = self._names[key]
+        return goal if isinstance(own, str) else dict(zip(own, goal.values(), strict=True))
