@@ -21,13 +21,15 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_her import load_checkpoint
+from torchrl_her.modules.networks import take_run
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_envs.toy.bit_flip import BitFlip
 from torchrl_her_envs.toy.treasure_hunt import TreasureHunt
-from torchrl_her_recipes import Callback, RunView, Study, build, load_study, run
+from torchrl_her_recipes import Callback, RunFolder, RunView, Study, build, load_study, run
+from torchrl_her_recipes.components.agents import make_player
 from torchrl_her_recipes.components.devices import place_of
 from torchrl_her_recipes.components.envs import make_task_envs
-from torchrl_her_recipes.runs.play import load_actor
 from torchrl_her_recipes.runs.plots import colors, count_frames, draw_curve, save_figure
 from torchrl_her_recipes.studies.seed_batches import Batches
 
@@ -194,12 +196,18 @@ def plot_values(runs: Sequence[Batches], path: Path) -> None:
     grid = figure.subplots(1, len(runs), sharey=True, squeeze=False)[0]
     for axes, own in zip(grid, runs, strict=True):
         recipe = own.homes[0].recipe()
-        actors = [
-            load_actor(home.path, run=run) for home in own.homes for run in range(home.recipe().run.num_runs)
-        ]
+        actors = [_load_actor(home, run) for home in own.homes for run in range(home.recipe().run.num_runs)]
         _draw(goal_env(make_task_envs(recipe, 1, [0])), axes, actors, recipe.learner.gamma)
         axes.set_title(own.path.name)
     save_figure(figure, path)
+
+
+def _load_actor(home: RunFolder, run: int) -> TensorDictModuleBase:
+    """Returns the actor of a run of DQN, which gives the values of all actions."""
+    recipe = home.recipe()
+    actor = make_player(recipe.replace(num_runs=1), make_task_envs(recipe, 1, [0]))
+    actor.load_state_dict(take_run(load_checkpoint(home.policy)["actor"], run, recipe.run.num_runs))
+    return actor
 
 
 @singledispatch

@@ -24,14 +24,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("suffix", ["pt", "onnx"])
-def test_an_exported_policy_acts_in_the_units_of_the_task(folder: Path, suffix: str) -> None:
-    if suffix == "onnx":
-        pytest.importorskip("onnxscript")
-    file = folder / f"mine.{suffix}"
-    card = export_policy(folder / "run", file).card
-    assert (card.low, card.high) == (tuple(LOW.tolist()), tuple(HIGH.tolist()))
-    assert card.success > 0.9
+def test_an_exported_policy_acts_in_the_units_of_the_task(folder: Path) -> None:
+    file = folder / "mine.pt"
+    info = export_policy(folder / "run", file).info
+    assert (info.low, info.high) == (tuple(LOW.tolist()), tuple(HIGH.tolist()))
+    assert info.success > 0.9
     env = make_task_envs(small(task=TASK), 20, [3], scaled=False)
     action = env.rollout(8, load_policy(file), break_when_any_done=False)["action"]
     assert (action.amin((0, 1)) < LOW + 3).all()
@@ -39,7 +36,8 @@ def test_an_exported_policy_acts_in_the_units_of_the_task(folder: Path, suffix: 
 
 
 def test_it_is_filmed(folder: Path) -> None:
-    assert play(folder / "run", folder / "film.gif", goals=3) >= 2
+    ((achieved, goals),) = play(folder / "run", out=folder / "film.gif", goals=3)
+    assert 2 <= achieved <= goals == 3
 
 
 def test_demonstrations_are_in_the_units_of_the_task_and_learned_from_in_those_of_the_learner(

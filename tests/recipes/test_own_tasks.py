@@ -19,13 +19,10 @@ from torchrl_her_recipes import (
     allow_imports,
     build,
     export_policy,
-    load_actor,
     load_policy,
     load_space,
-    load_trained,
     make_recipe,
     play,
-    play_beside,
     resume,
     run,
     run_study,
@@ -94,11 +91,9 @@ def test_an_environment_of_one_s_own_end_to_end(
     for call in (
         partial(build, recipe),
         partial(resume, "run", progress=False),
-        partial(load_actor, "run"),
         partial(load_policy, "run"),
         partial(export_policy, "run", "out.pt"),
-        partial(play, "run", "out.gif"),
-        partial(play_beside, ["run", "run"], "out.gif"),
+        partial(play, "run", out="out.gif"),
         partial(run_study, Study(name="theirs", vary={"task": [stranger]}), Path("study"), progress=False),
         partial(tune, Search(recipe=recipe, space=load_space("ddpg")), "search", trials=1),
     ):
@@ -112,10 +107,10 @@ def test_an_environment_of_one_s_own_end_to_end(
         check_permitted(stranger)
     with allow_imports():
         policy = export_policy("run", "maze.pt")
-    assert 0.0 <= policy.success < 1.0  # goals that are missed give 0, which is no success
+    assert 0.0 <= policy.info.success < 1.0  # goals that are missed give 0, which is no success
     forget(monkeypatch)
     assert load_policy("maze.pt").in_keys == ["observation", "desired_goal"]
-    assert load_trained("maze.pt").task == stranger
+    assert load_policy("maze.pt").info.task == stranger
     assert imports._permitted == set()
 
 
@@ -176,7 +171,7 @@ def test_a_torchrl_environment_of_one_s_own_trains_by_its_name(tmp_path: Path) -
     result = run(build(recipe), tmp_path / "run", progress=False)
     assert result.rows[-1]["rows_virtual"] > 0
     assert (tmp_path / "run" / "policy.gif").exists()
-    play(tmp_path / "run", tmp_path / "film.gif", goals=2, size=32)
+    play(tmp_path / "run", out=tmp_path / "film.gif", goals=2, size=32)
     resume(tmp_path / "run", progress=False)
 
 

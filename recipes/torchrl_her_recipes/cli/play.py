@@ -16,7 +16,6 @@ from torchrl_her_recipes.config.shipped import policy_names
 
 _SUFFIXES = (".gif", ".mp4")
 _RUN = click.Path(path_type=Path)
-_IN_A_WINDOW = 480  # pixels of one environment
 _best = click.option(
     "--best", is_flag=True, help="the policy of the evaluation with the best success, not the last one"
 )
@@ -39,7 +38,7 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
     help="another policy of the same task beside it, with the same starts and goals; may be repeated",
 )
 @click.option("--out", type=_RUN, help="the .gif or .mp4 (default: RUN/play.gif, FILE.gif or TASK.gif)")
-@click.option("--run", type=click.IntRange(0), default=0, help="which, of several side by side in RUN")
+@click.option("--run", type=click.IntRange(0), help="which, of several in RUN (default: the median)")
 @_best
 @click.option("--goals", type=click.IntRange(1), help="how many, side by side (default: 6, in a window 1)")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of the goals and starts")
@@ -52,7 +51,7 @@ def play(
     window: bool,
     others: tuple[str, ...],
     out: Path | None,
-    run: int,
+    run: int | None,
     best: bool,
     goals: int | None,
     seed: int,
@@ -60,8 +59,8 @@ def play(
 ) -> int:
     """Show a policy: as a GIF or MP4, or live in a window.
 
-    RUN is the folder of a run, or policy.pt or best.pt in it, FILE what `torchrl-her export` wrote (.pt or
-    .onnx), TASK one of the trained policies.
+    RUN is the folder of a run, or policy.pt or best.pt in it, FILE a .pt that `torchrl-her export` wrote,
+    TASK one of the trained policies.
 
     Keys in the window: space pauses, n or the right arrow takes one step, r goes on to the next goals, + and
     - change the speed, q or escape quits.
@@ -69,27 +68,18 @@ def play(
     sources = (source, *others)
     for name in sources:
         _check_source(name)
-    if window:
-        if out is not None:
-            raise click.UsageError("--window and --out cannot be given together")
-        seen = recipes.watch(
-            sources, run=run, best=best, goals=goals or 1, seed=seed, size=size or _IN_A_WINDOW
-        )
-        for name, (achieved, ended) in zip(sources, seen, strict=True):
-            click.echo(f"{achieved} of {ended} goals achieved: {name}")
-        return 0
-    film = out or _film_of(Path(source), compared=bool(others))
-    if film.suffix.lower() not in _SUFFIXES:
+    if window and out is not None:
+        raise click.UsageError("--window and --out cannot be given together")
+    film = None if window else out or _film_of(Path(source), compared=bool(others))
+    if film is not None and film.suffix.lower() not in _SUFFIXES:
         raise ValueError(f"cannot write {film.name!r}: its suffix must be one of {', '.join(_SUFFIXES)}")
-    goals, size = goals or 6, size or 240
-    if others:
-        counts = recipes.play_beside(sources, film, run=run, best=best, goals=goals, seed=seed, size=size)
-        for name, achieved in zip(sources, counts, strict=True):
-            click.echo(f"{achieved} of {goals} goals achieved: {name}")
+    view = {"goals": goals or (1 if window else 6), "size": size or (480 if window else 240), "seed": seed}
+    seen = recipes.play(*sources, out=film, run=run, best=best, **view)
+    alone = film is not None and not others
+    for name, (achieved, ended) in zip([str(film)] if alone else sources, seen, strict=True):
+        click.echo(f"{achieved} of {ended} goals achieved: {name}")
+    if film is not None and others:
         click.echo(film)
-        return 0
-    achieved = recipes.play(source, film, run=run, best=best, goals=goals, seed=seed, size=size)
-    click.echo(f"{achieved} of {goals} goals achieved: {film}")
     return 0
 
 
@@ -119,7 +109,7 @@ def _film_of(source: Path, *, compared: bool) -> Path:
     "--format",
     "form",
     type=click.Choice(["torch", "onnx"]),
-    help="torch: for load_policy; onnx: for onnxruntime, too (default: what --out ends with, or torch)",
+    help="torch: for load_policy; onnx: for onnxruntime (default: what --out ends with, or torch)",
 )
 @click.option("--run", "index", type=click.IntRange(0), help="which, of several (default: the median)")
 @click.option("--task", help="that it is for, if not the run's own")
@@ -140,16 +130,18 @@ def export(
     card: bool,
     best: bool,
 ) -> int:
-    """Write a policy as a file, for `torchrl-her play` and load_policy.
+    """Write a policy as a file: .pt for `torchrl-her play` and load_policy, .onnx for onnxruntime.
 
     RUN is the folder of a run, or best.pt in it. FILE.pt, which export wrote, or TASK, one of the trained
     policies, can be written in another format.
     """
     file = out or _file_of(source, task, ".onnx" if form == "onnx" else ".pt")
-    policy = recipes.export_policy(source, file, run=index, task=task, best=best, format=form, card=card)
-    own = policy.card
+    if form is not None and (form == "onnx") != (file.suffix == ".onnx"):
+        wanted = ".onnx" if form == "onnx" else ".pt"
+        raise ValueError(f"a file of format={form} must have the suffix {wanted}, got {file.name!r}")
+    own = recipes.export_policy(source, file, run=index, task=task, best=best, card=card).info
     touched = f" (reached at some step {own.reached:.0%})" if own.reached > own.success else ""
-    click.echo(f"seed {policy.recipe.run.seed}, success {own.success:.0%}{touched} on {policy.task}: {file}")
+    click.echo(f"seed {own.seed}, success {own.success:.0%}{touched} on {own.task}: {file}")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""What comes with the package, by name: presets, and trained policies (:mod:`..runs.policies` loads them)."""
+"""Names of the presets and trained policies that come with the package."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from torch.overrides import TorchFunctionMode
 
 from torchrl_her import FusedLearner, LossLearner, load_checkpoint
 from torchrl_her.trainers import GraphLearner
-from torchrl_her_recipes import Components, build, cli, load_actor, resume, run
+from torchrl_her_recipes import Components, build, cli, load_policy, resume, run
 from torchrl_her_recipes.components.devices import devices_of
 
 from ...emulated import emulated_device
@@ -120,7 +120,7 @@ def test_a_run_goes_on_in_the_middle_of_an_epoch(name: str, tmp_path: Path) -> N
 
 def test_policies_are_played_without_the_device(name: str, tmp_path: Path) -> None:
     run(build(small(epochs=1, **{"learner.device": name})), tmp_path / "run", progress=False)
-    assert {own.device.type for own in load_actor(tmp_path / "run").parameters()} == {"cpu"}
+    assert {own.device.type for own in load_policy(tmp_path / "run").parameters()} == {"cpu"}
 
 
 def test_steps_are_compiled_for_their_device(name: str) -> None:

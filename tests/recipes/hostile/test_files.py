@@ -19,19 +19,15 @@ from filelock import FileLock
 from torchrl_her import load_checkpoint, save_checkpoint
 from torchrl_her.demonstrations import Demonstrations
 from torchrl_her_envs import make_controller, make_env
-from torchrl_her_recipes import build, cli
+from torchrl_her_recipes import build, cli, load_policy
 from torchrl_her_recipes.cli.train_options import requests
 from torchrl_her_recipes.config.shipped import CONF
 from torchrl_her_recipes.config.study import load_study
-from torchrl_her_recipes.runs.exported.network import load_network
-from torchrl_her_recipes.runs.exported.onnx_export import write_onnx
-from torchrl_her_recipes.runs.exported.onnx_file import read_onnx
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap
-from torchrl_her_recipes.runs.policies import load_trained
 from torchrl_her_recipes.runs.run import resume, run
 
-from ..runs.exported.tiny import needs_onnx, states, tiny_policy
+from ..policies.tiny import tiny_policy
 from ..small import small
 from . import damage
 from .damage import Damage
@@ -76,8 +72,7 @@ def _use_run(path: Path) -> Any:
 
 KINDS = {
     "checkpoint": Kind("run/checkpoint.pt", load_checkpoint, TENSORS, ("train", "--resume", "DIR")),
-    "policy": Kind("policy.pt", load_trained, TENSORS, ("play", "FILE", "--out", "NEW")),
-    "onnx": Kind("policy.onnx", read_onnx, BYTES, ("play", "FILE", "--out", "NEW")),
+    "policy": Kind("policy.pt", load_policy, TENSORS, ("play", "FILE", "--out", "NEW")),
     "demonstrations": Kind(
         "demos.pt",
         Demonstrations.load,
@@ -109,28 +104,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recipe = small(task="hand_v0", algo="her_ibs", epochs=1, epoch_frames=480, hidden=8, keep_buffer=False)
     run(build(recipe), folder / "run", progress=False)
     shutil.rmtree(folder / "run" / "tensorboard")
-    policy = tiny_policy()
-    card = {name: list(own) if isinstance(own, tuple) else own for name, own in policy.card.to_dict().items()}
-    weights = dict(policy.actor.state_dict())
-    fits = {name.removeprefix("module."): own for name, own in weights.items()}
-    try:
-        load_network(policy.card, policy.recipe, fits)
-    except ValueError:
-        fits = weights
-    save_checkpoint({"card": card, "recipe": policy.recipe.to_dict(), "actor": fits}, folder / "policy.pt")
+    tiny_policy().save(folder / "policy.pt", card=False)
     env = make_env("hand_v0", num_envs=2, seed=0)
     played = env.rollout(20, make_controller(env), break_when_any_done=False)
     Demonstrations.from_rollout(played, task="hand_v0", first=True).save(folder / "demos.pt")
     shutil.copy(CONF / "preset" / "demo.yaml", folder / "mine.yaml")
     shutil.copy(CONF / "study" / "curriculum.yaml", folder / "study.yaml")
     return folder
-
-
-@pytest.fixture(scope="module")
-def with_onnx(whole: Path) -> Path:
-    policy = tiny_policy()
-    write_onnx(policy.actor, policy.card, policy.recipe, whole / "policy.onnx", states=states(policy.card, 5))
-    return whole
 
 
 @pytest.fixture(autouse=True)
@@ -209,9 +189,7 @@ def check_commands(kind: Kind, whole: Path, tmp_path: Path, cases: list[int], ca
 QUICK, COMMANDS, ALL = 40, 3, 10_000
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=needs_onnx) if name == "onnx" else name for name in KINDS]
-)
+@pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize(
     "count", [QUICK, pytest.param(-(-ALL // len(KINDS)), marks=pytest.mark.full)], ids=["few", "many"]
 )
@@ -220,11 +198,8 @@ def test_a_damaged_file_is_of_use_or_refused_in_one_line(
     name: str,
     whole: Path,
     tmp_path: Path,
-    request: pytest.FixtureRequest,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    if name == "onnx":
-        request.getfixturevalue("with_onnx")
     kind = KINDS[name]
     kind.read(whole / kind.name)
     fine, refused = try_files(kind, whole, tmp_path, range(count))

@@ -16,7 +16,6 @@ from torchrl_her_recipes import (
     RunView,
     build,
     export_policy,
-    load_actor,
     load_policy,
     play,
     resume,
@@ -84,7 +83,7 @@ def test_runs_side_by_side_are_kept_as_of_the_evaluation_with_the_best_median(
     best = load_checkpoint(tmp_path / "best.pt")
     assert (best["epoch"], best["success"]) == (1, 0.5)
     assert_same(best["actor"], weights.actors[1])
-    first, third = load_actor(tmp_path, run=0, best=True), load_actor(tmp_path, run=2, best=True)
+    first, third = load_policy(tmp_path, run=0, best=True), load_policy(tmp_path, run=2, best=True)
     assert not all(torch.equal(value, third.state_dict()[name]) for name, value in first.state_dict().items())
 
 
@@ -146,16 +145,15 @@ def test_the_best_policy_is_played_loaded_and_exported(
     two: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert load_checkpoint(two / "best.pt")["epoch"] == 1
-    last, best = load_actor(two, run=1), load_actor(two, run=1, best=True)
-    assert_same(dict(best.state_dict()), dict(load_actor(two / "best.pt", run=1).state_dict()))
+    last, best = load_policy(two, run=1), load_policy(two, run=1, best=True)
+    assert_same(dict(best.state_dict()), dict(load_policy(two / "best.pt", run=1).state_dict()))
     assert not all(torch.equal(value, last.state_dict()[name]) for name, value in best.state_dict().items())
 
     written = export_policy(two, tmp_path / "best_1.pt", run=1, best=True)
-    assert written.frames == 480
-    for source in (tmp_path / "best_1.pt", two / "best.pt"):
-        assert_same(dict(load_policy(source, run=1).state_dict()), dict(written.actor.state_dict()))
-    assert_same(dict(load_policy(two, run=1, best=True).state_dict()), dict(written.actor.state_dict()))
-    assert export_policy(two, tmp_path / "last.pt").frames == 960
+    assert written.info.frames == 480
+    for own in (load_policy(tmp_path / "best_1.pt"), load_policy(two / "best.pt", run=1), best):
+        assert_same(dict(own.state_dict()), dict(written.state_dict()))
+    assert export_policy(two, tmp_path / "last.pt").info.frames == 960
 
     options = ["--goals", "2", "--size", "64"]
     films = {name: tmp_path / f"{name}.gif" for name in ("flag", "file", "last")}
@@ -171,7 +169,7 @@ def test_without_a_best_policy_one_line_says_so(
     two: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(ValueError, match="best goes with the folder of a run, and hand_v1 is none"):
-        play("hand_v1", tmp_path / "film.gif", best=True)
+        play("hand_v1", out=tmp_path / "film.gif", best=True)
     (two / "best.pt").unlink()
     for command in ("play", "export"):
         assert main([command, str(two), "--best"]) == 2

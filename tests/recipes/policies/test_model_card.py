@@ -12,15 +12,14 @@ import pytest
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import make_recipe
 from torchrl_her_recipes.cli.overrides import parse_override, sweep
-from torchrl_her_recipes.runs.exported.model_card import (
+from torchrl_her_recipes.policies.model_card import (
     card_path,
     check_free,
     training_command,
     write_model_card,
 )
-from torchrl_her_recipes.runs.exported.onnx_export import write_onnx
 
-from .tiny import needs_onnx, states, tiny_policy
+from .tiny import needs_onnx, tiny_policy
 
 
 @pytest.mark.parametrize(
@@ -47,24 +46,23 @@ def test_the_command_trains_the_same_recipe(options: dict[str, Any]) -> None:
     assert make_recipe(**values) == recipe
 
 
-@needs_onnx
+@pytest.mark.parametrize("suffix", [pytest.param(".onnx", marks=needs_onnx), ".pt"])
 @pytest.mark.parametrize("options", [{}, {"task": "bit_flip", "learner": "dqn"}], ids=["hand", "bits"])
 def test_the_code_of_a_card_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], suffix: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     policy = tiny_policy(**options)
-    write_onnx(policy.actor, policy.card, policy.recipe, "my policy.onnx", states=states(policy.card, 5))
-    write_model_card(Path("my policy.md"), "my policy.onnx", policy.card, policy.recipe)
+    policy.save(f"my policy{suffix}")
     text = Path("my policy.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 1
     for block in blocks:
         exec(compile(block, "card", "exec"), {})
-    assert "torchrl-her play 'my policy.onnx'" in text
+    assert ("torchrl-her play 'my policy.pt'" in text) == (suffix == ".pt")
     assert "| success | 50.0 % of 1,000 episodes have their goal achieved at the last step |" in text
     assert "| reached | 75.0 % at some step |" in text
-    assert f"`{policy.card.task}`" in text
+    assert f"`{policy.info.task}`" in text
     for part in ("How it was trained", "What it expects", "Limits", "License"):
         assert f"\n## {part}\n" in text
 
@@ -73,7 +71,7 @@ def test_a_page_that_somebody_wrote_is_not_replaced(tmp_path: Path) -> None:
     policy, page = tiny_policy(normalize=True), tmp_path / "mine.md"
     assert card_path(tmp_path / "mine.pt") == page
     check_free(page)
-    write_model_card(page, "mine.pt", policy.card, policy.recipe)
+    write_model_card(page, "mine.pt", policy.info, policy.recipe)
     check_free(page)  # a newer one may replace it
     text = page.read_text()
     assert "clips\nthem to plus and minus 5." in text

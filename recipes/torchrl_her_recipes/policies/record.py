@@ -19,13 +19,13 @@ from torchrl_her_envs.registry import GYM
 from torchrl_her_envs.throwing.experts.controller import make_controller
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.config.recipe import Recipe, make_recipe
-from torchrl_her_recipes.runs.policies import load_trained
+from torchrl_her_recipes.policies.policy import Policy
 
 EXPERT = "expert"
 _AT_ONCE, _OF_GYM_AT_ONCE = 100, 10  # environments
 _MOST = 10  # episodes that are played for each one that is asked for, at most
 
-Policy = Callable[[TensorDictBase], TensorDictBase]
+Player = Callable[[TensorDictBase], TensorDictBase]
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def record_demonstrations(
     return recorded
 
 
-def _find_policy(recipe: Recipe, env: EnvBase, policy: str | Path | None) -> tuple[Policy, str]:
+def _find_policy(recipe: Recipe, env: EnvBase, policy: str | Path | None) -> tuple[Player, str]:
     """A policy that plays in some environments, and its name."""
     task = recipe.task.name
     if policy is None or str(policy) == EXPERT:
@@ -99,13 +99,13 @@ def _find_policy(recipe: Recipe, env: EnvBase, policy: str | Path | None) -> tup
                 f"{task} has no scripted controller: give --policy (policy=...), a file that `torchrl-her "
                 "export` wrote or the name of a trained policy"
             ) from None
-    trained = load_trained(policy)
-    trained.card.check_plays(env, task)
-    return trained.actor, f"{policy}, a policy of {trained.task}"
+    trained = Policy.load(policy)
+    trained.info.check_plays(env, task)
+    return trained, f"{policy}, a policy of {trained.info.task}"
 
 
 def _play(
-    env: EnvBase, player: Policy, name: str, episodes: int, *, keep_all: bool, facts: dict[str, Any]
+    env: EnvBase, player: Player, name: str, episodes: int, *, keep_all: bool, facts: dict[str, Any]
 ) -> Recorded:
     """Plays one episode after the other in each environment, until there are enough."""
     reward, parts = reward_range(goal_env(env))[1], []

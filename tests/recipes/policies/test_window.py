@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +13,11 @@ import torch
 from PIL import Image
 from tensordict import TensorDictBase
 
-from torchrl_her_envs import make_env
 from torchrl_her_envs.common.rendering.key_window import Command
-from torchrl_her_envs.common.rendering.live import LiveEpisodes
-from torchrl_her_recipes import play_beside
+from torchrl_her_recipes import Policy, load_policy, play
 from torchrl_her_recipes.cli import main
-from torchrl_her_recipes.runs.side_by_side import SideBySide
-from torchrl_her_recipes.runs.watch import Viewing, show
+from torchrl_her_recipes.policies.viewer import View, Viewer
+from torchrl_her_recipes.policies.window import Viewing, show
 
 
 def still(tensordict: TensorDictBase) -> TensorDictBase:
@@ -33,19 +31,23 @@ def to_the_ball(tensordict: TensorDictBase) -> TensorDictBase:
     return tensordict.set("action", action.clamp(-1, 1))
 
 
+def acting(forward: Callable[[TensorDictBase], TensorDictBase], name: str) -> Policy:
+    policy = load_policy("hand_reach")
+    policy.forward, policy.source = forward, name  # type: ignore[method-assign]
+    return policy
+
+
 @pytest.fixture
-def episodes() -> SideBySide:
+def viewer() -> Viewer:
     """A policy that achieves all goals beside one that achieves none."""
-    both = [
-        LiveEpisodes(make_env("hand_reach", num_envs=2, seed=0), policy, size=32)
-        for policy in (to_the_ball, still)
-    ]
-    return SideBySide(both, ["good", "bad"])
+    return Viewer(
+        [acting(to_the_ball, "good"), acting(still, "bad")], View(goals=2, seed=5, size=32, named=True)
+    )
 
 
 @pytest.fixture
-def viewing(episodes: SideBySide) -> Viewing:
-    return Viewing(episodes, seed=5)
+def viewing(viewer: Viewer) -> Viewing:
+    return Viewing(viewer)
 
 
 def test_space_pauses_and_n_takes_one_step(viewing: Viewing) -> None:
@@ -71,33 +73,32 @@ def test_plus_and_minus_change_the_speed_within_limits(viewing: Viewing) -> None
 
 
 def test_goals_are_the_same_for_all_and_the_counts_are_of_all_that_was_seen(
-    viewing: Viewing, episodes: SideBySide
+    viewing: Viewing, viewer: Viewer
 ) -> None:
-    goals = [own.desired_goal for own in episodes._episodes]
+    goals = [own.desired_goal for own in viewer._episodes]
     assert goals[0].equal(goals[1])
-    while episodes.running:
+    while viewer.running:
         viewing.tick()
-    assert (episodes.achieved, episodes.ended) == ([2, 0], [2, 2])
+    assert viewer.seen == [(2, 2), (0, 2)]
     frozen = viewing.frame()
     for _ in range(viewing.rate):  # a second to see how it ended
         viewing.tick()
         assert viewing.frame().equal(frozen)
     viewing.tick()
     assert viewing.status().startswith("goals 3 to 4, step 0 of 50")
-    assert (episodes.achieved, episodes.ended) == ([2, 0], [2, 2])
+    assert viewer.seen == [(2, 2), (0, 2)]
     viewing.tick()
     viewing.handle(Command.RESET)  # these were neither achieved nor missed
-    goals = [own.desired_goal for own in episodes._episodes]
+    goals = [own.desired_goal for own in viewer._episodes]
     assert goals[0].equal(goals[1])
     assert viewing.status().startswith("goals 5 to 6, step 0 of 50")
-    assert (episodes.achieved, episodes.ended) == ([2, 0], [2, 2])
+    assert viewer.seen == [(2, 2), (0, 2)]
 
 
 def test_a_single_goal_of_few_coordinates_is_written_out() -> None:
-    env = make_env("hand_reach", seed=0)
-    live = LiveEpisodes(env, still, size=32)
-    viewing = Viewing(SideBySide([live], ["mine"]), seed=5)
-    x, y = live.desired_goal[0].tolist()
+    viewer = Viewer([acting(still, "mine")], View(goals=1, seed=5, size=32))
+    viewing = Viewing(viewer)
+    x, y = viewer.desired_goal[0].tolist()
     assert viewing.status() == f"goal 1 at ({x:.2f}, {y:.2f}), step 0 of 50, 12 steps a second"
 
 
@@ -120,13 +121,13 @@ class Script:
         raise AssertionError("it belongs to somebody else")
 
 
-def test_keys_are_looked_for_often_however_slow_the_steps_are(viewing: Viewing, episodes: SideBySide) -> None:
+def test_keys_are_looked_for_often_however_slow_the_steps_are(viewing: Viewing, viewer: Viewer) -> None:
     window = Script({1: [Command.SLOWER] * 3, 61: [Command.FASTER] * 6, 71: [Command.QUIT]})
     show(viewing, window)
     assert len(window.pictures) == 71
     assert window.rates == [30] * 61 + [100] * 10
     # 2 steps a second for two seconds, then 100 a second for nine looks, and none once it is over.
-    assert episodes.step_count == 4 + 9
+    assert viewer.step_count == 4 + 9
 
 
 # On the command line
@@ -210,4 +211,4 @@ def test_a_film_of_several_policies_has_them_beside_each_other(
         assert film.n_frames > 3
         first = np.asarray(film.convert("RGB"))
     assert np.array_equal(first[:64, :128], first[:64, 136:264])  # the same starts and goals
-    assert play_beside(["hand_reach"], "single.gif", goals=3, size=32, seed=4) == [3]
+    assert play("hand_reach", out="single.gif", goals=3, size=32, seed=4) == [(3, 3)]

@@ -14,10 +14,10 @@ from torchrl_her.files.writing import write_text
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.shortcuts import GROUPS, locate
-from torchrl_her_recipes.runs.exported.card import PolicyCard
-from torchrl_her_recipes.runs.exported.onnx_file import SUFFIX
+from torchrl_her_recipes.policies.info import PolicyInfo
+from torchrl_her_recipes.policies.onnx import SUFFIX
 
-_TEMPLATE = Path(__file__).parents[2] / "templates" / "model_card.md"
+_TEMPLATE = Path(__file__).parents[1] / "templates" / "model_card.md"
 _MARK = "<!-- written by torchrl-her export; it may be replaced by the next export -->"
 
 
@@ -44,7 +44,7 @@ def check_free(path: Path) -> None:
         )
 
 
-def write_model_card(path: Path, file: str, card: PolicyCard, recipe: Recipe) -> None:
+def write_model_card(path: Path, file: str, card: PolicyInfo, recipe: Recipe) -> None:
     """Writes the model card of a policy.
 
     Args:

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 
 from torchrl_her_envs import TASKS, make_env
-from torchrl_her_recipes import PolicyCard, read_card
-from torchrl_her_recipes.runs.exported.card import describe_env
+from torchrl_her_recipes import PolicyInfo, load_policy
+from torchrl_her_recipes.policies.info import describe_env
 
 
-def card(**values: Any) -> PolicyCard:
+def card(**values: Any) -> PolicyInfo:
     known: dict[str, Any] = {
         "task": "mine",
         "widths": {"observation": 3, "desired_goal": 2},
@@ -23,14 +23,14 @@ def card(**values: Any) -> PolicyCard:
         "seed": 7,
         "frames": 100,
     }
-    return PolicyCard(**known | values)
+    return PolicyInfo(**known | values)
 
 
 def test_a_card_survives_plain_data() -> None:
     own = card(success=0.25, reached=0.5, versions={"torch": "2.14.1"}, normalize_clip=5.0)
-    assert PolicyCard.from_dict(own.to_dict()) == own
+    assert PolicyInfo.from_dict(own.to_dict()) == own
     discrete = card(action_shape=(), action_dtype="int64", low=(0.0,), high=(3.0,))
-    assert PolicyCard.from_dict({**discrete.to_dict(), "action_shape": [], "high": [3]}) == discrete
+    assert PolicyInfo.from_dict({**discrete.to_dict(), "action_shape": [], "high": [3]}) == discrete
     assert discrete.discrete
     assert discrete.expects() == "observation [3], desired_goal [2] and action of 4 choices"
 
@@ -64,14 +64,14 @@ def test_values_that_no_policy_has_are_refused(values: dict[str, Any], message: 
 def test_plain_data_of_something_else_is_refused() -> None:
     own = card().to_dict()
     with pytest.raises(ValueError, match="a policy's card must have task, .*, got surprise"):
-        PolicyCard.from_dict({**own, "surprise": 1})
+        PolicyInfo.from_dict({**own, "surprise": 1})
     with pytest.raises(ValueError, match="a policy's card must have task, .*, got int"):
-        PolicyCard.from_dict(3)
+        PolicyInfo.from_dict(3)
     del own["seed"]
     with pytest.raises(ValueError, match="a policy's card lacks seed"):
-        PolicyCard.from_dict(own)
+        PolicyInfo.from_dict(own)
     with pytest.raises(ValueError, match="low of a policy must be a list, got '5'"):
-        PolicyCard.from_dict({**card().to_dict(), "low": 5})
+        PolicyInfo.from_dict({**card().to_dict(), "low": 5})
 
 
 def test_another_task_is_refused_with_both_widths() -> None:
@@ -82,8 +82,8 @@ def test_another_task_is_refused_with_both_widths() -> None:
         r"desired_goal \[2\] and action \[3\], and robot_v0 has observation \[15\], desired_goal \[2\] "
         r"and action \[3\]",
     ):
-        read_card("hand_v0").check_plays(robot, "robot_v0")
-    read_card("robot_v1").check_plays(robot, "robot_v0")
+        load_policy("hand_v0").info.check_plays(robot, "robot_v0")
+    load_policy("robot_v1").info.check_plays(robot, "robot_v0")
     own = {**describe_env(make_env("bit_flip", bits=4)), "task": "four"}
     four = card(**own)
     four.check_plays(make_env("bit_flip", bits=4), "four")
@@ -91,12 +91,9 @@ def test_another_task_is_refused_with_both_widths() -> None:
         four.check_plays(make_env("bit_flip", bits=5), "five")
 
 
-def test_the_policies_of_the_package_have_cards_without_their_networks(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("torchrl_her_recipes.runs.policies.load_network", None)  # not called
+def test_the_policies_of_the_package_fit_their_tasks() -> None:
     for task in TASKS:
-        own = read_card(task)
+        own = load_policy(task).info
         assert own.task == task
         assert own.learner == "ddpg"
         assert own.success > 0.5

@@ -11,12 +11,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_her.modules import RunningNorm
-from torchrl_her_recipes import PolicyCard, make_recipe
+from torchrl_her_recipes import Policy, PolicyInfo, make_recipe
 from torchrl_her_recipes.components.agents import make_player
 from torchrl_her_recipes.components.envs import make_task_envs
-from torchrl_her_recipes.runs.exported.card import describe_env
-from torchrl_her_recipes.runs.exported.network import load_network
-from torchrl_her_recipes.runs.policies import TrainedPolicy
+from torchrl_her_recipes.policies.info import describe_env
 
 needs_onnx = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxruntime", "onnxscript")),
@@ -33,7 +31,7 @@ LEARNERS: list[dict[str, Any]] = [
 ]
 
 
-def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, **options: Any) -> TrainedPolicy:
+def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, **options: Any) -> Policy:
     """A policy whose actions differ from state to state, with statistics of inputs if it normalizes."""
     recipe = make_recipe(task=task, algo="her", hidden=8, **options)
     env = make_task_envs(recipe, 1, [0])
@@ -42,7 +40,7 @@ def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, **options: Any) ->
         for weight in player.parameters():
             weight.copy_(0.5 * torch.randn_like(weight))
     own = describe_env(env)
-    card = PolicyCard(
+    info = PolicyInfo(
         task=task,
         **own,
         normalize_clip=recipe.learner.normalize_clip if recipe.learner.normalize else None,
@@ -55,15 +53,15 @@ def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, **options: Any) ->
         versions={"torchrl-her": "0.1.0"},
     )
     if scale != 1.0:
-        card = replace(card, low=tuple(-scale for _ in card.low), high=tuple(2 * scale for _ in card.high))
+        info = replace(info, low=tuple(-scale for _ in info.low), high=tuple(2 * scale for _ in info.high))
     for module in player.modules():
         if isinstance(module, RunningNorm):
-            module.update(states(card, 200, mean=3.0))
-    return TrainedPolicy(card, load_network(card, recipe, player.state_dict()), recipe)
+            module.update(states(info, 200, mean=3.0))
+    return Policy(info, recipe, player.state_dict(), source="tiny")
 
 
-def states(card: PolicyCard, rows: int, *, mean: float = 0.0) -> TensorDictBase:
+def states(info: PolicyInfo, rows: int, *, mean: float = 0.0) -> TensorDictBase:
     """Random inputs of a policy."""
     return TensorDict(
-        {key: mean + 2 * torch.randn(rows, width) for key, width in card.widths.items()}, batch_size=[rows]
+        {key: mean + 2 * torch.randn(rows, width) for key, width in info.widths.items()}, batch_size=[rows]
     )

@@ -21,7 +21,7 @@ _FLOATS = ("float32", "float64")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolicyCard:
+class PolicyInfo:
     """What an exported policy reads and writes, and what made it.
 
     Attributes:
@@ -43,9 +43,9 @@ class PolicyCard:
         ValueError: a value that no policy has.
 
     Example:
-        >>> from torchrl_her_recipes import read_card
-        >>> card = read_card("hand_v1")
-        >>> card.widths, card.action_shape, card.success > 0.9
+        >>> from torchrl_her_recipes import load_policy
+        >>> info = load_policy("hand_v1").info
+        >>> info.widths, info.action_shape, info.success > 0.9
         ({'observation': 9, 'desired_goal': 2}, (3,), True)
     """
 
@@ -107,7 +107,7 @@ class PolicyCard:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, values: object) -> PolicyCard:
+    def from_dict(cls, values: object) -> PolicyInfo:
         """A card from what :meth:`to_dict` gave.
 
         Raises:
@@ -129,8 +129,8 @@ class PolicyCard:
         """What it reads and writes, in words.
 
         Example:
-            >>> from torchrl_her_recipes import read_card
-            >>> read_card("hand_v1").expects()
+            >>> from torchrl_her_recipes import load_policy
+            >>> load_policy("hand_v1").info.expects()
             'observation [9], desired_goal [2] and action [3]'
         """
         return _words(self.widths, self.action_shape, self.high)
@@ -157,7 +157,7 @@ class PolicyCard:
 
 
 def describe_env(env: EnvBase) -> dict[str, Any]:
-    """The entries of a :class:`PolicyCard` that environments tell: widths, actions and their limits.
+    """The entries of a :class:`PolicyInfo` that environments tell: widths, actions and their limits.
 
     Example:
         >>> from torchrl_her_envs import make_env

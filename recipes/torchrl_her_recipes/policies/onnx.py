@@ -1,4 +1,4 @@
-"""Writing policies as ONNX files, and checking them against the policy itself.
+"""Policies as ONNX files for onnxruntime, checked against the policy itself when they are written.
 
 torch has two exporters. The one over ``torch.export`` (``dynamo=True``) is maintained and converts all
 networks of this library; the older one over TorchScript is deprecated and fails at layer normalization over
@@ -14,101 +14,108 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from torchrl_her.files.writing import written
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.runs.exported.card import KEYS, PolicyCard
-from torchrl_her_recipes.runs.exported.network import TensorPolicy
-from torchrl_her_recipes.runs.exported.onnx_file import CARD, DIGEST, RECIPE, check_onnx, digest, need_onnx
-from torchrl_her_recipes.runs.exported.onnx_policy import OnnxPolicy
+from torchrl_her_recipes.policies.info import KEYS, PolicyInfo
+from torchrl_her_recipes.policies.network import TensorPolicy
 
+SUFFIX = ".onnx"
 TOLERANCE = 1e-5  # of actions, relative to the greatest one where that is above 1
 
 _OPSET = 18  # the lowest that torch's exporter writes without converting; runtimes have it since 2023
 
 
+def need_onnx() -> ModuleType:
+    """Returns the package ``onnxruntime``, if all that writing ONNX files takes is installed.
+
+    Raises:
+        ImportError: A package is missing; the message names the extra.
+    """
+    try:
+        # All are an extra that few need, and take a second to import.
+        import onnx  # noqa: F401, PLC0415
+        import onnxruntime  # noqa: PLC0415
+        import onnxscript  # noqa: F401, PLC0415
+    except ImportError as error:
+        raise ImportError(
+            "ONNX files need onnx, onnxruntime and onnxscript: pip install '.[onnx]'"
+        ) from error
+    return onnxruntime
+
+
 def write_onnx(
     policy: TensorDictModuleBase,
-    card: PolicyCard,
+    info: PolicyInfo,
     recipe: Recipe,
     path: str | Path,
     *,
     states: TensorDictBase,
-) -> None:
+) -> PolicyInfo:
     """Writes a policy as an ONNX file that takes any number of rows and gives their actions, in float32.
 
     The graph has the inputs ``observation`` [batch, width] and ``desired_goal`` [batch, width] and the output
     ``action`` [batch, width], or integers [batch]. Normalization and the scaling of actions are inside.
-    The card and the recipe are in the file's metadata, as JSON.
+    The facts and the recipe are in the file's metadata, as JSON.
 
     The file gets its name only after onnxruntime has given the policy's actions with what was written.
 
     Args:
-        policy: of :func:`~torchrl_her_recipes.load_policy` or the like.
-        card: what it expects.
-        recipe: of the run that trained it.
-        path: of the file.
+        policy: The network of :func:`~torchrl_her_recipes.policies.network.load_network`.
+        info: Facts about the policy.
+        recipe: Recipe of the run that trained it.
+        path: The file.
+        states: Rows of ``observation`` and ``desired_goal`` on which the actions are compared.
 
-    Keyword Args:
-        states: rows of ``observation`` and ``desired_goal`` on which the actions are compared.
+    Returns:
+        The facts about the policy of the file.
 
     Raises:
-        ValueError: onnxruntime gives other actions, or the graph has an operator that policies must not have.
+        ValueError: onnxruntime gives other actions.
         ImportError: onnx, onnxruntime or onnxscript is missing.
-        OSError: the file cannot be written.
+        OSError: The file cannot be written.
     """
-    need_onnx(writes=True)
+    runtime = need_onnx()
     path, own = Path(path), TensorPolicy(policy)
-    card = replace(card, dtype="float32", action_dtype="int64" if card.discrete else "float32")
-    proto = _graph_of(own, card)
-    described = {CARD: json.dumps(card.to_dict()), RECIPE: json.dumps(recipe.to_dict())}
-    described[DIGEST] = digest(proto, described[CARD], described[RECIPE])
-    for name, text in described.items():
-        proto.metadata_props.add(key=name, value=text)
+    info = replace(info, dtype="float32", action_dtype="int64" if info.discrete else "float32")
+    proto = _graph_of(own, info)
+    for name, facts in (("card", info.to_dict()), ("recipe", recipe.to_dict())):
+        proto.metadata_props.add(key=f"torchrl_her.{name}", value=json.dumps(facts))
+    seen = {key: states[key].reshape(-1, info.widths[key]).float() for key in KEYS}
     with written(path) as part:
-        part.write_bytes(proto.SerializeToString())
-        try:
-            read_again = OnnxPolicy(check_onnx(part.read_bytes()))
-        except ValueError as error:
-            raise ValueError(f"this policy cannot be written as an ONNX file: the file {error}") from error
-        check_actions(own, read_again, card, states)
+        part.write_bytes(model := proto.SerializeToString())
+        session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
+        (action,) = session.run(["action"], {key: value.numpy() for key, value in seen.items()})
+        _check_actions(own, torch.from_numpy(action), info, seen)
+    return info
 
 
-def check_actions(
-    own: TensorPolicy, written: TensorDictModuleBase, card: PolicyCard, states: TensorDictBase
-) -> None:
-    """Compares the actions of a file with those of the policy that it was made of.
+def _check_actions(own: TensorPolicy, action: Tensor, info: PolicyInfo, seen: dict[str, Tensor]) -> None:
+    """Raises a ValueError if actions differ from the policy's by more than :data:`TOLERANCE`.
 
-    Args:
-        own: the policy.
-        written: the file's.
-        card: has the limits of actions.
-        states: rows to act on.
-
-    Raises:
-        ValueError: they differ by more than :data:`TOLERANCE`. For integers, their values do.
+    Of integers, the values are compared: two actions may have the same value.
     """
-    seen = {key: states[key].reshape(-1, card.widths[key]).float() for key in KEYS}
-    action = written(TensorDict(seen, [len(seen[KEYS[0]])]))["action"]
     worst = float(own.deviation(action, *seen.values()).nan_to_num(torch.inf).max())
-    scale = max([1.0, *(abs(side) for side in (*card.low, *card.high) if abs(side) < float("inf"))])
-    limit = TOLERANCE * (1.0 if card.discrete else scale)
+    scale = max([1.0, *(abs(side) for side in (*info.low, *info.high) if abs(side) < float("inf"))])
+    limit = TOLERANCE * (1.0 if info.discrete else scale)
     if not worst <= limit:
         raise ValueError(
-            f"the ONNX file would not act as the policy of {card.task} does: on {len(action):,} states of "
+            f"the ONNX file would not act as the policy of {info.task} does: on {len(action):,} states of "
             f"the task, onnxruntime's actions differ by up to {worst:.1e}, more than {limit:.0e}; it was "
             "removed"
         )
 
 
-def _graph_of(own: TensorPolicy, card: PolicyCard) -> Any:
+def _graph_of(own: TensorPolicy, info: PolicyInfo) -> Any:
     """The policy as a protobuf, without what tells of the machine that made it."""
-    inputs = tuple(torch.zeros(2, card.widths[key]) for key in KEYS)  # 2: torch takes 1 for a constant
+    inputs = tuple(torch.zeros(2, info.widths[key]) for key in KEYS)  # 2: torch takes 1 for a constant
     batch = torch.export.Dim("batch")
     with _silent():
         program = torch.onnx.export(

@@ -1,31 +1,24 @@
-"""Policies at work, live in a window."""
+"""Policies at work, live in a window or as a film."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from torch import Tensor
 
 from torchrl_her_envs.common.rendering.key_window import Command, KeyWindow
 from torchrl_her_envs.common.rendering.pictures import underlined
+from torchrl_her_recipes.policies.policy import Policy
+from torchrl_her_recipes.policies.viewer import Seen, View, Viewer
 from torchrl_her_recipes.runs.film import FPS
-from torchrl_her_recipes.runs.play import shown
-from torchrl_her_recipes.runs.side_by_side import SideBySide
 
 _RATES = (1, 2, 4, 8, FPS, 25, 50, 100, 200)  # steps a second
 _LOOKS = 30  # times a second that keys are looked for, at least
 _MOST_NUMBERS = 3  # of a goal that are written out
 _KEYS = "space: pause    n: one step    r: next goals    + -: speed    q: quit"
-
-
-class Seen(NamedTuple):
-    """What somebody has seen of a policy: goals that it achieved, of those that it had."""
-
-    achieved: int
-    goals: int
 
 
 class Window(Protocol):
@@ -37,52 +30,53 @@ class Window(Protocol):
     def close(self) -> None: ...
 
 
-def watch(
-    sources: Sequence[str | Path],
-    *,
-    run: int = 0,
+def play(
+    *sources: str | Path,
+    out: str | Path | None = None,
+    run: int | None = None,
     best: bool = False,
-    goals: int = 1,
-    seed: int = 0,
-    size: int = 480,
+    **view: Any,
 ) -> list[Seen]:
-    """Shows policies in a window, with the same starts and goals, until somebody closes it.
+    """Shows policies on the same starts and goals: as a film, or in a window until it is closed.
 
-    Keys: space pauses, n or the right arrow takes one step, r goes on to the next goals, plus and minus
-    change the speed, q or escape quits.
+    Keys in the window: space pauses, n or the right arrow takes one step, r goes on to the next goals, plus
+    and minus change the speed, q or escape quits.
 
     Args:
-        sources: of one policy or several, as for :func:`~torchrl_her_recipes.play`; all of the same task.
-        run: which one of the first folder, if there are several side by side in it.
-        best: whether to take the best policy of the first folder.
-        goals: how many at a time.
-        seed: of the first goals and starts; the next ones have the next seed.
-        size: pixels of one environment.
+        sources: The policies, see :meth:`Policy.load`; all of the same task.
+        out: A .gif or .mp4 file; a window opens if None.
+        run: Index of the run of the first source, if that is a folder; the run with the median success if
+            None.
+        best: Whether to take the best policy of the first source, if that is a folder.
+        view: ``goals``, ``seed``, ``size`` and ``named`` of
+            :class:`~torchrl_her_recipes.policies.viewer.View`.
 
     Returns:
-        What was seen of each policy.
+        Goals that each policy achieved, and all that it had.
 
     Raises:
-        ValueError: as for :func:`~torchrl_her_recipes.play`, the policies are not of the same task, or there
-            is no display.
-        ImportError: the package pygame-ce is missing.
-        OSError: a run has not saved a policy yet.
+        ValueError: There is no such policy, the policies are of different tasks, nothing can be drawn, or
+            there is no display.
+        ImportError: A window needs the package pygame-ce.
+        OSError: A run has not saved a policy yet.
+
+    Example:
+        >>> from torchrl_her_recipes import play
+        >>> play("hand_reach", out="reach.gif", goals=2)
+        [Seen(achieved=2, goals=2)]
     """
-    window = KeyWindow(f"torchrl-her: {', '.join(map(str, sources))}")
-    try:
-        with shown(
-            sources,
-            goals=goals,
-            seed=seed,
-            size=size,
-            run=run,
-            best=best,
-            named=True,
-        ) as episodes:
-            show(Viewing(episodes, seed=seed), window)
-            return [Seen(*pair) for pair in zip(episodes.achieved, episodes.ended, strict=True)]
-    finally:
-        window.close()
+    first, *others = sources
+
+    def viewer() -> Viewer:
+        policies = [Policy.load(first, run=run, best=best), *map(Policy.load, others)]
+        return Viewer(policies, View(**{"named": out is None or bool(others), **view}))
+
+    if out is not None:
+        with viewer() as shown:
+            return shown.write(out)
+    with closing(KeyWindow(f"torchrl-her: {', '.join(map(str, sources))}")) as window, viewer() as shown:
+        show(Viewing(shown), window)
+        return shown.seen
 
 
 def show(viewing: Viewing, window: Window) -> None:
@@ -104,19 +98,17 @@ class Viewing:
     """What somebody looks at: episodes, how fast they go, and whether they are paused.
 
     Args:
-        episodes: of the policies.
-        seed: of the first goals; the next ones have the next seed.
+        viewer: Shows the policies.
 
     Attributes:
         paused: whether no steps are taken unless they are asked for.
         over: whether somebody has had enough.
     """
 
-    def __init__(self, episodes: SideBySide, *, seed: int) -> None:
+    def __init__(self, viewer: Viewer) -> None:
         self.paused = self.over = False
-        self._episodes, self._seed = episodes, seed
+        self._viewer = viewer
         self._rate = _RATES.index(FPS)
-        self._round = 0
         self._begin()
 
     @property
@@ -134,7 +126,7 @@ class Viewing:
             self.paused = True
             self._go_on(hold=0)
         elif command is Command.RESET:
-            self._next()
+            self._begin()
         elif command is Command.FASTER:
             self._rate = min(self._rate + 1, len(_RATES) - 1)
         elif command is Command.SLOWER:
@@ -147,33 +139,28 @@ class Viewing:
 
     def frame(self) -> Tensor:
         """The present picture [height, width, 3] of uint8, with what there is to know below it."""
-        return underlined(self._episodes.frame(), [self.status(), _KEYS])
+        return underlined(self._viewer.frame(), [self.status(), _KEYS])
 
     def status(self) -> str:
         """Which goals, which step, and how fast."""
-        goals, own = self._episodes.goals, self._episodes
-        first = self._round * goals + 1
+        own, goals, first = self._viewer, self._viewer.view.goals, self._viewer.first_goal
         which = f"goal {first}{self._where()}" if goals == 1 else f"goals {first} to {first + goals - 1}"
         speed = "paused" if self.paused else f"{self.rate} steps a second"
         return f"{which}, step {own.step_count} of {own.max_steps}, {speed}"
 
     def _where(self) -> str:
         """The coordinates of the goal, if there are few."""
-        goal = self._episodes.desired_goal[0].flatten().tolist()
+        goal = self._viewer.desired_goal[0].flatten().tolist()
         return f" at ({', '.join(f'{x:.2f}' for x in goal)})" if len(goal) <= _MOST_NUMBERS else ""
 
     def _go_on(self, *, hold: int) -> None:
-        if self._episodes.running:
-            self._episodes.step()
+        if self._viewer.running:
+            self._viewer.step()
         elif self._held < hold:
             self._held += 1
         else:
-            self._next()
-
-    def _next(self) -> None:
-        self._round += 1
-        self._begin()
+            self._begin()
 
     def _begin(self) -> None:
         self._held = 0
-        self._episodes.start(seed=self._seed + self._round)
+        self._viewer.start()

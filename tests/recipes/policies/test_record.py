@@ -12,7 +12,7 @@ import torch
 from torchrl_her.demonstrations import Demonstrations
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import cli, record_demonstrations
-from torchrl_her_recipes.runs import record
+from torchrl_her_recipes.policies import record
 
 
 def test_the_scripted_controller_s_episodes_are_written(tmp_path: Path) -> None:

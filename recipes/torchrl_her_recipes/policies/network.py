@@ -1,4 +1,4 @@
-"""The network of an exported policy, made from what its card says, without the task's environments."""
+"""The network of an exported policy, made from what its info says, without the task's environments."""
 
 from __future__ import annotations
 
@@ -20,51 +20,53 @@ from torchrl_her_recipes.components.learner import LearnerBuilder
 from torchrl_her_recipes.components.normalization import acting, make_norm
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
-from torchrl_her_recipes.runs.exported.card import KEYS, PolicyCard
+from torchrl_her_recipes.policies.info import KEYS, PolicyInfo
 
 _CONSTANTS = ("mean", "std", "limit")  # of the normalization of an entry
 
 
 class _Shown:
-    """What builders of learners ask of an environment, as a policy's card says it."""
+    """What builders of learners ask of an environment, as a policy's info says it."""
 
-    def __init__(self, card: PolicyCard) -> None:
-        self.observation_spec = Composite({key: Unbounded(card.widths[key]) for key in KEYS})
-        self.action_spec = self.action_spec_unbatched = _action_spec(card)
-
-
-def _action_spec(card: PolicyCard) -> TensorSpec:
-    if card.discrete:
-        return Categorical(int(card.high[0]) + 1, dtype=torch.int64)
-    return Bounded(-1.0, 1.0, shape=card.action_shape, dtype=torch.float32)  # as learners take them
+    def __init__(self, info: PolicyInfo) -> None:
+        self.observation_spec = Composite({key: Unbounded(info.widths[key]) for key in KEYS})
+        self.action_spec = self.action_spec_unbatched = _action_spec(info)
 
 
-def load_network(card: PolicyCard, recipe: Recipe, weights: Mapping[str, Tensor]) -> TensorDictModuleBase:
+def _action_spec(info: PolicyInfo) -> TensorSpec:
+    if info.discrete:
+        return Categorical(int(info.high[0]) + 1, dtype=torch.int64)
+    return Bounded(-1.0, 1.0, shape=info.action_shape, dtype=torch.float32)  # as learners take them
+
+
+def load_network(info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor]) -> TensorDictModuleBase:
     """The greedy policy of some weights: reads ``observation`` and ``desired_goal``, writes ``action``.
 
     Args:
-        card: says the widths.
+        info: says the widths.
         recipe: says what the network is like; of a single run.
         weights: ``state_dict()`` of its actor, with its normalization if there is one.
 
     Raises:
         ValueError: these are not the weights of such an actor. Nothing of its size was made then.
     """
-    check_weights(card, recipe, weights)
-    builder = _builder(card, recipe)
+    builder = _builder(info, recipe)
+    check_weights(info, recipe, weights, builder)
     actor = builder.player(1)
-    player = _with_norm(actor, card, recipe)
+    player = _with_norm(actor, info, recipe)
     player.load_state_dict(dict(weights))
     net = builder.greedy(actor)
-    bounds = (*card.low, *card.high)
-    if not card.discrete and {*map(abs, bounds)} != {1.0} and all(map(math.isfinite, bounds)):
-        net = ScaledActions(net, card.low, card.high)
+    bounds = (*info.low, *info.high)
+    if not info.discrete and {*map(abs, bounds)} != {1.0} and all(map(math.isfinite, bounds)):
+        net = ScaledActions(net, info.low, info.high)
     greedy = TensorDictModule(net, in_keys=list(KEYS), out_keys=["action"])
     norm = player.norm if isinstance(player, NormalizedPolicy) else None
     return acting(greedy, norm).requires_grad_(False)
 
 
-def check_weights(card: PolicyCard, recipe: Recipe, weights: Mapping[str, Tensor]) -> None:
+def check_weights(
+    info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor], builder: LearnerBuilder
+) -> None:
     """Refuses weights that are not those of the actor that a recipe describes.
 
     Shapes come from a file, so they are compared before memory is taken for them.
@@ -78,11 +80,10 @@ def check_weights(card: PolicyCard, recipe: Recipe, weights: Mapping[str, Tensor
         raise ValueError(f"these are not the weights of an actor of learner={name}")
     if loose := [key for key, value in weights.items() if not value.is_contiguous()]:
         raise ValueError(f"weights must have a place for each of their numbers, got {loose[0]!r} without")
-    builder = _builder(card, recipe)
     with torch.device("meta"):  # shapes alone
         actor = builder.player(1)
         wanted = {
-            key: tuple(value.shape) for key, value in _with_norm(actor, card, recipe).state_dict().items()
+            key: tuple(value.shape) for key, value in _with_norm(actor, info, recipe).state_dict().items()
         }
     if own != wanted:
         odd = next(key for key in {**wanted, **own} if own.get(key) != wanted.get(key))
@@ -92,13 +93,13 @@ def check_weights(card: PolicyCard, recipe: Recipe, weights: Mapping[str, Tensor
         )
 
 
-def _builder(card: PolicyCard, recipe: Recipe) -> LearnerBuilder:
-    shown = cast(EnvBase, _Shown(card))
+def _builder(info: PolicyInfo, recipe: Recipe) -> LearnerBuilder:
+    shown = cast(EnvBase, _Shown(info))
     return load_name(find_learner(recipe, shown).builder)(recipe, shown, KEYS)
 
 
-def _with_norm(actor: TensorDictModule, card: PolicyCard, recipe: Recipe) -> TensorDictModuleBase:
-    return acting(actor, make_norm(recipe, card.widths))
+def _with_norm(actor: TensorDictModule, info: PolicyInfo, recipe: Recipe) -> TensorDictModuleBase:
+    return acting(actor, make_norm(recipe, info.widths))
 
 
 class ScaledActions(nn.Module):
@@ -119,10 +120,13 @@ class ScaledActions(nn.Module):
         least, greatest = torch.tensor(low), torch.tensor(high)
         self.register_buffer("middle", (greatest + least) / 2)
         self.register_buffer("reach", (greatest - least) / 2)
+        self.register_buffer("low", least)
+        self.register_buffer("high", greatest)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """[..., widths] of the inputs to [..., actions]."""
-        return self.middle + self.reach * self.net(*inputs)
+        action = self.middle + self.reach * self.net(*inputs)
+        return action.minimum(self.high).maximum(self.low)  # rounding may lead out of the bounds
 
 
 class TensorPolicy(nn.Module):
@@ -136,7 +140,7 @@ class TensorPolicy(nn.Module):
 
     Example:
         >>> from torchrl_her_recipes import load_policy
-        >>> TensorPolicy(load_policy("hand_v1"))(torch.zeros(5, 9), torch.zeros(5, 2)).shape
+        >>> TensorPolicy(load_policy("hand_v1").module)(torch.zeros(5, 9), torch.zeros(5, 2)).shape
         torch.Size([5, 3])
     """
 

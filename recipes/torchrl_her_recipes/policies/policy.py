@@ -1,0 +1,348 @@
+"""Trained policies: of runs, of files, and those that come with the package."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_her.modules.networks import take_run
+from torchrl_her.trainers.checkpoint import load_checkpoint, save_checkpoint
+from torchrl_her.trainers.metrics import reached, success
+from torchrl_her.trainers.trainer import evaluate
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_recipes.components.agents import find_learner
+from torchrl_her_recipes.components.curricula import make_curriculum
+from torchrl_her_recipes.components.envs import judging, make_task_envs
+from torchrl_her_recipes.config.imports import permit_task
+from torchrl_her_recipes.config.plain_files import reason
+from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.shipped import TRAINED, policy_names
+from torchrl_her_recipes.policies.info import KEYS, PolicyInfo, describe_env, present_versions
+from torchrl_her_recipes.policies.model_card import card_path, check_free, write_model_card
+from torchrl_her_recipes.policies.network import load_network
+from torchrl_her_recipes.policies.onnx import SUFFIX, need_onnx, write_onnx
+from torchrl_her_recipes.runs.folder import RunFolder
+from torchrl_her_recipes.runs.run import median_run
+
+_MEASURED = 1 << 41  # seeds that no training uses: of the episodes that measure a policy,
+_COMPARED = 1 << 42  # and of those on whose states an ONNX file is compared with it
+
+
+class Policy(TensorDictModuleBase):
+    """A trained greedy policy: reads ``observation`` and ``desired_goal``, writes ``action``.
+
+    It acts in any TorchRL environment, collector or :func:`~torchrl_her.evaluate`, and by :meth:`predict` on
+    arrays of gymnasium's.
+
+    Args:
+        info: Facts about the policy: its inputs, its actions, its success.
+        recipe: Recipe of the run that trained it, of its seed alone. Its task may be a harder one.
+        weights: Weights of the run's actor, with its normalization if there is one.
+        source: Name, folder or file that the policy was loaded from.
+
+    Raises:
+        ValueError: These are not the weights of such an actor.
+
+    Example:
+        >>> policy = Policy.load("hand_v1")
+        >>> policy
+        Policy('hand_v1', task='hand_v1', success=0.997)
+        >>> from torchrl_her_envs import make_env
+        >>> make_env("hand_v1", num_envs=2).rollout(10, policy)["action"].shape
+        torch.Size([2, 10, 3])
+    """
+
+    def __init__(
+        self,
+        info: PolicyInfo,
+        recipe: Recipe,
+        weights: Mapping[str, Tensor],
+        source: str = "",
+    ) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = list(KEYS), ["action"]
+        self.module = load_network(info, recipe, weights)
+        self.info, self.recipe, self.source = info, recipe, source
+        self._weights = dict(weights)
+
+    @classmethod
+    def load(cls, source: str | Path, *, run: int | None = None, best: bool = False) -> Policy:
+        """Loads the policy of a task, a run or a file.
+
+        Nothing is imported for a file, whatever module its task names. For a run, an environment of its task
+        is made.
+
+        Args:
+            source: Name of a task whose policy comes with the package, a ``.pt`` file that :meth:`save`
+                wrote, the folder of a run, or ``policy.pt`` or ``best.pt`` in it.
+            run: Index of the run, of several side by side in a folder; the run with the median success if
+                None.
+            best: Whether to take the policy of the evaluation with the best median success, not the last.
+
+        Raises:
+            ValueError: There is no such policy or run, the file is damaged, ``run`` or ``best`` is given for
+                a file, or the run's task names a module that must not be imported.
+            OSError: The run has not saved a policy yet.
+        """
+        home = RunFolder.of(source)
+        if best and (home is None or home.path != Path(source)):
+            raise ValueError(f"best goes with the folder of a run, and {source} is none")
+        if home is not None:
+            file = Path(source) if home.path != Path(source) else home.best if best else home.policy
+            return cls._of_run(home, file, run, str(source))
+        if run is not None:
+            raise ValueError(
+                f"run={run} has no effect with {source}, which holds a single policy: leave it out"
+            )
+        path = _path_of(source)
+        state = load_checkpoint(path)
+        if not isinstance(state, dict) or not {"actor", "recipe"} <= set(state):
+            raise ValueError(
+                f"{path} is no exported policy: `torchrl-her export RUN` writes one of a run's folder"
+            )
+        try:
+            info, recipe = PolicyInfo.from_dict(state.get("card")), Recipe.of_file(state["recipe"])
+            return cls(info, recipe, state["actor"], str(source))
+        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+            raise ValueError(f"{path} is no exported policy: {reason(error)}") from error
+
+    @classmethod
+    def _of_run(cls, home: RunFolder, file: Path, run: int | None, source: str) -> Policy:
+        recipe, rows = home.recipe(), home.rows()
+        if file == home.best and not file.exists():
+            raise ValueError(f"{home.path} has no {file.name}: the run has not been evaluated yet")
+        state = load_checkpoint(file)
+        rows = [row for row in rows if row["epoch"] <= state.get("epoch", math.inf)]
+        if not rows:
+            raise ValueError(f"the run in {home.path} has not been evaluated yet")
+        chosen = median_run(rows) if run is None else run
+        runs = recipe.run.num_runs
+        if chosen not in range(runs):
+            raise ValueError(f"there is no run {chosen} in {home.path}; it has runs 0 to {runs - 1}")
+        env = make_task_envs(recipe, 1, [0], scaled=False)
+        shown = describe_env(env)
+        info = PolicyInfo(
+            task=recipe.task.name,
+            **{**shown, "action_dtype": shown.get("action_dtype", recipe.run.dtype)},
+            dtype=recipe.run.dtype,
+            normalize_clip=recipe.learner.normalize_clip if recipe.learner.normalize else None,
+            algorithm=recipe.hindsight.algo,
+            learner=find_learner(recipe, env).name,
+            seed=recipe.run.seed + chosen,
+            frames=int(rows[-1]["frames"]),
+            versions=present_versions(),
+        )
+        curriculum, width = make_curriculum(recipe, env), sum(info.widths.values())
+        # positions of the network's inputs in the observation and the desired goal behind it
+        places = torch.arange(width)
+        if curriculum is not None:
+            last = curriculum.state_index[-1]
+            places = torch.cat((last[: curriculum.observation_width], last[-curriculum.goal_width :]))
+        weights = _as_shown(take_run(state["actor"], chosen, runs), places, width)
+        try:
+            return cls(info, recipe.replace(num_runs=1, seed=info.seed), weights, source)
+        except ValueError as error:
+            raise ValueError(
+                f"the policy of learner={recipe.learner.name} in {home.path} cannot be loaded: {error}"
+            ) from error
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes ``action`` [..., width], or integers [...] where actions are discrete."""
+        return self.module(tensordict)
+
+    @torch.no_grad()
+    def predict(self, observation: Mapping[str, np.ndarray], **_kwargs: Any) -> tuple[np.ndarray, None]:
+        """Returns the action for one observation of gymnasium's, or for several, as Stable-Baselines3 does.
+
+        Args:
+            observation: Arrays ``observation`` and ``desired_goal``, [width] or [n, width]; other entries are
+                not read.
+            _kwargs: Not read: ``deterministic``, ``state`` and the like of Stable-Baselines3. The policy is
+                greedy.
+
+        Returns:
+            The action, [width] or [n, width], and None in place of a recurrent state.
+
+        Example:
+            >>> import gymnasium, torchrl_her_envs
+            >>> env = gymnasium.make("torchrl_her/HandThrow-v1")
+            >>> observation, _ = env.reset(seed=0)
+            >>> action, _ = Policy.load("hand_v1").predict(observation)
+            >>> env.action_space.contains(action)
+            True
+        """
+        seen = {key: torch.as_tensor(observation[key], dtype=getattr(torch, self.info.dtype)) for key in KEYS}
+        for key, value in seen.items():
+            if value.shape[-1:] != (self.info.widths[key],):
+                raise ValueError(
+                    f"{key} must have {self.info.widths[key]} numbers for a policy of {self.info.task}, "
+                    f"got shape {list(value.shape)}"
+                )
+        batch = seen["observation"].shape[:-1]
+        return self.module(TensorDict(seen, batch))["action"].numpy(), None
+
+    def envs(self, number: int, *, seed: int = 0, pictures: bool = False) -> EnvBase:
+        """Makes environments of the policy's task.
+
+        Args:
+            number: Number of environments.
+            seed: Seed of their starts and goals.
+            pictures: Whether they give pictures, if they can.
+
+        Raises:
+            ValueError: They differ from what the policy was trained on, or the task names a module that must
+                not be imported.
+        """
+        recipe = self.recipe.replace(task=self.info.task)
+        env = make_task_envs(recipe, number, [seed], pictures=pictures, scaled=False)
+        self.info.check_plays(env, self.info.task)
+        return env
+
+    def measure(self, episodes: int = 1_000, *, seed: int = _MEASURED) -> tuple[float, float]:
+        """Returns the shares of episodes whose goal is achieved at the last step, and at some step."""
+        env = self.envs(episodes, seed=seed)
+        rollout = evaluate(env, self, max_steps=goal_env(env).max_steps)
+        at_last, at_some = (metric(rollout, **judging(env)).float().mean() for metric in (success, reached))
+        env.close()
+        return float(at_last), float(at_some)
+
+    def save(self, path: str | Path, *, card: bool = True) -> None:
+        """Writes the policy as a file: for onnxruntime if its suffix is ``.onnx``, for :meth:`load`
+        otherwise.
+
+        An ONNX file is only left behind if onnxruntime gives the policy's actions to 1e-5 on states of the
+        task.
+
+        Args:
+            path: The file.
+            card: Whether a model card is written beside the file, with the suffix ``.md``.
+
+        Raises:
+            ValueError: The card would replace a page that is none, or the ONNX file does not act as the
+                policy does.
+            ImportError: The suffix is ``.onnx``, and the extra ``onnx`` is missing.
+            OSError: The file cannot be written.
+        """
+        path, info = Path(path), self.info
+        if card:
+            check_free(card_path(path))
+        if path.suffix == SUFFIX:
+            need_onnx()
+            env = self.envs(16, seed=_COMPARED)
+            states = evaluate(env, self, max_steps=goal_env(env).max_steps).select(*KEYS).flatten()
+            env.close()
+            info = write_onnx(self.module, info, self.recipe, path, states=states)
+        else:
+            described = json.loads(json.dumps(info.to_dict()))  # lists for tuples
+            save_checkpoint(
+                {"card": described, "recipe": self.recipe.to_dict(), "actor": self._weights}, path
+            )
+        if card:
+            write_model_card(card_path(path), path.name, info, self.recipe)
+
+    def __repr__(self) -> str:
+        return f"Policy({self.source!r}, task={self.info.task!r}, success={self.info.success:.3f})"
+
+
+def load_policy(source: str | Path, *, run: int | None = None, best: bool = False) -> Policy:
+    """Loads the policy of a task, a run or a file; see :meth:`Policy.load`."""
+    return Policy.load(source, run=run, best=best)
+
+
+def export_policy(
+    source: str | Path,
+    out: str | Path,
+    *,
+    run: int | None = None,
+    task: str | None = None,
+    best: bool = False,
+    card: bool = True,
+) -> Policy:
+    """Writes the policy of a run as a small file of its own, measured on 1,000 episodes, and a page about it.
+
+    Args:
+        source: The policy, as for :meth:`Policy.load`.
+        out: The file; its suffix ``.onnx`` or ``.pt`` is its format, see :meth:`Policy.save`.
+        run: Index of the run, of several side by side in a folder; the run with the median success if None.
+        task: Name of the task that the policy is for, if not the run's own: one that shows and takes the
+            same.
+        best: Whether to take the policy of the evaluation with the best median success, not the last.
+        card: Whether a model card is written beside the file, with the suffix ``.md``.
+
+    Returns:
+        The policy that was written.
+
+    Raises:
+        ValueError: See :meth:`Policy.load` and :meth:`Policy.save`, or the policy cannot play the task.
+        ImportError: The suffix is ``.onnx``, and the extra ``onnx`` is missing.
+        OSError: The run has not saved a policy yet, or the file cannot be written.
+    """
+    out = Path(out)
+    if card:
+        check_free(card_path(out))
+    if out.suffix == SUFFIX:
+        need_onnx()  # before anything takes long
+    policy = Policy.load(source, run=run, best=best)
+    info = replace(policy.info, task=task or policy.info.task, versions=present_versions())
+    if task is not None:
+        permit_task(task)  # named by the caller
+        policy.info.check_plays(make_task_envs(policy.recipe.replace(task=task), 1, [0], scaled=False), task)
+    measured = info.task == policy.info.task and not math.isnan(info.success)
+    policy.info = info
+    if not measured:
+        at_last, at_some = policy.measure()
+        policy.info = replace(info, success=at_last, reached=at_some)
+    policy.save(out, card=card)
+    return policy
+
+
+def _path_of(source: str | Path) -> Path:
+    """Returns the path of a policy's file, or of one that comes with the package.
+
+    Raises:
+        ValueError: There is no such file, or it is an ONNX file.
+    """
+    path = TRAINED / f"{source}.pt" if str(source) in policy_names() else Path(source)
+    if path.suffix == SUFFIX:
+        raise ValueError(
+            f"{path} is for onnxruntime and cannot be loaded: give the run or the .pt file that it is of"
+        )
+    if not path.is_file():
+        if path.suffix or len(path.parts) > 1:
+            raise ValueError(f"there is no file {path}")
+        raise ValueError(f"there is no policy {str(source)!r}; there are {', '.join(policy_names())}")
+    return path
+
+
+def _as_shown(actor: dict[str, Tensor], places: Tensor, width: int) -> dict[str, Tensor]:
+    """Returns an actor's weights for inputs in other places; inputs that no place names have no effect.
+
+    Args:
+        actor: Weights of the actor and its normalization.
+        places: New position of each input.
+        width: Number of inputs then.
+    """
+    moved = dict(actor)
+    for key, value in actor.items():
+        if key.endswith("layers.0.0.weight"):
+            moved[key] = _wider(value, -2, width).index_add(-2, places, value)
+        elif key in ("norm.n", "norm.mean", "norm.var"):
+            moved[key] = _wider(value, -1, width, key == "norm.var").index_copy(-1, places, value)
+    return moved
+
+
+def _wider(value: Tensor, dim: int, width: int, fill: float = 0.0) -> Tensor:
+    shape = list(value.shape)
+    shape[dim] = width
+    return value.new_full(shape, fill)

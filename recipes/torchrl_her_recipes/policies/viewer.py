@@ -1,0 +1,199 @@
+"""Policies at work side by side: as pictures, and as a film."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+from torch import Tensor
+
+from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_envs.common.rendering.live import LiveEpisodes
+from torchrl_her_envs.common.rendering.pictures import beside, underlined
+from torchrl_her_envs.common.rendering.video import write_video
+from torchrl_her_envs.registry import get_task_spec
+from torchrl_her_recipes.config.groups import TaskConfig
+from torchrl_her_recipes.policies.policy import Policy
+from torchrl_her_recipes.runs.film import FPS
+
+_GAP = 8  # pixels between policies
+_HOLD = 25  # times that the last frame of a film is repeated
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """How policies are shown.
+
+    Args:
+        goals: Number of goals, side by side.
+        seed: Seed of goals and starts.
+        size: Pixels of one environment.
+        named: Whether names and successes stand below the pictures.
+    """
+
+    goals: int = 6
+    seed: int = 0
+    size: int = 240
+    named: bool = False
+
+
+class Seen(NamedTuple):
+    """Goals that a policy achieved, and all that it had."""
+
+    achieved: int
+    goals: int
+
+
+class Viewer:
+    """Shows policies on the same starts and goals, side by side. As a context, it closes their environments.
+
+    Args:
+        policies: The policies, all of the same task.
+        view: How they are shown.
+
+    Raises:
+        ValueError: The policies are of different tasks, or an environment gives no pictures.
+    """
+
+    def __init__(self, policies: Sequence[Policy], view: View) -> None:
+        _check_comparable(policies)
+        self.view = view
+        self._labels = _labels_of(policies) if view.named else None
+        self._opened = ExitStack()
+        self._episodes: list[LiveEpisodes] = []
+        with ExitStack() as opened:
+            for policy in policies:
+                env = policy.envs(view.goals, seed=view.seed, pictures=True)
+                opened.callback(env.close, raise_if_closed=False)
+                if not goal_env(env).can_render:
+                    raise ValueError(f"{policy.source} cannot be filmed: its environment gives no pictures")
+                self._episodes.append(LiveEpisodes(env, policy, size=view.size))
+            self._opened = opened.pop_all()
+        self._before = [Seen(0, 0)] * len(self._episodes)  # in earlier episodes
+        self._round = -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+    @property
+    def running(self) -> bool:
+        """Whether an episode still goes on."""
+        return any(own.running for own in self._episodes)
+
+    @property
+    def step_count(self) -> int:
+        """Steps since the start of these episodes."""
+        return max(own.step_count for own in self._episodes)
+
+    @property
+    def max_steps(self) -> int:
+        """Largest number of steps of an episode."""
+        return self._episodes[0].max_steps
+
+    @property
+    def first_goal(self) -> int:
+        """Number of the first goal that is shown, counted from 1."""
+        return self._round * self.view.goals + 1
+
+    @property
+    def desired_goal(self) -> Tensor:
+        """The goals [goals, g], as the first policy sees them."""
+        return self._episodes[0].desired_goal
+
+    @property
+    def seen(self) -> list[Seen]:
+        """Achieved goals of each policy since the first start, and all whose episode has ended."""
+        pairs = zip(self._before, self._episodes, strict=True)
+        return [
+            Seen(before.achieved + own.achieved, before.goals + own.worlds - len(own.running))
+            for before, own in pairs
+        ]
+
+    def start(self) -> None:
+        """Begins episodes with the next goals; episodes that go on are given up, and do not count."""
+        if self._round >= 0:
+            self._before = self.seen
+        self._round += 1
+        for own in self._episodes:
+            own.start(seed=self.view.seed + self._round)
+
+    def step(self) -> None:
+        """Takes a step with each policy whose episodes go on."""
+        for own in self._episodes:
+            own.step()
+
+    def frame(self) -> Tensor:
+        """Returns the present picture [height, width, 3] of uint8."""
+        if self._labels is None:
+            return beside([own.frame for own in self._episodes], gap=_GAP)
+        shown = zip(self._episodes, self._labels, self.seen, strict=True)
+        return beside(
+            [
+                underlined(own.frame, [label, f"{seen.achieved} of {seen.goals} achieved"])
+                for own, label, seen in shown
+            ],
+            gap=_GAP,
+        )
+
+    def write(self, out: str | Path) -> list[Seen]:
+        """Writes a film of one episode for each goal.
+
+        Args:
+            out: A .gif or .mp4 file.
+
+        Returns:
+            Goals that each policy achieved, and all.
+        """
+        self.start()
+        frames = [self.frame()]
+        while self.running:
+            self.step()
+            frames.append(self.frame())
+        write_video(frames + frames[-1:] * _HOLD, out, fps=FPS)
+        return self.seen
+
+
+def _check_comparable(policies: Sequence[Policy]) -> None:
+    """Refuses policies of different tasks: with the same seeds they would not have the same goals.
+
+    Raises:
+        ValueError: two tasks, or two settings of one.
+    """
+    first, *others = policies
+    for other in others:
+        ours, theirs = _described(_task_of(first)), _described(_task_of(other))
+        if ours != theirs:
+            raise ValueError(
+                f"only policies of the same task can be compared: {first.source} plays {ours}, and "
+                f"{other.source} plays {theirs}"
+            )
+
+
+def _task_of(policy: Policy) -> TaskConfig:
+    return policy.recipe.replace(task=policy.info.task).task
+
+
+def _described(task: TaskConfig) -> str:
+    """Returns a task with those of its options that are not as usual, in words."""
+    usual: dict[str, Any] = dict(get_task_spec(task.name).options)
+    own = {**usual, **(task.options or {})}
+    if task.threshold is not None:
+        own["threshold"] = task.threshold
+    other = [f"{name}={value}" for name, value in sorted(own.items()) if value != usual.get(name)]
+    return " ".join([task.name, *other])
+
+
+def _labels_of(policies: Sequence[Policy]) -> list[str]:
+    """Returns short names of policies that tell them apart: the last part of each path, or all of it.
+
+    Two policies that are called the same stay so.
+    """
+    sources = [policy.source for policy in policies]
+    short = [Path(source).name or source for source in sources]
+    return [name if short.count(name) == 1 else source for name, source in zip(short, sources, strict=True)]

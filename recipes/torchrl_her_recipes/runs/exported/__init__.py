@@ -1,1 +1,0 @@
-"""Exported policies: what they expect, their networks, ONNX files, and model cards."""

@@ -1,0 +1,296 @@
+"""Policies as files: exported from runs, and those that come with the package."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_her import evaluate, load_checkpoint, save_checkpoint, success
+from torchrl_her_envs import TASKS, make_env
+from torchrl_her_recipes import build, export_policy, load_policy, run
+from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.components.curricula import make_played_env
+from torchrl_her_recipes.config.shipped import policy_names
+from torchrl_her_recipes.policies import policy
+from torchrl_her_recipes.policies.network import ScaledActions
+
+from ..small import small
+from .tiny import needs_onnx, states, tiny_policy
+
+
+def backwards() -> list[dict[str, Any]]:
+    """A layer of hand_v1 that sees its observation from the end, and not all of it."""
+    (*_, last) = make_env("hand_v1", num_envs=1).layers()
+    observation = last["observation"][:0:-1]
+    return [last | {"observation": observation}]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"algo": "filtered_her"},
+        {"algo": "cher"},
+        {"algo": "her", "normalize": True},
+        {"algo": "cher", "normalize": True},
+        {"algo": "cher", "curriculum": backwards()},
+        {"algo": "cher", "curriculum": backwards(), "normalize": True},
+        pytest.param({"algo": "her", "learner": "td3"}, marks=pytest.mark.full),
+        {"algo": "filtered_her", "learner": "sac", "normalize": True},
+        pytest.param({"algo": "cher", "learner": "tqc"}, marks=pytest.mark.full),
+        {"algo": "her", "task": "bit_flip"},
+    ],
+    ids=lambda options: "_".join(options),
+)
+def test_an_exported_policy_acts_as_its_run_does(options: dict[str, Any], tmp_path: Path) -> None:
+    recipe = small(**{"task": "hand_v1", "num_runs": 2, "epochs": 1, "hidden": 8, **options})
+    components = build(recipe)
+    run(components, tmp_path / "run", progress=False)
+    written = export_policy(tmp_path / "run", tmp_path / "policy.pt", run=1)
+    assert written.recipe.run.seed == 1
+    assert written.info.frames == 1_600
+    seen = make_env(recipe.task.name, num_envs=4, seed=7).reset()
+    shown = make_played_env(recipe, 4, [7]).reset()
+    played = components.greedy(torch.cat((shown, shown)))["action"][4:]  # of the second of two runs
+    for own in (load_policy(tmp_path / "run", run=1), load_policy(tmp_path / "policy.pt"), written):
+        torch.testing.assert_close(own(seen.clone())["action"], played)
+
+
+def test_export_takes_the_median_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    run(build(small(num_runs=3, epochs=1)), folder, progress=False)
+    lines = (folder / "metrics.csv").read_text().splitlines()
+    place = lines[0].split(",").index("success")
+    for index, value in enumerate(("0.5", "0.9", "0.1")):
+        cells = lines[index + 1].split(",")
+        cells[place] = value
+        lines[index + 1] = ",".join(cells)
+    (folder / "metrics.csv").write_text("\n".join(lines) + "\n")
+    assert main(["export", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("seed 0, success ")
+    assert said.endswith(f" on hand_v0: {folder / 'hand_v0.pt'}\n")
+
+
+def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    run(build(small(task="hand_v0", epochs=1)), other, progress=False)
+    with pytest.raises(ValueError, match="a policy of hand_v0 cannot play robot_v0: it has other widths"):
+        export_policy(other, tmp_path / "policy.pt", task="robot_v0")
+    with pytest.raises(ValueError, match="unknown task 'nope'"):
+        export_policy(other, tmp_path / "policy.pt", task="nope")
+    with pytest.raises(ValueError, match="there is no run 4 in .*; it has runs 0 to 0"):
+        export_policy(other, tmp_path / "policy.pt", run=4)
+    state = load_checkpoint(other / "policy.pt")
+    save_checkpoint({"actor": {"own": state["actor"].popitem()[1]}}, other / "policy.pt")
+    with pytest.raises(ValueError, match="the policy of learner=auto in .* cannot be loaded: these are not"):
+        export_policy(other, tmp_path / "policy.pt")
+    assert list(tmp_path.iterdir()) == [other]
+    with pytest.raises(ValueError, match="there is no policy 'hand_v9'; there are hand_reach"):
+        load_policy("hand_v9")
+
+
+def test_every_task_has_a_trained_policy() -> None:
+    assert policy_names() == sorted(TASKS)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_trained_policies_are_as_good_as_they_say(task: str) -> None:
+    """300 other episodes; five standard deviations of room."""
+    trained = load_policy(task)
+    assert trained.info.task == task
+    env = make_env(task, num_envs=300, seed=99)
+    measured = float(success(evaluate(env, trained, max_steps=env.max_steps)).float().mean())
+    assert measured > trained.info.success - 5 * 0.029
+    assert measured > 0.3
+
+
+def test_a_task_is_played_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "hand_v1.gif"
+    assert main(["play", "hand_v1", "--out", str(out), "--goals", "2", "--size", "64"]) == 0
+    assert out.stat().st_size > 1_000
+    assert "of 2 goals achieved" in capsys.readouterr().out
+    assert main(["play", "hand_v9"]) == 2
+    assert "nor the file of an exported policy, nor one of the trained policies" in capsys.readouterr().err
+
+
+def test_what_export_wrote_is_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run(build(small(task="hand_v0", epochs=1, pictures=True)), "run", progress=False)
+    assert main(["export", "run", "--out", "mine.pt"]) == 0
+    assert main(["play", "mine.pt", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
+    alone = capsys.readouterr().out.splitlines()[-1]
+    assert alone.endswith(" of 2 goals achieved: mine.gif")
+    assert main(["play", "run", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == alone.replace("mine.gif", "run/play.gif")
+    assert Path("mine.gif").read_bytes() == Path("run/play.gif").read_bytes()
+    filmed = Path("run/policy.gif").read_bytes()
+    assert main(["play", "run/policy.pt", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
+    assert Path("mine.gif").read_bytes() == Path("run/play.gif").read_bytes()
+    assert Path("run/policy.gif").read_bytes() == filmed
+    assert main(["play", "run/checkpoint.pt"]) == 2
+    said = "torchrl-her: run/checkpoint.pt is no exported policy: `torchrl-her export RUN`"
+    assert said in capsys.readouterr().err
+    Path("notes.txt").write_text("not a policy")
+    assert main(["play", "notes.txt"]) == 2
+    assert "notes.txt is not a checkpoint of torchrl-her" in capsys.readouterr().err
+
+
+@needs_onnx
+def test_on_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", "hand_reach", "--format", "onnx"]) == 0
+    assert capsys.readouterr().out == "seed 1, success 100% on hand_reach: hand_reach.onnx\n"
+    assert "`hand_reach`" in Path("hand_reach.md").read_text()
+    assert main(["export", "hand_reach", "--out", "other.pt", "--no-card"]) == 0
+    assert not Path("other.md").exists()
+    assert load_policy("other.pt").info.success == 1.0
+    capsys.readouterr()
+    for wrong, message in (
+        (
+            ["hand_reach.onnx", "--out", "new.pt"],
+            "hand_reach.onnx is for onnxruntime and cannot",
+        ),
+        (["other.pt"], "other.pt would be replaced by itself: give --out or --format onnx"),
+        (
+            ["other.pt", "--out", "a.pt", "--run", "1"],
+            "run=1 has no effect with other.pt, which holds a single",
+        ),
+        (
+            ["other.pt", "--out", "a.pt", "--format", "onnx"],
+            "format=onnx must have the suffix .onnx, got 'a.pt'",
+        ),
+        (["other.pt", "--out", "a.onnx", "--task", "robot_v0"], "observation [5], desired_goal [2] and"),
+        (["nowhere"], "nowhere is no folder of a run: it has no config.yaml; nor is it the file"),
+    ):
+        assert main(["export", *wrong]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert said.count("\n") == 1
+    Path("a.md").write_text("mine")
+    assert main(["export", "other.pt", "--out", "a.onnx"]) == 2
+    assert "a.md exists and is no model card that export wrote" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "a.md", "hand_reach.md", "hand_reach.onnx", "other.pt"
+    ]  # fmt: skip
+    for command in (["play", "hand_reach.onnx"], ["record", "hand_reach", "--policy", "hand_reach.onnx"]):
+        assert main(command) == 2
+        assert "hand_reach.onnx is for onnxruntime and cannot be loaded" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("missing", ["onnx", "onnxruntime", "onnxscript"])
+def test_without_the_extra_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], missing: str
+) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    assert main(["export", "hand_reach", "--out", str(tmp_path / "a.onnx")]) == 2
+    said = capsys.readouterr().err
+    assert said == "torchrl-her: ONNX files need onnx, onnxruntime and onnxscript: pip install '.[onnx]'\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def _wide(state: dict[str, Any]) -> None:
+    state["recipe"]["learner"]["hidden"] = 10_000_000
+
+
+def _claims_much(state: dict[str, Any]) -> None:
+    state["recipe"]["learner"]["hidden"] = 2_000
+    state["actor"] = {
+        name: torch.zeros(()).expand([2_000 if side == 64 else side for side in value.shape])
+        for name, value in state["actor"].items()
+    }
+
+
+def _no_widths(state: dict[str, Any]) -> None:
+    del state["card"]["widths"]
+
+
+def _other_learner(state: dict[str, Any]) -> None:
+    state["recipe"]["learner"]["name"] = "theirs"
+
+
+def _no_weights(state: dict[str, Any]) -> None:
+    state["actor"] = [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_wide, "must be (1, 7, 10000000), got (1, 7, 64)"),
+        (_claims_much, "weights must have a place for each of their numbers"),
+        (_no_widths, "a policy's card lacks widths"),
+        (_other_learner, "unknown learner 'theirs'"),
+        (_no_weights, "bad.pt is no exported policy: "),
+    ],
+)
+def test_files_that_somebody_made_give_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[dict[str, Any]], None],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    export_policy("hand_reach", "good.pt", card=False)
+    state = load_checkpoint("good.pt")
+    change(state)
+    save_checkpoint(state, "bad.pt")
+    assert main(["play", "bad.pt"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("torchrl-her: bad.pt is no exported policy: ")
+    assert message in said
+    assert said.count("\n") == 1
+
+
+def test_a_policy_that_no_longer_fits_its_task_is_not_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = make_env("robot_v0", num_envs=2)
+    monkeypatch.setattr(policy, "make_task_envs", lambda *_args, **_options: robot)
+    assert main(["play", "hand_reach", "--out", str(tmp_path / "a.gif")]) == 2
+    assert "a policy of hand_reach cannot play hand_reach: it has other widths" in capsys.readouterr().err
+
+
+def test_predict_takes_what_gymnasium_shows() -> None:
+    env = gymnasium.make("torchrl_her/HandThrow-v1")
+    own = load_policy("hand_v1")
+    shown, _ = env.reset(seed=4)
+    action, state = own.predict(shown, deterministic=True)
+    assert state is None
+    assert env.action_space.contains(action)
+    several = {key: np.stack([value, value + 0.01]) for key, value in shown.items()}
+    both, _ = own.predict(several)
+    np.testing.assert_allclose(both[0], action, atol=1e-6)
+    seen = TensorDict({key: torch.as_tensor(several[key]) for key in ("observation", "desired_goal")}, [2])
+    np.testing.assert_array_equal(both, own(seen)["action"].numpy())
+    with pytest.raises(ValueError, match=r"observation must have 9 numbers for .*, got shape \[3\]"):
+        own.predict({**shown, "observation": np.zeros(3)})
+
+
+def test_a_policy_that_was_saved_is_the_same(tmp_path: Path) -> None:
+    own = tiny_policy(normalize=True)
+    own.save(tmp_path / "mine.pt")
+    again = load_policy(tmp_path / "mine.pt")
+    assert (again.info, again.recipe) == (own.info, own.recipe)
+    seen = states(own.info, 9)
+    assert torch.equal(again(seen.clone())["action"], own(seen)["action"])
+
+
+def test_no_action_leaves_the_bounds_by_rounding() -> None:
+    low, high = [0.1, 0.3], [0.7, 0.3]
+    seen = torch.linspace(-1, 1 + 1e-6, 1_000)[:, None].expand(-1, 2)
+    action = ScaledActions(torch.nn.Identity(), low, high)(seen)
+    assert (action >= torch.tensor(low)).all()
+    assert (action <= torch.tensor(high)).all()
+    assert action[:, 0].std() > 0.1
