@@ -19,7 +19,7 @@ MOST_KB = 250  # of a film
 def make_film(task: str) -> str:
     """Films one policy, and says how many of its goals it achieved."""
     path = GALLERY / f"{task}.gif"
-    achieved = play(task, path, goals=GOALS, size=SIZE, seed=SEED)
+    ((achieved, _),) = play(task, out=path, goals=GOALS, size=SIZE, seed=SEED)
     size = path.stat().st_size / 1000
     if size > MOST_KB:
         raise SystemExit(f"{path.name} has {size:.0f} kB; {MOST_KB} are allowed: make it smaller")

@@ -57,7 +57,7 @@ class Policy(TensorDictModuleBase):
     Example:
         >>> policy = Policy.load("hand_v1")
         >>> policy
-        Policy('hand_v1', task='hand_v1', success=0.997)
+        Policy('hand_v1', task='hand_v1')
         >>> from torchrl_her_envs import make_env
         >>> make_env("hand_v1", num_envs=2).rollout(10, policy)["action"].shape
         torch.Size([2, 10, 3])
@@ -252,7 +252,7 @@ class Policy(TensorDictModuleBase):
             write_model_card(card_path(path), path.name, info, self.recipe)
 
     def __repr__(self) -> str:
-        return f"Policy({self.source!r}, task={self.info.task!r}, success={self.info.success:.3f})"
+        return f"Policy({self.source!r}, task={self.info.task!r})"
 
 
 def load_policy(source: str | Path, *, run: int | None = None, best: bool = False) -> Policy:
