@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,13 +40,10 @@ from torchrl_her_envs.common.seeding import as_seeds, block_keys
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
 _GOALS = KEYS[1:]
+Names = str | Sequence[str]
 _SUCCESS = "is_success"
-_OURS = (
-    "max_steps",
-    "termination",
-    "achieved_reward",
-    "info_keys",
-)  # options that every such environment takes
+# Options that every such environment takes.
+_OURS = ("max_steps", "termination", "achieved_reward", "info_keys", *(f"{key}_key" for key in KEYS))
 _TRIED_STEPS = 100
 _PAIRED = 8  # goals of each kind whose pairs are tried
 
@@ -60,6 +57,9 @@ def make_own_env(
     termination: str = "auto",
     achieved_reward: float | None = None,
     info_keys: Sequence[str] = (),
+    observation_key: Names = "observation",
+    achieved_goal_key: Names = "achieved_goal",
+    desired_goal_key: Names = "desired_goal",
     **options: Any,
 ) -> EnvBase:
     """Makes a batch of an environment of the user's own.
@@ -76,6 +76,8 @@ def make_own_env(
         termination: what ends an episode at its goal, see :class:`OwnGoalEnv`.
         achieved_reward: the reward from which on a goal counts as achieved, for dense rewards.
         info_keys: entries of a step that rewards read besides goals, see :class:`OwnGoalEnv`.
+        observation_key, achieved_goal_key, desired_goal_key: what it calls these entries; lists of several
+            entries follow each other in their order, and its functions get dictionaries of them.
         options: for the function.
 
     Returns:
@@ -123,8 +125,10 @@ def make_own_env(
         return [first, *(make_one(share, own) for own in seed[1:])]
 
     envs = make_many(num_envs, seed)
+    names = dict(zip(KEYS, (observation_key, achieved_goal_key, desired_goal_key), strict=True))
     if isinstance(envs[0], TaskTraits) and is_goal_env(envs[0]):
-        if termination not in ("auto", "watch") or achieved_reward is not None or len(info_keys) > 0:
+        plain = len(info_keys) == 0 and all(key == name for key, name in names.items())
+        if termination not in ("auto", "watch") or achieved_reward is not None or not plain:
             raise ValueError(f"{path} says itself how it ends and rewards: leave out {', '.join(_OURS[1:])}")
         return envs[0]
     # A single one is tried, so that what is found out does not depend on how many are asked for.
@@ -135,9 +139,18 @@ def make_own_env(
         termination=termination,
         achieved_reward=achieved_reward,
         info_keys=info_keys,
+        names=names,
     )
     tried.close()
-    return OwnGoalEnv(envs, name=path, seed=seed, max_steps=max_steps, rules=tried.rules, info_keys=info_keys)
+    return OwnGoalEnv(
+        envs,
+        name=path,
+        seed=seed,
+        max_steps=max_steps,
+        rules=tried.rules,
+        info_keys=info_keys,
+        names=names,
+    )
 
 
 def _check_made(path: str, env: object, batch_size: list[int]) -> None:
@@ -225,6 +238,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         achieved_reward: the reward from which on a goal counts as achieved; that of equal goals if None.
         rules: what another such environment was found to do; some steps are tried if None.
         info_keys: entries of a step that rewards read besides goals.
+        names: its entry, or entries, for observation, achieved and desired goal, where they differ.
 
     Attributes:
         rules: how it rewards and ends.
@@ -244,6 +258,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         achieved_reward: float | None = None,
         rules: GoalRules | None = None,
         info_keys: Sequence[str] = (),
+        names: Mapping[str, Names] | None = None,
     ) -> None:
         first = envs[0]
         self._whole = len(first.batch_size) == 1  # each environment is a batch
@@ -257,6 +272,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
                 f"got {limit!r}"
             )
         self.max_steps, self._info = limit, list(info_keys)
+        self._names: dict[str, Names] = {key: key for key in KEYS} | dict(names or {})
         self._check(first)
         self._make_specs(first)
         self._latest: list[TensorDictBase] = []
@@ -428,6 +444,19 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         entries = [own.get(key) for own in each]
         return torch.cat(entries) if self._whole else torch.stack(entries)
 
+    def _entries(self, key: str) -> Sequence[str]:
+        """Its own names of observation or goal."""
+        names = self._names[key]
+        return [names] if isinstance(names, str) else names
+
+    def _named(self, key: str, goals: Tensor) -> Any:
+        """Goals [..., g] as its functions take them: several entries as a dictionary."""
+        if isinstance(self._names[key], str):
+            return goals
+        spec, names = self._envs[0].full_observation_spec, self._entries(key)
+        parts = goals.split([spec[name].shape[-1] for name in names], -1)
+        return dict(zip(names, parts, strict=True))
+
     def _flag(self, each: list[TensorDictBase], key: str) -> Tensor:
         """A flag [N, 1]; false where there is none."""
         if each[0].get(key, None) is None:
@@ -435,7 +464,10 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         return self._stack(each, key).bool().view(-1, 1)
 
     def _shown(self, each: list[TensorDictBase]) -> dict[str, Any]:
-        shown: dict[str, Any] = {key: self._stack(each, key).float() for key in KEYS}
+        shown: dict[str, Any] = {
+            key: torch.cat([self._stack(each, name) for name in self._entries(key)], -1).float()
+            for key in KEYS
+        }
         for key, rows in shown.items():
             if not bool((finite := rows.isfinite()).all()):
                 row, at = (~finite).nonzero()[0].tolist()
@@ -461,7 +493,8 @@ class OwnGoalEnv(TaskTraits, EnvBase):
             if info is None:
                 raise ValueError(needs_info(self))
             given.append(info_rows(info, self._info, achieved.shape[:-1]))
-        answer = getattr(self._envs[0], method)(achieved, desired, *given)
+        pair = (self._named(*own) for own in zip(_GOALS, (achieved, desired), strict=True))
+        answer = getattr(self._envs[0], method)(*pair, *given)
         shape = (*achieved.shape[:-1], 1)
         if not isinstance(answer, Tensor) or answer.shape != shape:
             got = list(answer.shape) if isinstance(answer, Tensor) else type(answer).__name__
@@ -474,16 +507,16 @@ class OwnGoalEnv(TaskTraits, EnvBase):
     def _check(self, env: EnvBase) -> None:
         """Raises a ValueError that names what the environment lacks."""
         shown = env.full_observation_spec
-        for key in KEYS:
+        for key in [name for own in KEYS for name in self._entries(own)]:
             if key not in shown:
                 raise ValueError(f"{self._name} lacks {key!r} in what it shows: {', '.join(map(str, shown))}")
             if len(shown[key].shape) != 1 + self._whole:
                 raise ValueError(f"{self._name} must show {key!r} as a vector, got {list(shown[key].shape)}")
-        achieved, desired = (shown[key].shape for key in _GOALS)
+        achieved, desired = ([list(shown[name].shape) for name in self._entries(key)] for key in _GOALS)
         if achieved != desired:
             raise ValueError(
-                f"{self._name}'s achieved and desired goals must have one shape, got {list(achieved)} and "
-                f"{list(desired)}"
+                f"{self._name}'s achieved and desired goals must have one shape, got "
+                f"{' and '.join(', '.join(map(str, own)) for own in (achieved, desired))}"
             )
         for name in self._info:
             if name not in shown:
@@ -507,7 +540,8 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         def flag() -> Binary:
             return Binary(n=1, shape=(n, 1), dtype=torch.bool)
 
-        seen = {key: Unbounded(shape=(n, shown[key].shape[-1]), dtype=torch.float32) for key in KEYS}
+        widths = {key: sum(shown[name].shape[-1] for name in self._entries(key)) for key in KEYS}
+        seen = {key: Unbounded(shape=(n, width), dtype=torch.float32) for key, width in widths.items()}
         self.observation_spec = Composite(seen, shape=(n,))
         if _SUCCESS in shown:
             self.observation_spec[_SUCCESS] = flag()

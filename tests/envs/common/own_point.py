@@ -162,6 +162,32 @@ def make_costly(num_envs: int) -> Costly:
     return Costly(num_envs)
 
 
+class Crane(Point):
+    """A point whose goals are its coordinates, each an entry of its own, x behind y."""
+
+    def __init__(self, size: int = 0) -> None:
+        super().__init__(size)
+        names = ("sensors", "y", "x", "y_to", "x_to")
+        widths = {name: 2 if name == "sensors" else 1 for name in names}
+        batch = self.batch_size
+        seen = {name: Unbounded(shape=(*batch, width)) for name, width in widths.items()}
+        self.observation_spec = Composite(seen, shape=batch)
+
+    def _shown(self) -> dict[str, Tensor]:
+        (x, y), (x_to, y_to) = self.at.split(1, -1), self.goal.split(1, -1)
+        return {"sensors": self.at, "x": x.clone(), "y": y.clone(), "x_to": x_to, "y_to": y_to}
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any) -> Tensor:
+        if isinstance(achieved_goal, dict):
+            achieved_goal = torch.cat([achieved_goal[key] for key in ("x", "y")], -1)
+            desired_goal = torch.cat([desired_goal[key] for key in ("x_to", "y_to")], -1)
+        return super().compute_reward(achieved_goal, desired_goal)
+
+
+def make_crane(num_envs: int) -> Crane:
+    return Crane(num_envs)
+
+
 class Lost(Point):
     """A point whose second coordinate cannot be seen at the right."""
 

@@ -194,3 +194,21 @@ def test_further_entries_must_be_shown_and_given() -> None:
     env = make_env(f"{HERE}:Costly", info_keys=["cost"], achieved_reward=-0.5)
     with pytest.raises(ValueError, match="info_keys=env.info_keys"):
         env.compute_reward(torch.zeros(1, 2), torch.zeros(1, 2))
+
+
+@pytest.mark.parametrize("name", ["Crane", "make_crane"])
+def test_entries_have_names_of_their_own_and_goals_may_be_several(name: str) -> None:
+    names: dict[str, Any] = {"achieved_goal_key": ["y", "x"], "desired_goal_key": ["y_to", "x_to"]}
+    names["observation_key"] = "sensors"
+    env = make_env(f"{HERE}:{name}", num_envs=3, seed=5, **names)
+    check_env_specs(env)
+    after = rollout(env)["next"]
+    assert torch.equal(after["achieved_goal"], after["observation"].flip(-1))
+    met = (after["achieved_goal"] - after["desired_goal"]).norm(dim=-1, keepdim=True) < 0.5
+    assert met.any()
+    assert torch.equal(after["reward"], met.float() - 1)
+    assert torch.equal(env.compute_reward(after["achieved_goal"], after["desired_goal"]), after["reward"])
+    with pytest.raises(ValueError, match="own_point:Crane lacks 'angle' in what it shows: sensors, "):
+        make_env(f"{HERE}:Crane", **{**names, "achieved_goal_key": ["y", "angle"]})
+    with pytest.raises(ValueError, match=r"must have one shape, got \[1\], \[1\] and \[1\]$"):
+        make_env(f"{HERE}:Crane", **{**names, "desired_goal_key": "y_to"})
