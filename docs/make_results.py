@@ -11,6 +11,7 @@ studies are made by ``make docs``.
 from __future__ import annotations
 
 import argparse
+import csv
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -120,6 +121,18 @@ def draw_study(cells: Sequence[Combination], study: Study, path: Path) -> None:
     plot_comparison(panels, path, metrics=study.figure)
 
 
+def draw_staying(path: Path) -> None:
+    """Draws success at the last step on FetchPush, of the default agent and of the preset."""
+    shown = {"default agent": "default agent", "preset fetch_push": "preset=fetch_push"}
+    curves: dict[str, Rows] = {label: [] for label in shown.values()}
+    with open(RESULTS / "staying" / "runs.csv") as file:
+        for row in csv.DictReader(file):
+            if row["case"] in shown:
+                own = {name: float(row[name]) for name in ("seed", "epoch", "frames", "success")}
+                curves[shown[row["case"]]].append({"run": own["seed"], **own})
+    plot_comparison({"FetchPush, at the last step": curves}, path)
+
+
 def draw_the_ends(cells: Sequence[Combination], measure: str, label: str, path: Path) -> None:
     """A line for each combination: median and 33rd to 67th percentile of its runs at the end."""
     ends = [at_the_end(cell.rows, measure, evaluations=1) for cell in cells]
@@ -187,6 +200,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.runs is not None:
         export(options.runs)
+    draw_staying(options.images / "staying.png")
     for name in STUDIES:
         if is_results(RESULTS / name):
             every = read_results(RESULTS / name).cells
