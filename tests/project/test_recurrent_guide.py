@@ -12,6 +12,9 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.modules import set_recurrent_mode
 
+# The episodes of a batch are of different lengths, and stay so.
+pytestmark = pytest.mark.filterwarnings("ignore:SliceSampler returned a short flat batch:UserWarning")
+
 DOCS = Path(__file__).parents[2] / "docs"
 
 

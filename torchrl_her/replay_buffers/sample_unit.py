@@ -72,8 +72,8 @@ class _Ahead(NamedTuple):
 class _Chosen(NamedTuple):
     """The changes that a batch needs."""
 
-    size: int
-    rows: Tensor  # [V], places in the batch
+    shape: torch.Size  # of the batch
+    rows: Tensor  # [V], places in the flat batch
     goals: Tensor  # [V, g]
     ends: Tensor | None  # [B, 1], where a sampler of slices ends them
     ahead: _Ahead | None
@@ -197,9 +197,12 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             )
         stored = self._read(storage)
         row = _flat(index, storage.shape).to(stored.after.device)
+        shape, row = row.shape, row.flatten()
         sampler, ends = self._slice_sampler(storage), None
         own = torch.arange(len(row), device=row.device).unsqueeze(-1)
-        if sampler is not None:
+        if len(shape) == 2:  # a row for each slice: output_layout="batch_time"
+            own = own.view(shape)
+        elif sampler is not None:
             ends = self._ends(sampler, info, row.device)
             place = stored.episodes.place(row)
             inside = _moved(info.get(MASK), row.device)  # type: ignore[call-overload]  # TorchRL's keys may be nested
@@ -209,7 +212,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         if self.weights is not None:
             self.weights.update(goals)
         ahead = None if self.options.n_steps == 1 else self._look_ahead(stored, row, rows, goals)
-        self._chosen[self._key()] = _Chosen(len(row), rows, goals, ends, ahead)
+        self._chosen[self._key()] = _Chosen(shape, rows, goals, ends, ahead)
         if ends is not None:
             hidden = {self._keys.terminated, self._keys.done}
             info = {key: value for key, value in info.items() if key not in hidden}
@@ -219,10 +222,11 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         """Puts the chosen goals into a batch that was just sampled, with their rewards and ends.
 
         Args:
-            data: [B], as read from the storage.
+            data: [B], as read from the storage; [S, T] under a sampler of slices with
+                ``output_layout="batch_time"``.
 
         Returns:
-            [B], with the goals chosen by :meth:`expand`, and the mark of virtual transitions.
+            The same shape, with the goals chosen by :meth:`expand`, and the mark of virtual transitions.
 
         Raises:
             RuntimeError: no goals were chosen for this batch.
@@ -234,11 +238,17 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                 "Read what is stored from buffer.storage[...]; in a ReplayBufferEnsemble, relabel while "
                 "writing, with HERWriter"
             )
-        if data.batch_size != (chosen.size,):
-            raise RuntimeError(f"{chosen.size} rows were drawn, but a batch {list(data.shape)} was read")
+        if data.batch_size != chosen.shape:
+            raise RuntimeError(
+                f"a batch {list(chosen.shape)} was drawn, but a batch {list(data.shape)} was read"
+            )
+        return self._relabeled(data.reshape(-1), chosen).reshape(chosen.shape)
+
+    def _relabeled(self, data: TensorDictBase, chosen: _Chosen) -> TensorDictBase:
+        """A batch [B] with the changes that it needs."""
         out, rows = data.exclude(*self._exclude), chosen.rows
         if self.options.virtual_key is not None:
-            marks = torch.zeros(chosen.size, 1, dtype=torch.bool, device=device_of(rows))
+            marks = torch.zeros(len(data), 1, dtype=torch.bool, device=device_of(rows))
             out.set(self.options.virtual_key, marks.index_fill_(0, rows, True))
         if chosen.ahead is not None:
             after, returns = chosen.ahead

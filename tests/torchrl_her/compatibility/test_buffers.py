@@ -25,6 +25,7 @@ _CELLS = [
 
 
 @pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors:UserWarning")  # in TorchRL's ensembles
+@pytest.mark.filterwarnings("ignore:SliceSampler returned a short flat batch:UserWarning")
 @pytest.mark.parametrize(("storage", "sampler"), _CELLS)
 @pytest.mark.parametrize("room", [ROOM, FULL], ids=["all rows", "new rows over old ones"])
 def test_a_buffer_is_right_or_refused(storage: str, sampler: str, room: int) -> None:

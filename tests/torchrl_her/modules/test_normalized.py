@@ -158,7 +158,7 @@ def test_sequences_are_normalized_too() -> None:
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(1000),
         writer=HERWriter(GoalReward(0.5), per="episode", k=2, on_write=norm.update),
-        sampler=SliceSampler(slice_len=3, traj_key=ids, strict_length=False),
+        sampler=SliceSampler(slice_len=3, traj_key=ids, strict_length=False, pad_output=True),
         batch_size=30,
         prefetch=2,
     )

@@ -963,6 +963,7 @@ def test_an_episode_in_which_nothing_moved_has_no_virtual_copy() -> None:
     assert [len(rows) for rows in split(buffer)] == [4, 0]
 
 
+@pytest.mark.filterwarnings("ignore:SliceSampler returned a short flat batch:UserWarning")
 @settings(max_examples=30, deadline=None)
 @given(
     st.lists(st.lists(st.integers(1, 6), min_size=1, max_size=4), min_size=1, max_size=3),

@@ -494,6 +494,7 @@ def draw(buffer: TensorDictReplayBuffer) -> TensorDict:
     return rows
 
 
+@pytest.mark.filterwarnings("ignore:SliceSampler returned a short flat batch:UserWarning")
 @pytest.mark.parametrize("emptied", [False, True])
 @pytest.mark.parametrize("over", [False, True], ids=["filled in part", "written over"])
 @pytest.mark.parametrize(
