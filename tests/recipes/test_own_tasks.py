@@ -153,6 +153,7 @@ def test_import_on_the_command_line_permits_a_module_and_what_is_in_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(imports, "_imported", ["mine"])
+    monkeypatch.setattr(imports, "_permitted", set())  # whatever other tests have asked for
     for task in ("mine:make", "mine.parts:make", "gym:mine:My-v0", "gym:FetchReach-v4", "hand_v0"):
         check_permitted(task)
     for task in ("mined:make", "gym:other:My-v0", "gymnasium:make", "torchrl_her_envs.registry:make_env"):
