@@ -29,6 +29,57 @@ _QUICK: dict[str, Any] = {
 }
 
 
+@dataclass(frozen=True)
+class Order:
+    """An expected order of two algorithms.
+
+    Attributes:
+        measure: Metric that is compared.
+        more, less: Algorithms with more and with less of it.
+        text: The order as it was written.
+    """
+
+    measure: str
+    more: str
+    less: str
+    text: str
+
+    @classmethod
+    def parse(cls, measure: str, text: str) -> Order:
+        """Reads an order from ``a > b`` or ``a < b``.
+
+        Raises:
+            ValueError: The text has another form.
+
+        Example:
+            >>> order = Order.parse("kl", "her_ibs < her")
+            >>> order.more, order.less
+            ('her', 'her_ibs')
+        """
+        words = text.split() if isinstance(text, str) else []
+        if len(words) != 3 or words[1] not in "<>":
+            raise ValueError(f"an order is written 'a > b' or 'a < b', got {text!r}")
+        more, less = (words[0], words[2]) if words[1] == ">" else (words[2], words[0])
+        return cls(measure, more, less, text)
+
+
+def read_orders(expect: Mapping[str, Sequence[str]]) -> list[Order]:
+    """Returns the orders of a study's ``expect``, metric to orders.
+
+    Raises:
+        ValueError: There is no list of orders, or an order has another form.
+
+    Example:
+        >>> [order.more for order in read_orders({"success": ["cher > her"]})]
+        ['cher']
+    """
+    if not isinstance(expect, Mapping) or not all(
+        isinstance(orders, list | tuple) for orders in expect.values()
+    ):
+        raise ValueError(f"expect must hold lists of orders by metric, such as [cher > her]; got {expect!r}")
+    return [Order.parse(measure, text) for measure, orders in expect.items() for text in orders]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Study:
     """A comparison of recipes.
@@ -45,6 +96,10 @@ class Study:
             options must have an effect with all that varies.
         for_task: options of the runs on some of the tasks alone, by the task's name.
         figure: the metrics that are drawn over environment steps.
+        expect: orders that are expected at the end, ``a > b`` or ``a < b`` of two combinations, in lists by
+            metric. The report says on each task whether they hold.
+        published: numbers of others, which stand beside those of the runs in the report: ``numbers`` by
+            metric, task and algorithm, and ``where`` and ``notes`` by metric.
 
     Raises:
         ValueError: there is nothing to compare, the values of an option are no list, there are options for a
@@ -58,6 +113,8 @@ class Study:
     cases: dict[str, dict[str, Any]] = field(default_factory=dict)
     for_task: dict[str, dict[str, Any]] = field(default_factory=dict)
     figure: str | Sequence[str] = ("success",)
+    expect: dict[str, Sequence[str]] = field(default_factory=dict)
+    published: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.recipe, Mapping):
@@ -95,6 +152,7 @@ class Study:
             known = ", ".join(metric_names())
             raise ValueError(f"figure of {self.name} must be some of {known}; got {self.figure!r}")
         object.__setattr__(self, "figure", drawn)
+        read_orders(self.expect)  # refuses what is no order
 
     def combinations(self) -> Iterator[dict[str, Any]]:
         """What each combination has of its own, in the order of :meth:`cells`; ``case`` names one."""
@@ -185,9 +243,13 @@ def load_study(
         raise ValueError(f"{path}: a study has no {', '.join(unknown)}; it has preset, {', '.join(known)}")
     with naming(path):
         study = _shortened(path, values, preset, seeds=seeds, frames=frames, quick=quick)
-        recipes = [recipe for _, recipe in study.cells()]  # whether all of them can work
+        cells = list(study.cells())  # whether all of them can work
+        known = dict.fromkeys(curve_label(label, recipe) for label, recipe in cells)
+        named = (name for order in read_orders(study.expect) for name in (order.more, order.less))
+        if strange := next((name for name in named if name not in known), None):
+            raise ValueError(f"expect must name combinations, which are {', '.join(known)}; got {strange!r}")
     if path.parent == _STUDIES:  # this package's own files may name modules
-        for recipe in recipes:
+        for _, recipe in cells:
             permit_task(recipe.task.name)
     return study
 

@@ -1,19 +1,20 @@
-"""What the combinations of a study reached, how they differ, and whether the orders of the thesis hold."""
+"""What the combinations of a study reached, how they differ, and whether expected orders hold."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
+from torchrl_her_recipes.config.study import Order
 from torchrl_her_recipes.reports.bootstrap import Interval, bootstrap
 from torchrl_her_recipes.reports.results import LAST, Combination, at_the_end
-from torchrl_her_recipes.reports.thesis import Order, Thesis
 
 ALL_TASKS = "all tasks"
 _COUNTED = ("kl", "rows_")  # metrics that sum up all of a run: the last one stands for it
@@ -37,7 +38,7 @@ class Final:
     percentile_67: float
     least: float
     most: float
-    thesis: float | None
+    published: float | None
 
     @property
     def interval(self) -> Interval:
@@ -63,7 +64,7 @@ class Difference:
 
 
 class Verdict(StrEnum):
-    """What became of an order that the thesis states."""
+    """Outcome of an expected order."""
 
     APART = "holds, apart"  # the intervals of the two algorithms
     HOLDS = "holds, overlap"
@@ -74,7 +75,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Judged:
-    """An order of the thesis on one task: a row of the table."""
+    """An expected order on one task: a row of the table."""
 
     measure: str
     task: str
@@ -96,7 +97,7 @@ def values_of(cell: Combination, measure: str) -> list[float]:
 
 
 def compare(
-    cells: Sequence[Combination], measure: str, thesis: Thesis
+    cells: Sequence[Combination], measure: str, published: Mapping[str, Any]
 ) -> tuple[list[Final], list[Difference]]:
     """What all combinations reached, and how each two algorithms differ on the same task.
 
@@ -106,7 +107,7 @@ def compare(
     Args:
         cells: of a study.
         measure: which metric.
-        thesis: what it says of the study.
+        published: numbers of others, see :class:`~torchrl_her_recipes.Study`.
     """
     shown = [cell for cell in cells if values_of(cell, measure)]
     samples = [values_of(cell, measure) for cell in shown]
@@ -122,14 +123,15 @@ def compare(
         if keys[first][0] == keys[second][0] and final[first] and final[second]
     ]
     means, gaps = bootstrap(samples, groups, pairs)
-    finals = []
+    finals, numbers = [], published.get("numbers", {}).get(measure, {})
     for key, group, mean, finished in zip(keys, groups, means, final, strict=True):
         pooled = [value for index in group for value in samples[index]]
         low, middle, high = (float(value) for value in np.percentile(pooled, [33, 50, 67]))
         frames = max(shown[index].frames for index in group)
         spread = (mean.value, mean.low, mean.high, middle, low, high, min(pooled), max(pooled))
-        said = thesis.number(measure, *key)
-        finals.append(Final(measure, *key, finished, len(pooled), frames, *spread, said))
+        task, algorithm = key
+        number = numbers.get(task, {}).get(algorithm)
+        finals.append(Final(measure, *key, finished, len(pooled), frames, *spread, number))
     differences = [
         Difference(
             measure,
@@ -160,7 +162,7 @@ def judge(cells: Sequence[Combination], orders: Sequence[Order], found: Sequence
 
     Args:
         cells: of the study.
-        orders: of the thesis; the ones of algorithms that the study does not have are left out.
+        orders: the expected ones; those of algorithms that the study does not have are left out.
         found: all differences.
     """
     tasks = list(dict.fromkeys(cell.task for cell in cells))

@@ -15,13 +15,12 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from torchrl_her.files.writing import write_text
-from torchrl_her_recipes.config.study import Study
+from torchrl_her_recipes.config.study import Study, read_orders
 from torchrl_her_recipes.reports.bootstrap import REPETITIONS
 from torchrl_her_recipes.reports.compare import ALL_TASKS, Difference, Final, Judged, Verdict, compare, judge
 from torchrl_her_recipes.reports.formatting import MEASURES, SIGNS, show, show_gap, show_interval, show_range
 from torchrl_her_recipes.reports.pictures import Film, draw_pictures
 from torchrl_her_recipes.reports.results import LAST, Combination
-from torchrl_her_recipes.reports.thesis import load_thesis
 from torchrl_her_recipes.reports.tidy import Results, read_study
 from torchrl_her_recipes.runs.plots import band
 from torchrl_her_recipes.studies.plan import duration
@@ -76,17 +75,17 @@ def write_page(results: Results, out: Path, *, back: str | None = None) -> Path:
 
 def _describe(results: Results, out: Path) -> dict[str, Any]:
     """Writes a page's tables and pictures, and returns its values by the names in the template."""
-    cells, thesis = results.cells, load_thesis(results.name if results.kind == "study" else "")
-    measures = list(dict.fromkeys([*_AT_THE_END, *(order.measure for order in thesis.orders)]))
-    compared = [compare(cells, measure, thesis) for measure in measures]
+    cells, orders = results.cells, read_orders(results.expect)
+    measures = list(dict.fromkeys([*_AT_THE_END, *results.expect]))
+    compared = [compare(cells, measure, results.published) for measure in measures]
     finals = [row for rows, _ in compared for row in rows]
     differences = [row for _, rows in compared for row in rows]
-    judged = judge(cells, thesis.orders, differences)
+    judged = judge(cells, orders, differences)
     (out / "figures").mkdir(parents=True, exist_ok=True)
     _write_tables(out, cells, finals, differences, judged)
     return {
         "study": results,
-        "thesis": thesis,
+        "published": results.published,
         "cells": cells,
         "tasks": list(dict.fromkeys(cell.task for cell in cells)),
         "finals": {measure: rows for measure, (rows, _) in zip(measures, compared, strict=True)},
@@ -127,13 +126,13 @@ def _success_now(cell: Combination) -> str:
 
 
 def _shares(rows: Sequence[Final]) -> dict[tuple[str, str], tuple[float, float | None]]:
-    """What each algorithm leaves of HER's divergence on the same task: here, and in the thesis."""
+    """What each algorithm leaves of HER's divergence on the same task: here, and as published."""
     her = {row.task: row for row in rows if row.algorithm == "her" and row.iqm > 0}
     shares = {}
     for row in rows:
         base = her.get(row.task)
         if base is not None and base is not row:
-            said = row.thesis / base.thesis if row.thesis is not None and base.thesis else None
+            said = row.published / base.published if row.published is not None and base.published else None
             shares[row.task, row.algorithm] = (row.iqm / base.iqm, said)
     return shares
 

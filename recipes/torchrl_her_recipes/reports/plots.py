@@ -63,7 +63,7 @@ def plot_finals(
     title: str,
     palette: Mapping[str, str],
 ) -> None:
-    """Draws success at the end: each run, the interquartile mean with its interval, the thesis's number.
+    """Draws success at the end: each run, the interquartile mean with its interval, the published number.
 
     Args:
         finals: label to the success of each run, and what they have in common.
@@ -77,15 +77,15 @@ def plot_finals(
         axes.scatter(values, [place + 0.22] * len(values), s=9, color=color, alpha=0.45, linewidths=0)
         axes.plot([final.low, final.high], [place, place], color=color, linewidth=4, alpha=0.5)
         axes.plot([final.iqm], [place], "o", color=color, markersize=6)
-        if final.thesis is not None:
-            axes.plot([final.thesis], [place], "D", color=_INK, markersize=6, fillstyle="none")
+        if final.published is not None:
+            axes.plot([final.published], [place], "D", color=_INK, markersize=6, fillstyle="none")
     axes.set(ylim=(len(finals) - 0.5, -0.5), xlim=(-0.02, 1.02), xlabel="success at the end")
     axes.set_yticks(range(len(finals)), list(finals))
     axes.xaxis.set_major_formatter(PercentFormatter(1.0))
     axes.grid(axis="x", alpha=0.3)
-    if any(final.thesis is not None for _, final in finals.values()):
-        thesis = Line2D([], [], marker="D", linestyle="", color=_INK, fillstyle="none", label="the thesis")
-        figure.legend(handles=[thesis], loc="outside lower center", frameon=False)
+    if any(final.published is not None for _, final in finals.values()):
+        mark = Line2D([], [], marker="D", linestyle="", color=_INK, fillstyle="none", label="published")
+        figure.legend(handles=[mark], loc="outside lower center", frameon=False)
     _save(figure, stem)
 
 

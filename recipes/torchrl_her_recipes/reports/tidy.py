@@ -6,7 +6,7 @@ import csv
 import gzip
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -36,6 +36,7 @@ class Results:
         summary: one line for people.
         cells: its combinations.
         kind: what they are: of a ``"study"``, or single ``"runs"``.
+        expect, published: as in :class:`~torchrl_her_recipes.Study`.
         film: the newest film of its policies and what it shows, if there is one.
     """
 
@@ -43,6 +44,8 @@ class Results:
     summary: str
     cells: list[Combination]
     kind: Literal["study", "runs"] = "study"
+    expect: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    published: Mapping[str, Any] = field(default_factory=dict)
     film: tuple[Path, str] | None = None
 
 
@@ -63,7 +66,13 @@ def read_study(study: Study, folder: Path) -> Results:
     """
     if not is_results(folder):
         cells = read_combinations(study, folder)
-        return Results(name=study.name, summary=study.summary, cells=cells)
+        return Results(
+            name=study.name,
+            summary=study.summary,
+            cells=cells,
+            expect=study.expect,
+            published=study.published,
+        )
     results = read_results(folder)
     if results.name != study.name:
         raise ValueError(f"{folder} holds results of the study {results.name}, not of {study.name}")
@@ -107,6 +116,8 @@ def write_results(
         "vary": {name: list(values) for name, values in study.vary.items()},
         **({"cases": dict(study.cases)} if study.cases else {}),
         **({"for_task": dict(study.for_task)} if study.for_task else {}),
+        **({"expect": dict(study.expect)} if study.expect else {}),
+        **({"published": dict(study.published)} if study.published else {}),
     }
     return write_files(about, cells, out)
 
@@ -154,7 +165,8 @@ def read_results(folder: Path) -> Results:
             )
             for label, state in about["combinations"].items()
         ]
-        return Results(name=about["study"], summary=about["summary"], cells=cells)
+        said = {name: about.get(name, {}) for name in ("expect", "published")}
+        return Results(name=about["study"], summary=about["summary"], cells=cells, **said)
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error} is missing or of the wrong kind") from error
 

@@ -154,3 +154,27 @@ def test_studies_of_this_package_may_name_modules(monkeypatch: pytest.MonkeyPatc
         check_permitted(task)
     load_study("defaults")
     check_permitted(task)
+
+
+@pytest.mark.parametrize("name", [name for name in study_names() if load_study(name).published])
+def test_published_numbers_are_of_what_the_study_has(name: str) -> None:
+    study = load_study(name)
+    cells = {(recipe.task.name, curve_label(label, recipe)) for label, recipe in study.cells()}
+    for numbers in study.published.get("numbers", {}).values():
+        assert {(task, algorithm) for task, own in numbers.items() for algorithm in own} <= cells
+
+
+def test_what_is_no_order_is_refused() -> None:
+    for expect, message in (
+        ({"success": ["her = cher"]}, "an order is written 'a > b' or 'a < b', got 'her = cher'"),
+        ({"success": "her > cher"}, "expect must hold lists of orders by metric"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Study(name="mine", vary={"algo": ["her", "cher"]}, expect=expect)
+
+
+def test_an_order_of_what_the_study_does_not_have_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("vary: {algo: [her, cher]}\nrecipe: {task: hand_v1}\nexpect: {success: [chre > her]}")
+    with pytest.raises(ValueError, match="expect must name combinations, which are her, cher; got 'chre'"):
+        load_study(str(path))

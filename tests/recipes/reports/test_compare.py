@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_her_recipes.config.study import Order
 from torchrl_her_recipes.reports.compare import ALL_TASKS, Verdict, compare, judge
 from torchrl_her_recipes.reports.results import read_combinations
-from torchrl_her_recipes.reports.thesis import Order, Thesis
 
 from .small_study import STUDY, TASKS, write_run
 
@@ -19,7 +19,7 @@ def test_algorithms_at_their_end_everywhere_are_compared_on_all_tasks(tmp_path: 
     write_run(tmp_path, STUDY, "robot_v2_her", [0.3] * 4)
     write_run(tmp_path, STUDY, "robot_v2_filtered_her", [0.6] * 4)
     cells = read_combinations(STUDY, tmp_path)
-    finals, gaps = compare(cells, "success", Thesis())
+    finals, gaps = compare(cells, "success", {})
     means = {(row.task, row.algorithm): row.iqm for row in finals}
     assert means[ALL_TASKS, "her"] == pytest.approx(0.2)
     assert means[ALL_TASKS, "filtered_her"] == pytest.approx(0.55)
@@ -39,7 +39,7 @@ def test_an_order_within_the_spread_is_undecided_and_its_sign_is_as_written(tmp_
     write_run(tmp_path, STUDY, "hand_v2_her", [0.0, 0.4, 0.6, 1.0])
     write_run(tmp_path, STUDY, "hand_v2_filtered_her", [0.0, 0.5, 0.7, 1.0])
     cells = read_combinations(STUDY, tmp_path)
-    _, gaps = compare(cells, "success", Thesis())
+    _, gaps = compare(cells, "success", {})
     (row, *_) = judge(cells, [Order.parse("success", "her < filtered_her")], gaps)
     assert row.verdict is Verdict.UNDECIDED
     assert row.difference == pytest.approx(-0.1)

@@ -15,7 +15,7 @@ from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config.study import Study
 from torchrl_her_recipes.reports.page import write_report
 
-from .small_study import ALGORITHMS, RECIPE, STUDY, table, write_run
+from .small_study import ALGORITHMS, RECIPE, SAID, STUDY, table, write_run
 
 VOID = {"area", "base", "br", "col", "hr", "img", "input", "link", "meta", "source"}
 
@@ -28,7 +28,7 @@ def unfinished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_run(folder, STUDY, "hand_v2_filtered_her", [0.5, 0.7, 0.9, 1.0])
     write_run(folder, STUDY, "robot_v2_her", [0.25, 0.25, 0.25, 0.25], epochs=2)
     own = folder / "bias.yaml"
-    about = {"summary": "a <small> one", "recipe": RECIPE, "vary": STUDY.vary}
+    about = {"summary": "a <small> one", "recipe": RECIPE, "vary": STUDY.vary, **SAID}
     own.write_text(yaml.safe_dump(about, sort_keys=False))
     assert main(["report", str(own), "--folder", str(folder)]) == 0
     return folder
@@ -114,8 +114,8 @@ def test_numbers_and_those_of_the_thesis_stand_side_by_side(page: str, unfinishe
     rows = {(row["measure"], row["task"], row["algorithm"]): row for row in table(out / "final.csv")}
     assert float(rows["success", "hand_v2", "filtered_her"]["iqm"]) == pytest.approx(0.8)
     assert float(rows["success", "hand_v2", "her"]["iqm"]) == pytest.approx(0.2)
-    assert rows["success", "hand_v2", "her"]["thesis"] == ""
-    assert (rows["kl", "hand_v2", "her"]["iqm"], rows["kl", "hand_v2", "her"]["thesis"]) == ("2", "2.0317")
+    assert rows["success", "hand_v2", "her"]["published"] == ""
+    assert (rows["kl", "hand_v2", "her"]["iqm"], rows["kl", "hand_v2", "her"]["published"]) == ("2", "2.0317")
     assert "filtered_her 0.50 (0.50 to 0.50) 0.34 25 % 17 %" in text_of(page)  # KL, thesis, both beside HER's
     (gap,) = [row for row in table(out / "differences.csv") if row["measure"] == "success"]
     assert (gap["task"], gap["first"], gap["second"]) == ("hand_v2", "filtered_her", "her")
