@@ -244,10 +244,11 @@ def load_study(
     with naming(path):
         study = _shortened(path, values, preset, seeds=seeds, frames=frames, quick=quick)
         cells = list(study.cells())  # whether all of them can work
-        known = dict.fromkeys(curve_label(label, recipe) for label, recipe in cells)
+        combined = dict.fromkeys(curve_label(label, recipe) for label, recipe in cells)
         named = (name for order in read_orders(study.expect) for name in (order.more, order.less))
-        if strange := next((name for name in named if name not in known), None):
-            raise ValueError(f"expect must name combinations, which are {', '.join(known)}; got {strange!r}")
+        if strange := next((name for name in named if name not in combined), None):
+            there = ", ".join(combined)
+            raise ValueError(f"expect must name combinations, which are {there}; got {strange!r}")
     if path.parent == _STUDIES:  # this package's own files may name modules
         for _, recipe in cells:
             permit_task(recipe.task.name)
