@@ -169,6 +169,8 @@ class HindsightConfig(Group):
         check_strategy(self.strategy)
         if self.goal_sources not in (None, AUTO):
             object.__setattr__(self, "goal_sources", check_goal_sources(self.goal_sources))
+        elif (self.k, self.strategy) != (4, "future"):  # given, in place of auto
+            object.__setattr__(self, "goal_sources", None)
 
     @property
     def sources(self) -> dict[str, int]:

@@ -223,7 +223,9 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     _drop_options_of_another_learner(below, given)
     _drop_options_of_another_task(below, given)
     _drop_another_curriculum(below, given)
-    _drop_other_goal_sources(given)
+    drop_other_goal_sources(given)
+    if "goal_sources" not in below.get("hindsight", {}):
+        drop_other_goal_sources(below)
     if "epochs" in given.get("run", {}):
         below.get("run", {}).pop("frames", None)
     for group, own in without_effect(_groups(over(below, given))):
@@ -286,8 +288,12 @@ def _drop_another_curriculum(below: Nested, given: Nested) -> None:
         below.get("curriculum", {}).pop("name", None)
 
 
-def _drop_other_goal_sources(given: Nested) -> None:
-    """Asks for no goal sources, not even those of the base, where k or the strategy is asked for."""
+def drop_other_goal_sources(given: Nested) -> None:
+    """Sets ``goal_sources`` to None, in place of the base's, if k or the strategy is given.
+
+    Raises:
+        ValueError: ``goal_sources`` is given, too.
+    """
     asked = given.get("hindsight", {})
     short = {name: asked[name] for name in ("k", "strategy") if name in asked}
     if not short:

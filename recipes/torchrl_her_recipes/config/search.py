@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.spaces import Space, make_space
 
@@ -53,6 +54,15 @@ class Search:
                 "has fewer: take tpe or random"
             )
         self.space.check(self.recipe)
+        own = self.space.values_of(self.recipe)
+        for entry in self.space:
+            value = own.get(entry.name, AUTO)
+            numbers = self.sampler == "cmaes" and entry.kind != "choice"
+            if numbers and value != AUTO and not entry.holds(value):
+                raise ValueError(
+                    f"--sampler cmaes needs a space with the recipe's own values, and {entry.name}={value} "
+                    "lies outside; widen its range, or choose --sampler tpe"
+                )
 
     def to_plain(self) -> dict[str, Any]:
         """The search as plain values, as its folder keeps them."""

@@ -12,11 +12,11 @@ from typing import Any, Literal, get_args
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.learners import BY_ACTIONS
-from torchrl_her_recipes.config.options import what_there_is
+from torchrl_her_recipes.config.options import AUTO, what_there_is
 from torchrl_her_recipes.config.plain_files import read_yaml
-from torchrl_her_recipes.config.recipe import Recipe, compose
+from torchrl_her_recipes.config.recipe import Recipe, compose, drop_other_goal_sources
 from torchrl_her_recipes.config.shipped import CONF
-from torchrl_her_recipes.config.shortcuts import locate, merge
+from torchrl_her_recipes.config.shortcuts import locate, merge, place
 from torchrl_her_recipes.config.values import as_kind
 from torchrl_her_recipes.config.without_effect import without_effect
 
@@ -159,8 +159,8 @@ class Space:
         if not self.entries:
             raise ValueError(f"the space {self.name} varies nothing")
         places = [locate(entry.name) for entry in self.entries]
-        for place, entry in zip(places, self.entries, strict=True):
-            if places.count(place) > 1:
+        for home, entry in zip(places, self.entries, strict=True):
+            if places.count(home) > 1:
                 raise ValueError(f"the space {self.name} has two entries for {entry.name}")
 
     def __iter__(self) -> Iterator[Entry]:
@@ -187,7 +187,7 @@ class Space:
 
     def with_effect(self, recipe: Recipe) -> Space:
         """The space without options that have no effect on a recipe."""
-        idle = without_effect(recipe)
+        idle = _idle(recipe)
         return replace(self, entries=tuple(own for own in self.entries if locate(own.name) not in idle))
 
     def check(self, recipe: Recipe) -> None:
@@ -218,20 +218,32 @@ class Space:
     def recipe(self, base: Recipe, values: Mapping[str, Any]) -> Recipe:
         """A recipe with some values of the options that are varied.
 
-        What has no effect besides the others is left out.
+        Values without effect besides the others are left out; k and strategy replace goal_sources.
 
         Raises:
             ValueError: values that cannot go together.
         """
-        return compose(merge(base.to_dict(), values), {})
+        given = place(values)
+        drop_other_goal_sources(given)
+        return compose(merge(base.to_dict(), given), {})
 
-    def values_of(self, recipe: Recipe) -> dict[str, Any] | None:
-        """The values that a recipe itself has; None if some of them do not lie in the space."""
-        places = {entry: locate(entry.name) for entry in self.entries}
-        values = {entry: getattr(getattr(recipe, group), name) for entry, (group, name) in places.items()}
-        if not all(entry.holds(value) for entry, value in values.items()):
-            return None
-        return {entry.name: value for entry, value in values.items()}
+    def values_of(self, recipe: Recipe) -> dict[str, Any]:
+        """A recipe's values of the options that have an effect, in the space or outside."""
+        idle = _idle(recipe)
+        places = {entry.name: locate(entry.name) for entry in self.entries}
+        return {
+            name: getattr(getattr(recipe, group), own)
+            for name, (group, own) in places.items()
+            if (group, own) not in idle
+        }
+
+
+def _idle(recipe: Recipe) -> set[tuple[str, str]]:
+    """The options that have no effect on a recipe, as (group, name)."""
+    idle = set(without_effect(recipe))
+    if recipe.hindsight.goal_sources == AUTO:  # sources that a run takes in place of k and strategy
+        idle |= {("hindsight", "k"), ("hindsight", "strategy")}
+    return idle
 
 
 def space_names() -> list[str]:

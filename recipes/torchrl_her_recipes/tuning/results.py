@@ -7,12 +7,13 @@ import io
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 from matplotlib import rc_context
 from optuna.importance import get_param_importances
-from optuna.study import Study
+from optuna.study import Study, create_study
 from optuna.trial import FrozenTrial, Trial, TrialState
 from optuna.visualization import matplotlib as figures
 
@@ -22,6 +23,9 @@ from torchrl_her_recipes.runs.plots import save_figure
 
 _FEWEST = 5  # complete trials, from which importances are estimated
 _SHOWN = 5  # trials in the table that is printed
+DEFAULT = (
+    "default"  # attribute of the trial of the recipe as it is: its values, some perhaps outside of the space
+)
 
 
 def folder_of(trial: FrozenTrial | Trial) -> str:
@@ -44,7 +48,7 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
     writer.writerow(["trial", "state", "score", "epochs", *names, "folder"])
     for own in trials:
         value = own.value if own.value is not None else own.intermediate_values.get(own.last_step or 0, "")
-        values = [own.params.get(name, "") for name in names]
+        values = [_values(own).get(name, "") for name in names]
         writer.writerow(
             [own.number, own.state.name.lower(), value, own.last_step or 0, *values, folder_of(own)]
         )
@@ -58,10 +62,19 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
 
 def importances(study: Study) -> dict[str, float]:
     """Importance of each option for the score (PED-ANOVA), as fractions; empty for too few trials."""
-    done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    if len(done) < _FEWEST or len({own.value for own in done}) < 2:
+    done = _in_space(study)
+    if len(done.trials) < _FEWEST or len({own.value for own in done.trials}) < 2:
         return {}
-    return dict(get_param_importances(study))
+    return dict(get_param_importances(done))
+
+
+def _in_space(study: Study) -> Study:
+    """Returns a study of the complete trials with a value of each option, which the first one may lack."""
+    done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    most = max((len(own.params) for own in done), default=0)
+    inside = create_study(direction="maximize")
+    inside.add_trials([own for own in done if len(own.params) == most])
+    return inside
 
 
 def write_pictures(study: Study, folder: Path) -> None:
@@ -75,7 +88,7 @@ def write_pictures(study: Study, folder: Path) -> None:
             "options": figures.plot_slice(study, target_name="score"),
         }
         if importances(study):
-            drawn["importance"] = figures.plot_param_importances(study, target_name="score")
+            drawn["importance"] = figures.plot_param_importances(_in_space(study), target_name="score")
     for name, axes in drawn.items():
         save_figure(np.atleast_1d(np.asarray(axes, dtype=object)).flat[0].figure, folder / f"{name}.png")
 
@@ -86,7 +99,7 @@ def search_summary(study: Study) -> list[str]:
     ranked = sorted(done, key=lambda own: (-(own.value or 0.0), own.number))[:_SHOWN]
     lines = [
         f"trial {own.number}: score {own.value:.0%}  "
-        + " ".join(f"{name}={_short(value)}" for name, value in own.params.items())
+        + " ".join(f"{name}={_short(value)}" for name, value in _values(own).items())
         for own in ranked
     ]
     if weights := importances(study):
@@ -94,6 +107,10 @@ def search_summary(study: Study) -> list[str]:
         shares = ", ".join(f"{name} {share:.0%}" for name, share in weights.items())
         lines.append(f"importance{guess}: {shares}")
     return lines
+
+
+def _values(trial: FrozenTrial) -> dict[str, Any]:
+    return {**trial.user_attrs.get(DEFAULT, {}), **trial.params}
 
 
 def _short(value: object) -> str:

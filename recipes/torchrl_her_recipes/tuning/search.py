@@ -33,7 +33,7 @@ from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.score import score
 from torchrl_her_recipes.studies.jobs import Job, Outcome
 from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
-from torchrl_her_recipes.tuning.results import folder_of, write_pictures, write_results
+from torchrl_her_recipes.tuning.results import DEFAULT, folder_of, write_pictures, write_results
 
 _NAME, _SETTINGS, _DATABASE = "search", "search.yaml", "search.db"
 _TICK = 1.0  # seconds
@@ -160,9 +160,12 @@ def _begin(search: Search, database: Path) -> Study:
     )
     begun = study.get_trials(deepcopy=False)
     study.sampler = make_sampler(search.sampler, search.recipe.run.seed + len(begun))
-    first = search.space.values_of(search.recipe)
-    if not begun and first is not None:
-        study.enqueue_trial(first)
+    if not begun:
+        values = search.space.values_of(search.recipe)
+        inside = {entry.name for entry in search.space if entry.holds(values.get(entry.name))}
+        study.enqueue_trial(
+            {name: value for name, value in values.items() if name in inside}, user_attrs={DEFAULT: values}
+        )
     for trial in begun:
         if trial.state == TrialState.RUNNING:
             _repeat(study, trial)
@@ -211,9 +214,10 @@ def _counted(study: Study) -> list[FrozenTrial]:
 
 def _repeat(study: Study, trial: FrozenTrial | Trial, *, attempt: int = 0) -> None:
     """Ends a trial that was cut short; another one with its values goes on with its run."""
+    kept = {name: value for name, value in trial.user_attrs.items() if name == DEFAULT}
     Trial(study, trial._trial_id).set_user_attr(_REPEATED, True)
     study.tell(trial.number, state=TrialState.FAIL)
-    study.enqueue_trial(trial.params, user_attrs={"folder": folder_of(trial), _ATTEMPT: attempt})
+    study.enqueue_trial(trial.params, user_attrs={**kept, "folder": folder_of(trial), _ATTEMPT: attempt})
 
 
 class _TrialRuns:
@@ -261,8 +265,13 @@ class _TrialRuns:
     def _start(self, threads: ThreadPoolExecutor) -> None:
         trial = self.study.ask()
         try:
-            values = self.search.space.suggest(trial)
-            recipe = self.search.space.recipe(self.search.recipe, values)
+            space, default = self.search.space, trial.user_attrs.get(DEFAULT)
+            values = {
+                entry.name: entry.suggest(trial)
+                for entry in space
+                if default is None or entry.holds(default.get(entry.name))
+            }
+            recipe = space.recipe(self.search.recipe, values)
         except ValueError as error:  # values that do not go together
             self._tell(trial, TrialState.FAIL, error=str(error))
             return

@@ -37,7 +37,7 @@ def test_a_search_says_what_it_varies_and_how_to_train_the_best(
     # What is given is not varied: gamma, and batch_size and hidden among the options that make it small.
     assert said[:2] == [
         "search: runs/tune_bit_flip_s0",
-        "varied: learning_rate, tau, norm, epsilon_decay, epsilon_end, k",
+        "varied: learning_rate, tau, norm, epsilon_decay, epsilon_end",
     ]
     assert re.fullmatch(r"trial 0: score \d+% \(best \d+%, trial 0\)", said[2])
     assert said[4].startswith("trial ")

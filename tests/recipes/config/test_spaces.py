@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from torchrl_her_recipes import LEARNERS, Search, load_preset, load_space, make_recipe, space_for
+from torchrl_her_recipes.config.groups import HindsightConfig
 from torchrl_her_recipes.config.shipped import preset_names
 from torchrl_her_recipes.config.spaces import make_space, space_names
 
@@ -19,8 +20,16 @@ def test_every_learner_has_a_space_that_its_recipes_take(learner: str) -> None:
     space = space_for(recipe)
     Search(recipe=recipe, space=space)
     assert space.name == learner
-    assert space.values_of(recipe) is not None  # the defaults can be the first trial
     assert {"learning_rate", "gamma", "k"} <= set(space.to_plain())
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_the_defaults_of_every_learner_lie_in_its_space(learner: str) -> None:
+    recipe = make_recipe(task="bit_flip" if learner == "dqn" else "hand_v0", learner=learner, gamma=0.96)
+    space = space_for(recipe)
+    values = space.values_of(recipe)
+    assert [entry.name for entry in space if not entry.holds(values[entry.name])] == []
+    assert "k" not in values  # goals come from goal_sources
 
 
 def test_there_are_no_other_spaces() -> None:
@@ -37,6 +46,15 @@ def test_the_space_of_the_learner_that_auto_stands_for_and_of_options_that_have_
     assert space_for(make_recipe(task="bit_flip")).name == "dqn"
     assert space_for(make_recipe(task="hand_v0")).name == "ddpg"
     assert "k" not in space_for(make_recipe(algo="no_hindsight")).to_plain()
+
+
+def test_k_and_strategy_replace_the_goal_sources_of_a_recipe() -> None:
+    plain = {"k": {"kind": "int", "low": 1, "high": 8}}
+    recipe = make_recipe(task="hand_v0", goal_sources={"future": 3, "actual": 2})
+    assert make_space("mine", plain).recipe(recipe, {"k": 7}).hindsight.sources == {"future": 7}
+    assert make_recipe({"k": 7}).hindsight.sources == {"future": 7}  # a preset
+    assert make_recipe({"k": 4}).hindsight.sources == {"future": 4}
+    assert HindsightConfig(k=7).sources == {"future": 7}
 
 
 def test_values_of_a_trial_that_have_no_effect_beside_others_are_left_out() -> None:
@@ -161,6 +179,13 @@ def test_samplers_and_spaces_that_do_not_go_together() -> None:
     space = make_space("mine", {"k": {"kind": "int", "low": 1, "high": 4}})
     with pytest.raises(ValueError, match="--sampler cmaes needs two options that are no choices"):
         Search(recipe=recipe, space=space, sampler="cmaes")
+    steps = make_space(
+        "mine", {name: {"kind": "float", "low": 0.1, "high": 0.2} for name in ("tau", "action_noise")}
+    )
+    with pytest.raises(
+        ValueError, match="cmaes needs a space with the recipe's own values, and tau=0.05 lies"
+    ):
+        Search(recipe=recipe, space=steps, sampler="cmaes")
     with pytest.raises(ValueError, match="sampler must be one of tpe, random, cmaes, got 'grid'"):
         Search(recipe=recipe, space=space, sampler="grid")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="all options of the space mine are given"):

@@ -15,6 +15,7 @@ from filelock import FileLock
 from PIL import Image
 
 from torchrl_her_recipes import RunFolder, load_preset, make_recipe, run_score, search_summary
+from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.studies.jobs import Job, Outcome
 from torchrl_her_recipes.tuning import search as search_module
 from torchrl_her_recipes.tuning.search import SearchResult
@@ -36,12 +37,13 @@ def states(result: SearchResult) -> list[str]:
 
 def test_a_search_leaves_the_best_as_a_preset_and_more_trials_can_be_added(tmp_path: Path) -> None:
     lines: list[str] = []
-    first = go_on(small_search(), tmp_path, 2, say=lines.append)
+    own = make_recipe(RECIPE, goal_sources=None)
+    first = go_on(small_search(goal_sources=None), tmp_path, 2, say=lines.append)
     assert [line.split(":")[0] for line in lines] == ["trial 0", "trial 1"]
     before = first.trials
     assert len(before) == 2
     assert len(search_summary(first.study)) == 2  # too early for importances
-    result = go_on(small_search(), tmp_path, 7, pictures=True)
+    result = go_on(small_search(goal_sources=None), tmp_path, 7, pictures=True)
     assert result.trials[:2] == before
     best = result.study.best_trial
     assert best.value == result.best
@@ -49,7 +51,6 @@ def test_a_search_leaves_the_best_as_a_preset_and_more_trials_can_be_added(tmp_p
     assert "importance (a guess" in search_summary(result.study)[-1]
 
     # The first trial is the recipe as it is, which any other has to beat.
-    own = make_recipe(RECIPE)
     assert table(tmp_path)[0]["learning_rate"] == str(own.learner.learning_rate)
     # Training with the preset repeats the best trial.
     recipe = make_recipe(load_preset(str(tmp_path / "best.yaml")))
@@ -62,6 +63,21 @@ def test_a_search_leaves_the_best_as_a_preset_and_more_trials_can_be_added(tmp_p
     left = [path.name for path in tmp_path.iterdir() if path.name != ".lock" and path.is_file()]
     expected = ["best.yaml", "search.db", "search.yaml", "trials.csv"]
     assert sorted(left) == sorted([*expected, "history.png", "importance.png", "options.png"])
+
+
+def test_the_first_trial_is_the_recipe_even_outside_of_the_space(tmp_path: Path) -> None:
+    space = {
+        "learning_rate": {"kind": "log_float", "low": 1e-5, "high": 1e-4},
+        "hidden": {"kind": "choice", "values": [8, 12]},
+        "tau": {"kind": "float", "low": 0.01, "high": 0.1},
+    }
+    died = Outcome(error="its process was ended by SIGKILL", died=True)
+    result = go_on(small_search(space), tmp_path, 7, workers=Actors(trial_0000=[died]), pictures=True)
+    assert RunFolder(tmp_path / "trial_0000").recipe() == resolved(small_search(space).recipe)
+    first, *others = table(tmp_path)
+    assert (first["learning_rate"], first["hidden"], first["tau"]) == ("0.001", "16", "0.05")
+    assert {row["hidden"] for row in others} <= {"8", "12"}
+    assert "hidden" in search_summary(result.study)[-1]  # importances are of all that is varied
 
 
 @pytest.mark.long
