@@ -87,6 +87,7 @@ def _describe(results: Results, out: Path) -> dict[str, Any]:
         "study": results,
         "published": results.published,
         "cells": cells,
+        "averaged": _averaged(cells),
         "tasks": list(dict.fromkeys(cell.task for cell in cells)),
         "finals": {measure: rows for measure, (rows, _) in zip(measures, compared, strict=True)},
         "differences": [row for row in differences if row.measure == "success"],
@@ -110,7 +111,7 @@ def _template() -> Any:
     environment.filters |= {"show": show, "show_interval": show_interval, "show_gap": show_gap}
     environment.filters |= {"duration": _duration, "success_now": _success_now}
     environment.globals["show_range"] = show_range
-    environment.globals |= {"ALL_TASKS": ALL_TASKS, "LAST": LAST, "MEASURES": MEASURES}
+    environment.globals |= {"ALL_TASKS": ALL_TASKS, "MEASURES": MEASURES}
     environment.globals |= {"REPETITIONS": REPETITIONS, "SIGNS": SIGNS}
     return environment.get_template("report.html")
 
@@ -123,6 +124,15 @@ def _success_now(cell: Combination) -> str:
     """The success of its last evaluation, the median of its runs."""
     last = [row["success"] for row in cell.rows if row["epoch"] == cell.epoch]
     return show(statistics.median(last), "success")
+
+
+def _averaged(cells: Sequence[Combination]) -> str:
+    """The evaluations whose mean is shown: the last ones, as far as there are as many."""
+    counts = [min(LAST, len({row["epoch"] for row in cell.rows})) for cell in cells if not cell.missing]
+    least, most = min(counts), max(counts)
+    if most == 1:
+        return "last evaluation"
+    return f"last {most} evaluations" if least == most else f"last {least} to {most} evaluations"
 
 
 def _shares(rows: Sequence[Final]) -> dict[tuple[str, str], tuple[float, float | None]]:

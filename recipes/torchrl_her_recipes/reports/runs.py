@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.reports.page import write_page
 from torchrl_her_recipes.reports.results import read_single
 from torchrl_her_recipes.reports.tidy import Results
@@ -14,7 +16,7 @@ _FILMS = (".gif", ".mp4")
 
 
 def read_runs(folders: Sequence[Path]) -> Results:
-    """What there is of some runs, each of which is an algorithm of its own on the page.
+    """What there is of some runs; those that differ in nothing but their seeds are one algorithm on the page.
 
     Args:
         folders: of runs, or of batches of seeds (``seeds_*``), or with such folders in them.
@@ -23,8 +25,10 @@ def read_runs(folders: Sequence[Path]) -> Results:
         ValueError: one of them has no run, or a run cannot be read.
     """
     paths = [path for folder in folders for path in _runs_in(folder)]
-    labels = _labels(paths)
-    cells = [read_single(label, Batches(path)) for label, path in zip(labels, paths, strict=True)]
+    groups = _by_recipe(paths)
+    cells = [
+        read_single(label, Batches(*group)) for label, group in zip(_labels(groups), groups, strict=True)
+    ]
     return Results(
         kind="runs",
         name=", ".join(folder.resolve().name for folder in folders),
@@ -76,7 +80,28 @@ def _runs_in(folder: Path) -> list[Path]:
     return found
 
 
-def _labels(paths: Sequence[Path]) -> list[str]:
-    """The last part of each path; all of it where that does not tell them apart."""
-    names = [path.resolve().name for path in paths]
-    return [name if names.count(name) == 1 else str(path) for name, path in zip(names, paths, strict=True)]
+def _by_recipe(paths: Sequence[Path]) -> list[list[Path]]:
+    """Returns the folders in groups that differ in nothing but their seeds, and have different ones."""
+    groups: list[tuple[Recipe, set[int], list[Path]]] = []
+    for path in paths:
+        recipes = [home.recipe() for home in Batches(path).homes]
+        alike, seeds = recipes[0].replace(seed=0, num_runs=1), {seed for own in recipes for seed in own.seeds}
+        for recipe, others, group in groups:
+            if recipe == alike and not seeds & others:
+                others |= seeds
+                group.append(path)
+                break
+        else:
+            groups.append((alike, seeds, [path]))
+    return [group for _, _, group in groups]
+
+
+def _labels(groups: Sequence[Sequence[Path]]) -> list[str]:
+    """Returns the last part of each group's first path, without the seed of several; else all of the path."""
+    names = [
+        re.sub(r"_s\d+(_\d+)?$", "", group[0].resolve().name) if len(group) > 1 else group[0].resolve().name
+        for group in groups
+    ]
+    return [
+        name if names.count(name) == 1 else str(group[0]) for name, group in zip(names, groups, strict=True)
+    ]

@@ -25,18 +25,19 @@ class Batches:
     way, up to the last epoch that all of them have reached.
 
     Args:
-        path: of the folder; there may be none yet.
+        paths: folders; several if each holds some of the seeds. They may not exist yet.
 
     Attributes:
-        path: likewise.
         homes: the batches that were begun, in the order of their seeds.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        found = [RunFolder(path)]
-        if not found[0].config.exists():
-            found = [RunFolder(folder) for folder in sorted(path.glob("seeds_*"), key=_seeds_of)]
+    def __init__(self, *paths: Path) -> None:
+        found: list[RunFolder] = []
+        for path in paths:
+            single = (path / "config.yaml").exists()
+            found += [
+                RunFolder(own) for own in ([path] if single else sorted(path.glob("seeds_*"), key=_seeds_of))
+            ]
         self.homes = [home for home in found if home.config.exists()]
 
     @cached_property

@@ -30,7 +30,9 @@ SAID: dict[str, Any] = {
 STUDY = Study(name="bias", summary="small", recipe=RECIPE, vary={"task": TASKS, "algo": ALGORITHMS}, **SAID)
 
 
-def write_run(folder: Path, study: Study, label: str, success: Sequence[float], *, epochs: int = 3) -> None:
+def write_run(
+    folder: Path, study: Study, label: str, success: Sequence[float], *, epochs: int = 3, seed: int = 0
+) -> None:
     """The folder that a batch of runs leaves behind, a constant success for each run."""
     recipe = dict(study.cells())[label]
     home = folder / label
@@ -39,7 +41,7 @@ def write_run(folder: Path, study: Study, label: str, success: Sequence[float], 
     rows = [
         {
             "run": run,
-            "seed": run,
+            "seed": seed + run,
             "epoch": epoch,
             "frames": 1_000 * epoch,
             "seconds": 60.0 * epoch,

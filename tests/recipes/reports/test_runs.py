@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import html
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -67,6 +69,26 @@ def test_several_runs_and_folders_of_runs_share_a_page(tmp_path: Path) -> None:
     for own in (page, both):
         assert "Runs" in own
         assert re.findall(r'<span class="name">(\w+)</span>', own) == ["hand_v2_her", "robot_v2_her"]
+
+
+def test_runs_that_differ_in_their_seed_alone_are_one_case(tmp_path: Path) -> None:
+    for seed, success in ((0, [0.25, 0.75]), (2, [0.5, 0.5])):
+        for gamma in (0.9, 0.95):
+            recipe = {**STUDY.recipe, "seed": seed, "num_runs": 2, "gamma": gamma, "epochs": 2}
+            own = replace(STUDY, recipe=recipe, vary={"task": ["hand_v2"], "algo": ["her"]})
+            write_run(tmp_path / "made", own, "hand_v2_her", success, epochs=2, seed=seed)
+            (tmp_path / "sweep").mkdir(exist_ok=True)
+            name = f"hand_v2_g{100 * gamma:.0f}_s{seed}"
+            (tmp_path / "made" / "hand_v2_her").rename(tmp_path / "sweep" / name)
+    page = Path(recipes_page(tmp_path / "sweep", out=tmp_path / "page")).read_text()
+    assert re.findall(r'<span class="name">(\w+)</span>', page) == ["hand_v2_g90", "hand_v2_g95"]
+    assert "Success at the end (mean of each run's last 2 evaluations)" in html.unescape(page)
+    (tmp_path / "made").rmdir()
+    shutil.copytree(tmp_path / "sweep" / "hand_v2_g90_s0", tmp_path / "sweep" / "repeated")
+    page = Path(recipes_page(tmp_path / "sweep", out=tmp_path / "page")).read_text()
+    assert (
+        re.findall(r'<span class="name">(\w+)</span>', page)[-1] == "repeated"
+    )  # its seeds are there already
 
 
 def recipes_page(*folders: Path, out: Path) -> str:
