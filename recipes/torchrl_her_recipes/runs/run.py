@@ -33,7 +33,7 @@ from torchrl_her_recipes.runs.log_to import LogByName
 from torchrl_her_recipes.runs.notices import notices
 from torchrl_her_recipes.runs.plots import plot_curves, plot_goals
 from torchrl_her_recipes.runs.progress import Progress
-from torchrl_her_recipes.runs.state import load_run_state, run_state
+from torchrl_her_recipes.runs.state import load_run_state, run_state, seed_epoch
 from torchrl_her_recipes.runs.virtual_goals import at_virtual_goals
 
 
@@ -129,9 +129,10 @@ def resume(
     A finished run can be given more epochs only if its recipe said ``keep_buffer=True``. Otherwise its
     checkpoint has no replay buffer any more, and all that is made again are its pictures and its policy.
 
-    With the tasks of this library the result is bit for bit that of a run that never stopped. So it is with
-    an environment of your own if it keeps no state from one epoch to the next; after a stop in the middle
-    of an epoch, however, the rest of that epoch consists of new episodes.
+    With the tasks of this library the result is bit for bit that of a run that never stopped. With
+    environments of gymnasium and your own it is if the run stopped between two epochs: they are seeded anew
+    in each epoch. After a stop within an epoch, the rest of that epoch consists of new episodes. An
+    environment must draw from the generator that it seeds alone, and begin episodes without earlier state.
 
     Args:
         folder: of the run.
@@ -300,6 +301,7 @@ def _epoch(
         between_batches()
 
     began = time.perf_counter()
+    seed_epoch(components, trainer)
     measured = trainer.epoch(on_batch)
     rollout = play_greedily(components, components.eval_env, trainer.epochs)
     measured |= measure(components, rollout) | at_virtual_goals(components, trainer.epochs)

@@ -19,6 +19,7 @@ from torchrl_her.trainers.checkpoint import (
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_envs.common.batched_env import BatchedEnv
 from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_recipes.components.collection_worker import derive_seed
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
 
@@ -104,6 +105,14 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
         components.collector.reset()
         if isinstance(components.buffer.writer, HERWriter):
             components.buffer.writer.end_episodes()
+
+
+def seed_epoch(components: Components, trainer: Trainer) -> None:
+    """Seeds environments whose state no checkpoint holds, so that a resumed run plays the same epoch."""
+    recipe = components.recipe
+    begins = trainer.epochs > 0 and not trainer.in_epoch
+    if begins and recipe.collection.processes == 0 and _worlds(components) is None:
+        goal_env(components.env).set_seeds([derive_seed(seed, trainer.epochs) for seed in recipe.seeds])
 
 
 def _gpu_of(components: Components) -> torch.device | None:

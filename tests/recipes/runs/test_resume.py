@@ -16,7 +16,17 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchrl_her import load_checkpoint
-from torchrl_her_recipes import Callback, Components, Recipe, RunView, build, cli, resume, run
+from torchrl_her_recipes import (
+    Callback,
+    Components,
+    EarlyStopping,
+    Recipe,
+    RunView,
+    build,
+    cli,
+    resume,
+    run,
+)
 from torchrl_her_recipes.runs import state as run_state
 from torchrl_her_recipes.runs.folder import RunFolder
 
@@ -162,6 +172,20 @@ def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
 
 
 # Between epochs
+
+
+@pytest.mark.parametrize(
+    "task", ["gym:torchrl_her_envs:torchrl_her/HandReach-v0", "tests.envs.common.own_point:Point"]
+)
+def test_environments_that_cannot_be_saved_go_on_bit_for_bit_between_epochs(
+    task: str, tmp_path: Path
+) -> None:
+    recipe = small(task=task, algo="filtered_her", num_runs=2, epochs=3, epoch_frames=400)
+    run(build(recipe), tmp_path / "whole", progress=False)
+    early = EarlyStopping("epoch", at_least=1)
+    assert run(build(recipe), tmp_path / "part", callbacks=[early], progress=False).stopped
+    resume(tmp_path / "part", progress=False)
+    assert_same_runs(tmp_path / "whole", tmp_path / "part")
 
 
 @pytest.mark.parametrize(
