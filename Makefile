@@ -22,7 +22,7 @@ test: $(VENV)/.ready-test  ## tests and doctests; those of some files or folders
 test-full: $(VENV)/.ready-test  ## the same, and the tests marked "full", which take much longer
 	$(PYTEST) -m "" $(TESTS)
 
-test-versions: $(VENV)/.ready-test  ## lowest and newest torch, tensordict and torchrl, and each Python, in environments of their own
+test-versions: $(VENV)/.ready-test  ## lowest, mixed and newest torch and TorchRL, and each Python, in environments of their own
 	$(BIN)/python .ci/try_versions.py $(TESTS)
 
 lint: $(VENV)/.ready-test  ## style, formatting, who imports whom, types

@@ -1,6 +1,7 @@
 """Runs a few tests with the ends of the version ranges in pyproject.toml and with each Python named there.
 
-Each try is a virtual environment in a temporary folder, removed afterwards. Arguments are the tests to run.
+Each try is a virtual environment in a temporary folder, removed afterwards. While the newest TorchRL of the
+range is not released, its nightly build stands in for it. Arguments are the tests to run.
 """
 
 from __future__ import annotations
@@ -21,6 +22,15 @@ SHOW = (
     "import sys, importlib.metadata; print('Python', sys.version.split()[0], "
     f"*(f'{{name}} {{importlib.metadata.version(name)}}' for name in {RANGED}))"
 )
+# A nightly build has another name and its date as version. This gives it those of the release to come.
+ALIAS = """
+import importlib.metadata, sys
+nightly = importlib.metadata.distribution("torchrl-nightly")
+version = sys.argv[1] + ".0.dev" + "".join(f"{int(part):02}" for part in nightly.version.split("."))
+folder = nightly.locate_file(f"torchrl-{version}.dist-info")
+folder.mkdir()
+(folder / "METADATA").write_text(f"Metadata-Version: 2.1\\nName: torchrl\\nVersion: {version}\\n")
+"""
 
 
 def main(tests: list[str]) -> int:
@@ -31,44 +41,65 @@ def main(tests: list[str]) -> int:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     ranges = [text for text in project["dependencies"] if re.match(rf"({'|'.join(RANGED)})[<>=]", text)]
     pythons = re.findall(r":: (3\.\d+)", "\n".join(project["classifiers"]))
-    tries = [(pythons[0], "lowest"), *((python, "newest") for python in pythons)]
+    tries = [(pythons[0], "lowest"), (pythons[0], "mixed"), *((python, "newest") for python in pythons)]
     outcomes = []
-    for python, end in tries:
-        outcome = attempt(python, ranges, end, tests or TESTS)
-        print(f"-- Python {python}, {end} versions: {outcome}", flush=True)
-        outcomes.append((python, end, outcome))
+    for python, which in tries:
+        outcome = attempt(python, ranges, which, tests or TESTS)
+        print(f"-- Python {python}, {which} versions: {outcome}", flush=True)
+        outcomes.append((python, which, outcome))
     print("\nPython  versions  outcome")
-    for python, end, outcome in outcomes:
-        print(f"{python:6}  {end:8}  {outcome}")
+    for python, which, outcome in outcomes:
+        print(f"{python:6}  {which:8}  {outcome}")
     return int(any(outcome.startswith("FAILED") for _, _, outcome in outcomes))
 
 
-def attempt(python: str, ranges: list[str], end: str, tests: list[str]) -> str:
+def attempt(python: str, ranges: list[str], which: str, tests: list[str]) -> str:
     """Makes one environment and runs the tests in it.
 
     Args:
         python: a version of Python, such as 3.12.
-        ranges: the requirements of which the lowest or newest release is installed.
-        end: ``"lowest"`` or ``"newest"``.
+        ranges: the requirements of which releases are installed.
+        which: ``"lowest"``, ``"newest"``, or ``"mixed"``: the newest torch beside the oldest TorchRL.
         tests: files or folders.
 
     Returns:
         What came of it, in words.
     """
+    oldest, newest = _minors(ranges)
     with tempfile.TemporaryDirectory() as folder:
         interpreter = Path(folder) / "bin" / "python"
         if uv("venv", "--quiet", "--clear", "--python", python, folder):
             return "skipped: this Python is not here, and uv cannot install it"
         install = ["pip", "install", "--quiet", "--python", str(interpreter)]
-        resolution = "lowest-direct" if end == "lowest" else "highest"
-        if uv(*install, "--resolution", resolution, *ranges) or uv(*install, "--editable", f"{ROOT}[test]"):
+        wanted = (
+            ["--resolution", "lowest-direct", *ranges]
+            if which == "lowest"
+            else [*ranges, f"torchrl=={oldest}.*"]
+        )
+        if uv(*install, *wanted) or uv(*install, "--editable", f"{ROOT}[test]"):
             return "FAILED: cannot be installed"
+        if which == "newest" and uv(*install, "--upgrade", *ranges, f"torchrl=={newest}.*"):
+            print(f"-- TorchRL {newest} is not released; its nightly build is tried", flush=True)
+            uv("pip", "uninstall", "--quiet", "--python", str(interpreter), "torchrl")
+            nightly = ["--no-deps", "torchrl-nightly", f"tensordict=={newest}.*"]
+            if (
+                uv(*install, *nightly)
+                or subprocess.run([interpreter, "-c", ALIAS, newest], check=False).returncode
+            ):
+                return "FAILED: cannot be installed"
         one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
         shown = subprocess.run([interpreter, "-c", SHOW], capture_output=True, text=True, check=False)
         print(f"\n-- {shown.stdout.strip() or shown.stderr}", flush=True)
         command = [interpreter, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests]
         failed = subprocess.run(command, cwd=ROOT, env=one_thread, check=False).returncode
     return f"{'FAILED' if failed else 'passed'}: {shown.stdout.strip()}"
+
+
+def _minors(ranges: list[str]) -> tuple[str, str]:
+    """The oldest and the newest minor release of TorchRL in its range: 0.14 and 0.15 of >=0.14,<0.16."""
+    (torchrl,) = (text for text in ranges if text.startswith("torchrl"))
+    ((oldest, major, beyond),) = re.findall(r">=([\d.]+),<(\d+)\.(\d+)", torchrl)
+    return oldest, f"{major}.{int(beyond) - 1}"
 
 
 def uv(*arguments: str) -> int:

@@ -9,9 +9,9 @@ from importlib import metadata
 
 # The releases that the tests were run with; `make test-versions` runs some of them again.
 TRIED = {
-    "torch": ("2.14.0", "2.14.1"),
-    "tensordict": ("0.14.2", "0.14.3"),
-    "torchrl": ("0.14.0", "0.14.1"),
+    "torch": ("2.14.0", "2.14.1", "2.15.0"),
+    "tensordict": ("0.14.2", "0.14.3", "0.15.3"),
+    "torchrl": ("0.14.0", "0.14.1", "0.15.0.dev20261027"),  # the last one was torchrl-nightly
 }
 
 
@@ -23,16 +23,15 @@ def own_version() -> str:
 def check_versions(installed: Callable[[str], str] = metadata.version) -> None:
     """Compares torch, tensordict and torchrl with the ranges that this project requires.
 
-    TorchRL's compiled part is bound to the minor release of torch that it was built for. Beside another
-    one it only warns when it is imported, and fails later, in the middle of a run. So this is asked
-    first, and without importing any of the three.
+    Beside a torch that it does not fit, TorchRL only warns when it is imported, and fails later, in the
+    middle of a run. So this is asked first, and without importing any of the three.
 
     Args:
         installed: gives the version of a package.
 
     Raises:
-        ImportError: one of them is outside of its range, or not installed. The message names it and
-            what to install.
+        ImportError: one of them is outside of its range, or not installed, or tensordict is not of TorchRL's
+            minor release. The message names it and what to install.
 
     Warns:
         UserWarning: one of them is inside of its range, but a release that was never tried.
@@ -46,11 +45,17 @@ def check_versions(installed: Callable[[str], str] = metadata.version) -> None:
         raise ImportError(
             f"{', '.join(misfits)} {verb} not fit this version of torchrl-her; install {remedy}"
         )
+    minor = _numbers(have["torchrl"])[:2]
+    if _numbers(have["tensordict"])[:2] != minor:
+        raise ImportError(
+            f"tensordict {have['tensordict']} does not fit torchrl {have['torchrl']}; "
+            f"install 'tensordict~={'.'.join(map(str, minor))}.0'"
+        )
     for name, version in have.items():
         if version not in TRIED[name]:
             warnings.warn(
                 f"{name} {version} was never tried with this version of torchrl-her; "
-                f"the tests were run with {' and '.join(TRIED[name])}",
+                f"the tests were run with {', '.join(TRIED[name])}",
                 stacklevel=2,
             )
 
@@ -68,11 +73,11 @@ def _ranges(requirements: list[str]) -> dict[str, tuple[str, str]]:
 
 def _contains(span: tuple[str, str], version: str) -> bool:
     low, high = span
-    # A pre-release of the first version that is too new (2.15.0.dev1) is too new as well.
+    # A pre-release of the first version that is too new (2.16.0.dev1) is too new as well.
     return _numbers(low) <= _numbers(version) < _numbers(high)
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """The leading numbers of a version: (2, 15, 0) of 2.15.0.dev1."""
+    """The leading numbers of a version: (2, 16, 0) of 2.16.0.dev1."""
     (release,) = re.findall(r"^\d+(?:\.\d+)*", version) or ["0"]
     return tuple(int(number) for number in release.split("."))

@@ -17,7 +17,7 @@ INSTALLED = {"torch": "2.14.1", "tensordict": "0.14.3", "torchrl": "0.14.1"}
 
 @pytest.mark.parametrize(
     "given",
-    [{"torch": "2.13.0+cpu"}, {"torch": "2.15.0"}, {"torch": "2.15.0.dev20260801"}, {"torch": "3.0"}],
+    [{"torch": "2.13.0+cpu"}, {"torch": "2.16.0"}, {"torch": "2.16.0.dev20260801"}, {"torch": "3.0"}],
 )
 def test_a_version_outside_of_its_range_is_named_with_the_remedy(given: dict[str, str]) -> None:
     shown = given["torch"].split("+")[0]
@@ -25,14 +25,23 @@ def test_a_version_outside_of_its_range_is_named_with_the_remedy(given: dict[str
         check_versions({**INSTALLED, **given}.__getitem__)
     assert str(error.value) == (
         f"torch {shown} does not fit this version of torchrl-her; "
-        "install 'torch>=2.14,<2.15' 'tensordict>=0.14,<0.15' 'torchrl>=0.14,<0.15'"
+        "install 'torch>=2.14,<2.16' 'tensordict>=0.14,<0.16' 'torchrl>=0.14,<0.16'"
     )
 
 
 def test_all_versions_that_do_not_fit_are_named() -> None:
-    installed = {"torch": "2.14.1", "tensordict": "0.13.0", "torchrl": "0.15.0"}
-    with pytest.raises(ImportError, match=r"^tensordict 0\.13\.0, torchrl 0\.15\.0 do not fit"):
+    installed = {"torch": "2.14.1", "tensordict": "0.13.0", "torchrl": "0.16.0"}
+    with pytest.raises(ImportError, match=r"^tensordict 0\.13\.0, torchrl 0\.16\.0 do not fit"):
         check_versions(installed.__getitem__)
+
+
+@pytest.mark.parametrize(("tensordict", "torchrl"), [("0.15.3", "0.14.1"), ("0.14.3", "0.15.0")])
+def test_tensordict_is_of_torchrl_s_minor_release(tensordict: str, torchrl: str) -> None:
+    with pytest.raises(ImportError) as error:
+        check_versions({**INSTALLED, "tensordict": tensordict, "torchrl": torchrl}.__getitem__)
+    assert str(error.value) == (
+        f"tensordict {tensordict} does not fit torchrl {torchrl}; install 'tensordict~={torchrl[:4]}.0'"
+    )
 
 
 @pytest.mark.parametrize("version", ["2.14.1+cu130", "2.14.0", "2.14.1+cpu"])
@@ -48,14 +57,16 @@ def test_a_patch_release_never_tried_only_warns_in_one_line(version: str) -> Non
         check_versions({**INSTALLED, "torch": version}.__getitem__)
     assert [str(warning.message) for warning in warned] == [
         f"torch {version} was never tried with this version of torchrl-her; "
-        "the tests were run with 2.14.0 and 2.14.1"
+        "the tests were run with 2.14.0, 2.14.1, 2.15.0"
     ]
 
 
-@pytest.mark.parametrize("name", TRIED)
-def test_what_was_tried_lies_in_the_ranges(name: str) -> None:
-    for version in TRIED[name]:
-        check_versions({**INSTALLED, name: version}.__getitem__)
+@pytest.mark.parametrize("torch", TRIED["torch"])
+@pytest.mark.parametrize(
+    ("tensordict", "torchrl"), list(zip(TRIED["tensordict"], TRIED["torchrl"], strict=True))
+)
+def test_what_was_tried_lies_in_the_ranges(torch: str, tensordict: str, torchrl: str) -> None:
+    check_versions({"torch": torch, "tensordict": tensordict, "torchrl": torchrl}.__getitem__)
 
 
 def test_versions_are_checked_before_anything_is_imported(tmp_path: Path) -> None:

@@ -47,6 +47,23 @@ take the places of old ones. Buffers of other processes had room for all; they w
 
 """
 
+_VERSIONS = """
+## Versions
+
+Tried in November 2026, all with success; `make test-versions` tries the ends of the ranges again.
+
+| Python | torch | tensordict | torchrl |
+| --- | --- | --- | --- |
+| 3.11.7 | 2.14.0 | 0.14.2 | 0.14.0 |
+| 3.11.7 | 2.14.1 | 0.14.3 | 0.14.0 |
+| 3.11.7 | 2.14.0 | 0.14.3 | 0.14.1 |
+| 3.11.7, 3.12.1, 3.13.0 | 2.14.1 | 0.14.3 | 0.14.1 |
+| 3.11.7 | 2.15.0 | 0.14.3 | 0.14.1 |
+| 3.11.7 | 2.15.0 | 0.15.3 | nightly |
+
+TorchRL asks for the tensordict of its own minor release, from 0.14.2 on, and takes any torch. "nightly" is
+`torchrl-nightly` 2026.10.27, which stands in for TorchRL 0.15 until that is released.
+"""
 
 _THEIRS = " This error is TorchRL's own."
 
@@ -73,6 +90,7 @@ def page() -> str:
             "\n## Errors\n\n",
             "\n".join(reasons),
             "\n",
+            _VERSIONS,
         ]
     )
 
