@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_her.checks import check_finite
 from torchrl_her.goals.rewards import Outcome, RewardFunction, ask_reward, outcomes
 
-_LEAST_COST = 1e-4  # relative: what is less is an error of rounding
+LEAST_COST = 1e-4  # relative: what is less is an error of rounding
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,14 @@ class TransitionKeys:
                 f"goals must be vectors of one width, {[*rows.shape, 'g']}, got {shapes}: flatten images"
             )
 
+    def rewards(
+        self, rows: TensorDictBase, reward_fn: RewardFunction, achieved_reward: float
+    ) -> tuple[Tensor, Tensor]:
+        """Rewards [n] by a reward function, with what failures cost, and those that were collected."""
+        computed, _ = ask_reward(reward_fn, self.after(rows, reward_fn), entry_of(rows, self.goals[1]))
+        cost = failures(rows, self, reward_fn, achieved_reward)[1]
+        return (computed + cost).flatten(), entry_of(rows, self.reward).flatten()
+
     def changes(
         self, goals: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor
     ) -> dict[NestedKey, Tensor]:
@@ -130,7 +138,7 @@ def failures(
         failed[at] = ~own_end
         less = (reward[at] - own_reward).to(cost.dtype)
         cost[at] = less.where(
-            ~own_end & (less < -_LEAST_COST * (1 + own_reward.abs())), torch.zeros_like(less)
+            ~own_end & (less < -LEAST_COST * (1 + own_reward.abs())), torch.zeros_like(less)
         )
     return failed.unsqueeze(-1), cost.unsqueeze(-1)
 

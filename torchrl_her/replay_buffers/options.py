@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from typing import Any, Generic, Literal, TypeVar, get_args, overload
 
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torchrl_her.checks import check_whole
@@ -17,7 +17,7 @@ from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.sources import GoalSources, check_goal_sources, sources_name
 from torchrl_her.goals.strategies import RECENT, Strategy, get_strategy
 from torchrl_her.goals.weights import GoalWeights
-from torchrl_her.replay_buffers.keys import TransitionKeys, in_root_and_next, under_next
+from torchrl_her.replay_buffers.keys import LEAST_COST, TransitionKeys, in_root_and_next, under_next
 
 T = TypeVar("T")
 Per = Literal["transition", "episode"]
@@ -266,6 +266,7 @@ class HindsightBase:
         self.reward_fn, self.weights = reward_fn, weights
         self.options = (options or HindsightOptions()).changed(changes)
         self._time_seen = False  # whether an episode had several steps, or their absence was said
+        self._compared = False  # whether rewards were compared with the reward function
 
     @property
     def options(self) -> HindsightOptions:
@@ -277,6 +278,22 @@ class HindsightBase:
         self._options = options
         self._keys = options.transition_keys()
         self._exclude = in_root_and_next([*options.exclude, options.real_goal_key])
+
+    def _compare_rewards(self, rows: TensorDictBase) -> None:
+        """Warns, at the first rows [n] only, if their rewards are not those of the reward function."""
+        if self._compared or self.k == 0:
+            return
+        self._compared = True
+        computed, reward = self._keys.rewards(rows, self.reward_fn, self.achieved_reward)
+        differ = ((reward - computed).abs() > LEAST_COST * (1 + computed.abs())).nonzero()
+        if len(differ) > 0:
+            one, other = (float(values[differ[0, 0]]) for values in (computed, reward))
+            warnings.warn(
+                f"the reward function gives {one:g} where the collected reward is {other:g}, and other ones "
+                f"in {len(differ):,} of {len(reward):,} rows; pass the environment's own rule, or virtual "
+                "transitions have rewards by another one (this is said once)",
+                stacklevel=4,
+            )
 
     def _look_at_time(self, lengths: Tensor) -> None:
         """Warns, once, if all of the first episodes [E] have a single step: time may be another dimension."""

@@ -15,6 +15,7 @@ index and priorities are those of the real transitions, and reading (``buffer[:]
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from threading import get_ident
 from typing import Any, ClassVar, NamedTuple
@@ -122,8 +123,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             work beside another part of the buffer.
         TypeError: an unknown option; when sampling, the storage holds no tensordicts.
         KeyError: when sampling, the storage lacks an entry.
-        RuntimeError: the buffer is shared between processes; :meth:`relabel` was not handed to the buffer (at
-            the second batch), or is given a batch for which no goals were chosen.
+        RuntimeError: the buffer is shared between processes; :meth:`relabel` was not handed to the buffer, or
+            is given a batch for which no goals were chosen.
 
     Example:
         >>> from tensordict import TensorDict
@@ -191,11 +192,13 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             ``(index, info)``, unchanged; but under a sampler of slices without its entries that are written
             over a batch afterwards and would hide where it terminates.
         """
-        if self._chosen.pop(self._key(), None) is not None:
-            raise RuntimeError(
-                "the batch before was never relabeled: make the buffer with collate_fn=unit.relabel, too"
-            )
+        pending = self._chosen.pop(self._key(), None) is not None
         stored = self._read(storage)
+        if pending or not self._may_relabel(storage):
+            raise RuntimeError(
+                "HERSampleUnit chooses goals that nothing puts into batches; make the buffer with "
+                "collate_fn=unit.relabel, too"
+            )
         row = _flat(index, storage.shape).to(stored.after.device)
         shape, row = row.shape, row.flatten()
         sampler, ends = self._slice_sampler(storage), None
@@ -283,11 +286,24 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _key(self) -> tuple[str, int]:
         return self._token, get_ident()
 
+    def _buffers(self, storage: Storage) -> Iterator[ReplayBuffer]:
+        """The buffers that sample with this unit."""
+        for buffer in storage._attached_entities:
+            if isinstance(buffer, ReplayBuffer) and buffer._sample_unit is self:
+                yield buffer
+
+    def _may_relabel(self, storage: Storage) -> bool:
+        """Whether the buffer has a function of the user's that may call :meth:`relabel`."""
+        for buffer in self._buffers(storage):
+            own = [buffer._collate_fn, *(getattr(each, "func", None) for each in buffer._transform or ())]
+            if all(each is None or each.__module__.startswith("torchrl.") for each in own):
+                return False
+        return True
+
     def _slice_sampler(self, storage: Storage) -> SliceSampler | None:
         """The sampler of this unit's buffer, if it samples sequences."""
-        for buffer in storage._attached_entities:
-            own = isinstance(buffer, ReplayBuffer) and buffer._sample_unit is self
-            if own and isinstance(buffer._sampler, SliceSampler):
+        for buffer in self._buffers(storage):
+            if isinstance(buffer._sampler, SliceSampler):
                 if self.options.n_steps > 1:
                     raise ValueError(
                         "under a sampler of slices, HERSampleUnit needs n_steps=1, got "
@@ -398,6 +414,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                 seams=((after, before), (next_wanted, wanted)),
             )
             self._look_at_time(episodes.first.diff())
+            self._compare_rewards(rows)
             if "actual" in self.options.sources:
                 wanted = stored_as(self._keys.asked_for(rows), after, self._keys.next_achieved)
             self._stored = stored = _Stored(storage, state, rows, after, wanted, episodes, {})

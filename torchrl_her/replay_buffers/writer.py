@@ -294,6 +294,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         # Last of all, so that a batch that cannot be written loses nothing that was held back before.
         self._held, self._recent = batch.take(left), recent
         self._loaded = self._all_over = False
+        if not self.layers and not self._own_rewards:
+            self._compare_rewards(batch.rows)
         if self.held_back > self._storage.max_size and not self._overfull:
             self._overfull = True
             warnings.warn(

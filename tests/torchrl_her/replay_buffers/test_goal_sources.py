@@ -22,6 +22,7 @@ from torchrl_her.goals import GoalHistogram
 
 from ..her_data import make_batch, tag
 
+pytestmark = pytest.mark.filterwarnings("ignore:the reward function gives")  # made up as each test needs it
 REWARD = GoalReward(0.5)
 MIXED = {"future": 2, "actual": 2}
 IDS = ("collector", "traj_ids")

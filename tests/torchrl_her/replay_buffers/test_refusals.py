@@ -18,6 +18,7 @@ from torchrl_her.modules import RunningNorm
 
 from ..her_data import make_batch
 
+pytestmark = pytest.mark.filterwarnings("ignore:the reward function gives")  # made up as each test needs it
 REWARD = GoalReward(0.5)
 GOALS = ["achieved_goal", "desired_goal", ("next", "achieved_goal"), ("next", "desired_goal")]
 

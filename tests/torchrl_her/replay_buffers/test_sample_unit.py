@@ -37,13 +37,14 @@ from torchrl.data.replay_buffers.samplers import (
     SliceSamplerWithoutReplacement,
 )
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictMaxValueWriter
-from torchrl.envs.transforms import MultiStepTransform
+from torchrl.envs.transforms import MultiStepTransform, RewardScaling
 
 from torchrl_her import EnvReward, GoalReward, GoalWeights, HERSampleUnit, HERWriter
 from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
 
 from ..her_data import WANTED, costly, make_batch, tag
 
+pytestmark = pytest.mark.filterwarnings("ignore:the reward function gives")  # made up as each test needs it
 REWARD = GoalReward(0.5)  # tags differ by at least 1
 
 
@@ -713,9 +714,30 @@ def test_a_unit_without_its_other_half_is_noticed() -> None:
         storage=LazyTensorStorage(9), sample_unit=HERSampleUnit(REWARD), batch_size=4
     )
     buffer.extend(flat([[4]]))
-    buffer.sample()
-    with pytest.raises(RuntimeError, match="never relabeled: make the buffer with collate_fn=unit.relabel"):
+    with pytest.raises(RuntimeError, match="nothing puts into batches; make the buffer with collate_fn=unit"):
         buffer.sample()
+    buffer.append_transform(RewardScaling(0.0, 1.0))  # TorchRL's own, which does not relabel either
+    with pytest.raises(RuntimeError, match="nothing puts into batches"):
+        buffer.sample()
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(9),
+        sample_unit=HERSampleUnit(REWARD),
+        collate_fn=lambda rows: rows,
+        batch_size=4,
+    )
+    buffer.extend(flat([[4]]))
+    buffer.sample()  # the function may have relabeled
+    with pytest.raises(RuntimeError, match="nothing puts into batches"):
+        buffer.sample()
+
+
+def test_rewards_of_another_rule_are_named_once() -> None:
+    buffer = make_buffer(reward=GoalReward(1e9))
+    buffer.extend(flat([[4]]))
+    with pytest.warns(UserWarning, match="gives 0 where the collected reward is -1, and other .* in 4 of 4"):
+        buffer.sample(4)
+    buffer.extend(flat([[4]]))
+    buffer.sample(4)
 
 
 def test_a_batch_of_another_size_is_refused() -> None:

@@ -31,6 +31,7 @@ from torchrl_her.replay_buffers.runs import RunsSampler
 
 from ..her_data import WANTED, costly, make_batch, tag
 
+pytestmark = pytest.mark.filterwarnings("ignore:the reward function gives")  # made up as each test needs it
 REWARD = GoalReward(0.5)  # tags differ by at least 1
 
 
@@ -850,6 +851,13 @@ def test_environments_of_several_workers_are_told_apart_by_their_ids(joined: boo
     last = {0: 5.0, 1: 103.0, 10: 1004.0, 11: 1104.0, 20: 2002.0, 21: 2106.0, 30: 3008.0}
     for observation, goal in zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True):
         assert goal == last[int(observation // 100)]
+
+
+def test_rewards_of_another_rule_are_named_once() -> None:
+    buffer = make_buffer(10, reward=GoalReward(1e9))
+    with pytest.warns(UserWarning, match="gives 0 where the collected reward is -1, and other .* in 4 of 4"):
+        buffer.extend(make_batch([[4]]))
+    buffer.extend(make_batch([[4]]))
 
 
 def test_the_values_of_environment_ids_do_not_matter() -> None:
