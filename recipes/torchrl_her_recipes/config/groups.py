@@ -386,7 +386,7 @@ class RunConfig(Group):
     num_runs: int = option(1, "independent runs side by side; run i has the seed `seed + i`", at_least=1)
     epochs: int = option(30, "epochs; each ends with an evaluation", at_least=1)
     frames: int | None = option(
-        None, "environment steps of each run, in place of epochs; rounded up to whole ones", at_least=1
+        None, "environment steps of each run, in place of epochs; rounded up to whole epochs", at_least=1
     )
     checkpoint_interval: int = option(10, "epochs between two checkpoints", at_least=1)
     keep_checkpoints: int = option(2, "how many of the newest checkpoints are kept", at_least=1)

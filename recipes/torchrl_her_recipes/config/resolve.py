@@ -55,7 +55,10 @@ def _num_envs(recipe: Recipe, facts: EnvFacts) -> int:
 def _epoch_frames(recipe: Recipe, facts: EnvFacts) -> int:
     own = recipe.collection
     episodes = _EPISODES if not facts.batched else 4 * own.num_envs
-    return max(episodes * facts.max_steps, own.num_envs * own.steps_per_batch)
+    frames = episodes * facts.max_steps
+    if recipe.run.frames is not None:  # a short run is one epoch, and no longer than it should be
+        frames = min(frames, recipe.run.frames)
+    return max(frames, own.num_envs * own.steps_per_batch)
 
 
 def _warmup_frames(recipe: Recipe, facts: EnvFacts) -> int:

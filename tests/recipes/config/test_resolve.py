@@ -58,6 +58,13 @@ def test_frames_become_epochs() -> None:
     assert make_recipe({"frames": 12_000, "epoch_frames": 4_000}, epochs=7).run.epochs == 7
 
 
+def test_a_run_of_few_frames_is_one_short_epoch() -> None:
+    recipe = resolve(make_recipe(frames=3_000), EnvFacts(max_steps=2_000))
+    assert (recipe.run.epochs, recipe.collection.epoch_frames) == (1, 3_000)
+    recipe = resolve(make_recipe(frames=10), EnvFacts(max_steps=2_000))
+    assert recipe.total_frames == recipe.collection.num_envs * recipe.collection.steps_per_batch
+
+
 @pytest.mark.parametrize("preset", preset_names())
 def test_presets_leave_nothing_to_the_environment(preset: str) -> None:
     assert auto_options(make_recipe(load_preset(preset))) == []
