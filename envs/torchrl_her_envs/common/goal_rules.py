@@ -139,8 +139,8 @@ class GoalEnds:
             why = f"{seen} ended where a goal was achieved, so goals end an episode, where {where}"
         else:
             why = (
-                f"no goal was achieved in {self.steps:,} random steps, so goals are taken to end no episode; "
-                f"if they do, choose task.options.termination={by}"
+                f"no goal was achieved in {self.steps:,} random steps, and goals are assumed to end no "
+                f"episode; if they do, choose task.options.termination={by}"
             )
         rule = self.found() or "never"
         return f"{self.name} has no compute_terminated: {why} (task.options.termination={rule})"

@@ -13,15 +13,15 @@ from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.cli.train_options import OptionsCommand, complete, requests
 
 
-@click.command(cls=OptionsCommand, short_help="look at a task before training, and say what may help")
+@click.command(cls=OptionsCommand, short_help="play random actions on a task, and suggest options")
 @click.option("--steps", type=click.IntRange(1), default=3_000, show_default=True, help="that are played")
 @allow_import
 @click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
 def check(options: tuple[str, ...], steps: int) -> int:
     """Play random actions on a task; for instance: torchrl-her check task=gym:FetchPush-v4
 
-    Options are those of `torchrl-her train`. Nothing is trained. In half a minute it says what hindsight has
-    to learn from there, and what may help.
+    Options are those of `torchrl-her train`. Nothing is trained. In half a minute, prints what hindsight can
+    learn from, and suggests options.
     """
     (wanted,) = requests(options, multirun=False)
     facts = recipes.look_at(wanted.recipe, steps=steps)
@@ -33,9 +33,7 @@ def check(options: tuple[str, ...], steps: int) -> int:
             file.write_text(yaml.safe_dump(facts.layers, sort_keys=False, default_flow_style=None))
         click.echo(f"  layers                {file}")
     click.echo("")
-    click.echo(
-        "\n".join(f"- {line}" for line in lines) or "nothing was found that stands in the way of learning"
-    )
+    click.echo("\n".join(f"- {line}" for line in lines) or "no obstacle to learning was found")
     return 0
 
 
@@ -50,7 +48,7 @@ def _table(facts: recipes.Facts) -> list[str]:
         + (f", {len(facts.constant)} that never change" if facts.constant else ""),
         "goals achieved": f"in {facts.achieved:.0%} of the episodes",
         "ends without goals": f"as by a fall: {facts.fallen:.1%} of the episodes",
-        "what is achieved": f"changes, by the reward, in {facts.moved:.0%} of the episodes",
-        "the filter": f"leaves later goals of the episode to {facts.kept:.1%} of the transitions",
+        "the achieved goal": f"changes, by the reward, in {facts.moved:.0%} of the episodes",
+        "the filter": f"keeps later goals of the episode for {facts.kept:.1%} of the transitions",
     }
     return [f"  {name:<20}  {said}" for name, said in rows.items()]

@@ -81,7 +81,7 @@ def _train(wanted: RunRequest) -> recipes.RunResult:
     if wanted.recipe.hindsight.algo == AUTO and components.recipe.hindsight.algo == "cher":
         inside = components.recipe.curriculum.layers[0]["achieved_goal"]
         click.echo(
-            f"random actions seldom change what is achieved: entries {inside} of the observation are first "
+            f"random actions seldom change the achieved goal: entries {inside} of the observation are first "
             "brought near it (algo=filtered_her does without)"
         )
     if wanted.recipe.learner.device == "auto":

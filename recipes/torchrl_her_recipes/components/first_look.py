@@ -1,4 +1,4 @@
-"""What random actions show of a task, before anything is trained."""
+"""Facts about a task from random actions, before anything is trained."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Meets = Callable[[Outcome, Tensor], Tensor]
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What random actions showed of a task.
+    """Facts about a task from random actions.
 
     Attributes:
         steps, episodes: how many were played; episodes that were still open at the end do not count.

@@ -144,7 +144,7 @@ class HindsightConfig(Group):
     algo: str = option(
         AUTO,
         "an algorithm of `torchrl-her list`; auto: filtered_her, or cher where random actions seldom change "
-        "what is achieved, or with the layers of curriculum=FILE",
+        "the achieved goal, or with the layers of curriculum=FILE",
     )
     k: int = option(4, "virtual transitions for each real one", at_least=0)
     strategy: str = option(

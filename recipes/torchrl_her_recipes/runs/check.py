@@ -1,4 +1,4 @@
-"""What follows from what random actions show of a task, with the options to set."""
+"""Advice on options from random actions on a task."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ _MOSTLY = 0.5
 _ROUNDED = 0.005
 
 _STILL = (
-    "random actions change what is achieved, by the reward, in {moved} of the episodes: "
-    "most virtual goals are achieved already, and the filter leaves {facts.kept:.1%} of the transitions with "
-    "goals."
+    "random actions change the achieved goal, by the reward, in {moved} of the episodes: most virtual goals "
+    "are achieved already, and the filter keeps others for {facts.kept:.1%} of the transitions."
 )
 
 
 def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> list[str]:
-    """What follows from the facts, with the options to set; nothing where nothing stands in the way.
+    """Returns a line for each problem that the facts show, with the options to set.
 
     Args:
-        facts: of :func:`look_at`.
-        recipe: of the run that is meant.
-        layers_file: where the proposed layers are.
+        facts: Facts of :func:`look_at`.
+        recipe: Recipe of the planned run.
+        layers_file: File of the proposed layers.
     """
     recipe, lines = resolved(recipe), []
     if facts.disagree:
@@ -44,7 +43,7 @@ def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> li
             f"{_STILL.format(facts=facts, moved=_percent(facts.moved))} {_remedy(facts, recipe, layers_file)}"
         )
     if not facts.moved:
-        lines.append("is achieved_goal what the goal is about? By the reward, it never changed")
+        lines.append("by the reward, achieved_goal never changed: does it hold what the goal is about?")
     if facts.fallen and recipe.task.failure == "environment":
         lines.append(
             f"{facts.fallen:.1%} of the episodes terminate without the goal: if each step costs a reward of "

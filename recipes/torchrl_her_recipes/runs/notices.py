@@ -103,7 +103,7 @@ def _nothing_to_relabel(rows: Sequence[Row], recipe: Recipe) -> str | None:
     if algorithm.filter_achieved and row["rows_relabeled"] <= _FEW * row["rows_real"]:
         return (
             f"the filter has left {row['rows_relabeled']:,.0f} of {row['rows_real']:,.0f} transitions with "
-            "goals of their own episode: what is achieved hardly changes. What helps: a curriculum "
+            "goals of their own episode: the achieved goal hardly changes. What helps: a curriculum "
             "(algo=cher), longer episodes (task.options.max_steps) or demonstrations; "
             f"`torchrl-her check task={recipe.task.name}` looks for the cause"
         )
