@@ -52,7 +52,7 @@ def study(
     ray: str | None,
     gpus_per_job: float,
 ) -> int:
-    """Run the study NAME: one of torchrl-her list, or a .yaml file. The same command goes on with it."""
+    """Run the study NAME: one of torchrl-her list, or a .yaml file. The same command resumes it."""
     if jobs is not None and ray is not None:
         raise click.UsageError("--jobs and --ray cannot be given together")
     if gpus_per_job and ray is None:
@@ -86,7 +86,7 @@ def _say_study(result: StudyResult) -> int:
     if result.figure is not None:
         click.echo(result.figure)
         return 0
-    click.echo("interrupted: " * result.interrupted + "the same command goes on with it")
+    click.echo("interrupted: " * result.interrupted + "the same command resumes it")
     return INTERRUPTED if result.interrupted else FAILED
 
 

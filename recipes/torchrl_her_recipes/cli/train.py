@@ -93,7 +93,7 @@ def _sweep(wanted: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
     """Several runs, on all cores: if one fails, the others are trained nevertheless."""
     runs = {each.folder.name: each.recipe for each in wanted}
     folder = wanted[0].folder.parent
-    if anew:  # the same command goes on with what it has begun
+    if anew:  # the same command resumes an unfinished sweep
         folder = recipes.unfinished_sweep(runs, folder.parent) or folder
     plan, workers = recipes.plan_sweep(runs, folder), recipes.make_workers(jobs=jobs)
     to_go = plan.to_go
@@ -112,7 +112,7 @@ def _sweep(wanted: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
         unfinished = f"; {left} of {len(runs)} did not end" if left else ""
         click.echo(f"the whole sweep: {success_line(every)}{unfinished}")
     if result.interrupted:
-        click.echo("interrupted: the same command goes on with it")
+        click.echo("interrupted: the same command resumes it")
         return INTERRUPTED
     return FAILED if result.failed else 0
 

@@ -64,7 +64,7 @@ def tune(
     """Search for good options; for instance: torchrl-her tune preset=demo num_runs=3 --trials 30
 
     Options are given as to train; those that are given are not varied. Each trial trains num_runs seeds side
-    by side. The same command goes on with a search.
+    by side. The same command resumes a search.
     """
     given = single(with_folder(options, folder))
     folder, preset = (given.pop(name, None) for name in ARGUMENTS[::-1])
@@ -93,6 +93,6 @@ def _say(result: SearchResult) -> int:
     if result.best is not None:
         click.echo(f"the best: torchrl-her train preset={result.folder / 'best.yaml'}")
     if result.interrupted:
-        click.echo("interrupted: the same command goes on with it")
+        click.echo("interrupted: the same command resumes it")
         return INTERRUPTED
     return FAILED if result.best is None else 0

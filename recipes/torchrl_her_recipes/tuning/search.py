@@ -128,7 +128,7 @@ def tune(
     except (OptunaError, SQLAlchemyError) as error:
         cause = error.__cause__ or error
         why = " ".join(str(getattr(cause, "orig", cause)).split())
-        raise OSError(f"{home / _DATABASE} cannot be used ({why}); the same command goes on") from error
+        raise OSError(f"{home / _DATABASE} cannot be used ({why}); the same command resumes it") from error
     finally:
         workers.close()
 

@@ -60,7 +60,7 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     assert main(command) == 1
     said, failed = capsys.readouterr()
     assert "torchrl-her: her/seeds_0 failed: NotADirectoryError: " in failed
-    assert "the same command goes on with it" in said
+    assert "the same command resumes it" in said
 
     (folder / "her").unlink()
     # another process would take seconds to start

@@ -126,7 +126,7 @@ def test_ctrl_c_saves_all_runs_and_ends_all_processes(tmp_path: Path) -> None:
         assert len(workers) == 2
         assert not [pid for pid in workers if Path(f"/proc/{pid}").exists()]
         lines = (tmp_path / "said").read_text().splitlines()
-        assert lines[-1] == "interrupted: the same command goes on with it"
+        assert lines[-1] == "interrupted: the same command resumes it"
         assert "hand_v0_filtered_her_s1_0: interrupted" in lines
         assert bool(before) == any(f"at epoch {before} of 100000" in line for line in lines)
         before = epochs(tmp_path)
