@@ -334,10 +334,11 @@ class _Reporter(Callback):
         self.trial = Trial(study, study.get_trials(deepcopy=False)[number]._trial_id)
 
     def on_epoch(self, run: RunView) -> bool:
-        """Whether the trial is pruned; never at its last epoch."""
+        """Returns whether the trial is pruned; never at its last epoch, nor the recipe as it is."""
         epoch = run.trainer.epochs
         self.trial.report(score(run.rows), epoch)
-        pruned = epoch < run.components.recipe.run.epochs and self.trial.should_prune()
+        may_end = epoch < run.components.recipe.run.epochs and DEFAULT not in self.trial.user_attrs
+        pruned = may_end and self.trial.should_prune()
         if pruned:
             self.trial.set_user_attr(_PRUNED, epoch)
         return pruned

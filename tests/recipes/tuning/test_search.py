@@ -110,6 +110,11 @@ def test_trials_that_fall_behind_are_pruned(tmp_path: Path, pruner: str, ends: b
     assert bool(list((tmp_path / f"trial_{last.number:04}").glob("checkpoint*"))) != ends
 
 
+def test_the_recipe_as_it_is_is_never_pruned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(optuna.trial.Trial, "should_prune", lambda _trial: True)
+    assert states(go_on(small_search(), tmp_path, 2)) == ["complete", "pruned"]
+
+
 def test_a_sampler_whose_package_is_missing_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search_module, "find_spec", lambda _name: None)
     with pytest.raises(ImportError, match=r"--sampler cmaes needs cmaes: pip install '.\[tune\]'"):
