@@ -14,7 +14,7 @@ from torchrl_her_recipes.cli.train_options import OptionsCommand, complete, requ
 
 
 @click.command(cls=OptionsCommand, short_help="play random actions on a task, and suggest options")
-@click.option("--steps", type=click.IntRange(1), default=3_000, show_default=True, help="that are played")
+@click.option("--steps", type=click.IntRange(1), default=3_000, show_default=True, help="random steps")
 @allow_import
 @click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
 def check(options: tuple[str, ...], steps: int) -> int:

@@ -68,7 +68,7 @@ def _import(context: click.Context, _parameter: click.Parameter, modules: tuple[
     multiple=True,
     expose_value=False,
     callback=_import,
-    help="import a module of your own first: what it registers can be named; may be repeated",
+    help="import a module first, whose registered names can then be used; may be repeated",
 )
 @click.pass_context
 def group(context: click.Context) -> None:

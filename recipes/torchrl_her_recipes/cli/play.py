@@ -26,7 +26,7 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
     return [*names, CompletionItem(incomplete, type="file")]
 
 
-@click.command(short_help="a policy at work: of a run, an exported one, or one that comes with the package")
+@click.command(short_help="film or show a policy: of a run, an exported one, or one of the package")
 @click.argument("source", metavar="RUN|FILE|TASK", shell_complete=_complete)
 @click.option("--window", is_flag=True, help="show it live in a window, with keys, instead of writing a film")
 @click.option(
@@ -38,10 +38,10 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
     help="another policy of the same task beside it, with the same starts and goals; may be repeated",
 )
 @click.option("--out", type=_RUN, help="the .gif or .mp4 (default: RUN/play.gif, FILE.gif or TASK.gif)")
-@click.option("--run", type=click.IntRange(0), help="which, of several in RUN (default: the median)")
+@click.option("--run", type=click.IntRange(0), help="index of the run in RUN (default: the median)")
 @_best
-@click.option("--goals", type=click.IntRange(1), help="how many, side by side (default: 6, in a window 1)")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of the goals and starts")
+@click.option("--goals", type=click.IntRange(1), help="episodes side by side (default: 6, in a window 1)")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="seed of goals and starts")
 @click.option(
     "--size", type=click.IntRange(32), help="pixels of one environment (default: 240, in a window 480)"
 )
@@ -102,7 +102,7 @@ def _film_of(source: Path, *, compared: bool) -> Path:
     return source.with_name(f"{source.stem if source.is_file() else source.name}{'_compare' * compared}.gif")
 
 
-@click.command(short_help="a run's policy as a small file of its own, for TorchRL or as ONNX")
+@click.command(short_help="write a run's policy to a small file, for TorchRL or as ONNX")
 @click.argument("source", metavar="RUN|FILE.pt|TASK", shell_complete=_complete)
 @click.option("--out", type=_RUN, help="the .pt or .onnx file (default: RUN/TASK.pt, FILE.onnx or TASK.onnx)")
 @click.option(
@@ -111,8 +111,8 @@ def _film_of(source: Path, *, compared: bool) -> Path:
     type=click.Choice(["torch", "onnx"]),
     help="torch: for load_policy; onnx: for onnxruntime (default: what --out ends with, or torch)",
 )
-@click.option("--run", "index", type=click.IntRange(0), help="which, of several (default: the median)")
-@click.option("--task", help="that it is for, if not the run's own")
+@click.option("--run", "index", type=click.IntRange(0), help="index of the run in RUN (default: the median)")
+@click.option("--task", help="task of the policy, if not the run's own")
 @click.option(
     "--card/--no-card",
     default=True,

@@ -10,7 +10,7 @@ import torchrl_her_recipes as recipes  # its names are loaded when they are used
 from torchrl_her_recipes.cli.permission import allow_import
 
 
-@click.command(short_help="virtual goals of a run beside q*")
+@click.command(short_help="draw virtual goals of a run beside q*")
 @click.argument("run", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="the figure (default: virtual_goals.png in RUN)")
 @allow_import

@@ -11,19 +11,18 @@ from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import file_name
 
 
-@click.command(short_help="demonstrations of a task, for demonstrations.file=FILE")
+@click.command(short_help="record demonstrations of a task, for demonstrations.file=FILE")
 @click.argument("task", metavar="TASK")
 @click.option(
-    "--episodes", type=click.IntRange(1), default=100, show_default=True, help="how many are written"
+    "--episodes", type=click.IntRange(1), default=100, show_default=True, help="episodes in the file"
 )
 @click.option("--out", type=click.Path(path_type=Path), help="the .pt file (default: TASK_demos.pt)")
 @click.option(
     "--policy",
     metavar="expert|FILE.pt|NAME",
-    help="who plays: the scripted controller (default), an exported policy, or one that comes with the "
-    "package",
+    help="player: the scripted controller (default), an exported policy, or one of the package",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of starts and goals")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="seed of starts and goals")
 @click.option("--all", "keep_all", is_flag=True, help="write episodes that fail, too")
 @click.option("--force", is_flag=True, help="replace the file if it exists")
 @allow_import

@@ -29,9 +29,9 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 @click.argument("name", shell_complete=_complete)
 @click.option("--seeds", type=click.IntRange(1), help="runs of each combination")
 @click.option("--frames", type=click.IntRange(1), help="environment steps of each run")
-@click.option("--quick", is_flag=True, help="a size that ends in minutes")
-@click.option("--folder", type=_FOLDER, help="where it goes (default: runs/NAME)")
-@click.option("--plan", is_flag=True, help="only say what is to do, and how long it takes")
+@click.option("--quick", is_flag=True, help="shrink the study to minutes")
+@click.option("--folder", type=_FOLDER, help="output folder (default: runs/NAME)")
+@click.option("--plan", is_flag=True, help="only print the runs to do and their time")
 @click.option("--jobs", type=click.IntRange(1), help="batched runs at once (default: one for each core)")
 @click.option("--ray", metavar="ADDRESS", help="over a Ray cluster: auto, or HOST:PORT")
 @click.option(
@@ -97,10 +97,10 @@ def _refuse_follow(_context: click.Context, _parameter: click.Parameter, given: 
         )
 
 
-@click.command(short_help="a page about a study or runs: curves, goals, a film")
+@click.command(short_help="write a page about a study or runs: curves, goals, a film")
 @click.argument("names", metavar="NAME|RUN...", nargs=-1, required=True, shell_complete=_complete)
-@click.option("--folder", type=_FOLDER, help="where the study's runs are (default: runs/NAME)")
-@click.option("--out", type=_FOLDER, help="where the page goes (default: FOLDER/report)")
+@click.option("--folder", type=_FOLDER, help="folder of the study's runs (default: runs/NAME)")
+@click.option("--out", type=_FOLDER, help="folder of the page (default: FOLDER/report)")
 @click.option(
     "--export",
     "tidy",

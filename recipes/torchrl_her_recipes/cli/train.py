@@ -25,14 +25,14 @@ from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.resolve import auto_options
 
 
-@click.command(cls=OptionsCommand, short_help="train, or go on with a run")
+@click.command(cls=OptionsCommand, short_help="train, or resume a run")
 @click.option("-m", "--multirun", is_flag=True, help="a sweep: algo=her,cher seed=0,1 are four runs")
 @click.option("--jobs", type=click.IntRange(1), help="runs of a sweep at once (default: one for each core)")
 @click.option(
     "--resume",
     metavar="RUN",
     type=click.Path(path_type=Path),
-    help="go on with the run in this folder; with epochs=N, up to so many epochs",
+    help="resume the run in this folder; with epochs=N, up to N epochs",
 )
 @click.option("--show", is_flag=True, help="print all options of the run as YAML, and train nothing")
 @folder_option

@@ -22,7 +22,7 @@ from torchrl_her_recipes.config.recipe import Recipe, check_extending, make_reci
 from torchrl_her_recipes.config.shipped import load_preset, preset_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, option_names
 
-folder_option = click.option("--folder", metavar="DIR", help="where it goes")
+folder_option = click.option("--folder", metavar="DIR", help="output folder")
 
 
 def with_folder(options: tuple[str, ...], folder: str | None) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ class OptionsCommand(click.Command):
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         presets = f"start from the values of a preset: {', '.join(preset_names())}, or a YAML file"
-        folder = "where the run goes (default: a folder of its own in runs/)"
+        folder = "folder of the run (default: a new one in runs/)"
         with formatter.section("Besides options"):
             formatter.write_dl([("preset=NAME", presets), ("folder=DIR", folder)])
         for group, kind in GROUPS.items():

@@ -27,9 +27,9 @@ _SEEDS = 3  # of a trial
 
 
 @click.command(short_help="search for good options with Optuna, on all cores")
-@click.option("--trials", type=click.IntRange(1), help="how many in all (default: 50, without --minutes)")
+@click.option("--trials", type=click.IntRange(1), help="trials in all (default: 50, without --minutes)")
 @click.option(
-    "--minutes", type=click.FloatRange(0.0, min_open=True), help="after which no trial begins any more"
+    "--minutes", type=click.FloatRange(0.0, min_open=True), help="minutes after which no further trial begins"
 )
 @click.option("--jobs", type=click.IntRange(1), help="trials at once (default: one for each core)")
 @click.option(
@@ -39,13 +39,13 @@ _SEEDS = 3  # of a trial
     help=f"the options that are varied: a YAML file, or {', '.join(space_names())} (default: the learner's)",
 )
 @click.option(
-    "--sampler", type=click.Choice(SAMPLERS), default="tpe", help="how trials are chosen (default: tpe)"
+    "--sampler", type=click.Choice(SAMPLERS), default="tpe", help="sampler of Optuna (default: tpe)"
 )
 @click.option(
     "--pruner",
     type=click.Choice(PRUNERS),
     default="median",
-    help="which trials are ended early: those below the median, all but a third at each rung of successive "
+    help="trials that end early: those below the median, all but a third at each rung of successive "
     "halving, or none (default: median)",
 )
 @folder_option
