@@ -120,7 +120,7 @@ def test_the_guide_s_study_is_planned_as_it_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     guide = (Path(__file__).parents[3] / "docs" / "studies.md").read_text()
-    mine, cases = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
+    mine, cases, expected = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text(mine)
     assert main(["study", "mine.yaml", "--plan", "--jobs", "2"]) == 0
@@ -131,6 +131,8 @@ def test_the_guide_s_study_is_planned_as_it_says(
     Path("parts.yaml").write_text(f"vary: {{task: [hand_v1]}}\n{cases}")
     assert main(["study", "parts.yaml", "--plan"]) == 0
     assert "hand_v1_no_filter" in capsys.readouterr().out
+    Path("expected.yaml").write_text(f"vary: {{task: [hand_v0, hand_v1], algo: [her, her_ibs]}}\n{expected}")
+    assert main(["study", "expected.yaml", "--plan"]) == 0
 
 
 def test_a_combination_that_was_cut_short_goes_on(tmp_path: Path) -> None:
