@@ -72,6 +72,15 @@ def test_a_page_s_python_runs_from_top_to_bottom(
         exec(compile(block, page, "exec"), names)
 
 
+def test_hindsight_is_configured_by_hydra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("hydra")
+    monkeypatch.chdir(tmp_path)
+    (config,) = re.findall(r"```yaml\n(.*?)```", (DOCS / "hydra.md").read_text(), re.DOTALL)
+    Path("hindsight.yaml").write_text(config)
+    (block,) = blocks("hydra.md")
+    exec(compile(block, "hydra.md", "exec"), {"__name__": "hydra.md"})
+
+
 def test_a_policy_is_exported_loaded_and_played_by_onnxruntime(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
