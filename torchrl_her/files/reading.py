@@ -1,66 +1,55 @@
-"""Reading what ``torch.save`` wrote, without its unpickler: tensors and plain data, and nothing else.
+"""Reads files that ``torch.save`` wrote, if they hold tensors and plain data and nothing else.
 
-``torch.load(weights_only=True)`` executes nothing either, but a small file can make it take any amount of
-memory (torch 2.14.1: it unpacks compressed records, so that 0.2 MB become 200 MB, and a ``bytearray`` as
-long as a file says, 2 GB for one of a kilobyte). Here every size is compared with what is there before memory
-is taken for it.
+``torch.load(weights_only=True)`` executes nothing, but a small file can make it take any amount of memory
+(torch 2.14: it unpacks compressed records, makes a ``bytearray`` of a declared length, and formats or hashes
+values that share their parts over and over). The file is therefore checked before it is loaded.
 """
 
 from __future__ import annotations
 
 import math
-import pickletools
+import re
 import struct
-import sys
-from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
-from zipfile import ZIP_STORED, BadZipFile, ZipFile
+from pickletools import genops, markobject
+from typing import Any, BinaryIO
+from zipfile import ZIP_STORED, ZipFile
 
 import torch
 from torch import Tensor, nn
 
-_STEPS = 1 << 22  # of a file's description: they take a few hundred megabytes at most
-_SHARED = 16  # how often entries are shared, on average over the steps
-_DESCRIPTION = 1 << 26  # bytes of it
+_STEPS = 1 << 22  # of a description: they take a few hundred megabytes at most
 _DEPTH = 100
-_WIDENED = 1 << 24  # numbers of all tensors that repeat what they store
-_LOCAL = struct.Struct("<4s22xHH")  # of a record: its mark, and the lengths of its name and of what follows
-_DTYPES = {name: own for name in dir(torch) if isinstance(own := getattr(torch, name), torch.dtype)}
-_STORAGES = {
-    "Bool": torch.bool,
-    "Byte": torch.uint8,
-    "Char": torch.int8,
-    "Short": torch.int16,
-    "Int": torch.int32,
-    "Long": torch.int64,
-    "Half": torch.float16,
-    "BFloat16": torch.bfloat16,
-    "Float": torch.float32,
-    "Double": torch.float64,
-    "ComplexFloat": torch.complex64,
-    "ComplexDouble": torch.complex128,
+_REPEATED = 1 << 24  # numbers of tensors beyond those that are stored
+# The last bytes of an archive of torch.save. They give the size and the place of the directory, and the place
+# of what follows it. Other readers of archives disagree on where the directory is if these do not fit.
+_END = struct.Struct("<4s36xQQ4s4xQ4x4s16xH")
+_MARKS = (b"PK\6\6", b"PK\6\7", b"PK\5\6")
+# torch looks records up without regard to case; numbers have none, so each record has one name.
+_RECORD = re.compile(r"[^/\0]+/(data\.pkl|data/[0-9]+|\.?\w+|\.data/\w+)", re.ASCII)
+_NAMES = {
+    "collections OrderedDict",
+    "torch Size",
+    "torch.storage UntypedStorage",
+    "torch._utils _rebuild_tensor_v2",
+    "torch._utils _rebuild_tensor_v3",
+    "torch._utils _rebuild_parameter",
+    *(f"torch {name}" for name in dir(torch) if name.endswith("Storage")),
+    *(f"torch {name}" for name in dir(torch) if isinstance(getattr(torch, name), torch.dtype)),
 }
+_NAME, _STORAGE = -1, 6  # sizes: of a name, and of ("storage", type, key, device, count)
+_SIZES = {"GLOBAL": _NAME, "BINPERSID": _STORAGE}
+_NEEDS = {"REDUCE": _NAME, "NEWOBJ": _NAME, "BINPERSID": _STORAGE}  # what a step is applied to
+_PLAIN = (bool, int, float, str, type(None), torch.dtype, dict, list, tuple)
 
 
 class MoreThanDataError(ValueError):
     """A file names something that is neither a tensor nor plain data."""
 
 
-class _RefusedError(ValueError):
-    """What a file says of itself cannot be; the message says what."""
-
-
-class _Storage(NamedTuple):
-    """Numbers that tensors are views of; ``dtype`` is None if the tensor says it."""
-
-    data: torch.UntypedStorage
-    dtype: torch.dtype | None
-
-
 def read_tensors(path: str | Path) -> Any:
-    """What ``torch.save`` wrote, if it is tensors and plain data.
+    """Returns what ``torch.save`` wrote, if it is tensors and plain data.
 
     Args:
         path: the file.
@@ -86,339 +75,127 @@ def read_tensors(path: str | Path) -> Any:
 
 
 def load_tensors(file: BinaryIO, *, map_location: torch.device | str = "cpu") -> Any:
-    """The same of an open file, which may begin with something else.
+    """Returns what ``torch.save`` wrote from the position of an open file to its end.
 
     Args:
-        file: that can be read anywhere.
+        file: Open file that can be read at any position.
 
     Keyword Args:
-        map_location: where its tensors come, wherever they were.
+        map_location: Device of the loaded tensors.
 
     Raises:
-        MoreThanDataError: the file names something else; the message goes on after "the file holds".
-        ValueError: it is damaged; the message goes on after "the file cannot be read:".
+        MoreThanDataError: the file names something else; the message continues "the file holds".
+        ValueError: it is damaged; the message continues "the file cannot be read:".
     """
+    begin = file.tell()
     try:
-        archive = _Archive(file)
-        machine = _Machine(archive, torch.device(map_location))
-        loaded = machine.run(archive.description())
-        _check_tree(loaded, most=_SHARED * machine.steps + 1_000)
+        _check_archive(file, begin)
+        file.seek(begin)
+        _check_description(torch._C.PyTorchFileReader(file).get_record("data.pkl"))
+        file.seek(begin)
+        loaded = torch.load(file, map_location="cpu", weights_only=True, mmap=False)
+        _check_tree(loaded)
+        if torch.device(map_location).type != "cpu":  # where storages may grow to any declared size
+            file.seek(begin)
+            loaded = torch.load(file, map_location=map_location, weights_only=True, mmap=False)
         return loaded
     except (MoreThanDataError, _RefusedError):
         raise
-    except Exception as error:  # of any type: steps of a damaged description may ask for anything
-        raise ValueError(f"its description is damaged ({type(error).__name__})") from error
+    except Exception as error:  # of any type: a damaged description may lead to anything
+        raise ValueError(f"it is damaged ({type(error).__name__})") from error
 
 
-class _Archive:
-    """The records of a file. None of them is compressed, so all of them together are no larger than it."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._size = file.seek(0, 2)
-        try:
-            with ZipFile(file) as archive:
-                records = archive.infolist()
-        except (BadZipFile, NotImplementedError, EOFError, OSError, struct.error) as error:
-            raise _RefusedError("it is damaged, or no archive of tensors") from error
-        if strange := [own.filename for own in records if own.compress_type != ZIP_STORED]:
-            raise _RefusedError(f"its record {strange[0][:80]!r} is compressed")
-        if sum(own.file_size for own in records) > self._size:
-            raise _RefusedError(f"its records are larger than its {self._size:,} bytes")
-        self._places = {own.filename: (own.header_offset, own.file_size) for own in records}
-        if len(self._places) < len(records):
-            raise _RefusedError("two of its records have the same name")
-        described = [name for name in self._places if name.endswith("/data.pkl") and name.count("/") == 1]
-        if len(described) != 1:
-            raise _RefusedError("it is no archive of tensors: it has no description of them")
-        self._root = described[0].removesuffix("data.pkl")
-        order = self._root + "byteorder"
-        if order in self._places and self.read(order).numpy().tobytes() != sys.byteorder.encode():
-            raise _RefusedError(f"its numbers are not in the order of bytes of this machine, {sys.byteorder}")
-
-    def description(self) -> bytes:
-        """The pickle of what the file holds."""
-        if (size := self._places[self._root + "data.pkl"][1]) > _DESCRIPTION:
-            raise _RefusedError(f"its description has {size:,} bytes, more than {_DESCRIPTION:,}")
-        return self.read(self._root + "data.pkl").numpy().tobytes()
-
-    def storage(self, key: str, size: int) -> torch.UntypedStorage:
-        """The numbers of a storage, which take so many bytes."""
-        name = f"{self._root}data/{key}"
-        if name not in self._places or self._places[name][1] != size:
-            there = f"{self._places[name][1]:,}" if name in self._places else "no"
-            raise _RefusedError(f"the tensor {key[:20]} declares {size:,} bytes, there are {there}")
-        return self.read(name).untyped_storage()
-
-    def read(self, name: str) -> Tensor:
-        """The bytes of a record."""
-        start, size = self._places[name]
-        if not 0 <= start <= self._size - _LOCAL.size:
-            raise _RefusedError(f"its record {name[:80]!r} is not in it")
-        self._file.seek(start)
-        mark, named, more = _LOCAL.unpack(self._file.read(_LOCAL.size))
-        begin = start + _LOCAL.size + named + more
-        if mark != b"PK\3\4" or begin + size > self._size:
-            raise _RefusedError(f"its record {name[:80]!r} is not in it")
-        self._file.seek(begin)
-        data = torch.empty(size, dtype=torch.uint8)
-        if self._file.readinto(data.numpy()) != size:  # type: ignore[attr-defined]
-            raise _RefusedError(f"its record {name[:80]!r} is cut short")
-        return data
+class _RefusedError(ValueError):
+    """A file contradicts itself, or torch.save did not write it. The message says where."""
 
 
-class _Machine:
-    """Carries out the steps of a pickle that make data; any other step is refused."""
-
-    def __init__(self, archive: _Archive, device: torch.device) -> None:
-        self._archive, self._device = archive, device
-        self._stack: list[Any] = []
-        self._marks: list[int] = []
-        self._memo: dict[int, Any] = {}
-        self._storages: dict[str, tuple[torch.UntypedStorage, int]] = {}
-        self._widened = 0
-        self.steps = 0
-
-    def run(self, description: bytes) -> Any:
-        """What the description makes."""
-        for step, value, _ in pickletools.genops(description):
-            self.steps += 1
-            if self.steps > _STEPS:
-                raise _RefusedError(f"its description has more than {_STEPS:,} steps")
-            if step.name == "STOP":
-                (made,) = self._stack
-                return made
-            act = _ACTS.get(step.name)
-            if act is None:
-                raise _RefusedError(f"its description has the step {step.name}, which no data needs")
-            act(self, value)
-        raise _RefusedError("its description has no end")
-
-    def push(self, value: Any) -> None:
-        self._stack.append(value)
-
-    def pop(self) -> Any:
-        if self._marks and len(self._stack) <= self._marks[-1]:
-            raise _RefusedError("its description is damaged: a mark is in the way")
-        return self._stack.pop()
-
-    def mark(self, _value: Any) -> None:
-        self._marks.append(len(self._stack))
-
-    def since_mark(self) -> list[Any]:
-        place = self._marks.pop()
-        values, self._stack[place:] = self._stack[place:], []
-        return values
-
-    def put(self, place: int) -> None:
-        value = self.pop()
-        self.push(value)
-        self._memo[place] = value
-
-    def take(self, count: int) -> list[Any]:
-        return [self.pop() for _ in range(count)][::-1]
-
-    def append(self, values: list[Any]) -> None:
-        into = self.pop()
-        if type(into) is not list:
-            raise _RefusedError("its description is damaged: entries of no list")
-        into.extend(values)
-        self.push(into)
-
-    def set_items(self, values: list[Any]) -> None:
-        into = self.pop()
-        if type(into) not in (dict, OrderedDict) or len(values) % 2:
-            raise _RefusedError("its description is damaged: entries of no mapping")
-        into.update(zip(values[::2], values[1::2], strict=True))
-        self.push(into)
-
-    def name(self, name: str) -> None:
-        module, _, own = name.partition(" ")
-        if module == "torch" and own in _DTYPES:
-            self.push(_DTYPES[own])
-        elif module == "torch" and own.endswith("Storage") and own.removesuffix("Storage") in _STORAGES:
-            self.push(_Storage(torch.UntypedStorage(), _STORAGES[own.removesuffix("Storage")]))
-        elif name == "torch.storage UntypedStorage":
-            self.push(_Storage(torch.UntypedStorage(), None))
-        elif name in _MAKERS:
-            self.push(_MAKERS[name])
-        else:
-            shown = ".".join(name.split())[:80].encode("unicode_escape").decode()
-            raise MoreThanDataError(f"more than tensors and plain data: {shown}")
-
-    def call(self, _value: Any) -> None:
-        maker, given = self.take(2)
-        if not _is_maker(maker) or type(given) is not tuple:
-            raise _RefusedError("its description is damaged: a call of no function")
-        self.push(maker(self, *given))
-
-    def build(self, _value: Any) -> None:
-        into, state = self.take(2)
-        if type(into) is not OrderedDict or type(state) is not dict or set(state) != {"_metadata"}:
-            raise MoreThanDataError("more than tensors and plain data: an object with a state")
-        into._metadata = state["_metadata"]  # type: ignore[attr-defined]  # the versions of modules
-        self.push(into)
-
-    def storage(self, _value: Any) -> None:
-        mark, kind, key, _place, count = self.pop()
-        if mark != "storage" or type(kind) is not _Storage or type(key) is not str or not _is_count(count):
-            raise _RefusedError("its description is damaged: a storage without its numbers")
-        size = count * (1 if kind.dtype is None else kind.dtype.itemsize)
-        if key not in self._storages:
-            own = self._archive.storage(key, size)
-            if self._device.type != "cpu":
-                own = torch.empty(0, dtype=torch.uint8).set_(own).to(self._device).untyped_storage()
-            self._storages[key] = own, size
-        if self._storages[key][1] != size:
-            raise _RefusedError(f"the tensor {key[:20]} declares two sizes")
-        self.push(_Storage(self._storages[key][0], kind.dtype))
-
-    def tensor(
-        self,
-        storage: _Storage,
-        offset: int,
-        shape: tuple[int, ...],
-        stride: tuple[int, ...],
-        needs_grad: bool,
-        _hooks: Any,
-        dtype: torch.dtype | None = None,
-    ) -> Tensor:
-        if type(storage) is not _Storage or not isinstance(dtype := dtype or storage.dtype, torch.dtype):
-            raise _RefusedError("its description is damaged: a tensor of no storage")
-        numbers = storage.data.nbytes() // dtype.itemsize
-        if not (
-            type(shape) in (tuple, torch.Size)
-            and type(stride) is tuple
-            and len(shape) == len(stride) <= 64
-            and all(map(_is_count, (offset, *shape, *stride)))
-        ):
-            raise _RefusedError("its description is damaged: a tensor without a shape")
-        count = math.prod(shape)
-        last = offset + sum((size - 1) * step for size, step in zip(shape, stride, strict=True))
-        if count and last >= numbers:
-            raise _RefusedError(f"a tensor of shape {list(shape)} has {numbers:,} numbers")
-        if count > numbers:
-            self._widened += count
-            if self._widened > _WIDENED:
-                raise _RefusedError(
-                    f"a tensor of shape {list(shape)} has {numbers:,} numbers, which it repeats"
-                )
-        if not count and max(shape, default=0) > _WIDENED:
-            raise _RefusedError(f"a tensor of shape {list(shape)} has no numbers")
-        made = torch.empty(0, dtype=dtype, device=storage.data.device)
-        made.set_(storage.data, offset if count else 0, shape, stride)
-        return made.requires_grad_(needs_grad is True)
+def _check_archive(file: BinaryIO, begin: int) -> None:
+    """Refuses an archive with records that are compressed, strange, or larger than the file."""
+    end = file.seek(0, 2)
+    place = max(0, end - begin - _END.size)
+    file.seek(begin + place)
+    first, size, start, second, follows, third, comment = _END.unpack(file.read().rjust(_END.size))
+    if (first, second, third) != _MARKS or comment or not start + size == follows == place:
+        raise _RefusedError("it is cut short, or torch.save did not write it")
+    with ZipFile(file) as archive:
+        records = archive.infolist()
+    names = [record.orig_filename for record in records]
+    for record, name in zip(records, names, strict=True):
+        if not _RECORD.fullmatch(name) or name.partition("/")[0] != names[0].partition("/")[0]:
+            raise _RefusedError(f"torch.save writes no record {name[:80]!r}")
+        if record.compress_type != ZIP_STORED:
+            raise _RefusedError(f"its record {name[:80]!r} is compressed")
+    if len({name.lower() for name in names}) < len(names):
+        raise _RefusedError("two of its records have the same name")
+    if sum(record.file_size for record in records) > end:
+        raise _RefusedError(f"its records are larger than its {end:,} bytes")
 
 
-def _is_count(value: object) -> bool:
-    return type(value) is int and 0 <= value < 1 << 62
+def _check_description(description: bytes) -> None:
+    """Refuses a pickle that names or calls anything but makers of tensors, or has tuples in tuples forever.
 
-
-def _bytes(_machine: _Machine, text: str = "", encoding: str = "latin1") -> bytes:
-    if type(text) is not str or encoding != "latin1":
-        raise _RefusedError("its description is damaged: bytes in no encoding")
-    return text.encode("latin1")
-
-
-def _complex(_machine: _Machine, real: float, imaginary: float) -> complex:
-    if type(real) is not float or type(imaginary) is not float:
-        raise _RefusedError("its description is damaged: a complex number of no numbers")
-    return complex(real, imaginary)
-
-
-def _shape(_machine: _Machine, shape: tuple[int, ...]) -> torch.Size:
-    return torch.Size(shape)
-
-
-def _place(_machine: _Machine, kind: str, index: int | None = None) -> torch.device:
-    return torch.device(kind) if index is None else torch.device(kind, index)
-
-
-def _mapping(_machine: _Machine) -> OrderedDict[Any, Any]:
-    return OrderedDict()
-
-
-def _tensor_2(machine: _Machine, *given: Any) -> Tensor:
-    if len(given) != 6:
-        raise _RefusedError("its description has a tensor of a kind that is not known here")
-    return machine.tensor(*given)
-
-
-def _tensor_3(machine: _Machine, *given: Any) -> Tensor:
-    if len(given) != 7:
-        raise _RefusedError("its description has a tensor of a kind that is not known here")
-    return machine.tensor(*given)
-
-
-def _parameter(_machine: _Machine, data: Tensor, needs_grad: bool, _hooks: Any) -> nn.Parameter:
-    return nn.Parameter(data.detach(), requires_grad=needs_grad is True)
-
-
-_MAKERS: dict[str, Callable[..., Any]] = {
-    "_codecs encode": _bytes,
-    "__builtin__ bytes": _bytes,
-    "__builtin__ complex": _complex,
-    "collections OrderedDict": _mapping,
-    "torch Size": _shape,
-    "torch device": _place,
-    "torch._utils _rebuild_tensor_v2": _tensor_2,
-    "torch._utils _rebuild_tensor_v3": _tensor_3,
-    "torch._utils _rebuild_parameter": _parameter,
-}
-
-
-def _is_maker(value: object) -> bool:
-    return any(value is own for own in _MAKERS.values())
-
-
-_ACTS: dict[str, Callable[[_Machine, Any], None]] = {
-    "PROTO": lambda _own, _value: None,
-    "MARK": _Machine.mark,
-    "NONE": lambda own, _value: own.push(None),
-    "NEWTRUE": lambda own, _value: own.push(True),
-    "NEWFALSE": lambda own, _value: own.push(False),
-    "EMPTY_DICT": lambda own, _value: own.push({}),
-    "EMPTY_LIST": lambda own, _value: own.push([]),
-    "EMPTY_TUPLE": lambda own, _value: own.push(()),
-    **dict.fromkeys(("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE"), _Machine.push),
-    **dict.fromkeys(("BINPUT", "LONG_BINPUT"), _Machine.put),
-    **dict.fromkeys(("BINGET", "LONG_BINGET"), lambda own, value: own.push(own._memo[value])),
-    "TUPLE": lambda own, _value: own.push(tuple(own.since_mark())),
-    "TUPLE1": lambda own, _value: own.push(tuple(own.take(1))),
-    "TUPLE2": lambda own, _value: own.push(tuple(own.take(2))),
-    "TUPLE3": lambda own, _value: own.push(tuple(own.take(3))),
-    "APPEND": lambda own, _value: own.append(own.take(1)),
-    "APPENDS": lambda own, _value: own.append(own.since_mark()),
-    "SETITEM": lambda own, _value: own.set_items(own.take(2)),
-    "SETITEMS": lambda own, _value: own.set_items(own.since_mark()),
-    "GLOBAL": _Machine.name,
-    "REDUCE": _Machine.call,
-    "BUILD": _Machine.build,
-    "BINPERSID": _Machine.storage,
-}
-
-
-def _check_tree(value: Any, *, most: int) -> None:
-    """Refuses what holds itself, or the same so often that looking at all of it takes for ever.
-
-    Args:
-        value: what was read.
-
-    Keyword Args:
-        most: how many entries it may have, on all levels.
+    A tuple that has the same tuple twice, and so on, is small. Its hash takes time for all of its entries.
+    Lists have no hash, but torch would print one that is called in its error.
 
     Raises:
-        ValueError: it does, or it holds what is no data by itself.
+        MoreThanDataError: it names something else.
+        ValueError: it is damaged, or too large with all tuples written in full.
     """
-    waiting, seen = [(value, 0)], 0
-    while waiting:
-        own, depth = waiting.pop()
-        seen += 1
-        if seen > most or depth > _DEPTH:
-            raise _RefusedError("its entries are nested too deeply, or too many")
-        if isinstance(own, dict):
-            waiting += [(each, depth + 1) for pair in own.items() for each in pair]
-        elif type(own) in (list, tuple):
-            waiting += [(each, depth + 1) for each in own]
-        elif type(own) is _Storage or _is_maker(own):
-            raise _RefusedError("its description is damaged: a name that nothing was made of")
+    stack: list[int] = []  # sizes of values; a tuple's is that of all of its entries
+    marks: list[int] = []
+    memo: dict[Any, int] = {}
+    steps = 0
+    for step, value, _ in genops(description):
+        name, before = step.name, step.stack_before
+        if name == "GLOBAL" and value not in _NAMES:
+            shown = ".".join(str(value).split())[:80].encode("unicode_escape").decode()
+            raise MoreThanDataError(f"more than tensors and plain data: {shown}")
+        if name == "PROTO" and value != 2:
+            raise _RefusedError(f"it is written in protocol {value} of pickle, not in 2")
+        place = marks.pop() - before.index(markobject) if markobject in before else len(stack) - len(before)
+        parts, stack[place:] = stack[place:], []
+        if name in _NEEDS and parts[0] != _NEEDS[name]:
+            raise _RefusedError(f"its description is damaged: {name} of a value")
+        if "PUT" in name:
+            memo[value] = stack[-1]
+        size = 1
+        if "GET" in name:
+            size = memo[value]
+        elif "TUPLE" in name:
+            size += sum(map(abs, parts))
+        elif name in _SIZES:
+            size = _SIZES[name]
+        steps += abs(size)
+        if steps > _STEPS:
+            raise _RefusedError(f"its description has more than {_STEPS:,} steps")
+        if name == "MARK":
+            marks.append(len(stack))
+        elif step.stack_after:
+            stack.append(size)
+
+
+def _check_tree(loaded: Any) -> None:
+    """Refuses values that are no data, and tensors that are far larger than what is stored of them."""
+    repeated = 0
+    for count, value in enumerate(_values(loaded)):
+        if type(value) in (Tensor, nn.Parameter):
+            stored = value.untyped_storage().nbytes() // value.itemsize
+            repeated += max(0, math.prod(max(1, size) for size in value.shape) - stored)
+        elif not isinstance(value, _PLAIN):
+            raise MoreThanDataError(f"more than tensors and plain data: {type(value).__name__}")
+        if count > _STEPS:
+            raise _RefusedError(f"it has more than {_STEPS:,} entries")
+        if repeated > _REPEATED:
+            raise _RefusedError(f"a tensor of shape {list(value.shape)} is larger than what is stored of it")
+
+
+def _values(value: Any, depth: int = 0) -> Iterator[Any]:
+    """Yields a value, and the values in it if it is a mapping, a list or a tuple."""
+    if depth > _DEPTH:
+        raise _RefusedError(f"its entries are nested more than {_DEPTH} levels deep")
+    yield value
+    if isinstance(value, dict):
+        value = [part for pair in value.items() for part in pair]
+    if isinstance(value, list | tuple):
+        for part in value:
+            yield from _values(part, depth + 1)

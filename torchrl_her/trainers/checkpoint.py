@@ -30,7 +30,7 @@ _PIECE = 1 << 26  # bytes that are written before they are synced to disk
 _BODY = len(_MAGIC) + hashlib.sha256().digest_size  # where it begins
 
 
-_PLAIN = (bool, int, float, complex, str, bytes, type(None), torch.Size, torch.dtype, torch.device)
+_PLAIN = (bool, int, float, str, type(None), torch.Size, torch.dtype)
 
 
 class CheckpointError(ValueError):

@@ -18,7 +18,6 @@ import yaml
 _LARGEST = 1 << 20  # bytes of a configuration
 LARGEST_TABLE = 1 << 28
 _DEPTH = 30
-_VALUES = 50_000  # in all, with those that are repeated by name
 # What damaged content may lead to, whatever reads it. A RuntimeError is torch's, or a RecursionError.
 _DAMAGE = (ArithmeticError, AttributeError, AssertionError, LookupError, RuntimeError, TypeError, ValueError)
 _SHOWN = 300  # letters of a reason
@@ -76,13 +75,15 @@ def read_text(path: Path, *, largest: int = _LARGEST) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads plain values, as many and as deep as configurations have."""
+    """Reads plain values, as deep as configurations are. A few aliases of aliases would make millions."""
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self._depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError("it has an alias (*name); write the value in full")
         self._depth += 1
         if self._depth > _DEPTH:
             raise ValueError(f"it is nested more than {_DEPTH} levels deep")
@@ -90,44 +91,19 @@ class _Loader(yaml.SafeLoader):
         self._depth -= 1
         return node
 
-    def get_single_node(self) -> Any:
-        node = super().get_single_node()
-        if node is not None:
-            _count(node, {})
-        return node
-
-
-def _count(node: Any, known: dict[int, int]) -> int:
-    """How many values a part of a document has, with each part that is repeated by name (``*name``).
-
-    Raises:
-        ValueError: there are too many, or it holds itself.
-    """
-    place = id(node)
-    if known.get(place) == 0:
-        raise ValueError("it holds itself")
-    if place not in known:
-        known[place] = 0
-        parts = node.value if isinstance(node, yaml.CollectionNode) else []
-        pairs = [each for pair in parts for each in pair] if isinstance(node, yaml.MappingNode) else parts
-        known[place] = 1 + sum(_count(each, known) for each in pairs)
-        if known[place] > _VALUES:
-            raise ValueError(f"it has more than {_VALUES:,} values")
-    return known[place]
-
 
 def parse_yaml(text: str) -> Any:
     """The plain values that a text spells in YAML.
 
     Raises:
-        ValueError: it is not YAML, or has too many values for a configuration.
+        ValueError: it is not YAML, or repeats values by name.
 
     Example:
         >>> parse_yaml("{a: [1, b]}")
         {'a': [1, 'b']}
         >>> parse_yaml("a: &a [1, *a]")
         Traceback (most recent call last):
-        ValueError: it holds itself
+        ValueError: it has an alias (*name); write the value in full
     """
     try:
         return yaml.load(text, _Loader)

@@ -62,7 +62,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 
-@pytest.mark.parametrize("value", [np.float64(1.0), np.int64(1), Path("a"), {1, 2}])
+@pytest.mark.parametrize("value", [np.float64(1.0), np.int64(1), Path("a"), {1, 2}, b"1"])
 def test_what_could_not_be_loaded_is_not_saved(value: Any, tmp_path: Path) -> None:
     said = rf"the state\['own'\]\[1\] must be a tensor or plain data, got {type(value).__name__}"
     with pytest.raises(TypeError, match=said):
