@@ -19,6 +19,7 @@ from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, RoundRob
 
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
+from torchrl_her.torchrl_private import buffers_of, samplers_in, unit_of
 
 SHARED = (
     "workers send episodes and the learner extends. Leave replay_buffer= of the collector out, and extend "
@@ -30,11 +31,11 @@ MASK = ("collector", "mask")  # TorchRL's mark of what is not padding
 
 def samplers_of(storage: Storage) -> Iterator[Sampler]:
     """The samplers of all buffers that read a storage, those of ensembles one by one."""
-    waiting: list[Any] = [getattr(buffer, "_sampler", None) for buffer in storage._attached_entities]
+    waiting: list[Any] = [getattr(buffer, "sampler", None) for buffer in buffers_of(storage)]
     while waiting:
         sampler = waiting.pop()
         if isinstance(sampler, SamplerEnsemble):
-            waiting.extend(sampler._samplers)
+            waiting.extend(samplers_in(sampler))
         elif isinstance(sampler, Sampler):
             yield sampler
 
@@ -71,7 +72,7 @@ def refuse_shared(name: str, storage: Storage) -> None:
     Raises:
         RuntimeError: a buffer of this storage is shared.
     """
-    if any(getattr(buffer, "shared", False) for buffer in storage._attached_entities):
+    if any(getattr(buffer, "shared", False) for buffer in buffers_of(storage)):
         raise RuntimeError(f"{name} cannot work in a buffer that is shared between processes: {SHARED}")
 
 
@@ -81,8 +82,8 @@ def refuse_unordered(name: str, storage: Storage) -> None:
     Raises:
         ValueError: a buffer of this storage writes them in another order, or relabels them.
     """
-    for buffer in storage._attached_entities:
-        writer = getattr(buffer, "_writer", None)
+    for buffer in buffers_of(storage):
+        writer = getattr(buffer, "writer", None)
         if isinstance(writer, HindsightBase) and writer.k > 0:
             raise ValueError(
                 f"{name} needs real transitions, but a {type(writer).__name__} with k={writer.k} relabels "
@@ -126,7 +127,7 @@ def refuse_priorities(name: str, storage: Storage, transitions: TensorDictBase) 
     Raises:
         ValueError: it does.
     """
-    for buffer in storage._attached_entities:
+    for buffer in buffers_of(storage):
         key = getattr(buffer, "priority_key", None)
         if transitions.ndim > 1 and key is not None and transitions.get(key, None) is not None:
             raise ValueError(
@@ -137,7 +138,7 @@ def refuse_priorities(name: str, storage: Storage, transitions: TensorDictBase) 
 
 def has_slices(storage: Storage) -> bool:
     """Whether sequences are sampled from a storage."""
-    units = (getattr(buffer, "_sample_unit", None) for buffer in storage._attached_entities)
+    units = (unit_of(buffer) for buffer in buffers_of(storage))
     return any(isinstance(sampler, SliceSampler) for sampler in samplers_of(storage)) or any(
         isinstance(unit, Sequence) for unit in units
     )

@@ -49,6 +49,15 @@ from torchrl_her.replay_buffers.neighbors import (
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.runs.streams import RunDraws
 from torchrl_her.replay_buffers.slices import slice_positions
+from torchrl_her.torchrl_private import (
+    buffers_of,
+    functions_on_batches,
+    generator_of,
+    is_full,
+    next_row,
+    revision_of,
+    unit_of,
+)
 
 
 class _Stored(NamedTuple):
@@ -210,7 +219,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             place = stored.episodes.place(row)
             inside = _moved(info.get(MASK), row.device)  # type: ignore[call-overload]  # TorchRL's keys may be nested
             own = slice_positions(place, stored.episodes.episode(place)[0], ends, inside)
-        generator = self.generator if self.generator is not None else storage._rng
+        generator = self.generator if self.generator is not None else generator_of(storage)
         rows, goals = self._choose(stored, row, own, generator)
         if self.weights is not None:
             self.weights.update(goals)
@@ -288,14 +297,14 @@ class HERSampleUnit(HindsightBase, SampleUnit):
 
     def _buffers(self, storage: Storage) -> Iterator[ReplayBuffer]:
         """The buffers that sample with this unit."""
-        for buffer in storage._attached_entities:
-            if isinstance(buffer, ReplayBuffer) and buffer._sample_unit is self:
+        for buffer in buffers_of(storage):
+            if isinstance(buffer, ReplayBuffer) and unit_of(buffer) is self:
                 yield buffer
 
     def _may_relabel(self, storage: Storage) -> bool:
         """Whether the buffer has a function of the user's that may call :meth:`relabel`."""
         for buffer in self._buffers(storage):
-            own = [buffer._collate_fn, *(getattr(each, "func", None) for each in buffer._transform or ())]
+            own = functions_on_batches(buffer)
             if all(each is None or each.__module__.startswith("torchrl.") for each in own):
                 return False
         return True
@@ -303,13 +312,13 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _slice_sampler(self, storage: Storage) -> SliceSampler | None:
         """The sampler of this unit's buffer, if it samples sequences."""
         for buffer in self._buffers(storage):
-            if isinstance(buffer._sampler, SliceSampler):
+            if isinstance(buffer.sampler, SliceSampler):
                 if self.options.n_steps > 1:
                     raise ValueError(
                         "under a sampler of slices, HERSampleUnit needs n_steps=1, got "
                         f"{self.options.n_steps}: the steps of a slice follow each other already"
                     )
-                return buffer._sampler
+                return buffer.sampler
         if self.options.per == "episode":
             raise ValueError("HERSampleUnit(per='episode') needs a sampler of slices, such as SliceSampler")
         return None
@@ -375,7 +384,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             raise ValueError(
                 "HERSampleUnit cannot work in a ReplayBufferEnsemble: relabel while writing, with HERWriter"
             )
-        state = (storage._mutation_revision, _oldest(storage))
+        state = (revision_of(storage), _oldest(storage))
         stored = self._stored
         if stored is None or stored.storage is not storage or stored.state != state:
             refuse_consuming("HERSampleUnit", storage)
@@ -520,12 +529,12 @@ def _oldest(storage: Storage) -> int:
     The writer's cursor tells; TorchRL does not restore that of the storage. If several buffers share a
     storage, it is the cursor of the one that has written most.
     """
-    if not storage._is_full:
+    if not is_full(storage):
         return 0
     cursors = [
-        (buffer.write_count, buffer.writer._cursor)
-        for buffer in storage._attached_entities
-        if hasattr(getattr(buffer, "writer", None), "_cursor")
+        (buffer.write_count, row)
+        for buffer in buffers_of(storage)
+        if isinstance(buffer, ReplayBuffer) and (row := next_row(buffer.writer)) is not None
     ]
     return max(cursors, default=(0, 0))[1]
 

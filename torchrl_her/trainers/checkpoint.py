@@ -23,6 +23,14 @@ from torchrl_her.files.reading import MoreThanDataError, load_tensors
 from torchrl_her.files.writing import written
 from torchrl_her.replay_buffers.runs.buffer import bounds_of_run, runs_of, sizes_of
 from torchrl_her.replay_buffers.runs.storage import Field, PackedStorage, unpack
+from torchrl_her.torchrl_private import (
+    carrier_of,
+    last_written,
+    set_carrier,
+    set_last_written,
+    set_length,
+    set_next_ids,
+)
 from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_state_dict
 
 _MAGIC = b"torchrl-her checkpoint 1\n"
@@ -192,7 +200,7 @@ def collector_state_dict(collector: BaseCollector) -> dict[str, Any]:
     give their episodes away: they continue with new ones.
     """
     state = {name: value for name, value in collector.state_dict().items() if name != "policy_state_dict"}
-    carrier = getattr(collector, "_carrier", None)
+    carrier = carrier_of(collector)
     return {**state, "carrier": None if carrier is None else carrier.clone().to_dict()}
 
 
@@ -208,11 +216,11 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
         collector.load_state_dict(own)
         return
     collector.load_state_dict(own, strict=False)  # its policy stays
-    carrier = collector._carrier
+    carrier: Any = carrier_of(collector)
     shown = TensorDict.from_dict(state["carrier"], batch_size=carrier.batch_size)
-    collector._carrier = carrier.empty().update(shown)
+    set_carrier(collector, carrier.empty().update(shown))
     if "traj_pool" in own:  # TorchRL has drawn new ids, but the episodes have theirs
-        collector._traj_pool.load_state_dict(own["traj_pool"])
+        set_next_ids(collector, own["traj_pool"])
 
 
 def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> dict[str, Any]:
@@ -234,7 +242,7 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> d
         "rows": [_block(buffer, *bounds, own) for bounds in blocks],
         "blocks": blocks,
         "capacity": _capacity(buffer),
-        "cursor": getattr(buffer.storage, "_last_cursor_index", None),
+        "cursor": last_written(buffer.storage),
         "writer": buffer.writer.state_dict(),
         "sampler": sampler_state_dict(buffer.sampler, len(buffer)),
     }
@@ -293,7 +301,7 @@ def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]
         if block is not None:
             _load_block(buffer.storage, begin, end, block)
     if state["cursor"] is not None:  # where slice samplers see the oldest row follow the newest
-        buffer.storage._set_last_cursor(state["cursor"])
+        set_last_written(buffer.storage, state["cursor"])
     buffer.writer.load_state_dict(state["writer"])
 
 
@@ -311,4 +319,4 @@ def _load_block(storage: Storage, begin: int, end: int, block: dict[str, Any]) -
         storage.set(place, rows)
     else:
         storage.set(place, rows, set_cursor=False)
-        storage._len = end
+        set_length(storage, end)

@@ -24,6 +24,7 @@ from torchrl_her.objectives.sac import PenalizedSACLoss
 from torchrl_her.objectives.targets import ClampedTD0, RunsHardUpdate
 from torchrl_her.objectives.td3 import PenalizedTD3Loss
 from torchrl_her.objectives.tqc import PenalizedTQCLoss
+from torchrl_her.torchrl_private import has_keyword_arguments
 from torchrl_her.trainers.adam import RunsAdam
 from torchrl_her.trainers.fused_layers import layers_of, parameter_shapes
 
@@ -213,7 +214,7 @@ def _strange_networks(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
         elif kind is CriticNet and fused.algorithm is not Algorithm.TQC and layers[-1].outputs != 1:
             yield f"critics with {layers[-1].outputs} outputs"
         inner = module[0] if isinstance(module, TensorDictSequential) else module
-        if inner._kwargs or inner._get_kwargs or inner.method is not None or inner.method_kwargs:
+        if has_keyword_arguments(inner) or inner.method is not None or inner.method_kwargs:
             yield "options of a network's TensorDictModule"
     if len({network_of(module).runs for module, _ in nets.values()}) > 1:
         yield "networks of different numbers of runs"

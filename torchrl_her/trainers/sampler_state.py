@@ -8,6 +8,7 @@ import torch
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler, SamplerEnsemble
 
 from torchrl_her.replay_buffers.runs.sampler import RunsPrioritizedSampler
+from torchrl_her.torchrl_private import capacity_of, samplers_in
 
 _REMAINING = "_remaining_batches"  # until a pass over the data is over; TorchRL's states leave it out
 
@@ -31,8 +32,7 @@ def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
     if isinstance(sampler, SamplerEnsemble):
         # Of parts with priorities the whole trees: how much each storage holds is not known here.
         own: dict[str, Any] = {
-            str(i): sampler_state_dict(part, getattr(part, "_max_capacity", 0))
-            for i, part in enumerate(sampler._samplers)
+            str(i): sampler_state_dict(part, capacity_of(part)) for i, part in enumerate(samplers_in(sampler))
         }
     elif isinstance(sampler, PrioritizedSampler) and not isinstance(sampler, RunsPrioritizedSampler):
         own = _priorities(sampler, size)
@@ -51,7 +51,7 @@ def load_sampler_state_dict(sampler: Sampler, state: dict[str, Any]) -> None:
     if state["kind"] != kind:
         raise ValueError(f"the state is that of a {state['kind']}, not of a {kind}")
     if isinstance(sampler, SamplerEnsemble):
-        for i, part in enumerate(sampler._samplers):
+        for i, part in enumerate(samplers_in(sampler)):
             load_sampler_state_dict(part, state["own"][str(i)])
     elif isinstance(sampler, PrioritizedSampler) and not isinstance(sampler, RunsPrioritizedSampler):
         _load_priorities(sampler, state["own"])
@@ -74,8 +74,8 @@ def _priorities(sampler: PrioritizedSampler, size: int) -> dict[str, Any]:
         "max_priority": [
             None if value is None else torch.as_tensor(value) for value in state["_max_priority"]
         ],
-        "alpha": float(sampler._alpha),
-        "beta": float(sampler._beta),
+        "alpha": float(state["_alpha"]),
+        "beta": float(state["_beta"]),
     }
 
 
@@ -86,5 +86,5 @@ def _load_priorities(sampler: PrioritizedSampler, own: dict[str, Any]) -> None:
         state["_sum_tree"][filled] = own["sum"]
         state["_min_tree"][filled] = own["min"]
     state["_max_priority"] = tuple(own["max_priority"])
+    state["_alpha"], state["_beta"] = own["alpha"], own["beta"]
     sampler.load_state_dict(state)
-    sampler._alpha, sampler._beta = own["alpha"], own["beta"]

@@ -7,6 +7,8 @@ from typing import Any
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
+from torchrl_her.torchrl_private import count_a_write
+
 
 def runs_of(buffer: ReplayBuffer) -> int:
     """For how many runs a buffer was made: 1, unless its writer is for more."""
@@ -61,7 +63,7 @@ def empty_run(buffer: ReplayBuffer, run: int = 0) -> None:
     sampler: Any = buffer.sampler
     writer.empty_run(run)
     sampler.empty_run(run)
-    buffer.storage._bump_mutation_revision()  # for whatever remembers what it has read
+    count_a_write(buffer.storage)
 
 
 def _check(buffer: ReplayBuffer, run: int) -> None:

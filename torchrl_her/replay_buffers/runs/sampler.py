@@ -16,6 +16,7 @@ from torchrl.data.replay_buffers.storages import Storage
 from torchrl_her.files.reading import read_tensors
 from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
 from torchrl_her.replay_buffers.runs.trees import SumTrees
+from torchrl_her.torchrl_private import generator_of
 
 _STATE_FILE = "runs_sampler.pt"
 
@@ -330,7 +331,7 @@ def _share(sampler: AnyRunsSampler, storage: Storage, batch_size: int) -> int:
 
 def generators_of(sampler: AnyRunsSampler) -> Generators:
     """A source of random numbers for each run."""
-    return [sampler._rng] if sampler.generators is None else sampler.generators
+    return [generator_of(sampler)] if sampler.generators is None else sampler.generators
 
 
 def rows_of(place: Tensor, filled: Sequence[bool], capacity: int) -> Tensor:

@@ -12,6 +12,8 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor,
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import LazyTensorStorage, TensorStorage
 
+from torchrl_her.torchrl_private import count_a_write, set_last_written, set_length, whole_of
+
 _ALIGNED = 8  # bytes: rows begin at a multiple of it, so that numbers of any type can be read in place
 
 
@@ -159,7 +161,7 @@ def write_slices(storage: TensorStorage, rows: TensorDictBase, moves: Sequence[M
         moves: which of them go where.
     """
     entries = dict(rows.items(True, True))
-    kept = dict(storage._storage.items(True, True)) if storage.initialized else {}
+    kept = dict(whole_of(storage).items(True, True)) if storage.initialized else {}
     if kept.keys() != entries.keys():  # also the first time, when the storage is made
         for move in moves:
             storage.set(move.to, rows[move.source], set_cursor=False)
@@ -167,10 +169,10 @@ def write_slices(storage: TensorStorage, rows: TensorDictBase, moves: Sequence[M
         for key, entry in entries.items():
             for source, to in moves:
                 kept[key][to] = entry[source]
-        storage._bump_mutation_revision()
+        count_a_write(storage)
     if moves:
-        storage._set_last_cursor(moves[-1].to)
-        storage._len = max(storage._len, *(move.to.stop for move in moves))
+        set_last_written(storage, moves[-1].to)
+        set_length(storage, max(len(storage), *(move.to.stop for move in moves)))
 
 
 def layout(rows: TensorDictBase) -> tuple[Field, ...]:
