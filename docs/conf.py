@@ -9,6 +9,8 @@ from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from PIL import Image
+
 from torchrl_her_recipes.reports import page as report_page
 from torchrl_her_recipes.reports.tidy import is_results, read_results
 
@@ -71,6 +73,7 @@ nitpick_ignore_regex = [
 ]
 
 html_theme = "furo"
+html_static_path, html_css_files = ["_static"], ["narrow.css"]
 html_title = f"torchrl-her {release}"
 html_theme_options = {
     "navigation_with_keys": True,
@@ -187,8 +190,18 @@ def on_signature(*event: Any) -> tuple[str, str | None] | None:
     return None if signature is None else (signature, returned)
 
 
+def mark_wide_pictures(app: Sphinx, page: Any, _name: str) -> None:
+    """Marks pictures that are more than twice as wide as high, for ``narrow.css``."""
+    for node in page.findall(lambda node: node.tagname == "image"):
+        path = Path(app.srcdir) / node["uri"]
+        if path.suffix in (".png", ".gif") and path.is_file():
+            with Image.open(path) as picture:
+                node["classes"] += ["wide"] if picture.width > 2 * picture.height else []
+
+
 def setup(app: Sphinx) -> None:
     app.connect("source-read", on_read)
     app.connect("include-read", on_read)
     app.connect("autodoc-process-signature", on_signature)
+    app.connect("doctree-resolved", mark_wide_pictures)
     app.connect("build-finished", make_report_pages)

@@ -268,6 +268,9 @@ class HindsightBase:
         self._time_seen = False  # whether an episode had several steps, or their absence was said
         self._compared = False  # whether rewards were compared with the reward function
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.reward_fn!r}, {self.options!r})"
+
     @property
     def options(self) -> HindsightOptions:
         """How transitions are relabeled."""

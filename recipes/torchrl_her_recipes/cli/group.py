@@ -7,6 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
+from difflib import get_close_matches
 
 import click
 
@@ -110,6 +111,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (click.Abort, KeyboardInterrupt):
         click.echo("torchrl-her: interrupted", err=True)
         return INTERRUPTED
+    except click.NoSuchOption as error:
+        near = get_close_matches(error.option_name, error.possibilities or (), cutoff=0.75)
+        return fail(click.NoSuchOption(error.option_name, possibilities=near).format_message().rstrip("."))
     except click.ClickException as error:
         return fail(error.format_message().rstrip("."))
     except BAD_INPUT_ERRORS as error:

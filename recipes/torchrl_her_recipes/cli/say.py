@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import statistics
 import sys
 from collections.abc import Sequence
@@ -31,7 +32,8 @@ def say_warning(message: Warning | str, *_where: Any, **_more: Any) -> None:
 
 def say_line(message: str) -> None:
     """Prints a notice in one line, above a progress bar if there is one."""
-    tqdm.write(f"torchrl-her: {' '.join(message.split())}", file=sys.stderr)
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", message)  # without the colors of gymnasium's warnings
+    tqdm.write(f"torchrl-her: {' '.join(plain.split())}", file=sys.stderr)
 
 
 def one_line(error: BaseException) -> str:
@@ -48,22 +50,20 @@ def _message(error: BaseException) -> str:
 
 
 def success_line(successes: Sequence[float]) -> str:
-    """How successful runs are: their median, the worst, and how many have hardly learned anything.
+    """Success of runs: the median, the worst, and the number of runs that have hardly learned anything.
 
     Example:
         >>> success_line([0.9])
         'success 90%'
         >>> success_line([0.9, 0.02, 0.95])
-        'success 90% in the median, 2% in the worst; 1 of 3 runs stayed below 10%'
+        'median success 90%, worst 2%; 1 of 3 runs below 10%'
     """
     median, worst = statistics.median(successes), min(successes)
     if len(successes) == 1:
         return f"success {median:.0%}"
     below = sum(success < _HARDLY for success in successes)
-    return (
-        f"success {median:.0%} in the median, {worst:.0%} in the worst; "
-        f"{below or 'none'} of {len(successes)} runs stayed below {_HARDLY:.0%}"
-    )
+    failed = f"; {below} of {len(successes)} runs below {_HARDLY:.0%}" if below else ""
+    return f"median success {median:.0%}, worst {worst:.0%}{failed}"
 
 
 def file_name(task: str) -> str:

@@ -20,7 +20,7 @@ from torchrl_her_recipes.cli.train_options import (
     requests,
     with_folder,
 )
-from torchrl_her_recipes.config.imports import foreign_module, imported_modules
+from torchrl_her_recipes.config.imports import imported_modules, needs_permission
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.resolve import auto_options
 
@@ -134,8 +134,8 @@ def _say_end(result: recipes.RunResult) -> int:
     if result.interrupted:
         click.echo(f"interrupted: everything so far was saved in {result.folder}")
         imports = "".join(f"--import {module} " for module in imported_modules())
-        foreign = foreign_module(recipes.RunFolder(result.folder).recipe().task.name)
-        allowed = " --allow-import" if foreign and foreign not in imported_modules() else ""
+        task = recipes.RunFolder(result.folder).recipe().task.name
+        allowed = " --allow-import" if needs_permission(task) else ""
         click.echo(f"go on with: torchrl-her {imports}train --resume {result.folder}{allowed}")
         return INTERRUPTED
     left = "" if result.reached == result.success else f", reached at some step {result.reached:.0%}"

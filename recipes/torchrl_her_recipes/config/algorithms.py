@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from torchrl_her_recipes.config.options import AUTO, what_there_is
+from torchrl_her_recipes.config.options import AUTO, REGISTERED, what_there_is
 
 STRATEGIES = ("future", "final", "episode")  # goal strategies that come with the library
 RECENT = ("actual", "achieved")  # sources of goals besides strategies: those of recent episodes
@@ -156,7 +156,9 @@ def get_algorithm(name: str) -> Algorithm:
     if name == AUTO:
         return _UNRESOLVED
     if name not in ALGORITHMS:
-        raise ValueError(f"unknown algorithm {name!r}{what_there_is(name, ALGORITHMS, 'algorithms')}")
+        raise ValueError(
+            f"unknown algorithm {name!r}{what_there_is(name, ALGORITHMS, 'algorithms')}{REGISTERED}"
+        )
     return ALGORITHMS[name]
 
 
@@ -171,7 +173,7 @@ def check_strategy(name: str) -> None:
     """
     known = _known_strategies()
     if name not in known:
-        hint = what_there_is(name, known, "strategies")
+        hint = what_there_is(name, known, "strategies") + REGISTERED
         if name in RECENT:
             hint = f", which looks beyond the own episode: write goal_sources='{{{name}: 4}}'"
         raise ValueError(f"unknown goal strategy {name!r}{hint}")
@@ -195,7 +197,9 @@ def check_goal_sources(sources: object) -> dict[str, int]:
         if isinstance(name, str) and ":" in name and number is None:  # YAML took it for a name
             raise ValueError(f"goal_sources needs a space behind each colon, {example}, got {dict(sources)}")
         if name not in known:
-            raise ValueError(f"unknown goal source {name!r}{what_there_is(name, known, 'sources')}")
+            raise ValueError(
+                f"unknown goal source {name!r}{what_there_is(name, known, 'sources')}{REGISTERED}"
+            )
         if not isinstance(number, int) or isinstance(number, bool) or number < 1:
             raise ValueError(f"goal_sources.{name} must be a whole number of at least 1, got {number!r}")
     return dict(sources)

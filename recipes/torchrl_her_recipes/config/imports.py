@@ -9,7 +9,7 @@ needs a permission: ``with allow_imports():``, or ``--allow-import`` on the comm
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -78,6 +78,18 @@ def foreign_module(task: str) -> str:
     return "" if task.startswith(GYM) and module in _HARMLESS else module
 
 
+def needs_permission(task: str, named: Collection[str] = ()) -> bool:
+    """Whether a task imports a module that is neither among the named ones nor imported already, nor in one.
+
+    Example:
+        >>> needs_permission("package.envs:make_env"), needs_permission("package.envs:f", ["package"])
+        (True, False)
+    """
+    parts = foreign_module(task).split(".")
+    known = {".".join(parts[: count + 1]) for count in range(len(parts))}
+    return parts != [""] and not known & {*named, *_imported}
+
+
 def permit_task(task: str) -> None:
     """Allows the module that a task names to be imported, from now on in this process."""
     if module := foreign_module(task):
@@ -111,11 +123,8 @@ def check_permitted(task: str) -> None:
         ValueError: task=downloaded:make_env would import the module 'downloaded', which a file names and not
         you: if you trust it, give --allow-import (in Python: with allow_imports():)
     """
-    module = foreign_module(task)
-    parts = module.split(".")
-    known = {".".join(parts[: count + 1]) for count in range(len(parts))}
-    if module and not _everything and not known & (_permitted | set(_imported)):
+    if not _everything and needs_permission(task, _permitted):
         raise ValueError(
-            f"task={task} would import the module {module!r}, which a file names and not you: "
+            f"task={task} would import the module {foreign_module(task)!r}, which a file names and not you: "
             "if you trust it, give --allow-import (in Python: with allow_imports():)"
         )

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 from torchrl_her_recipes.config.groups import Group
-from torchrl_her_recipes.config.options import AUTO, option, what_there_is
+from torchrl_her_recipes.config.options import AUTO, REGISTERED, option, what_there_is
 
 Actions = Literal["continuous", "discrete"]
 
@@ -50,7 +50,7 @@ class LearnerConfig(Group):
         3.0, "gradients of each network are clipped to this norm", above=0, infinite=True
     )
     hidden: int = option(256, "width of the hidden layers", at_least=1)
-    depth: int = option(3, "how many hidden layers the networks have", at_least=2)
+    depth: int = option(3, "number of hidden layers of the networks, at least 2", at_least=2)
     activation: str = option("relu", "behind each hidden layer", choices=("relu", "tanh", "elu"))
     norm: str = option(
         "layer",
@@ -325,7 +325,7 @@ def check_learner(name: str) -> None:
     """
     if name != "auto" and name not in LEARNERS:
         known = ["auto", *LEARNERS]
-        raise ValueError(f"unknown learner {name!r}{what_there_is(name, known, 'learners')}")
+        raise ValueError(f"unknown learner {name!r}{what_there_is(name, known, 'learners')}{REGISTERED}")
 
 
 def priority_power(name: str) -> int:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
-from torchrl_her_recipes.config.options import nearest
+from torchrl_her_recipes.config.options import REGISTERED, nearest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,7 @@ def _instead(name: object) -> str:
         return "; metrics.csv has the same numbers, or choose LogTo(CSVLogger(...)) in Python"
     if name == "mlflow":
         return "; choose LogTo(MLFlowLogger(...)) in Python"
-    return nearest(name, LOGGERS)
+    return nearest(name, LOGGERS) + REGISTERED
 
 
 def check_installed(names: tuple[str, ...]) -> None:

@@ -97,6 +97,9 @@ def default_of(own: Field[Any]) -> Any:
     return own.default_factory()
 
 
+REGISTERED = "; one of your own must be registered by a module, as in torchrl-her --import MODULE"
+
+
 def nearest(name: object, known: Any) -> str:
     """A hint for a name that was probably mistyped; empty if nothing is near.
 

@@ -226,7 +226,12 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     drop_other_goal_sources(given)
     if "goal_sources" not in below.get("hindsight", {}):
         drop_other_goal_sources(below)
-    if "epochs" in given.get("run", {}):
+    asked = given.get("run", {})
+    if asked.get("frames") is not None and "epochs" in asked:
+        raise ValueError(
+            f"frames={asked['frames']} and epochs={asked['epochs']} say the same: give one of them"
+        )
+    if "epochs" in asked:
         below.get("run", {}).pop("frames", None)
     for group, own in without_effect(_groups(over(below, given))):
         if own not in given.get(group, {}) and own in below.get(group, {}):

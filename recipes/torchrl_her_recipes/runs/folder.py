@@ -30,6 +30,10 @@ class RunFolder:
 
     Args:
         path: of the folder; :meth:`create` makes it.
+
+    Example:
+        >>> print(RunFolder("runs/mine"))
+        runs/mine
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -44,6 +48,12 @@ class RunFolder:
         self.goals = self.path / "virtual_goals.png"
         self.goal_map = self.path / "goal_map.npz"
         self.video = self.path / "policy.gif"
+
+    def __repr__(self) -> str:
+        return f"RunFolder({str(self.path)!r})"
+
+    def __str__(self) -> str:
+        return str(self.path)
 
     @classmethod
     def of(cls, source: str | Path) -> RunFolder | None:

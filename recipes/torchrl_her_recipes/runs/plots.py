@@ -222,7 +222,9 @@ def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> 
     """
     box = env.goal_box()
     if box is None or len(box[0]) != 2:
-        raise ValueError(f"goals of {env.task_name} cannot be drawn: they need a box in a plane")
+        raise ValueError(
+            f"goals of {env.task_name} cannot be drawn: goal_box() must return a box of two coordinates"
+        )
     frame = env.picture_box()
     if frame is not None:
         axes.imshow(env.render(0, size=_SCREEN).numpy(), extent=_extent(frame))

@@ -27,6 +27,16 @@ def plot_virtual_goals(folder: Path, out: Path) -> None:
     recipe = runs.homes[0].recipe()
     goals = runs.goal_map()
     if goals is None:
-        raise ValueError(f"{folder} has no map of goals: its runs have written no virtual goals")
+        raise ValueError(f"{folder} has no map of goals: {_missing(runs, recipe.task.name)}")
     task, algo = recipe.task.name, recipe.hindsight.algo
     plot_goals(goals, goal_env(make_task_envs(recipe, 1, [0])), out, title=f"virtual goals: {task}, {algo}")
+
+
+def _missing(runs: Batches, task: str) -> str:
+    """Returns why runs have no map of goals."""
+    rows = runs.rows()
+    if not rows or not rows[-1].get("rows_virtual"):
+        return "its runs have written no virtual goals"
+    if not runs.is_done:
+        return "it is written when a run ends"
+    return f"virtual goals are counted over the box that a task's goal_box() returns, and {task} has none"

@@ -125,3 +125,10 @@ def test_a_run_without_a_map_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
         .err.strip()
         .endswith("has no map of goals: its runs have written no virtual goals")
     )
+    run(build(small(task="chain", epochs=1)), tmp_path / "boxless", progress=False)
+    (tmp_path / "boxless" / "policy.pt").rename(tmp_path / "policy.pt")
+    assert main(["plot", str(tmp_path / "boxless")]) == 2
+    assert capsys.readouterr().err.endswith("has no map of goals: it is written when a run ends\n")
+    (tmp_path / "policy.pt").rename(tmp_path / "boxless" / "policy.pt")
+    assert main(["plot", str(tmp_path / "boxless")]) == 2
+    assert "over the box that a task's goal_box() returns, and chain has none" in capsys.readouterr().err

@@ -90,7 +90,9 @@ def test_an_environment_without_a_scale_has_goals_on_white() -> None:
 
 
 def test_goals_on_a_line_or_without_a_box_are_refused() -> None:
-    with pytest.raises(ValueError, match="goals of chain cannot be drawn: they need a box in a plane"):
+    with pytest.raises(
+        ValueError, match="goals of chain cannot be drawn: goal_box.. must return a box of two"
+    ):
         draw_goals(Figure().subplots(), np.zeros((20, 20)), make_env("chain"), limit=1.0)
 
 

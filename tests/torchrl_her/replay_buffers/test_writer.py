@@ -853,6 +853,10 @@ def test_environments_of_several_workers_are_told_apart_by_their_ids(joined: boo
         assert goal == last[int(observation // 100)]
 
 
+def test_a_writer_without_a_buffer_can_be_printed() -> None:
+    assert repr(HERWriter(REWARD, k=2)).startswith(f"HERWriter({REWARD!r}, HindsightOptions(k=2")
+
+
 def test_rewards_of_another_rule_are_named_once() -> None:
     buffer = make_buffer(10, reward=GoalReward(1e9))
     with pytest.warns(UserWarning, match="gives 0 where the collected reward is -1, and other .* in 4 of 4"):
