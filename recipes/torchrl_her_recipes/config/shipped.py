@@ -40,6 +40,8 @@ def _load(name: str, above: tuple[Path, ...]) -> dict[str, Any]:
     first = values.pop("preset", None)
     with naming(path):
         place(values)  # names that there are not
+        if first is not None:
+            _path(first)
     return values if first is None else merge(_load(first, (*above, path)), values)
 
 

@@ -70,6 +70,9 @@ def test_a_preset_begins_with_another_one(tmp_path: Path) -> None:
     assert values["learner"] == fetch["learner"] | {"tau": 0.01}
     assert values["run"] == fetch["run"] | {"epochs": 3}
     assert values["hindsight"] == fetch["hindsight"]
+    file.write_text("preset: fecth\n")
+    with pytest.raises(ValueError, match=r"own\.yaml cannot be read: there is no preset 'fecth'; did you"):
+        load_preset(str(file))
 
 
 @pytest.mark.parametrize("other", ["a.yaml", "b.yaml"])
