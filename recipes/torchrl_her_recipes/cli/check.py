@@ -8,14 +8,12 @@ import click
 import yaml
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
-from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.cli.train_options import OptionsCommand, complete, requests
 
 
 @click.command(cls=OptionsCommand, short_help="play random actions on a task, and suggest options")
 @click.option("--steps", type=click.IntRange(1), default=3_000, show_default=True, help="random steps")
-@allow_import
 @click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
 def check(options: tuple[str, ...], steps: int) -> int:
     """Play random actions on a task; for instance: torchrl-her check task=gym:FetchPush-v4

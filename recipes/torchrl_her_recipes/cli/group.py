@@ -28,7 +28,7 @@ from torchrl_her_recipes.cli.say import (
 from torchrl_her_recipes.cli.study import report, study
 from torchrl_her_recipes.cli.train import train
 from torchrl_her_recipes.cli.tune import tune
-from torchrl_her_recipes.config.imports import import_modules
+from torchrl_her_recipes.config.imports import allow_imports, import_modules
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.versions import own_version
 
@@ -82,8 +82,22 @@ def group(context: click.Context) -> None:
         context.exit(BAD_INPUT)
 
 
-for _command in (check, train, record, play, export, plot, study, report, tune, listing):
-    group.add_command(_command)
+def _permit(context: click.Context, _parameter: click.Parameter, given: bool) -> None:
+    if given:
+        context.with_resource(allow_imports())  # until the command ends
+
+
+_may_import = click.option(
+    "--allow-import",
+    is_flag=True,
+    expose_value=False,
+    callback=_permit,
+    help="import the module that a task in a file names (module:function, gym:module:ID), if you trust it",
+)
+
+for _command in (check, train, record, play, export, plot, study, report, tune):
+    group.add_command(_may_import(_command))
+group.add_command(listing)
 
 
 class _Notices(logging.Handler):

@@ -9,7 +9,6 @@ import click
 from click.shell_completion import CompletionItem
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `play`
-from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.shipped import policy_names
@@ -45,7 +44,6 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 @click.option(
     "--size", type=click.IntRange(32), help="pixels of one environment (default: 240, in a window 480)"
 )
-@allow_import
 def play(
     source: str,
     window: bool,
@@ -120,7 +118,6 @@ def _film_of(source: Path, *, compared: bool) -> Path:
     help="write a page about the policy beside it, FILE.md",
 )
 @_best
-@allow_import
 def export(
     source: str,
     out: Path | None,

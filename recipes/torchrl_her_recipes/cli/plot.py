@@ -7,13 +7,11 @@ from pathlib import Path
 import click
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
-from torchrl_her_recipes.cli.permission import allow_import
 
 
 @click.command(short_help="draw virtual goals of a run beside q*")
 @click.argument("run", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="the figure (default: virtual_goals.png in RUN)")
-@allow_import
 def plot(run: Path, out: Path | None) -> int:
     """Draw a heat map of a run's virtual goals beside the target q*.
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
-from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import file_name
 
 
@@ -25,7 +24,6 @@ from torchrl_her_recipes.cli.say import file_name
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="seed of starts and goals")
 @click.option("--all", "keep_all", is_flag=True, help="write episodes that fail, too")
 @click.option("--force", is_flag=True, help="replace the file if it exists")
-@allow_import
 def record(
     task: str, episodes: int, out: Path | None, policy: str | None, seed: int, keep_all: bool, force: bool
 ) -> int:

@@ -9,7 +9,6 @@ import click
 from click.shell_completion import CompletionItem
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
-from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, success_line
 from torchrl_her_recipes.config.study import load_study, study_names
 
@@ -40,7 +39,6 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
     default=0.0,
     help="with --ray, the share of a GPU that each batched run gets, as 0.25",
 )
-@allow_import
 def study(
     name: str,
     seeds: int | None,
@@ -108,7 +106,6 @@ def _refuse_follow(_context: click.Context, _parameter: click.Parameter, given: 
     help="also write a study's numbers as tidy files into a folder",
 )
 @click.option("--follow", is_flag=True, hidden=True, expose_value=False, callback=_refuse_follow)
-@allow_import
 def report(names: tuple[str, ...], folder: Path | None, out: Path | None, tidy: Path | None) -> int:
     """Write a page about what there is of the study NAME, or of single runs; trains nothing.
 

@@ -9,7 +9,6 @@ import click
 import yaml
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `build`
-from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, success_line
 from torchrl_her_recipes.cli.train_options import (
     OptionsCommand,
@@ -36,7 +35,6 @@ from torchrl_her_recipes.config.resolve import auto_options
 )
 @click.option("--show", is_flag=True, help="print all options of the run as YAML, and train nothing")
 @folder_option
-@allow_import
 @click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
 def train(
     options: tuple[str, ...],

@@ -11,7 +11,6 @@ from tqdm import tqdm
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `tune`
 from torchrl_her_recipes.cli.overrides import ARGUMENTS
-from torchrl_her_recipes.cli.permission import allow_import
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail
 from torchrl_her_recipes.cli.train_options import complete, folder_option, label, single, with_folder
 from torchrl_her_recipes.config.recipe import make_recipe
@@ -49,7 +48,6 @@ _SEEDS = 3  # of a trial
     "halving, or none (default: median)",
 )
 @folder_option
-@allow_import
 @click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
 def tune(
     options: tuple[str, ...],
