@@ -198,7 +198,8 @@ def plot_values(runs: Sequence[Batches], path: Path) -> None:
         recipe = own.homes[0].recipe()
         actors = [_load_actor(home, run) for home in own.homes for run in range(home.recipe().run.num_runs)]
         _draw(goal_env(make_task_envs(recipe, 1, [0])), axes, actors, recipe.learner.gamma)
-        axes.set_title(own.path.name)
+        home = own.homes[0].path
+        axes.set_title((home.parent if home.name.startswith("seeds_") else home).name)
     save_figure(figure, path)
 
 

@@ -290,7 +290,7 @@ class HindsightBase:
         computed, reward = self._keys.rewards(rows, self.reward_fn, self.achieved_reward)
         differ = ((reward - computed).abs() > LEAST_COST * (1 + computed.abs())).nonzero()
         if len(differ) > 0:
-            one, other = (float(values[differ[0, 0]]) for values in (computed, reward))
+            one, other = (values[differ[0, 0]].item() for values in (computed, reward))
             warnings.warn(
                 f"the reward function gives {one:g} where the collected reward is {other:g}, and other ones "
                 f"in {len(differ):,} of {len(reward):,} rows; pass the environment's own rule, or virtual "

@@ -113,6 +113,6 @@ def test_films_without_a_display(suffix: str, tmp_path: Path) -> None:
 
 
 def test_nothing_is_printed_when_they_are_made() -> None:
-    program = "from torchrl_her_envs.gym.check import make_one; make_one('FetchReach-v4', {}).close()"
+    program = "from torchrl_her_envs.gym.check import make_one; make_one('FetchReach-v4', None, {}).close()"
     made = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert made.stdout + made.stderr == ""
