@@ -230,6 +230,7 @@ def test_the_last_slot_of_a_capacity_that_is_no_multiple_of_the_environments() -
     }
 
 
+@pytest.mark.filterwarnings("ignore:all [0-9]+ episodes have one step")  # of an example, it may be so
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.lists(st.integers(1, 6), min_size=1, max_size=4), min_size=1, max_size=3),
