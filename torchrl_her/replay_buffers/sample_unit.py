@@ -15,8 +15,8 @@ index and priorities are those of the real transitions, and reading (``buffer[:]
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Callable, Iterator
+from functools import cache, partial
 from threading import get_ident
 from typing import Any, ClassVar, NamedTuple
 from uuid import uuid4
@@ -69,6 +69,7 @@ class _Stored(NamedTuple):
     after: Tensor  # [n, g], those that the action achieved: the candidates
     wanted: Tensor  # [n, g], those that were really wanted; of their type, if goals are drawn from them
     episodes: EpisodeIndex
+    ends: Callable[[], bool]  # whether episodes end at their goals; the reward function is asked once
     recent: dict[tuple[str, int], Tensor]  # rows of the newest episodes, as far as they were asked for
 
 
@@ -426,7 +427,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             self._compare_rewards(rows)
             if "actual" in self.options.sources:
                 wanted = stored_as(self._keys.asked_for(rows), after, self._keys.next_achieved)
-            self._stored = stored = _Stored(storage, state, rows, after, wanted, episodes, {})
+            ends = cache(partial(ends_at_goals, self.reward_fn, self._keys.after(rows, self.reward_fn)))
+            self._stored = stored = _Stored(storage, state, rows, after, wanted, episodes, ends, {})
         return stored
 
     def _draw(
@@ -489,7 +491,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         rule = partial(missed, self.reward_fn, achieved_reward=self.achieved_reward)
         before = self._keys.before(stored.rows, self.reward_fn)
         kept = rule(before[group].unsqueeze(1), goals.unsqueeze(2)).all(-1)
-        if ends_at_goals(self.reward_fn, self._keys.after(stored.rows, self.reward_fn)):
+        if stored.ends():
             return kept
         episodes = stored.episodes
         start = before[episodes.row(episodes.episode(episodes.place(group[:, -1]))[0])]
