@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase
 
 Box = tuple[list[float], list[float]]  # the least and the greatest coordinates
+Names = str | Sequence[str]  # of an entry that an environment shows, or of several
 INFO = "info"  # the entry of transitions that holds what rewards read besides goals
 _HAIR = 1e-6  # width of the bounds of a fixed action, relative to its value
 

@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_her_envs.common.goal_env import (
     INFO,
+    Names,
     TaskTraits,
     bounded_actions,
     choose_indices,
@@ -40,7 +41,6 @@ from torchrl_her_envs.common.seeding import as_seeds, block_keys
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
 _GOALS = KEYS[1:]
-Names = str | Sequence[str]
 _SUCCESS = "is_success"
 # Options that every such environment takes.
 _OURS = ("max_steps", "termination", "achieved_reward", "info_keys", *(f"{key}_key" for key in KEYS))

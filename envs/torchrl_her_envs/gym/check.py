@@ -15,10 +15,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
+from torchrl_her_envs.common.goal_env import Names
 from torchrl_her_envs.gym.goal_functions import GoalFunction
 from torchrl_her_envs.gym.layout import Layout
 from torchrl_her_envs.gym.quiet import make_quietly
-from torchrl_her_envs.gym.renamed import Names
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
 REWARD, TERMINATED = "compute_reward", "compute_terminated"

@@ -17,7 +17,14 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import GymWrapper
 
-from torchrl_her_envs.common.goal_env import INFO, TaskTraits, bounded_actions, choose_indices, needs_info
+from torchrl_her_envs.common.goal_env import (
+    INFO,
+    Names,
+    TaskTraits,
+    bounded_actions,
+    choose_indices,
+    needs_info,
+)
 from torchrl_her_envs.common.goal_rules import (
     Ends,
     GoalEnds,
@@ -57,7 +64,6 @@ from torchrl_her_envs.gym.goal_functions import GoalFunction
 from torchrl_her_envs.gym.infos import Infos
 from torchrl_her_envs.gym.layout import Layout
 from torchrl_her_envs.gym.quiet import make_quietly
-from torchrl_her_envs.gym.renamed import Names
 
 
 def make_gym_env(

@@ -11,7 +11,8 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from torchrl_her_envs.gym.renamed import Names, RenamedKeys
+from torchrl_her_envs.common.goal_env import Names
+from torchrl_her_envs.gym.renamed import RenamedKeys
 
 
 def make_quietly(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 import gymnasium
 from gymnasium import spaces
 
-Names = str | Sequence[str]
+from torchrl_her_envs.common.goal_env import Names
 
 
 class RenamedKeys(gymnasium.ObservationWrapper):

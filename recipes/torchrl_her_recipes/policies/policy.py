@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -211,10 +212,11 @@ class Policy(TensorDictModuleBase):
 
     def measure(self, episodes: int = 1_000, *, seed: int = _MEASURED) -> tuple[float, float]:
         """Returns the shares of episodes whose goal is achieved at the last step, and at some step."""
-        env = self.envs(episodes, seed=seed)
-        rollout = evaluate(env, self, max_steps=goal_env(env).max_steps)
-        at_last, at_some = (metric(rollout, **judging(env)).float().mean() for metric in (success, reached))
-        env.close()
+        with closing(self.envs(episodes, seed=seed)) as env:
+            rollout = evaluate(env, self, max_steps=goal_env(env).max_steps)
+            at_last, at_some = (
+                metric(rollout, **judging(env)).float().mean() for metric in (success, reached)
+            )
         return float(at_last), float(at_some)
 
     def save(self, path: str | Path, *, card: bool = True) -> None:
@@ -239,9 +241,8 @@ class Policy(TensorDictModuleBase):
             check_free(card_path(path))
         if path.suffix == SUFFIX:
             need_onnx()
-            env = self.envs(16, seed=_COMPARED)
-            states = evaluate(env, self, max_steps=goal_env(env).max_steps).select(*KEYS).flatten()
-            env.close()
+            with closing(self.envs(16, seed=_COMPARED)) as env:
+                states = evaluate(env, self, max_steps=goal_env(env).max_steps).select(*KEYS).flatten()
             info = write_onnx(self.module, info, self.recipe, path, states=states)
         else:
             described = json.loads(json.dumps(info.to_dict()))  # lists for tuples
@@ -297,7 +298,8 @@ def export_policy(
     info = replace(policy.info, task=task or policy.info.task, versions=present_versions())
     if task is not None:
         permit_task(task)  # named by the caller
-        policy.info.check_plays(make_task_envs(policy.recipe.replace(task=task), 1, [0], scaled=False), task)
+        with closing(make_task_envs(policy.recipe.replace(task=task), 1, [0], scaled=False)) as env:
+            policy.info.check_plays(env, task)
     measured = info.task == policy.info.task and not math.isnan(info.success)
     policy.info = info
     if not measured:

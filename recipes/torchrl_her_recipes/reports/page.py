@@ -25,13 +25,7 @@ from torchrl_her_recipes.reports.tidy import Results, read_study
 from torchrl_her_recipes.runs.plots import band
 from torchrl_her_recipes.studies.plan import duration
 
-_AT_THE_END = (
-    "success",
-    "reached",
-    "distance",
-    "kl",
-    "q_bias",
-)  # shown with intervals
+_AT_THE_END = ("success", "reached", "distance", "kl", "q_bias")  # shown with intervals
 
 
 def write_report(study: Study, folder: Path, out: Path) -> Path:

@@ -23,9 +23,8 @@ from torchrl_her_recipes.runs.plots import save_figure
 
 _FEWEST = 5  # complete trials, from which importances are estimated
 _SHOWN = 5  # trials in the table that is printed
-DEFAULT = (
-    "default"  # attribute of the trial of the recipe as it is: its values, some perhaps outside of the space
-)
+# Attribute of the trial of the recipe as it is: its values, some of which may lie outside of the space.
+DEFAULT = "default"
 
 
 def folder_of(trial: FrozenTrial | Trial) -> str:
