@@ -44,6 +44,9 @@ class ThrowingEnv(BatchedEnv):
     Positions are shown as ``2 * screen - 1``. The environments are independent: environment k with a
     given seed does the same in every batch, and a partial reset leaves the others as they are.
 
+    pymunk computes contacts and bounces only. Free flight is summed in Chipmunk's order, with equal results;
+    hand, arm, catching, goals and rewards are array code.
+
     Args:
         task: what is to be done; see :data:`~torchrl_her_envs.TASKS`.
         num_envs: N, the number of environments.
