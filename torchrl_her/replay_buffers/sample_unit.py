@@ -125,6 +125,12 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             not told when the buffer is emptied, so call its ``clear`` then. It is not part of the buffer's
             state but has a ``state_dict`` of its own.
         generator: source of the random numbers; None for the buffer's (``buffer.set_rng``).
+        metadata: whether batches say where goals are from, under the names of TorchRL's units.
+            ``"step_offset"`` is the number of steps from a transition's first state to that in which its goal
+            was achieved: 1 for what its own action achieved, and below 1 for goals of the past.
+            ``"validity_mask"`` tells where that counts: at virtual transitions whose goal is of their own
+            episode, those that fill up a slice excepted. Elsewhere the offset is 0. ``"anchor_index"`` is the
+            index in the storage.
         **changes: options by name, as in the example; all are listed in
             :class:`~torchrl_her.HindsightOptions`.
 
@@ -180,10 +186,11 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         *,
         weights: GoalWeights | None = None,
         generator: torch.Generator | None = None,
+        metadata: bool = False,
         **changes: Any,
     ) -> None:
         super().__init__(reward_fn, options, weights=weights, **changes)
-        self.generator = generator
+        self.generator, self.metadata = generator, metadata
         self._stored: _Stored | None = None
         self._token = uuid4().hex
 
@@ -199,8 +206,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         """Chooses the goals that :meth:`relabel` puts in.
 
         Returns:
-            ``(index, info)``, unchanged; but under a sampler of slices without its entries that are written
-            over a batch afterwards and would hide where it terminates.
+            ``(index, info)``, unchanged but for the metadata, if asked for; under a sampler of slices without
+            its entries that are written over a batch afterwards and would hide where it terminates.
         """
         pending = self._chosen.pop(self._key(), None) is not None
         stored = self._read(storage)
@@ -213,15 +220,15 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         shape, row = row.shape, row.flatten()
         sampler, ends = self._slice_sampler(storage), None
         own = torch.arange(len(row), device=row.device).unsqueeze(-1)
+        inside = _moved(info.get(MASK), row.device)  # type: ignore[call-overload]  # TorchRL's keys may be nested
         if len(shape) == 2:  # a row for each slice: output_layout="batch_time"
             own = own.view(shape)
         elif sampler is not None:
             ends = self._ends(sampler, info, row.device)
             place = stored.episodes.place(row)
-            inside = _moved(info.get(MASK), row.device)  # type: ignore[call-overload]  # TorchRL's keys may be nested
             own = slice_positions(place, stored.episodes.episode(place)[0], ends, inside)
         generator = self.generator if self.generator is not None else generator_of(storage)
-        rows, goals = self._choose(stored, row, own, generator)
+        rows, goals, lenders = self._choose(stored, row, own, generator)
         if self.weights is not None:
             self.weights.update(goals)
         ahead = None if self.options.n_steps == 1 else self._look_ahead(stored, row, rows, goals)
@@ -229,6 +236,17 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         if ends is not None:
             hidden = {self._keys.terminated, self._keys.done}
             info = {key: value for key, value in info.items() if key not in hidden}
+        if lenders is not None:
+            valid, episodes = lenders >= 0, stored.episodes
+            offset = torch.where(valid, episodes.place(lenders) - episodes.place(row) + 1, 0)
+            if inside is not None:
+                valid &= inside.flatten()
+            info = {
+                **info,
+                "step_offset": offset.view(shape),
+                "anchor_index": torch.stack(index, -1) if isinstance(index, tuple) else index,
+                "validity_mask": valid.view(shape),
+            }
         return index, info
 
     def relabel(self, data: TensorDictBase) -> TensorDictBase:
@@ -326,8 +344,10 @@ class HERSampleUnit(HindsightBase, SampleUnit):
 
     def _choose(
         self, stored: _Stored, row: Tensor, own: Tensor, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Places [V] in a batch of rows [B] that become virtual, and the goals [V, g] that they get.
+
+        With metadata, also the rows [B] of their own episodes that achieved these goals; -1 for none.
 
         ``own``, [G, L], are the places in the batch that get the same goal: single ones, or those of a slice.
         """
@@ -339,15 +359,19 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         own, number = own[becomes], torch.bucketize(coin[becomes] * (self.k + 1), bounds, right=True)
         virtual = torch.zeros_like(row, dtype=torch.bool)
         goals = stored.after.new_zeros(len(row), *stored.after.shape[1:])
+        lenders = torch.full_like(row, -1) if self.metadata else None
         for place, source in enumerate(sources):
             part = own[number == place]
-            drawn, valid = self._draw(stored, row[part], source, generator)
+            lent, valid = self._draw(stored, row[part], source, generator)
             if valid is not None:
-                part, drawn = part[valid], drawn[valid]
+                part, lent = part[valid], lent[valid]
             virtual.index_fill_(0, part.flatten(), True)
+            drawn = (stored.wanted if source == "actual" else stored.after)[lent]
             goals.index_put_((part,), drawn.unsqueeze(1).expand(-1, part.shape[1], -1))
+            if lenders is not None and source not in RECENT:
+                lenders[part] = lent.unsqueeze(1)
         rows = virtual.nonzero().squeeze(-1)
-        return rows, goals[rows]
+        return rows, goals[rows], lenders
 
     def _ends(self, sampler: SliceSampler, info: dict[str, Any], device: torch.device) -> Tensor | None:
         """Where a sampler of slices says that they end, [B, 1]; None if it does not."""
@@ -434,12 +458,12 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _draw(
         self, stored: _Stored, group: Tensor, source: Strategy, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor | None]:
-        """Goals [V, g] from a source, and for which groups [V] there is one; None for all.
+        """Rows [V] whose goals a source gives, and for which groups [V] there is one; None for all.
 
         Groups [V, L] are rows that get the same goal, which is one of their last row: single rows, or slices.
         """
         if len(group) == 0:
-            return stored.after[:0], None
+            return group[:, 0], None
         if source in RECENT:
             return self._draw_recent(stored, group, str(source), generator)
         episodes, row = stored.episodes, group[:, -1]
@@ -447,11 +471,10 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         begin, behind = episodes.episode(place)
         first, end = (bound + begin for bound in candidate_range(source, place - begin, behind - begin))
         if self.weights is not None and not self.weights.alike:
-            lent, valid = self._draw_by_likelihood(stored, group, first, end, generator)
-            return stored.after[lent], valid
+            return self._draw_by_likelihood(stored, group, first, end, generator)
         lent = episodes.row(draw_alike(first, end, 1, generator=generator).squeeze(-1))
         if not self.filter_achieved:
-            return stored.after[lent], None
+            return lent, None
         # Goals are proposed without the filter; only where it rejects one are all candidates looked at.
         kept = self._kept(stored, group, stored.after[lent].unsqueeze(1)).squeeze(1)
         again = (~kept).nonzero().squeeze(-1)
@@ -459,12 +482,12 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         lent[again], valid[again] = self._draw_by_likelihood(
             stored, group[again], first[again], end[again], generator
         )
-        return stored.after[lent], valid
+        return lent, valid
 
     def _draw_recent(
         self, stored: _Stored, group: Tensor, source: str, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """The same from the goals that were wanted or achieved in the newest episodes."""
+        """The same for goals that were wanted or achieved in the newest episodes."""
         goals, newest = stored.after, stored.episodes.newest
         if source == "actual":
             goals, newest = stored.wanted, stored.episodes.newest_episodes
@@ -484,7 +507,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             draws=RunDraws([generator]),
             tries=TRIES,
         )
-        return goals[index.squeeze(-1)], valid
+        return index.squeeze(-1), valid
 
     def _kept(self, stored: _Stored, group: Tensor, goals: Tensor) -> Tensor:
         """The filter: which of the goals [V, c, g] groups [V, L] may take, [V, c] of bool."""

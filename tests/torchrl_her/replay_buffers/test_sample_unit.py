@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+import torchrl.data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
@@ -882,6 +883,94 @@ def test_steps_never_cross_episodes_in_a_ring() -> None:
     ahead = rows["next", "observation"][:, 0] - rows["observation"][:, 0]
     assert torch.equal(ahead, rows["steps_to_next_obs"][:, 0].float())
     assert ((rows["next", "observation"][:, 0] % 100) <= 5).all()
+
+
+# Metadata: where goals are from
+
+METADATA = {"step_offset", "anchor_index", "validity_mask"}
+
+
+def metadata(rows: TensorDict) -> list[Tensor]:
+    """Step offset and validity of transitions, and by how many states their goals are ahead, [n] each."""
+    ahead = rows["desired_goal"][..., 0] - rows["observation"][..., 0]
+    return [rows["step_offset"].flatten(), rows["validity_mask"].flatten(), ahead.flatten().long()]
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+@pytest.mark.parametrize("ndim", [1, 2])
+def test_metadata_by_hand(ndim: int, n_steps: int) -> None:
+    buffer = make_buffer(strategy="final", k=NEVER_REAL, ndim=ndim, metadata=True, n_steps=n_steps, gamma=0.9)
+    batch = make_batch([[4, 2], [1, 5]])
+    buffer.extend(batch.reshape(-1) if ndim == 1 else batch)
+    rows = buffer.sample(300)
+    to_the_end = {tag(0, 0, 0): 4, tag(0, 0, 1): 3, tag(0, 0, 2): 2, tag(0, 0, 3): 1}
+    to_the_end |= {tag(0, 1, 0): 2, tag(0, 1, 1): 1, tag(1, 0, 0): 1}
+    to_the_end |= {tag(1, 1, step): 5 - step for step in range(5)}
+    assert rows["step_offset"].tolist() == [to_the_end[own] for own in tags(rows["observation"])]
+    assert rows["validity_mask"].all()
+    assert torch.equal(rows["anchor_index"], rows["index"])
+
+
+def test_offsets_to_goals_of_the_past_are_below_one() -> None:
+    buffer = make_buffer(14, strategy="episode", k=1, metadata=True)
+    for episode in range(4):  # the ring begins again
+        buffer.extend(flat([[5] * 4], steps=5, first=[(episode, 0)]))
+    rows = buffer.sample(500)
+    offset, valid, ahead = metadata(rows)
+    assert torch.equal(valid, rows["virtual"].flatten())
+    assert torch.equal(offset, torch.where(valid, ahead, 0))
+    assert set(offset[valid].tolist()) == set(range(-3, 6))
+
+
+@pytest.mark.parametrize("source", ["actual", "achieved"])
+def test_goals_of_other_episodes_have_no_offset(source: str) -> None:
+    buffer = make_buffer(goal_sources={"final": NEVER_REAL, source: NEVER_REAL}, metadata=True)
+    buffer.extend(flat([[3, 3]]))
+    offset, valid, ahead = metadata(buffer.sample(400))
+    assert 0.4 < valid.float().mean() < 0.6
+    assert torch.equal(offset[valid], ahead[valid])
+    assert (offset[~valid] == 0).all()
+
+
+@pytest.mark.parametrize("kind", list(SLICES))
+def test_each_transition_of_a_slice_has_its_own_offset(kind: str) -> None:
+    buffer = make_buffer(sampler=SLICES[kind](), k=4, metadata=True)
+    buffer.extend(flat([[6, 9, 5], [8, 4, 8]]))
+    rows = buffer.sample(24)
+    offset, valid, ahead = metadata(rows)
+    filled = ~rows.get(("collector", "mask"), torch.ones(24, dtype=torch.bool)).flatten()
+    assert torch.equal(valid, rows["virtual"].flatten() & ~filled)
+    assert torch.equal(rows["anchor_index"], rows["index"])
+    assert torch.equal(offset[valid], ahead[valid])
+
+
+@pytest.mark.parametrize("ndim", [1, 2])
+def test_metadata_changes_nothing_else(ndim: int) -> None:
+    plain, told = (make_buffer(100, per=True, ndim=ndim, metadata=own) for own in (False, True))
+    batch = make_batch([[6, 9, 5], [8, 4, 8]])
+    for buffer in (plain, told):
+        buffer.extend(batch if ndim == 2 else batch.reshape(-1))
+    for _ in range(3):
+        rows, more = (buffer.sample(32) for buffer in (plain, told))
+        assert set(more.keys()) - set(rows.keys()) == METADATA
+        assert (more.exclude(*METADATA) == rows).all()
+        for buffer, own in ((plain, rows), (told, more)):
+            own["td_error"] = own["observation"][:, 0]
+            buffer.update_tensordict_priority(own)
+
+
+@pytest.mark.skipif(not hasattr(torchrl.data, "SubgoalTriplet"), reason="TorchRL has it since 0.15")
+def test_metadata_has_the_names_and_types_of_torchrls_unit() -> None:
+    buffer, index = make_buffer(), torch.tensor([0, 2])
+    buffer.extend(flat([[4]]))
+    _, own = HERSampleUnit(REWARD, metadata=True).expand(index, {}, buffer.storage)
+    _, theirs = torchrl.data.SubgoalTriplet().expand(index, {}, buffer.storage)
+    assert {key: value.dtype for key, value in own.items()} == {
+        key: value.dtype for key, value in theirs.items()
+    }
+    assert {key: value.shape for key, value in own.items()} == {
+        key: value.view(2, 4)[:, 0].shape for key, value in theirs.items()
+    }
 
 
 # Ids that are used again
