@@ -64,6 +64,8 @@ class GoalEnv(Protocol):
 
     def state_names(self) -> dict[str, list[int]]: ...
 
+    def action_limits(self) -> tuple[Tensor, Tensor]: ...
+
     def goal_box(self) -> Box | None: ...
 
     def picture_box(self) -> Box | None: ...
@@ -166,6 +168,19 @@ class TaskTraits:
         spec = cast(Any, self).observation_spec
         seen, goal = (spec[key].shape[-1] for key in ("observation", "desired_goal"))
         return {"observation": list(range(seen)), "desired_goal": list(range(seen, seen + goal))}
+
+    def action_limits(self) -> tuple[Tensor, Tensor]:
+        """The least and the greatest action, [entries] each, of the type that the task itself takes.
+
+        They are equal at fixed entries, to which ``action_spec`` gives a width.
+
+        Example:
+            >>> from torchrl_her_envs import make_env
+            >>> make_env("hand_v1").action_limits()
+            (tensor([-1., -1., -1.]), tensor([1., 1., 1.]))
+        """
+        space = cast(Any, self).action_spec_unbatched.space
+        return space.low, space.high
 
     def goal_box(self) -> Box | None:
         """The least and greatest coordinates that achieved goals can have; None if the task does not say.

@@ -563,6 +563,11 @@ class OwnGoalEnv(TaskTraits, EnvBase):
             return bounded_actions(action.space.low, action.space.high, n)
         raise ValueError(f"{self._name}'s actions must be Bounded or Categorical, got {action}")
 
+    def action_limits(self) -> tuple[Tensor, Tensor]:
+        """Those of the environment's own spec."""
+        space = self._envs[0].action_spec_unbatched.space
+        return space.low.flatten(), space.high.flatten()
+
     def _own_actions(self, actions: Tensor) -> Tensor:
         """Actions of all environments in the shape, bounds and type of their own specs."""
         own = self._envs[0].action_spec_unbatched

@@ -450,8 +450,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         if isinstance(space, spaces.Discrete):
             self.action_spec = Categorical(n=int(space.n), shape=(n,), dtype=torch.int64)
         else:
-            low, high = map(torch.as_tensor, (space.low, space.high))
-            self.action_spec = bounded_actions(low, high, n)
+            self.action_spec = bounded_actions(*self.action_limits(), n)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32)
         self.done_spec = self._make_done_spec()
 
@@ -462,6 +461,11 @@ class GymGoalEnv(TaskTraits, GymWrapper):
             return rows + space.start
         space = cast(spaces.Box, space)
         return np.clip(Layout(space, "action").unflatten(rows), space.low, space.high)
+
+    def action_limits(self) -> tuple[Tensor, Tensor]:
+        """Those of the space."""
+        space = cast(spaces.Box, self._env.single_action_space)
+        return torch.as_tensor(space.low).flatten(), torch.as_tensor(space.high).flatten()
 
     def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
         """Observation and goals in float32, and ``is_success``; further keys are left out."""

@@ -18,6 +18,7 @@ KEYS = ("observation", "desired_goal")
 _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict")
 _WIDEST = 1 << 16  # of an entry or an action; more is a damaged file
 _FLOATS = ("float32", "float64")
+_WHOLE = ("bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +31,7 @@ class PolicyInfo:
         dtype: of both.
         action_shape: of one action: [width], or [] for an integer.
         action_dtype: ``"int64"`` for an integer, otherwise that of the inputs.
+        task_dtype: of the actions that the task itself takes, to which :meth:`Policy.predict` rounds.
         low, high: the least and the greatest actions that the task takes, one number for each entry.
         normalize_clip: normalized inputs are clipped to plus and minus this; None if the policy does not
             normalize. It normalizes by itself: what it reads is what the task shows.
@@ -54,6 +56,7 @@ class PolicyInfo:
     dtype: str = "float32"
     action_shape: tuple[int, ...]
     action_dtype: str = "float32"
+    task_dtype: str = "float32"
     low: tuple[float, ...]
     high: tuple[float, ...]
     normalize_clip: float | None = None
@@ -78,6 +81,8 @@ class PolicyInfo:
         _check("dtype", self.dtype in _FLOATS, f"be one of {', '.join(_FLOATS)}", self.dtype)
         allowed = ("int64",) if self.discrete else _FLOATS
         _check("action_dtype", self.action_dtype in allowed, f"be {' or '.join(allowed)}", self.action_dtype)
+        known = (*_FLOATS, "float16", *_WHOLE)
+        _check("task_dtype", self.task_dtype in known, f"be one of {', '.join(known)}", self.task_dtype)
         flat = len(self.action_shape) < 2 and all(map(_is_width, self.action_shape))
         _check("action_shape", flat, f"have one width from 1 to {_WIDEST}, or none", self.action_shape)
         entries = math.prod(self.action_shape)
@@ -102,6 +107,11 @@ class PolicyInfo:
         """Whether an action is one integer."""
         return not self.action_shape
 
+    @property
+    def whole(self) -> bool:
+        """Whether the task takes whole numbers alone."""
+        return self.task_dtype in _WHOLE
+
     def to_dict(self) -> dict[str, Any]:
         """All values, as plain data."""
         return asdict(self)
@@ -117,7 +127,8 @@ class PolicyInfo:
         if not isinstance(values, Mapping) or (unknown := [name for name in values if name not in known]):
             got = type(values).__name__ if not isinstance(values, Mapping) else ", ".join(map(str, unknown))
             raise ValueError(f"a policy's card must have {', '.join(known)}, got {got}")
-        own = {"reached": math.nan, **values}  # older files have none
+        older = {"reached": math.nan, "task_dtype": values.get("action_dtype")}  # not in older files
+        own = {**older, **values}
         for name in ("action_shape", "low", "high"):
             _check(name, isinstance(own.get(name), list | tuple), "be a list", own.get(name))
             own[name] = tuple(own[name])
@@ -165,13 +176,20 @@ def describe_env(env: EnvBase) -> dict[str, Any]:
         >>> own["widths"], own["action_shape"], own["high"]
         ({'observation': 4, 'desired_goal': 4}, (), (3.0,))
     """
-    shown, action = goal_env(env).observation_spec, env.action_spec_unbatched
+    task, action = goal_env(env), env.action_spec_unbatched
+    shown = task.observation_spec
     own = {"widths": {key: int(shown[key].shape[-1]) for key in KEYS}}
     if isinstance(action, Categorical):
-        last = float(action.space.n - 1)
-        return {**own, "action_shape": (), "action_dtype": "int64", "low": (0.0,), "high": (last,)}
-    limits = {name: tuple(getattr(action.space, name).double().tolist()) for name in ("low", "high")}
-    return {**own, "action_shape": tuple(action.shape), **limits}
+        whole = {"action_dtype": "int64", "task_dtype": "int64"}
+        return {**own, **whole, "action_shape": (), "low": (0.0,), "high": (float(action.space.n - 1),)}
+    low, high = task.action_limits()
+    return {
+        **own,
+        "action_shape": tuple(action.shape),
+        "task_dtype": str(low.dtype).removeprefix("torch."),
+        "low": tuple(low.double().tolist()),
+        "high": tuple(high.double().tolist()),
+    }
 
 
 def present_versions() -> dict[str, str]:

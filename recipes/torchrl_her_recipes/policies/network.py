@@ -56,8 +56,8 @@ def load_network(info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor]
     player = _with_norm(actor, info, recipe)
     player.load_state_dict(dict(weights))
     net = builder.greedy(actor)
-    bounds = (*info.low, *info.high)
-    if not info.discrete and {*map(abs, bounds)} != {1.0} and all(map(math.isfinite, bounds)):
+    scaled = {*info.low} != {-1.0} or {*info.high} != {1.0}
+    if not info.discrete and scaled and all(map(math.isfinite, (*info.low, *info.high))):
         net = ScaledActions(net, info.low, info.high)
     greedy = TensorDictModule(net, in_keys=list(KEYS), out_keys=["action"])
     norm = player.norm if isinstance(player, NormalizedPolicy) else None

@@ -173,7 +173,8 @@ class Policy(TensorDictModuleBase):
                 greedy.
 
         Returns:
-            The action, [width] or [n, width], and None in place of a recurrent state.
+            The action, [width] or [n, width], in the bounds and of the type of the task's own, and None in
+            place of a recurrent state.
 
         Example:
             >>> import gymnasium, torchrl_her_envs
@@ -191,7 +192,11 @@ class Policy(TensorDictModuleBase):
                     f"got shape {list(value.shape)}"
                 )
         batch = seen["observation"].shape[:-1]
-        return self.module(TensorDict(seen, batch))["action"].numpy(), None
+        action = self.module(TensorDict(seen, batch))["action"].numpy()
+        if self.info.discrete:
+            return action, None
+        action = np.clip(action, np.array(self.info.low), np.array(self.info.high))  # in float64
+        return (np.rint(action) if self.info.whole else action).astype(self.info.task_dtype), None
 
     def envs(self, number: int, *, seed: int = 0, pictures: bool = False) -> EnvBase:
         """Makes environments of the policy's task.

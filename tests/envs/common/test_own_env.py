@@ -108,6 +108,7 @@ def test_actions_have_the_shape_and_type_of_their_spec_and_fixed_ones_stay() -> 
     assert [own.pressed for own in env._envs] == [[[0, 4]], [[3, 4]]]
     fixed = make_own_env(f"{HERE}:Buttons", fixed=True)
     assert (fixed.action_spec.space.low < fixed.action_spec.space.high).all()
+    assert [side.tolist() for side in fixed.action_limits()] == [[0, 2], [4, 2]]
     fixed.rollout(4)
     (seen,) = fixed._envs
     assert {pressed for _, pressed in seen.pressed} == {2}

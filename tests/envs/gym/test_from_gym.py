@@ -89,8 +89,12 @@ def test_actions_have_the_shape_type_and_bounds_of_their_space(actions: spaces.B
     spec = env.action_spec_unbatched
     assert isinstance(spec, Bounded)
     assert (spec.space.low < spec.space.high).all()
-    for bound, side in ((actions.low, spec.space.low), (actions.high, spec.space.high)):
+    limits = zip(
+        (actions.low, actions.high), env.action_limits(), (spec.space.low, spec.space.high), strict=True
+    )
+    for bound, own, side in limits:
         assert np.array_equal(env.read_action(side.expand(3, -1))[0], bound)
+        assert np.array_equal(own.numpy(), bound.flatten())
     assert rollout(TransformedEnv(env, ActionScaling()))["action"].shape == (3, 40, width)
 
 

@@ -45,6 +45,7 @@ def test_a_card_survives_plain_data() -> None:
         ({"widths": {"observation": 3, "desired_goal": 1 << 17}}, "each from 1 to 65536"),
         ({"dtype": "float16"}, "dtype of a policy must be one of float32, float64, got 'float16'"),
         ({"action_dtype": "int64"}, "action_dtype of a policy must be float32 or float64, got 'int64'"),
+        ({"task_dtype": "complex64"}, "task_dtype of a policy must be one of float32, .*, got 'complex64'"),
         ({"action_shape": (2, 2)}, "action_shape of a policy must have one width"),
         ({"low": ()}, r"low of a policy must have 1 numbers, got '\(\)'"),
         (

@@ -11,6 +11,8 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from tensordict import TensorDict
 
 from torchrl_her import evaluate, load_checkpoint, save_checkpoint, success
@@ -22,6 +24,7 @@ from torchrl_her_recipes.config.shipped import policy_names
 from torchrl_her_recipes.policies import policy
 from torchrl_her_recipes.policies.network import ScaledActions
 
+from ...envs.gym.walk import Walk
 from ..small import small
 from .tiny import needs_onnx, states, tiny_policy
 
@@ -276,6 +279,38 @@ def test_predict_takes_what_gymnasium_shows() -> None:
     np.testing.assert_array_equal(both, own(seen)["action"].numpy())
     with pytest.raises(ValueError, match=r"observation must have 9 numbers for .*, got shape \[3\]"):
         own.predict({**shown, "observation": np.zeros(3)})
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [
+        spaces.Box(0, np.array([4, 9]), dtype=np.int32),
+        spaces.Box(0, 1, (3,), dtype=np.uint8),
+        spaces.Box(np.float32([-0.5, 0.3]), np.float32([1.0, 0.3])),  # the second is fixed
+        spaces.Box(np.float32([-1.0, 1.0]), np.float32([1.0, 1.0])),
+        spaces.Box(np.array([-0.1, 0.1]), np.array([0.1, 0.1]), dtype=np.float64),  # 0.1 is none of float32
+    ],
+)
+def test_predict_gives_actions_of_the_space(
+    actions: spaces.Box, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own_walk = EnvSpec("tests/OwnWalk-v0", lambda: Walk(actions=actions), max_episode_steps=6)
+    monkeypatch.setitem(gymnasium.registry, own_walk.id, own_walk)
+    plain = {"learner": "ddpg", "gamma": 0.9, "normalize": False, "norm": "none"}
+    tiny_policy(task=f"gym:{own_walk.id}", **plain).save(tmp_path / "mine.pt")
+    assert ("round them" in (tmp_path / "mine.md").read_text()) == (actions.dtype.kind in "iu")
+    own = load_policy(tmp_path / "mine.pt")
+    seen = {key: 300 * value.numpy() for key, value in states(own.info, 200).items()}  # to all sides
+    taken, _ = own.predict(seen)
+    assert taken.dtype == actions.dtype
+    assert all(actions.contains(action) for action in taken)
+    moving = actions.low < actions.high
+    assert (taken[:, moving].min(0) < taken[:, moving].max(0)).any()
+    one, _ = own.predict({key: value[0] for key, value in seen.items()})
+    assert actions.contains(one)
+    given = own(TensorDict({key: torch.as_tensor(value) for key, value in seen.items()}, [200]))["action"]
+    assert given.is_floating_point()
+    assert (np.abs(given.numpy() - taken) <= (0.5 if own.info.whole else 1e-6)).all()
 
 
 def test_a_policy_that_was_saved_is_the_same(tmp_path: Path) -> None:
