@@ -4,8 +4,9 @@
     python docs/make_results.py         # tables and pictures of the numbers that are in results/
 
 For every study that there is, it prints a table and draws ``docs/images/STUDY.png``; for those of
-virtual goals, if their histograms are there, also ``docs/images/STUDY_goals.png``. The pages of the
-studies are made by ``make docs``.
+virtual goals, if their histograms are there, also ``docs/images/STUDY_goals.png``, and for those of the
+thesis ``docs/images/STUDY_thesis.png``, the metrics of its other figures as far as they are stored. The
+pages of the studies are made by ``make docs``.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchrl_her_envs import make_env
-from torchrl_her_recipes.config.study import Study, load_study
+from torchrl_her_recipes.config.study import load_study
 from torchrl_her_recipes.reports.results import LAST, Combination, at_the_end
 from torchrl_her_recipes.reports.tidy import is_results, read_results, write_results
 from torchrl_her_recipes.runs.plots import draw_goals, plot_comparison
@@ -53,6 +54,13 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "initialisation": "initialisation",
 }
 MAPS = ("ibs", "bias")  # studies whose maps of virtual goals are drawn
+POSITIVE = ("rows_real_positive", "rows_virtual_positive", "rows_useful_virtual_positive")
+THESIS = {  # metrics of the thesis's figures beside success
+    "ibs": ("distance",),
+    "bias": ("distance", "q", "q_bias"),
+    "filter_bias": ("distance", "q"),
+    "curriculum": ("distance", *POSITIVE),
+}
 
 Rows = list[dict[str, float]]
 
@@ -113,12 +121,12 @@ def beginning_of_fetch(other: Combination) -> Combination:
     return replace(cell, algorithm="uniform", rows=rows)
 
 
-def draw_study(cells: Sequence[Combination], study: Study, path: Path) -> None:
-    """The metrics of the study's figure over environment steps."""
+def draw_study(cells: Sequence[Combination], metrics: Sequence[str], path: Path) -> None:
+    """Metrics of a study over environment steps."""
     panels: dict[str, dict[str, Rows]] = {}
     for cell in cells:
         panels.setdefault(cell.task, {})[cell.algorithm] = cell.rows
-    plot_comparison(panels, path, metrics=study.figure)
+    plot_comparison(panels, path, metrics=metrics)
 
 
 def draw_staying(path: Path) -> None:
@@ -218,7 +226,10 @@ def main() -> None:
             elif name == "demonstrations":
                 draw_demonstrations(cells, options.images / f"{name}.png")
             else:
-                draw_study(cells, load_study(STUDIES[name]), options.images / f"{name}.png")
+                draw_study(cells, load_study(STUDIES[name]).figure, options.images / f"{name}.png")
+            stored = [metric for metric in THESIS.get(name, ()) if all(cell.has(metric) for cell in cells)]
+            if stored:
+                draw_study(cells, stored, options.images / f"{name}_thesis.png")
             if name in MAPS and any(cell.goals is not None for cell in cells):
                 draw_maps(cells, options.images / f"{name}_goals.png")
 

@@ -12,7 +12,7 @@ PANELS = (
 )
 AXES = {name: (label, limits) for name, label, limits in PANELS} | {
     "reached": ("goal reached at some step", (-0.02, 1.02)),
-    "q": ("Q of the start, return", None),
+    "q": ("Q of the start", None),
     "rows_virtual_positive": ("positive rewards, virtual rows", None),
     "virtual_success": ("success rate at virtual goals", (-0.02, 1.02)),
     "virtual_q_bias": ("Q of the start minus return, virtual goals", None),

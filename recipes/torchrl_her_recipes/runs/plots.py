@@ -108,8 +108,7 @@ def plot_comparison(
             axes.set_ylabel("")
     for axes in grid.flat[len(columns) :]:
         axes.set_visible(False)
-    gap = " " if rows == 1 else "\n"
-    grid[0, 0].set_ylabel(f"{grid[0, 0].get_ylabel()}{gap}(median, 33rd to 67th percentile)")
+    grid[0, 0].set_ylabel(f"{grid[0, 0].get_ylabel()}\n(median, 33rd to 67th percentile)")
     save_figure(figure, path)
 
 
