@@ -16,7 +16,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 RANGED = ("torch", "tensordict", "torchrl")
-TESTS = ["tests/torchrl_her/replay_buffers", "tests/recipes/config", "tests/recipes/runs/test_run.py"]
+TESTS = [  # what another TorchRL breaks first, and what another Python does
+    "tests/torchrl_her/test_torchrl_private.py",
+    "tests/torchrl_her/compatibility",
+    "tests/torchrl_her/replay_buffers",
+    "tests/torchrl_her/objectives",
+    "tests/torchrl_her/trainers/test_checkpoint.py",
+    "tests/recipes/config",
+    "tests/recipes/runs/test_run.py",
+]
 UV = Path(sys.executable).parent / "uv"
 SHOW = (
     "import sys, importlib.metadata; print('Python', sys.version.split()[0], "
