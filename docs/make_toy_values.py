@@ -21,7 +21,6 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_her import load_checkpoint
 from torchrl_her.modules.networks import take_run
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_envs.toy.bit_flip import BitFlip
@@ -31,6 +30,7 @@ from torchrl_her_recipes.components.agents import make_player
 from torchrl_her_recipes.components.devices import place_of
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.runs.plots import colors, count_frames, draw_curve, save_figure
+from torchrl_her_recipes.runs.policy_file import read_policy
 from torchrl_her_recipes.studies.seed_batches import Batches
 
 STATES = 256  # for each number of wrong bits
@@ -207,7 +207,7 @@ def _load_actor(home: RunFolder, run: int) -> TensorDictModuleBase:
     """Returns the actor of a run of DQN, which gives the values of all actions."""
     recipe = home.recipe()
     actor = make_player(recipe.replace(num_runs=1), make_task_envs(recipe, 1, [0]))
-    actor.load_state_dict(take_run(load_checkpoint(home.policy)["actor"], run, recipe.run.num_runs))
+    actor.load_state_dict(take_run(read_policy(home.policy)[1], run, recipe.run.num_runs))
     return actor
 
 

@@ -91,7 +91,7 @@ def test_the_repository_names_no_package_index_and_no_path_of_a_machine() -> Non
     forbidden = re.compile(f"{index}|pythonhosted|/({'|'.join(('root', 'home', 'tmp'))})/")
     for name in listed.stdout.splitlines():
         path = ROOT / name
-        binary = path.suffix in {".png", ".gif", ".pt", ".npz", ".gz"}
+        binary = path.suffix in {".png", ".gif", ".safetensors", ".npz", ".gz"}
         if (
             path.exists() and not binary and path != Path(__file__)
         ):  # a file may be removed, but not yet in git

@@ -71,7 +71,8 @@ def assert_same(first: Any, second: Any, *, path: str = "") -> None:
 
 def assert_same_runs(first: Path, second: Path) -> None:
     """Two folders: all weights, buffers and generators, and the tables but for the time."""
-    for name in ("checkpoint.pt", "policy.pt", "best.pt"):
-        assert_same(load_checkpoint(first / name), load_checkpoint(second / name))
+    assert_same(*(load_checkpoint(folder / "checkpoint.pt") for folder in (first, second)))
+    for name in ("policy.safetensors", "best.safetensors"):
+        assert (first / name).read_bytes() == (second / name).read_bytes()
     tables = [pd.read_csv(folder / "metrics.csv").drop(columns="seconds") for folder in (first, second)]
     pd.testing.assert_frame_equal(*tables, check_exact=True)

@@ -25,7 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_an_exported_policy_acts_in_the_units_of_the_task(folder: Path) -> None:
-    file = folder / "mine.pt"
+    file = folder / "mine.safetensors"
     info = export_policy(folder / "run", file).info
     assert (info.low, info.high) == (tuple(LOW.tolist()), tuple(HIGH.tolist()))
     assert info.success > 0.9
@@ -43,9 +43,11 @@ def test_it_is_filmed(folder: Path) -> None:
 def test_demonstrations_are_in_the_units_of_the_task_and_learned_from_in_those_of_the_learner(
     folder: Path,
 ) -> None:
-    export_policy(folder / "run", folder / "teacher.pt")
+    export_policy(folder / "run", folder / "teacher.safetensors")
     file = folder / "demos.pt"
-    shown = record_demonstrations(TASK, file, episodes=5, policy=folder / "teacher.pt").demonstrations
+    shown = record_demonstrations(
+        TASK, file, episodes=5, policy=folder / "teacher.safetensors"
+    ).demonstrations
     assert (shown.rows["action"] > 1.5).any()
     options = {"demonstrations.file": str(file), "demonstrations.episodes": 5}
     components = build(small(task=TASK, epochs=1, **options))

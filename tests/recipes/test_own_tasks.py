@@ -92,7 +92,7 @@ def test_an_environment_of_one_s_own_end_to_end(
         partial(build, recipe),
         partial(resume, "run", progress=False),
         partial(load_policy, "run"),
-        partial(export_policy, "run", "out.pt"),
+        partial(export_policy, "run", "out.safetensors"),
         partial(play, "run", out="out.gif"),
         partial(run_study, Study(name="theirs", vary={"task": [stranger]}), Path("study"), progress=False),
         partial(tune, Search(recipe=recipe, space=load_space("ddpg")), "search", trials=1),
@@ -106,11 +106,11 @@ def test_an_environment_of_one_s_own_end_to_end(
     with pytest.raises(ValueError, match=refused):  # the permission ended with its command
         check_permitted(stranger)
     with allow_imports():
-        policy = export_policy("run", "maze.pt")
+        policy = export_policy("run", "maze.safetensors")
     assert 0.0 <= policy.info.success < 1.0  # goals that are missed give 0, which is no success
     forget(monkeypatch)
-    assert load_policy("maze.pt").in_keys == ["observation", "desired_goal"]
-    assert load_policy("maze.pt").info.task == stranger
+    assert load_policy("maze.safetensors").in_keys == ["observation", "desired_goal"]
+    assert load_policy("maze.safetensors").info.task == stranger
     assert imports._permitted == set()
 
 

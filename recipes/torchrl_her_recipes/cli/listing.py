@@ -7,7 +7,8 @@ import click
 from torchrl_her_envs.registry import GYM, get_task_spec, task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.learners import LEARNERS
-from torchrl_her_recipes.config.shipped import policy_facts, preset_names, preset_summary
+from torchrl_her_recipes.config.policy_header import read_header
+from torchrl_her_recipes.config.shipped import policy_names, policy_path, preset_names, preset_summary
 from torchrl_her_recipes.config.spaces import space_names, space_summary
 from torchrl_her_recipes.config.study import load_study, study_names
 
@@ -25,7 +26,8 @@ def listing() -> int:
         "learners": {name: spec.summary for name, spec in LEARNERS.items()},
         "studies": {name: load_study(name).summary for name in study_names()},
         "trained policies": {
-            name: f"{facts['success']:.0%} success" for name, facts in policy_facts().items()
+            name: f"{read_header(policy_path(name))['info']['success']:.0%} success"
+            for name in policy_names()
         },
         "spaces": {name: space_summary(name) for name in space_names()},
         "presets": {name: preset_summary(name) for name in preset_names()},

@@ -57,8 +57,8 @@ def play(
 ) -> int:
     """Show a policy: as a GIF or MP4, or live in a window.
 
-    RUN is the folder of a run, or policy.pt or best.pt in it, FILE a .pt that `torchrl-her export` wrote,
-    TASK one of the trained policies.
+    RUN is the folder of a run, or the file of a policy in it, FILE a .safetensors that `torchrl-her export`
+    wrote, TASK one of the trained policies.
 
     Keys in the window: space pauses, n or the right arrow takes one step, r goes on to the next goals, + and
     - change the speed, q or escape quits.
@@ -100,14 +100,16 @@ def _film_of(source: Path, *, compared: bool) -> Path:
     return source.with_name(f"{source.stem if source.is_file() else source.name}{'_compare' * compared}.gif")
 
 
-@click.command(short_help="write a run's policy to a small file, for TorchRL or as ONNX")
-@click.argument("source", metavar="RUN|FILE.pt|TASK", shell_complete=_complete)
-@click.option("--out", type=_RUN, help="the .pt or .onnx file (default: RUN/TASK.pt, FILE.onnx or TASK.onnx)")
+@click.command(short_help="write a run's policy to a small file, for load_policy or as ONNX")
+@click.argument("source", metavar="RUN|FILE|TASK", shell_complete=_complete)
+@click.option(
+    "--out", type=_RUN, help="the file (default: RUN/TASK.safetensors, FILE.onnx or TASK.safetensors)"
+)
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["torch", "onnx"]),
-    help="torch: for load_policy; onnx: for onnxruntime (default: what --out ends with, or torch)",
+    type=click.Choice(["safetensors", "onnx"]),
+    help="safetensors: for load_policy; onnx: for onnxruntime (default: what --out ends with, or the first)",
 )
 @click.option("--run", "index", type=click.IntRange(0), help="index of the run in RUN (default: the median)")
 @click.option("--task", help="task of the policy, if not the run's own")
@@ -121,21 +123,20 @@ def _film_of(source: Path, *, compared: bool) -> Path:
 def export(
     source: str,
     out: Path | None,
-    form: Literal["torch", "onnx"] | None,
+    form: Literal["safetensors", "onnx"] | None,
     index: int | None,
     task: str | None,
     card: bool,
     best: bool,
 ) -> int:
-    """Write a policy as a file: .pt for `torchrl-her play` and load_policy, .onnx for onnxruntime.
+    """Write a policy as a file: .safetensors for `torchrl-her play` and load_policy, .onnx for onnxruntime.
 
-    RUN is the folder of a run, or best.pt in it. FILE.pt, which export wrote, or TASK, one of the trained
-    policies, can be written in another format.
+    RUN is the folder of a run, or the file of a policy in it. FILE, which export wrote, or TASK, one of the
+    trained policies, can be written in another format.
     """
-    file = out or _file_of(source, task, ".onnx" if form == "onnx" else ".pt")
-    if form is not None and (form == "onnx") != (file.suffix == ".onnx"):
-        wanted = ".onnx" if form == "onnx" else ".pt"
-        raise ValueError(f"a file of format={form} must have the suffix {wanted}, got {file.name!r}")
+    file = out or _file_of(source, task, f".{form or 'safetensors'}")
+    if form is not None and file.suffix != f".{form}":
+        raise ValueError(f"a file of format={form} must have the suffix .{form}, got {file.name!r}")
     own = recipes.export_policy(source, file, run=index, task=task, best=best, card=card).info
     touched = f" (reached at some step {own.reached:.0%})" if own.reached > own.success else ""
     click.echo(f"seed {own.seed}, success {own.success:.0%}{touched} on {own.task}: {file}")

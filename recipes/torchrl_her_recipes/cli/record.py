@@ -18,7 +18,7 @@ from torchrl_her_recipes.cli.say import file_name
 @click.option("--out", type=click.Path(path_type=Path), help="the .pt file (default: TASK_demos.pt)")
 @click.option(
     "--policy",
-    metavar="expert|FILE.pt|NAME",
+    metavar="expert|FILE|NAME",
     help="player: the scripted controller (default), an exported policy, or one of the package",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="seed of starts and goals")

@@ -142,30 +142,12 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
-        """A recipe from the values that :meth:`to_dict` gives, or some of them.
+        """A recipe from the values that :meth:`to_dict` gives, or some of them; the rest are defaults.
 
         Raises:
             ValueError: a group or an option that does not exist, or a value that cannot work.
         """
         return _assemble(place(values))
-
-    @classmethod
-    def of_file(cls, values: Mapping[str, Any]) -> Recipe:
-        """The recipe that a file keeps: all values of :meth:`to_dict`, whatever the defaults are by now.
-
-        Raises:
-            ValueError: as for :meth:`from_dict`, or an option is missing, as in files of an older version.
-        """
-        recipe = cls.from_dict(values)
-        missing = [
-            name
-            for group, own in recipe.to_dict().items()
-            for name in own
-            if name not in (values.get(group) or {})
-        ]
-        if missing:
-            raise ValueError(f"an older version wrote it, without {', '.join(missing)}: train it again")
-        return recipe
 
 
 def check_extending(values: Mapping[str, Any]) -> None:

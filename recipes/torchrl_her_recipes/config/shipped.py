@@ -7,10 +7,11 @@ from typing import Any
 
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.plain_files import naming, read_mapping, shown
+from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
 from torchrl_her_recipes.config.shortcuts import merge, place
 
 CONF = Path(__file__).parent.parent / "conf"
-TRAINED = Path(__file__).parent.parent / "trained"
+_TRAINED = Path(__file__).parent.parent / "trained"
 
 
 def preset_names() -> list[str]:
@@ -60,9 +61,9 @@ def _path(name: str) -> Path:
 
 def policy_names() -> list[str]:
     """The tasks whose policies come with the package."""
-    return sorted(path.stem for path in TRAINED.glob("*.pt"))
+    return sorted(path.stem for path in _TRAINED.glob(f"*{POLICY_SUFFIX}"))
 
 
-def policy_facts() -> dict[str, dict[str, Any]]:
-    """Success and frames of each policy, copied from its file, so that listing them does not load torch."""
-    return read_mapping(TRAINED / "index.yaml")
+def policy_path(task: str) -> Path:
+    """Returns the file of the policy that comes with the package for a task."""
+    return _TRAINED / f"{task}{POLICY_SUFFIX}"

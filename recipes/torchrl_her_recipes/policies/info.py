@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any
 
@@ -38,8 +38,8 @@ class PolicyInfo:
         algorithm, learner, seed, frames: what trained it, for so many environment steps.
         success: share of 1,000 greedy episodes of the task at whose last step the goal is achieved, with
             starts and goals that no training has seen.
-        reached: share of them in which it is achieved at some step; NaN in files that are older.
-        versions: of the packages that exported it; empty in files that are older than this card.
+        reached: share of them in which it is achieved at some step; NaN if it was not measured.
+        versions: of the packages that exported it; may be empty.
 
     Raises:
         ValueError: a value that no policy has.
@@ -117,24 +117,17 @@ class PolicyInfo:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, values: object) -> PolicyInfo:
-        """A card from what :meth:`to_dict` gave.
+    def from_dict(cls, values: Mapping[str, Any]) -> PolicyInfo:
+        """Returns the info that :meth:`to_dict` gave, with lists in place of tuples.
 
         Raises:
-            ValueError: a value is missing or unknown, or one that no policy has.
+            ValueError: A value is missing or unknown, or one that no policy has.
         """
-        known = [own.name for own in fields(cls)]
-        if not isinstance(values, Mapping) or (unknown := [name for name in values if name not in known]):
-            got = type(values).__name__ if not isinstance(values, Mapping) else ", ".join(map(str, unknown))
-            raise ValueError(f"a policy's card must have {', '.join(known)}, got {got}")
-        older = {"reached": math.nan, "task_dtype": values.get("action_dtype")}  # not in older files
-        own = {**older, **values}
-        for name in ("action_shape", "low", "high"):
-            _check(name, isinstance(own.get(name), list | tuple), "be a list", own.get(name))
-            own[name] = tuple(own[name])
-        if missing := [name for name in known if name not in own]:
-            raise ValueError(f"a policy's card lacks {', '.join(missing)}")
-        return cls(**own)
+        try:
+            lists = {name: tuple(values[name]) for name in ("action_shape", "low", "high")}
+            return cls(**{**values, **lists})
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"its info is damaged: {error}") from error
 
     def expects(self) -> str:
         """What it reads and writes, in words.

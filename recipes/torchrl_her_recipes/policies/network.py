@@ -75,11 +75,9 @@ def check_weights(
         ValueError: they are not.
     """
     name = recipe.learner.name
-    own = {key: tuple(value.shape) for key, value in weights.items() if isinstance(value, Tensor)}
-    if recipe.learner.depth > len(weights) or len(own) < len(weights):
+    own = {key: tuple(value.shape) for key, value in weights.items()}
+    if recipe.learner.depth > len(weights):
         raise ValueError(f"these are not the weights of an actor of learner={name}")
-    if loose := [key for key, value in weights.items() if not value.is_contiguous()]:
-        raise ValueError(f"weights must have a place for each of their numbers, got {loose[0]!r} without")
     with torch.device("meta"):  # shapes alone
         actor = builder.player(1)
         wanted = {
@@ -91,6 +89,8 @@ def check_weights(
             f"these are not the weights of an actor of learner={name}: {odd} must be "
             f"{wanted.get(odd, 'missing')}, got {own.get(odd, 'nothing')}"
         )
+    if odd := [key for key, value in weights.items() if not value.isfinite().all()]:
+        raise ValueError(f"weights must be finite, got others in {odd[0]}")
 
 
 def _builder(info: PolicyInfo, recipe: Recipe) -> LearnerBuilder:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from contextlib import closing
@@ -18,7 +17,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_her.modules.networks import take_run
-from torchrl_her.trainers.checkpoint import load_checkpoint, save_checkpoint
 from torchrl_her.trainers.metrics import reached, success
 from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env
@@ -26,14 +24,16 @@ from torchrl_her_recipes.components.agents import find_learner
 from torchrl_her_recipes.components.curricula import make_curriculum
 from torchrl_her_recipes.components.envs import judging, make_task_envs
 from torchrl_her_recipes.config.imports import permit_task
-from torchrl_her_recipes.config.plain_files import reason
+from torchrl_her_recipes.config.plain_files import naming
+from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.shipped import TRAINED, policy_names
+from torchrl_her_recipes.config.shipped import policy_names, policy_path
 from torchrl_her_recipes.policies.info import KEYS, PolicyInfo, describe_env, present_versions
 from torchrl_her_recipes.policies.model_card import card_path, check_free, write_model_card
 from torchrl_her_recipes.policies.network import load_network
 from torchrl_her_recipes.policies.onnx import SUFFIX, need_onnx, write_onnx
 from torchrl_her_recipes.runs.folder import RunFolder
+from torchrl_her_recipes.runs.policy_file import read_policy, write_policy
 from torchrl_her_recipes.runs.run import median_run
 
 _MEASURED = 1 << 41  # seeds that no training uses: of the episodes that measure a policy,
@@ -85,8 +85,8 @@ class Policy(TensorDictModuleBase):
         is made.
 
         Args:
-            source: Name of a task whose policy comes with the package, a ``.pt`` file that :meth:`save`
-                wrote, the folder of a run, or ``policy.pt`` or ``best.pt`` in it.
+            source: Name of a task whose policy comes with the package, a ``.safetensors`` file that
+                :meth:`save` wrote, the folder of a run, or the file of a policy in it.
             run: Index of the run, of several side by side in a folder; the run with the median success if
                 None.
             best: Whether to take the policy of the evaluation with the best median success, not the last.
@@ -107,26 +107,25 @@ class Policy(TensorDictModuleBase):
                 f"run={run} has no effect with {source}, which holds a single policy: leave it out"
             )
         path = _path_of(source)
-        state = load_checkpoint(path)
-        if not isinstance(state, dict) or not {"actor", "recipe"} <= set(state):
+        described, weights = read_policy(path)
+        if not {"info", "recipe"} <= set(described):
             raise ValueError(
                 f"{path} is no exported policy: `torchrl-her export RUN` writes one of a run's folder"
             )
-        try:
-            info, recipe = PolicyInfo.from_dict(state.get("card")), Recipe.of_file(state["recipe"])
-            return cls(info, recipe, state["actor"], str(source))
-        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-            raise ValueError(f"{path} is no exported policy: {reason(error)}") from error
+        with naming(path, "is no exported policy"):
+            info, recipe = PolicyInfo.from_dict(described["info"]), Recipe.from_dict(described["recipe"])
+            return cls(info, recipe, weights, str(source))
 
     @classmethod
     def _of_run(cls, home: RunFolder, file: Path, run: int | None, source: str) -> Policy:
         recipe, rows = home.recipe(), home.rows()
         if file == home.best and not file.exists():
             raise ValueError(f"{home.path} has no {file.name}: the run has not been evaluated yet")
-        state = load_checkpoint(file)
-        rows = [row for row in rows if row["epoch"] <= state.get("epoch", math.inf)]
-        if not rows:
-            raise ValueError(f"the run in {home.path} has not been evaluated yet")
+        described, actor = read_policy(file)
+        with naming(file):
+            rows = [row for row in rows if row["epoch"] <= described.get("epoch", math.inf)]
+            if not rows:
+                raise ValueError(f"the run in {home.path} has not been evaluated yet")
         chosen = median_run(rows) if run is None else run
         runs = recipe.run.num_runs
         if chosen not in range(runs):
@@ -150,13 +149,9 @@ class Policy(TensorDictModuleBase):
         if curriculum is not None:
             last = curriculum.state_index[-1]
             places = torch.cat((last[: curriculum.observation_width], last[-curriculum.goal_width :]))
-        weights = _as_shown(take_run(state["actor"], chosen, runs), places, width)
-        try:
+        with naming(file):
+            weights = _as_shown(take_run(actor, chosen, runs), places, width)
             return cls(info, recipe.replace(num_runs=1, seed=info.seed), weights, source)
-        except ValueError as error:
-            raise ValueError(
-                f"the policy of learner={recipe.learner.name} in {home.path} cannot be loaded: {error}"
-            ) from error
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action`` [..., width], or integers [...] where actions are discrete."""
@@ -220,13 +215,13 @@ class Policy(TensorDictModuleBase):
         with closing(self.envs(episodes, seed=seed)) as env:
             rollout = evaluate(env, self, max_steps=goal_env(env).max_steps)
             at_last, at_some = (
-                metric(rollout, **judging(env)).float().mean() for metric in (success, reached)
+                metric(rollout, **judging(env)).double().mean() for metric in (success, reached)
             )
         return float(at_last), float(at_some)
 
     def save(self, path: str | Path, *, card: bool = True) -> None:
-        """Writes the policy as a file: for onnxruntime if its suffix is ``.onnx``, for :meth:`load`
-        otherwise.
+        """Writes the policy as a file: for :meth:`load` if its suffix is ``.safetensors``, for onnxruntime if
+        it is ``.onnx``.
 
         An ONNX file is only left behind if onnxruntime gives the policy's actions to 1e-5 on states of the
         task.
@@ -236,24 +231,19 @@ class Policy(TensorDictModuleBase):
             card: Whether a model card is written beside the file, with the suffix ``.md``.
 
         Raises:
-            ValueError: The card would replace a page that is none, or the ONNX file does not act as the
-                policy does.
+            ValueError: The suffix is another one, the card would replace a page that is none, or the ONNX
+                file does not act as the policy does.
             ImportError: The suffix is ``.onnx``, and the extra ``onnx`` is missing.
             OSError: The file cannot be written.
         """
         path, info = Path(path), self.info
-        if card:
-            check_free(card_path(path))
+        _check_out(path, card=card)
         if path.suffix == SUFFIX:
-            need_onnx()
             with closing(self.envs(16, seed=_COMPARED)) as env:
                 states = evaluate(env, self, max_steps=goal_env(env).max_steps).select(*KEYS).flatten()
             info = write_onnx(self.module, info, self.recipe, path, states=states)
         else:
-            described = json.loads(json.dumps(info.to_dict()))  # lists for tuples
-            save_checkpoint(
-                {"card": described, "recipe": self.recipe.to_dict(), "actor": self._weights}, path
-            )
+            write_policy(path, self._weights, {"info": info.to_dict(), "recipe": self.recipe.to_dict()})
         if card:
             write_model_card(card_path(path), path.name, info, self.recipe)
 
@@ -279,7 +269,7 @@ def export_policy(
 
     Args:
         source: The policy, as for :meth:`Policy.load`.
-        out: The file; its suffix ``.onnx`` or ``.pt`` is its format, see :meth:`Policy.save`.
+        out: The file; its suffix ``.safetensors`` or ``.onnx`` is its format, see :meth:`Policy.save`.
         run: Index of the run, of several side by side in a folder; the run with the median success if None.
         task: Name of the task that the policy is for, if not the run's own: one that shows and takes the
             same.
@@ -295,10 +285,7 @@ def export_policy(
         OSError: The run has not saved a policy yet, or the file cannot be written.
     """
     out = Path(out)
-    if card:
-        check_free(card_path(out))
-    if out.suffix == SUFFIX:
-        need_onnx()  # before anything takes long
+    _check_out(out, card=card)
     policy = Policy.load(source, run=run, best=best)
     info = replace(policy.info, task=task or policy.info.task, versions=present_versions())
     if task is not None:
@@ -314,21 +301,30 @@ def export_policy(
     return policy
 
 
+def _check_out(path: Path, *, card: bool) -> None:
+    """Refuses a file that cannot be written, before anything takes long."""
+    if path.suffix not in (POLICY_SUFFIX, SUFFIX):
+        raise ValueError(f"a policy's file must end with {POLICY_SUFFIX} or {SUFFIX}, got {path.name!r}")
+    if card:
+        check_free(card_path(path))
+    if path.suffix == SUFFIX:
+        need_onnx()
+
+
 def _path_of(source: str | Path) -> Path:
     """Returns the path of a policy's file, or of one that comes with the package.
 
     Raises:
-        ValueError: There is no such file, or it is an ONNX file.
+        ValueError: There is no such file, or its suffix is another one.
     """
-    path = TRAINED / f"{source}.pt" if str(source) in policy_names() else Path(source)
-    if path.suffix == SUFFIX:
-        raise ValueError(
-            f"{path} is for onnxruntime and cannot be loaded: give the run or the .pt file that it is of"
-        )
+    path = policy_path(str(source)) if str(source) in policy_names() else Path(source)
     if not path.is_file():
         if path.suffix or len(path.parts) > 1:
             raise ValueError(f"there is no file {path}")
         raise ValueError(f"there is no policy {str(source)!r}; there are {', '.join(policy_names())}")
+    if path.suffix != POLICY_SUFFIX:
+        why = "is for onnxruntime" if path.suffix == SUFFIX else f"does not end with {POLICY_SUFFIX}"
+        raise ValueError(f"{path} {why} and cannot be loaded: `torchrl-her export RUN` writes what can")
     return path
 
 

@@ -19,6 +19,7 @@ from filelock import FileLock, Timeout
 from torchrl_her.files.writing import part_of, write_text
 from torchrl_her_recipes.config.imports import foreign_module, permit_task
 from torchrl_her_recipes.config.plain_files import naming, read_json, read_mapping, read_table
+from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
 from torchrl_her_recipes.config.recipe import Recipe
 
 _COUNTED = ("run", "seed", "epoch", "frames")  # columns of the table
@@ -40,8 +41,8 @@ class RunFolder:
         self.path = Path(path)
         self.config = self.path / "config.yaml"
         self.checkpoint = self.path / "checkpoint.pt"  # the newest
-        self.policy = self.path / "policy.pt"
-        self.best = self.path / "best.pt"
+        self.policy = self.path / f"policy{POLICY_SUFFIX}"
+        self.best = self.path / f"best{POLICY_SUFFIX}"
         self.about = self.path / "run.json"
         self.metrics = self.path / "metrics.csv"
         self.curves = self.path / "curves.png"
@@ -60,10 +61,10 @@ class RunFolder:
         """The folder of a run that somebody means; None if that is no folder, and no policy's file in one.
 
         Args:
-            source: the folder, or ``policy.pt`` or ``best.pt`` in it.
+            source: the folder, or the file of one of its policies.
 
         Example:
-            >>> RunFolder.of("runs/nowhere.pt")
+            >>> RunFolder.of("runs/nowhere")
         """
         path = Path(source)
         home = cls(path if path.is_dir() else path.parent)
@@ -143,7 +144,7 @@ class RunFolder:
         self._check_links()
         values = read_mapping(self.config)
         with naming(self.config):
-            recipe = Recipe.of_file(values)
+            recipe = Recipe.from_dict(values)
         if is_own(self.config):
             permit_task(recipe.task.name)
         return recipe

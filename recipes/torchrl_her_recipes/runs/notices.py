@@ -161,8 +161,8 @@ def _fallen(rows: Sequence[Row], recipe: Recipe) -> str | None:
     if not getattr(learner, "average_decay", 1.0):
         helps.insert(0, "average_decay=0.999")
     return (
-        f"success was {max(means):.0%} and has fallen to {means[-1]:.0%}; best.pt has the best policy. "
-        f"What helps: {' or '.join(helps)}"
+        f"success was {max(means):.0%} and has fallen to {means[-1]:.0%}; best.safetensors has the best "
+        f"policy. What helps: {' or '.join(helps)}"
     )
 
 

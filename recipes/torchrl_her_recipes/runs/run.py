@@ -32,6 +32,7 @@ from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.log_to import LogByName
 from torchrl_her_recipes.runs.notices import notices
 from torchrl_her_recipes.runs.plots import plot_curves, plot_goals
+from torchrl_her_recipes.runs.policy_file import write_policy
 from torchrl_her_recipes.runs.progress import Progress
 from torchrl_her_recipes.runs.state import load_run_state, run_state, seed_epoch
 from torchrl_her_recipes.runs.virtual_goals import at_virtual_goals
@@ -359,7 +360,8 @@ def _save_best(best: BestPolicy, trainer: Trainer, home: RunFolder) -> None:
     """Writes the best policy if there is a new one."""
     if best.state is not None and best.is_new:
         with _despite_a_full_disk("best policy", trainer):
-            save_checkpoint(best.state, home.best)
+            described = {name: best.state[name] for name in ("epoch", "success")}
+            write_policy(home.best, best.state["actor"], described)
             home.describe_best(best.state["epoch"], best.state["success"])
             best.is_new = False
 
@@ -399,7 +401,7 @@ def _write_results(
     goals = _save_goals(components, home) if has_buffer else _saved_goals(home)
     if components.recipe.run.pictures:
         _draw(components, rows, goals, home)
-    save_checkpoint({"actor": dict(components.greedy.state_dict())}, home.policy)
+    write_policy(home.policy, components.greedy.state_dict(), {})
     if _has_ended(components, trainer):
         for path in home.older_checkpoints:
             path.unlink(missing_ok=True)

@@ -126,9 +126,9 @@ def test_a_run_without_a_map_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
         .endswith("has no map of goals: its runs have written no virtual goals")
     )
     run(build(small(task="chain", epochs=1)), tmp_path / "boxless", progress=False)
-    (tmp_path / "boxless" / "policy.pt").rename(tmp_path / "policy.pt")
+    (tmp_path / "boxless" / "policy.safetensors").rename(tmp_path / "policy.safetensors")
     assert main(["plot", str(tmp_path / "boxless")]) == 2
     assert capsys.readouterr().err.endswith("has no map of goals: it is written when a run ends\n")
-    (tmp_path / "policy.pt").rename(tmp_path / "boxless" / "policy.pt")
+    (tmp_path / "policy.safetensors").rename(tmp_path / "boxless" / "policy.safetensors")
     assert main(["plot", str(tmp_path / "boxless")]) == 2
     assert "over the box that a task's goal_box() returns, and chain has none" in capsys.readouterr().err

@@ -5,7 +5,10 @@ from __future__ import annotations
 import copy
 import hashlib
 import io
+import json
+import math
 import random
+import struct
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -144,6 +147,73 @@ def harmful(path: Path, draw: random.Random, trap: Path) -> None:
     file = io.BytesIO()
     torch.save(state, file)
     sealed(path, file.getvalue())
+
+
+# Policies
+
+
+def _opened(path: Path) -> tuple[dict[str, Any], bytearray]:
+    data = path.read_bytes()
+    begin = 8 + int.from_bytes(data[:8], "little")
+    return json.loads(data[8:begin]), bytearray(data[begin:])
+
+
+def _close(path: Path, header: bytes, body: bytes, *, size: int | None = None) -> None:
+    path.write_bytes((len(header) if size is None else size).to_bytes(8, "little") + header + body)
+
+
+def header_size(path: Path, draw: random.Random, trap: Path) -> None:
+    header, body = _opened(path)
+    sizes = (0, 1, len(body), 1 << 22, 1 << 31, 1 << 40, (1 << 64) - 1)
+    _close(path, json.dumps(header).encode(), body, size=draw.choice(sizes))
+
+
+def header_text(path: Path, draw: random.Random, trap: Path) -> None:
+    """Something else than JSON, or JSON of something else."""
+    header, body = _opened(path)
+    texts = ("", "{", "\xff", "null", "[]", "3", "[" * 5_000, '{"a":' * 5_000, "9" * 6_000, "x" * (1 << 21))
+    text = draw.choice(texts)
+    if draw.random() < 0.5:
+        header["__metadata__"]["torchrl_her"] = text
+        text = json.dumps(header)
+    _close(path, text.encode("latin-1"), body)
+
+
+def header_entries(path: Path, draw: random.Random, trap: Path) -> None:
+    """Entries of the header, of the description in it, and what it says of tensors."""
+    header, body = _opened(path)
+    metadata = header["__metadata__"]
+    kind = draw.randrange(3)
+    if kind == 0:
+        header = entries(header, draw, trap)
+    elif kind == 1:
+        metadata["torchrl_her"] = json.dumps(entries(json.loads(metadata["torchrl_her"]), draw, trap))
+    else:
+        tensor = header[draw.choice([name for name in header if name != "__metadata__"])]
+        begin, end = tensor["data_offsets"]
+        tensor |= draw.choice(
+            (
+                {"data_offsets": [end, begin]},
+                {"data_offsets": [begin + 4, end + 4]},
+                {"data_offsets": [begin, 1 << 40]},
+                {"data_offsets": [0, end]},
+                {"shape": tensor["shape"][::-1]},
+                {"shape": [*tensor["shape"], 1]},
+                {"shape": [1 << 62, 1 << 62]},
+                {"shape": [0, 1 << 40], "data_offsets": [begin, begin]},
+                *({"dtype": dtype} for dtype in ("F64", "I32", "BOOL", "C64", "F8_E4M3", "U16", "odd")),
+            )
+        )
+    _close(path, json.dumps(header).encode(), body)
+
+
+def weights(path: Path, draw: random.Random, trap: Path) -> None:
+    """Numbers that are not finite."""
+    header, body = _opened(path)
+    for _ in range(draw.randint(1, 3)):
+        place = 4 * draw.randrange(len(body) // 4)
+        body[place : place + 4] = struct.pack("<f", draw.choice((math.nan, math.inf, -math.inf)))
+    _close(path, json.dumps(header).encode(), body)
 
 
 # Plain values

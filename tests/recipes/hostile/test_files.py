@@ -46,6 +46,13 @@ TENSORS = (
     damage.saved_entries,
     damage.saved_entries,
 )
+POLICY = (
+    *BYTES,
+    damage.header_size,
+    damage.header_text,
+    *[damage.header_entries] * 4,
+    damage.weights,
+)
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,10 @@ def _use_run(path: Path) -> Any:
 
 KINDS = {
     "checkpoint": Kind("run/checkpoint.pt", load_checkpoint, TENSORS, ("train", "--resume", "DIR")),
-    "policy": Kind("policy.pt", load_policy, TENSORS, ("play", "FILE", "--out", "NEW")),
+    "policy": Kind("policy.safetensors", load_policy, POLICY, ("play", "FILE", "--out", "NEW")),
+    "best policy": Kind(
+        "run/best.safetensors", load_policy, POLICY, ("play", "DIR", "--best", "--out", "NEW")
+    ),
     "demonstrations": Kind(
         "demos.pt",
         Demonstrations.load,
@@ -80,7 +90,7 @@ KINDS = {
         ("train", "task=hand_v0", "demonstrations.file=FILE", "demonstrations.episodes=1", "folder=NEW"),
     ),
     "configuration": Kind("run/config.yaml", _use_run, TEXT, ("train", "--resume", "DIR")),
-    "table": Kind("run/metrics.csv", _use_run, (*BYTES, damage.lines), ("export", "DIR", "--out", "NEW")),
+    "table": Kind("run/metrics.csv", _use_run, (*BYTES, damage.lines), ("play", "DIR", "--out", "NEW")),
     "goals": Kind("run/goal_map.npz", GoalMap.load, BYTES, ("plot", "DIR", "--out", "NEW")),
     "preset": Kind(
         "mine.yaml",
@@ -104,7 +114,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recipe = small(task="hand_v0", algo="her_ibs", epochs=1, epoch_frames=480, hidden=8, keep_buffer=False)
     run(build(recipe), folder / "run", progress=False)
     shutil.rmtree(folder / "run" / "tensorboard")
-    tiny_policy().save(folder / "policy.pt", card=False)
+    tiny_policy().save(folder / "policy.safetensors", card=False)
     env = make_env("hand_v0", num_envs=2, seed=0)
     played = env.rollout(20, make_controller(env), break_when_any_done=False)
     Demonstrations.from_rollout(played, task="hand_v0", first=True).save(folder / "demos.pt")

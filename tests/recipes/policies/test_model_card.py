@@ -46,7 +46,7 @@ def test_the_command_trains_the_same_recipe(options: dict[str, Any]) -> None:
     assert make_recipe(**values) == recipe
 
 
-@pytest.mark.parametrize("suffix", [pytest.param(".onnx", marks=needs_onnx), ".pt"])
+@pytest.mark.parametrize("suffix", [pytest.param(".onnx", marks=needs_onnx), ".safetensors"])
 @pytest.mark.parametrize("options", [{}, {"task": "bit_flip", "learner": "dqn"}], ids=["hand", "bits"])
 def test_the_code_of_a_card_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], suffix: str
@@ -59,7 +59,7 @@ def test_the_code_of_a_card_runs(
     assert len(blocks) == 1
     for block in blocks:
         exec(compile(block, "card", "exec"), {})
-    assert ("torchrl-her play 'my policy.pt'" in text) == (suffix == ".pt")
+    assert ("torchrl-her play 'my policy.safetensors'" in text) == (suffix == ".safetensors")
     assert "| success | 50.0 % of 1,000 episodes have their goal achieved at the last step |" in text
     assert "| reached | 75.0 % at some step |" in text
     assert f"`{policy.info.task}`" in text
@@ -69,14 +69,14 @@ def test_the_code_of_a_card_runs(
 
 def test_a_page_that_somebody_wrote_is_not_replaced(tmp_path: Path) -> None:
     policy, page = tiny_policy(normalize=True), tmp_path / "mine.md"
-    assert card_path(tmp_path / "mine.pt") == page
+    assert card_path(tmp_path / "mine.safetensors") == page
     check_free(page)
-    write_model_card(page, "mine.pt", policy.info, policy.recipe)
+    write_model_card(page, "mine.safetensors", policy.info, policy.recipe)
     check_free(page)  # a newer one may replace it
     text = page.read_text()
     assert "clips\nthem to plus and minus 5." in text
     assert "It was trained on" not in text
-    assert "torchrl-her export mine.pt --format onnx" in text
+    assert "torchrl-her export mine.safetensors --format onnx" in text
     page.write_text(text.split("\n", 1)[1])
     with pytest.raises(ValueError, match="mine.md exists and is no model card that export wrote"):
         check_free(page)

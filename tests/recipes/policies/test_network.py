@@ -74,12 +74,7 @@ def test_weights_of_something_else_are_refused_before_memory_is_taken() -> None:
     wide = policy.recipe.replace(hidden=10_000_000)
     with pytest.raises(ValueError, match=r"layers.0.0.weight must be \(1, 11, 10000000\), got \(1, 11, 8\)"):
         load_network(policy.info, wide, weights)
-    huge = {name: torch.zeros(()).expand(value.shape) for name, value in weights.items()}
-    with pytest.raises(ValueError, match="must have a place for each of their numbers"):
-        load_network(policy.info, policy.recipe, huge)
     with pytest.raises(ValueError, match="not the weights of an actor of learner=auto"):
         load_network(policy.info, policy.recipe.replace(depth=1_000_000), weights)
-    with pytest.raises(ValueError, match="weights of an actor"):
-        load_network(policy.info, policy.recipe, {**weights, "more": "than tensors"})  # type: ignore[dict-item]
     with pytest.raises(ValueError, match="is no option|actions"):
         load_network(replace(policy.info), policy.recipe.replace(learner="dqn", task="bit_flip"), weights)

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from tensordict import TensorDict
 
-from torchrl_her import evaluate, load_checkpoint, save_checkpoint, success
+from torchrl_her import evaluate, success
 from torchrl_her_envs import TASKS, make_env
 from torchrl_her_recipes import build, export_policy, load_policy, run
 from torchrl_her_recipes.cli import main
@@ -23,6 +23,7 @@ from torchrl_her_recipes.components.curricula import make_played_env
 from torchrl_her_recipes.config.shipped import policy_names
 from torchrl_her_recipes.policies import policy
 from torchrl_her_recipes.policies.network import ScaledActions
+from torchrl_her_recipes.runs.policy_file import read_policy, write_policy
 
 from ...envs.gym.walk import Walk
 from ..small import small
@@ -56,13 +57,13 @@ def test_an_exported_policy_acts_as_its_run_does(options: dict[str, Any], tmp_pa
     recipe = small(**{"task": "hand_v1", "num_runs": 2, "epochs": 1, "hidden": 8, **options})
     components = build(recipe)
     run(components, tmp_path / "run", progress=False)
-    written = export_policy(tmp_path / "run", tmp_path / "policy.pt", run=1)
+    written = export_policy(tmp_path / "run", tmp_path / "policy.safetensors", run=1)
     assert written.recipe.run.seed == 1
     assert written.info.frames == 1_600
     seen = make_env(recipe.task.name, num_envs=4, seed=7).reset()
     shown = make_played_env(recipe, 4, [7]).reset()
     played = components.greedy(torch.cat((shown, shown)))["action"][4:]  # of the second of two runs
-    for own in (load_policy(tmp_path / "run", run=1), load_policy(tmp_path / "policy.pt"), written):
+    for own in (load_policy(tmp_path / "run", run=1), load_policy(tmp_path / "policy.safetensors"), written):
         torch.testing.assert_close(own(seen.clone())["action"], played)
 
 
@@ -79,22 +80,24 @@ def test_export_takes_the_median_run(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(["export", str(folder)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("seed 0, success ")
-    assert said.endswith(f" on hand_v0: {folder / 'hand_v0.pt'}\n")
+    assert said.endswith(f" on hand_v0: {folder / 'hand_v0.safetensors'}\n")
 
 
 def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
     other = tmp_path / "other"
     run(build(small(task="hand_v0", epochs=1)), other, progress=False)
     with pytest.raises(ValueError, match="a policy of hand_v0 cannot play robot_v0: it has other widths"):
-        export_policy(other, tmp_path / "policy.pt", task="robot_v0")
+        export_policy(other, tmp_path / "policy.safetensors", task="robot_v0")
     with pytest.raises(ValueError, match="unknown task 'nope'"):
-        export_policy(other, tmp_path / "policy.pt", task="nope")
+        export_policy(other, tmp_path / "policy.safetensors", task="nope")
     with pytest.raises(ValueError, match="there is no run 4 in .*; it has runs 0 to 0"):
-        export_policy(other, tmp_path / "policy.pt", run=4)
-    state = load_checkpoint(other / "policy.pt")
-    save_checkpoint({"actor": {"own": state["actor"].popitem()[1]}}, other / "policy.pt")
-    with pytest.raises(ValueError, match="the policy of learner=auto in .* cannot be loaded: these are not"):
-        export_policy(other, tmp_path / "policy.pt")
+        export_policy(other, tmp_path / "policy.safetensors", run=4)
+    _, weights = read_policy(other / "policy.safetensors")
+    write_policy(other / "policy.safetensors", {"own": weights.popitem()[1]}, {})
+    with pytest.raises(
+        ValueError, match=r"other/policy.safetensors cannot be read: these are not the weights"
+    ):
+        export_policy(other, tmp_path / "policy.safetensors")
     assert list(tmp_path.iterdir()) == [other]
     with pytest.raises(ValueError, match="there is no policy 'hand_v9'; there are hand_reach"):
         load_policy("hand_v9")
@@ -129,23 +132,32 @@ def test_what_export_wrote_is_played(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     run(build(small(task="hand_v0", epochs=1, pictures=True)), "run", progress=False)
-    assert main(["export", "run", "--out", "mine.pt"]) == 0
-    assert main(["play", "mine.pt", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
+    assert main(["export", "run", "--out", "mine.safetensors"]) == 0
+    assert main(["play", "mine.safetensors", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
     alone = capsys.readouterr().out.splitlines()[-1]
     assert alone.endswith(" of 2 goals achieved: mine.gif")
     assert main(["play", "run", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == alone.replace("mine.gif", "run/play.gif")
     assert Path("mine.gif").read_bytes() == Path("run/play.gif").read_bytes()
     filmed = Path("run/policy.gif").read_bytes()
-    assert main(["play", "run/policy.pt", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
+    assert main(["play", "run/policy.safetensors", "--goals", "2", "--size", "64", "--seed", "3"]) == 0
     assert Path("mine.gif").read_bytes() == Path("run/play.gif").read_bytes()
     assert Path("run/policy.gif").read_bytes() == filmed
-    assert main(["play", "run/checkpoint.pt"]) == 2
-    said = "torchrl-her: run/checkpoint.pt is no exported policy: `torchrl-her export RUN`"
+    Path("moved.safetensors").write_bytes(Path("run/policy.safetensors").read_bytes())
+    Path("notes.safetensors").write_text("not a policy")
+    for name, why in (
+        (
+            "run/checkpoint.pt",
+            "does not end with .safetensors and cannot be loaded: `torchrl-her export RUN`",
+        ),
+        ("moved.safetensors", "is no exported policy: `torchrl-her export RUN` writes one"),
+        ("notes.safetensors", "cannot be read: its header must have at most 4,194,304 bytes, got"),
+    ):
+        assert main(["play", name]) == 2
+        assert capsys.readouterr().err.startswith(f"torchrl-her: {name} {why}")
+    assert main(["export", "run", "--out", "mine.pt"]) == 2
+    said = "a policy's file must end with .safetensors or .onnx, got 'mine.pt'"
     assert said in capsys.readouterr().err
-    Path("notes.txt").write_text("not a policy")
-    assert main(["play", "notes.txt"]) == 2
-    assert "notes.txt is not a checkpoint of torchrl-her" in capsys.readouterr().err
 
 
 @needs_onnx
@@ -156,25 +168,28 @@ def test_on_the_command_line(
     assert main(["export", "hand_reach", "--format", "onnx"]) == 0
     assert capsys.readouterr().out == "seed 1, success 100% on hand_reach: hand_reach.onnx\n"
     assert "`hand_reach`" in Path("hand_reach.md").read_text()
-    assert main(["export", "hand_reach", "--out", "other.pt", "--no-card"]) == 0
+    assert main(["export", "hand_reach", "--out", "other.safetensors", "--no-card"]) == 0
     assert not Path("other.md").exists()
-    assert load_policy("other.pt").info.success == 1.0
+    assert load_policy("other.safetensors").info.success == 1.0
     capsys.readouterr()
     for wrong, message in (
         (
-            ["hand_reach.onnx", "--out", "new.pt"],
+            ["hand_reach.onnx", "--out", "new.safetensors"],
             "hand_reach.onnx is for onnxruntime and cannot",
         ),
-        (["other.pt"], "other.pt would be replaced by itself: give --out or --format onnx"),
+        (["other.safetensors"], "other.safetensors would be replaced by itself: give --out or --format onnx"),
         (
-            ["other.pt", "--out", "a.pt", "--run", "1"],
-            "run=1 has no effect with other.pt, which holds a single",
+            ["other.safetensors", "--out", "a.safetensors", "--run", "1"],
+            "run=1 has no effect with other.safetensors, which holds a single",
         ),
         (
-            ["other.pt", "--out", "a.pt", "--format", "onnx"],
-            "format=onnx must have the suffix .onnx, got 'a.pt'",
+            ["other.safetensors", "--out", "a.safetensors", "--format", "onnx"],
+            "format=onnx must have the suffix .onnx, got 'a.safetensors'",
         ),
-        (["other.pt", "--out", "a.onnx", "--task", "robot_v0"], "observation [5], desired_goal [2] and"),
+        (
+            ["other.safetensors", "--out", "a.onnx", "--task", "robot_v0"],
+            "observation [5], desired_goal [2] and",
+        ),
         (["nowhere"], "nowhere is no folder of a run: it has no config.yaml; nor is it the file"),
     ):
         assert main(["export", *wrong]) == 2
@@ -182,10 +197,10 @@ def test_on_the_command_line(
         assert message in said
         assert said.count("\n") == 1
     Path("a.md").write_text("mine")
-    assert main(["export", "other.pt", "--out", "a.onnx"]) == 2
+    assert main(["export", "other.safetensors", "--out", "a.onnx"]) == 2
     assert "a.md exists and is no model card that export wrote" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "a.md", "hand_reach.md", "hand_reach.onnx", "other.pt"
+        "a.md", "hand_reach.md", "hand_reach.onnx", "other.safetensors"
     ]  # fmt: skip
     for command in (["play", "hand_reach.onnx"], ["record", "hand_reach", "--policy", "hand_reach.onnx"]):
         assert main(command) == 2
@@ -207,16 +222,16 @@ def _wide(state: dict[str, Any]) -> None:
     state["recipe"]["learner"]["hidden"] = 10_000_000
 
 
-def _claims_much(state: dict[str, Any]) -> None:
-    state["recipe"]["learner"]["hidden"] = 2_000
-    state["actor"] = {
-        name: torch.zeros(()).expand([2_000 if side == 64 else side for side in value.shape])
-        for name, value in state["actor"].items()
-    }
+def _not_finite(state: dict[str, Any]) -> None:
+    state["weights"]["module.layers.3.bias"][:] = torch.nan
 
 
 def _no_widths(state: dict[str, Any]) -> None:
-    del state["card"]["widths"]
+    del state["info"]["widths"]
+
+
+def _newer(state: dict[str, Any]) -> None:
+    state["recipe"]["learner"]["warp"] = 9
 
 
 def _other_learner(state: dict[str, Any]) -> None:
@@ -224,17 +239,21 @@ def _other_learner(state: dict[str, Any]) -> None:
 
 
 def _no_weights(state: dict[str, Any]) -> None:
-    state["actor"] = [1, 2]
+    state["weights"].clear()
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (_wide, "must be (1, 7, 10000000), got (1, 7, 64)"),
-        (_claims_much, "weights must have a place for each of their numbers"),
-        (_no_widths, "a policy's card lacks widths"),
+        (_not_finite, "weights must be finite, got others in module.layers.3.bias"),
+        (_newer, "no option 'learner.warp'; the options of learner are"),
+        (
+            _no_widths,
+            "its info is damaged: PolicyInfo.__init__() missing 1 required keyword",
+        ),
         (_other_learner, "unknown learner 'theirs'"),
-        (_no_weights, "bad.pt is no exported policy: "),
+        (_no_weights, "these are not the weights of an actor of learner="),
     ],
 )
 def test_files_that_somebody_made_give_one_line(
@@ -245,13 +264,13 @@ def test_files_that_somebody_made_give_one_line(
     message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    export_policy("hand_reach", "good.pt", card=False)
-    state = load_checkpoint("good.pt")
-    change(state)
-    save_checkpoint(state, "bad.pt")
-    assert main(["play", "bad.pt"]) == 2
+    export_policy("hand_reach", "good.safetensors", card=False)
+    description, weights = read_policy(Path("good.safetensors"))
+    change({**description, "weights": weights})
+    write_policy(Path("bad.safetensors"), weights, description)
+    assert main(["play", "bad.safetensors"]) == 2
     said = capsys.readouterr().err
-    assert said.startswith("torchrl-her: bad.pt is no exported policy: ")
+    assert said.startswith("torchrl-her: bad.safetensors is no exported policy: ")
     assert message in said
     assert said.count("\n") == 1
 
@@ -297,9 +316,9 @@ def test_predict_gives_actions_of_the_space(
     own_walk = EnvSpec("tests/OwnWalk-v0", lambda: Walk(actions=actions), max_episode_steps=6)
     monkeypatch.setitem(gymnasium.registry, own_walk.id, own_walk)
     plain = {"learner": "ddpg", "gamma": 0.9, "normalize": False, "norm": "none"}
-    tiny_policy(task=f"gym:{own_walk.id}", **plain).save(tmp_path / "mine.pt")
+    tiny_policy(task=f"gym:{own_walk.id}", **plain).save(tmp_path / "mine.safetensors")
     assert ("round them" in (tmp_path / "mine.md").read_text()) == (actions.dtype.kind in "iu")
-    own = load_policy(tmp_path / "mine.pt")
+    own = load_policy(tmp_path / "mine.safetensors")
     seen = {key: 300 * value.numpy() for key, value in states(own.info, 200).items()}  # to all sides
     taken, _ = own.predict(seen)
     assert taken.dtype == actions.dtype
@@ -315,11 +334,20 @@ def test_predict_gives_actions_of_the_space(
 
 def test_a_policy_that_was_saved_is_the_same(tmp_path: Path) -> None:
     own = tiny_policy(normalize=True)
-    own.save(tmp_path / "mine.pt")
-    again = load_policy(tmp_path / "mine.pt")
+    own.save(tmp_path / "mine.safetensors")
+    again = load_policy(tmp_path / "mine.safetensors")
     assert (again.info, again.recipe) == (own.info, own.recipe)
     seen = states(own.info, 9)
     assert torch.equal(again(seen.clone())["action"], own(seen)["action"])
+
+
+def test_options_that_a_file_does_not_know_have_their_defaults(tmp_path: Path) -> None:
+    own, path = tiny_policy(gamma=0.9), tmp_path / "mine.safetensors"
+    own.save(path)
+    description, weights = read_policy(path)
+    del description["recipe"]["learner"]["tau"], description["recipe"]["novelty"]
+    write_policy(path, weights, description)
+    assert load_policy(path).recipe == own.recipe
 
 
 def test_no_action_leaves_the_bounds_by_rounding() -> None:

@@ -149,14 +149,16 @@ def press(*keys: int) -> None:
 
 @pytest.mark.usefixtures("dummy")
 def test_a_policy_in_a_window_beside_another(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["export", "hand_reach", "--out", "other.pt", "--no-card"])
+    main(["export", "hand_reach", "--out", "other.safetensors", "--no-card"])
     capsys.readouterr()
     press(*[pygame.K_n] * 50, pygame.K_ESCAPE)
-    assert main(["play", "hand_reach", "--window", "--compare", "other.pt", "--size", "64"]) == 0
+    assert main(["play", "hand_reach", "--window", "--compare", "other.safetensors", "--size", "64"]) == 0
     out = capsys.readouterr().out.splitlines()
     assert [re.sub(r"\d+ of (\d+)", r"N of \1", line) for line in out] == [
         f"N of {n} goals achieved: {name}"
-        for n, name in zip((line.split()[2] for line in out), ("hand_reach", "other.pt"), strict=True)
+        for n, name in zip(
+            (line.split()[2] for line in out), ("hand_reach", "other.safetensors"), strict=True
+        )
     ]
     assert out[0].split()[:3] == out[1].split()[:3]  # the same policy does the same
     assert int(out[0].split()[2]) >= 1
@@ -194,13 +196,13 @@ def test_a_film_of_several_policies_has_them_beside_each_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    main(["export", "hand_reach", "--out", "other.pt", "--no-card"])
+    main(["export", "hand_reach", "--out", "other.safetensors", "--no-card"])
     capsys.readouterr()
-    compared = ["--compare", "other.pt", "--compare", "hand_reach", "--goals", "2", "--size", "64"]
+    compared = ["--compare", "other.safetensors", "--compare", "hand_reach", "--goals", "2", "--size", "64"]
     assert main(["play", "hand_reach", *compared]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "2 of 2 goals achieved: hand_reach",
-        "2 of 2 goals achieved: other.pt",
+        "2 of 2 goals achieved: other.safetensors",
         "2 of 2 goals achieved: hand_reach",
         "hand_reach_compare.gif",
     ]

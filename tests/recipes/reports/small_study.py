@@ -63,7 +63,7 @@ def write_run(
         writer.writeheader()
         writer.writerows(rows)
     GoalMap(np.ones((len(success), 4, 4)), np.full((4, 4), 1 / 16)).save(home / "goal_map.npz")
-    (home / "policy.pt").touch()
+    (home / "policy.safetensors").touch()
 
 
 def table(path: Path) -> list[dict[str, str]]:

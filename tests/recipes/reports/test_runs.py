@@ -34,7 +34,7 @@ def write_epochs(folder: Path, epochs: int, *, done: bool = False) -> Path:
     shutil.rmtree(home, ignore_errors=True)
     write_run(folder, STUDY, "hand_v2_her", [0.25, 0.75], epochs=epochs)
     if not done:
-        (home / "policy.pt").unlink()
+        (home / "policy.safetensors").unlink()
     return home
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 
 from torchrl_her.modules import PolicyAverage, take_run
-from torchrl_her.trainers.checkpoint import load_checkpoint
 from torchrl_her_recipes import Components, build, run
 from torchrl_her_recipes.runs.curriculum import play_greedily
 from torchrl_her_recipes.runs.evaluation import measure
+from torchrl_her_recipes.runs.policy_file import read_policy
 
 from ..small import small
 
@@ -28,7 +28,7 @@ def test_the_average_is_what_plays_and_is_kept(tmp_path: Path) -> None:
     run(components, tmp_path / "run", progress=False)
     assert components.average is not None
     assert components.greedy is components.average.module
-    kept = load_checkpoint(tmp_path / "run" / "policy.pt")["actor"]
+    _, kept = read_policy(tmp_path / "run" / "policy.safetensors")
     for name, value in components.average.module.state_dict().items():
         assert torch.equal(kept[name], value)
     assert not all(torch.equal(kept[name], own) for name, own in components.actor.state_dict().items())

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 
-from torchrl_her import load_checkpoint
 from torchrl_her.modules import make_actor
 from torchrl_her_recipes import (
     Callback,
@@ -22,8 +21,10 @@ from torchrl_her_recipes import (
     run,
 )
 from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.config.policy_header import read_header
 from torchrl_her_recipes.runs import run as running
 from torchrl_her_recipes.runs.best import BestPolicy
+from torchrl_her_recipes.runs.policy_file import read_policy
 
 from ..small import assert_same, small
 
@@ -57,7 +58,7 @@ class Weights(Callback):
         self.actors[run.trainer.epochs] = own
         assert run.folder is not None
         if run.folder.best.exists():
-            self.written.append(int(load_checkpoint(run.folder.best)["epoch"]))
+            self.written.append(int(read_header(run.folder.best)["epoch"]))
 
 
 def test_the_best_evaluation_is_kept_and_the_later_of_two_equal_ones(
@@ -66,10 +67,10 @@ def test_the_best_evaluation_is_kept_and_the_later_of_two_equal_ones(
     says |= {1: [0.25], 2: [0.75], 3: [0.75], 4: [0.5]}
     weights = Weights()
     run(build(small(epochs=4, **SHORT)), tmp_path, callbacks=[weights], progress=False)
-    best = load_checkpoint(tmp_path / "best.pt")
+    best, actor = read_policy(tmp_path / "best.safetensors")
     assert (best["epoch"], best["success"]) == (3, 0.75)
-    assert_same(best["actor"], weights.actors[3])
-    assert not all(torch.equal(best["actor"][name], value) for name, value in weights.actors[4].items())
+    assert_same(actor, weights.actors[3])
+    assert not all(torch.equal(actor[name], value) for name, value in weights.actors[4].items())
     assert weights.written == [1, 2, 3]  # as seen one epoch later: the fourth one wrote nothing
     assert json.loads((tmp_path / "run.json").read_text())["best"] == {"epoch": 3, "success": 0.75}
 
@@ -80,9 +81,9 @@ def test_runs_side_by_side_are_kept_as_of_the_evaluation_with_the_best_median(
     says |= {1: [0.5, 0.5, 0.5], 2: [1.0, 0.25, 0.25], 3: [0.25, 0.25, 0.25]}
     weights = Weights()
     run(build(small(epochs=3, num_runs=3, **SHORT)), tmp_path, callbacks=[weights], progress=False)
-    best = load_checkpoint(tmp_path / "best.pt")
+    best, actor = read_policy(tmp_path / "best.safetensors")
     assert (best["epoch"], best["success"]) == (1, 0.5)
-    assert_same(best["actor"], weights.actors[1])
+    assert_same(actor, weights.actors[1])
     first, third = load_policy(tmp_path, run=0, best=True), load_policy(tmp_path, run=2, best=True)
     assert not all(torch.equal(value, third.state_dict()[name]) for name, value in first.state_dict().items())
 
@@ -106,11 +107,11 @@ def test_a_run_that_goes_on_remembers_its_best_policy(says: dict[int, list[float
     says |= {1: [0.75], 2: [0.5], 3: [0.5]}
     weights = Weights()
     run(build(small(epochs=3, **SHORT)), tmp_path, callbacks=[weights, Stop()], progress=False)
-    (tmp_path / "best.pt").unlink()  # as if it had been lost: it is in the checkpoint
+    (tmp_path / "best.safetensors").unlink()  # as if it had been lost: it is in the checkpoint
     resume(tmp_path, options={"checkpoint_interval": 2}, progress=False)
-    best = load_checkpoint(tmp_path / "best.pt")
+    best, actor = read_policy(tmp_path / "best.safetensors")
     assert best["epoch"] == 1
-    assert_same(best["actor"], weights.actors[1])
+    assert_same(actor, weights.actors[1])
     assert json.loads((tmp_path / "run.json").read_text())["best"]["epoch"] == 1
 
 
@@ -126,10 +127,10 @@ def test_a_best_policy_that_is_newer_than_the_checkpoint_does_not_survive_it(
     recipe = small(epochs=2, checkpoint_interval=5, **SHORT)
     with pytest.raises(RuntimeError, match="killed"):
         run(build(recipe.replace(epochs=3)), tmp_path, callbacks=[Fail()], progress=False)
-    assert load_checkpoint(tmp_path / "best.pt")["epoch"] == 2
+    assert read_header(tmp_path / "best.safetensors")["epoch"] == 2
     resume(tmp_path, options={"epochs": 2}, progress=False)
-    assert load_checkpoint(tmp_path / "best.pt")["epoch"] == 2
-    assert load_checkpoint(tmp_path / "best.pt")["success"] == 0.5
+    assert read_header(tmp_path / "best.safetensors")["epoch"] == 2
+    assert read_header(tmp_path / "best.safetensors")["success"] == 0.5
 
 
 @pytest.fixture
@@ -144,24 +145,28 @@ def two(says: dict[int, list[float]], tmp_path: Path) -> Path:
 def test_the_best_policy_is_played_loaded_and_exported(
     two: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert load_checkpoint(two / "best.pt")["epoch"] == 1
+    assert read_header(two / "best.safetensors")["epoch"] == 1
     last, best = load_policy(two, run=1), load_policy(two, run=1, best=True)
-    assert_same(dict(best.state_dict()), dict(load_policy(two / "best.pt", run=1).state_dict()))
+    assert_same(dict(best.state_dict()), dict(load_policy(two / "best.safetensors", run=1).state_dict()))
     assert not all(torch.equal(value, last.state_dict()[name]) for name, value in best.state_dict().items())
 
-    written = export_policy(two, tmp_path / "best_1.pt", run=1, best=True)
+    written = export_policy(two, tmp_path / "best_1.safetensors", run=1, best=True)
     assert written.info.frames == 480
-    for own in (load_policy(tmp_path / "best_1.pt"), load_policy(two / "best.pt", run=1), best):
+    for own in (
+        load_policy(tmp_path / "best_1.safetensors"),
+        load_policy(two / "best.safetensors", run=1),
+        best,
+    ):
         assert_same(dict(own.state_dict()), dict(written.state_dict()))
-    assert export_policy(two, tmp_path / "last.pt").info.frames == 960
+    assert export_policy(two, tmp_path / "last.safetensors").info.frames == 960
 
     options = ["--goals", "2", "--size", "64"]
     films = {name: tmp_path / f"{name}.gif" for name in ("flag", "file", "last")}
     assert main(["play", str(two), "--best", "--out", str(films["flag"]), *options]) == 0
-    assert main(["play", str(two / "best.pt"), "--out", str(films["file"]), *options]) == 0
+    assert main(["play", str(two / "best.safetensors"), "--out", str(films["file"]), *options]) == 0
     assert main(["play", str(two), "--out", str(films["last"]), *options]) == 0
     assert films["flag"].read_bytes() == films["file"].read_bytes() != films["last"].read_bytes()
-    assert main(["export", str(two), "--best", "--out", str(tmp_path / "mine.pt")]) == 0
+    assert main(["export", str(two), "--best", "--out", str(tmp_path / "mine.safetensors")]) == 0
     assert capsys.readouterr().out.splitlines()[-1].startswith("seed 3, success ")  # the median of epoch 1
 
 
@@ -170,9 +175,11 @@ def test_without_a_best_policy_one_line_says_so(
 ) -> None:
     with pytest.raises(ValueError, match="best goes with the folder of a run, and hand_v1 is none"):
         play("hand_v1", out=tmp_path / "film.gif", best=True)
-    (two / "best.pt").unlink()
+    (two / "best.safetensors").unlink()
     for command in ("play", "export"):
         assert main([command, str(two), "--best"]) == 2
         said = capsys.readouterr().err
-        assert said.startswith(f"torchrl-her: {two} has no best.pt: the run has not been evaluated yet")
+        assert said.startswith(
+            f"torchrl-her: {two} has no best.safetensors: the run has not been evaluated yet"
+        )
         assert len(said.splitlines()) == 1

@@ -141,7 +141,9 @@ def test_values_within_a_quarter_of_the_range_are_let_be() -> None:
 def test_success_that_falls_after_it_rose() -> None:
     fallen = [0.1, 0.9, 0.9, 0.9, 0.8, 0.3, 0.2, 0.2, 0.1]
     line = only(table(9, success=fallen), after=7)  # 0.9, and a mean of 0.43
-    assert line.startswith("seed 5: success was 90% and has fallen to 43%; best.pt has the best policy.")
+    assert line.startswith(
+        "seed 5: success was 90% and has fallen to 43%; best.safetensors has the best policy."
+    )
     assert not any(said(table(9, success=fallen, layer=[0, 0, 0, 0, 1, 1, 1, 1, 1])))  # a new layer
 
 

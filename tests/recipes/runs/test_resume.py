@@ -288,13 +288,13 @@ def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(
 def test_a_finished_run_draws_its_pictures_again_without_its_buffer(tmp_path: Path) -> None:
     recipe = small(epochs=2, epoch_frames=480, keep_buffer=False, algo="filtered_her_ibs", pictures=True)
     run(build(recipe), tmp_path, progress=False)
-    names = ("curves.png", "virtual_goals.png", "policy.gif", "policy.pt")
+    names = ("curves.png", "virtual_goals.png", "policy.gif", "policy.safetensors")
     same = (
         "curves.png",
         "virtual_goals.png",
-        "policy.pt",
+        "policy.safetensors",
         "goal_map.npz",
-        "best.pt",
+        "best.safetensors",
     )  # the film shows others
     before = {name: (tmp_path / name).read_bytes() for name in same}
     for name in names:
@@ -433,12 +433,12 @@ def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(tmp_p
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no disk that is always full")
 def test_a_full_disk_at_the_end_says_what_is_missing(tmp_path: Path) -> None:
-    (tmp_path / "policy.part.pt").symlink_to("/dev/full")
-    said = r"cannot write .*policy\.pt: no space left on device; policy\.pt will be written by: .* --resume"
+    (tmp_path / "policy.part.safetensors").symlink_to("/dev/full")
+    said = r"cannot write .*: no space left on device; policy\.safetensors will be written by: .* --resume"
     with pytest.raises(OSError, match=said):
         run(build(small(epochs=1)), tmp_path, progress=False)
     resume(tmp_path, progress=False)
-    assert (tmp_path / "policy.pt").is_file()
+    assert (tmp_path / "policy.safetensors").is_file()
 
 
 def test_parts_that_were_swapped_must_be_given_to_resume(tmp_path: Path) -> None:
@@ -452,7 +452,7 @@ def test_parts_that_were_swapped_must_be_given_to_resume(tmp_path: Path) -> None
     run(swapped(recipe.replace(epochs=1)), tmp_path / "run", progress=False)
     with pytest.raises(ValueError, match="the run's critic was NoneType, not TensorDictModule"):
         resume(tmp_path / "run", progress=False)
-    assert (tmp_path / "run" / "policy.pt").exists()
+    assert (tmp_path / "run" / "policy.safetensors").exists()
     assert resume(tmp_path / "run", components=swapped(recipe), progress=False).rows[-1]["epoch"] == 2
 
 

@@ -68,7 +68,7 @@ def test_a_job_that_was_killed_before_its_configuration_was_written_begins_again
 def test_a_job_that_was_killed_while_it_drew_its_pictures_draws_them(job: Job) -> None:
     assert run_job(job) == Outcome()
     assert kept_progress(job).epochs == 2
-    (job.folder / "policy.pt").unlink()
+    (job.folder / "policy.safetensors").unlink()
     (job.folder / "curves.png").unlink()
     rows = (job.folder / "metrics.csv").read_text()
     assert kept_progress(job).epochs == 1
@@ -104,7 +104,13 @@ def test_ctrl_c_before_it_has_begun_is_no_failure(job: Job, monkeypatch: pytest.
 def test_a_folder_arrives_as_it_was_sent_in_place_of_what_was_there(tmp_path: Path) -> None:
     sent, there = tmp_path / "sent", tmp_path / "there"
     (sent / "tensorboard").mkdir(parents=True)
-    for name in ("config.yaml", "checkpoint.pt", "checkpoint.1.pt", "policy.pt", "tensorboard/events"):
+    for name in (
+        "config.yaml",
+        "checkpoint.pt",
+        "checkpoint.1.pt",
+        "policy.safetensors",
+        "tensorboard/events",
+    ):
         (sent / name).write_bytes(name.encode())
     there.mkdir()
     (there / "old").touch()
@@ -112,7 +118,7 @@ def test_a_folder_arrives_as_it_was_sent_in_place_of_what_was_there(tmp_path: Pa
     assert sorted(path.name for path in there.rglob("*") if path.is_file()) == [
         "config.yaml",
         "events",
-        "policy.pt",
+        "policy.safetensors",
     ]
     assert (there / "tensorboard" / "events").read_bytes() == b"tensorboard/events"
     unpack(pack(sent, checkpoints=True), there)

@@ -66,7 +66,7 @@ def test_a_node_that_dies_loses_only_its_run_which_is_done_again(
     assert [path.stat().st_mtime_ns for path in first] == written
     for label in LABELS:
         assert read_progress(tmp_path / label).epochs == epochs
-        assert (tmp_path / label / "policy.pt").exists()
+        assert (tmp_path / label / "policy.safetensors").exists()
         assert not can_resume(tmp_path / label)  # buffers of what is done stay where they were
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", *sorted(ALGORITHMS), "small.png"]
 

@@ -1,0 +1,52 @@
+"""Files of policies: weights in safetensors, and a description in the header."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from torchrl_her.files.writing import written
+from torchrl_her_recipes.config.plain_files import naming
+from torchrl_her_recipes.config.policy_header import METADATA_KEY, read_header
+
+
+def write_policy(path: Path, weights: Mapping[str, Tensor], description: Mapping[str, Any]) -> None:
+    """Writes weights and what describes them, whole or not at all.
+
+    Args:
+        path: The file.
+        weights: ``state_dict()`` of a policy. Entries that are no tensors are left out.
+        description: Plain values, which JSON can hold.
+
+    Raises:
+        OSError: The file cannot be written; the one before is untouched.
+    """
+    tensors = {
+        name: value.detach().to("cpu", copy=True).contiguous()  # safetensors takes no views of one storage
+        for name, value in weights.items()
+        if isinstance(value, Tensor)
+    }
+    data = save(tensors, {METADATA_KEY: json.dumps(description)})
+    with written(path) as part:
+        part.write_bytes(data)
+
+
+def read_policy(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Returns the description and the weights of a policy's file.
+
+    Raises:
+        ValueError: The file is damaged or something else.
+        OSError: It cannot be read.
+    """
+    description = read_header(path)
+    with naming(path):
+        try:
+            return description, load(path.read_bytes())
+        except SafetensorError as error:
+            raise ValueError(str(error)) from error
