@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Callable
 from importlib import metadata
+
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 # The releases that the tests were run with; `make test-versions` runs some of them again.
 TRIED = {
@@ -36,48 +38,29 @@ def check_versions(installed: Callable[[str], str] = metadata.version) -> None:
     Warns:
         UserWarning: one of them is inside of its range, but a release that was never tried.
     """
-    wanted = _ranges(metadata.requires("torchrl-her") or [])
-    have = {name: installed(name).split("+")[0] for name in wanted}
-    misfits = [f"{name} {have[name]}" for name, span in wanted.items() if not _contains(span, have[name])]
+    requirements = {own.name: own for own in map(Requirement, metadata.requires("torchrl-her") or [])}
+    have = {name: Version(installed(name)) for name in TRIED}
+    misfits = [
+        f"{name} {own.public}"
+        for name, own in have.items()
+        if not requirements[name].specifier.contains(own, prereleases=True)
+    ]
     if misfits:
         verb = "does" if len(misfits) == 1 else "do"
-        remedy = " ".join(f"'{name}>={low},<{high}'" for name, (low, high) in wanted.items())
+        remedy = " ".join(f"'{requirements[name]}'" for name in TRIED)
         raise ImportError(
             f"{', '.join(misfits)} {verb} not fit this version of torchrl-her; install {remedy}"
         )
-    minor = _numbers(have["torchrl"])[:2]
-    if _numbers(have["tensordict"])[:2] != minor:
+    torchrl, tensordict = have["torchrl"], have["tensordict"]
+    if tensordict.release[:2] != torchrl.release[:2]:
         raise ImportError(
-            f"tensordict {have['tensordict']} does not fit torchrl {have['torchrl']}; "
-            f"install 'tensordict~={'.'.join(map(str, minor))}.0'"
+            f"tensordict {tensordict.public} does not fit torchrl {torchrl.public}; "
+            f"install 'tensordict~={torchrl.major}.{torchrl.minor}.0'"
         )
-    for name, version in have.items():
-        if version not in TRIED[name]:
+    for name, own in have.items():
+        if own.public not in TRIED[name]:
             warnings.warn(
-                f"{name} {version} was never tried with this version of torchrl-her; "
+                f"{name} {own.public} was never tried with this version of torchrl-her; "
                 f"the tests were run with {', '.join(TRIED[name])}",
                 stacklevel=2,
             )
-
-
-def _ranges(requirements: list[str]) -> dict[str, tuple[str, str]]:
-    """The lowest version and the first one that is too new, of each of the three packages."""
-    ranges = {}
-    for name in TRIED:
-        (requirement,) = (text for text in requirements if re.match(rf"{name}[<>=]", text))
-        # The build tool chooses the order of the two bounds.
-        bounds = dict(re.findall(r"(>=|<)([\d.]+)", requirement))
-        ranges[name] = (bounds[">="], bounds["<"])
-    return ranges
-
-
-def _contains(span: tuple[str, str], version: str) -> bool:
-    low, high = span
-    # A pre-release of the first version that is too new (2.16.0.dev1) is too new as well.
-    return _numbers(low) <= _numbers(version) < _numbers(high)
-
-
-def _numbers(version: str) -> tuple[int, ...]:
-    """The leading numbers of a version: (2, 16, 0) of 2.16.0.dev1."""
-    (release,) = re.findall(r"^\d+(?:\.\d+)*", version) or ["0"]
-    return tuple(int(number) for number in release.split("."))

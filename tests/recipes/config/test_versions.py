@@ -25,7 +25,7 @@ def test_a_version_outside_of_its_range_is_named_with_the_remedy(given: dict[str
         check_versions({**INSTALLED, **given}.__getitem__)
     assert str(error.value) == (
         f"torch {shown} does not fit this version of torchrl-her; "
-        "install 'torch>=2.14,<2.16' 'tensordict>=0.14,<0.16' 'torchrl>=0.14,<0.16'"
+        "install 'torch<2.16,>=2.14' 'tensordict<0.16,>=0.14' 'torchrl<0.16,>=0.14'"
     )
 
 
