@@ -8,17 +8,11 @@ from heapq import heapreplace
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.studies.jobs import Job, Progress, kept_progress
 
-# Seconds on one of two busy cores. What a study's own runs take soon outweighs them.
-_FRAME = 25e-6  # an environment step of a run: collecting, writing
-_CALL = 45e-6  # the same, once for all runs side by side
-_WORLD = 0.8e-3  # a step of an environment that is not one of this package's, where each steps alone
-_EPISODE = 50  # steps of its evaluation's episodes: those of the Fetch tasks
-_UPDATE = 0.3e-3  # a gradient step of a run
-_ROW = 2.6e-6  # each row of it
-_WEIGHT = 0.1e-9  # each row and weight between hidden layers, with an actor and a critic
-_NARROW = 0.6  # what a weight takes if products=bfloat16
-_AROUND = 8.0  # a worker's start, and the pictures at the end
-_PRIOR = 30.0  # how many measured seconds it takes to count as much as all of the above
+# Seconds of a core, as a first guess: what a study's own runs take soon outweighs it.
+_FRAME = 5e-5  # an environment step of a run
+_UPDATE = 3e-4  # a gradient step of a run
+_PRODUCT = 5e-11  # each row of it and each weight between hidden layers
+_PRIOR = 30.0  # measured seconds that count as much as the guess
 
 
 def expected_seconds(recipe: Recipe, epochs: int) -> float:
@@ -30,20 +24,9 @@ def expected_seconds(recipe: Recipe, epochs: int) -> float:
         >>> round(expected_seconds(fifteen, fifteen.run.epochs) / 60)
         13
     """
-    frames = epochs * recipe.collection.epoch_frames
-    played = frames * recipe.run.num_runs
-    own = ":" not in recipe.task.name
-    worlds = 0 if own else played + epochs * recipe.run.num_runs * recipe.evaluation.episodes * _EPISODE
-    steps = played / recipe.collection.frames_per_update
-    return frames * _CALL + played * _FRAME + worlds * _WORLD + steps * _step(recipe)
-
-
-def _step(recipe: Recipe) -> float:
-    """Seconds of a gradient step of a run."""
-    learner = recipe.learner
-    weights = learner.hidden_weights / 2
-    weight = _WEIGHT * (_NARROW if learner.products == "bfloat16" else 1)
-    return _UPDATE + recipe.replay.batch_size * (_ROW + weights * weight)
+    steps = epochs * recipe.collection.epoch_frames * recipe.run.num_runs
+    update = _UPDATE + _PRODUCT * recipe.replay.batch_size * recipe.learner.hidden_weights
+    return steps * (_FRAME + update / recipe.collection.frames_per_update)
 
 
 def wall_clock(seconds: Iterable[float], at_once: int) -> float:
@@ -116,7 +99,7 @@ class Plan:
 
     def seconds_to_go(self, job: Job) -> float:
         """About how long a job that has not ended will still take on one core."""
-        return self._pace() * expected_seconds(job.recipe, self._epochs_to_go(job)) + _AROUND
+        return self._pace() * expected_seconds(job.recipe, self._epochs_to_go(job))
 
     def wall_clock(self, jobs: Iterable[Job], at_once: int) -> float:
         """About how many seconds it is until some jobs are done, so many at once."""

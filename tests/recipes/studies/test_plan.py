@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -60,37 +59,17 @@ def test_measured_times_outweigh_expected_ones(tmp_path: Path) -> None:
     assert plan.seconds_to_go(short) < before
 
 
-def test_twice_the_runs_or_updates_take_longer() -> None:
+def test_what_costs_more_takes_longer() -> None:
     one = expected_seconds(small(), 10)
     assert expected_seconds(small(), 20) == pytest.approx(2 * one)
-    assert one < expected_seconds(small(num_runs=2), 10) < 2 * one  # side by side they share some
-    assert expected_seconds(small(frames_per_update=5), 10) > one
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
+    for more in (
+        {"num_runs": 2},
+        {"frames_per_update": 5},
         {"hidden": 256},
         {"depth": 4},
         {"batch_size": 256},
-        {"learner": "td3"},
-        {"task": "gym:FetchPush-v4"},  # each of its worlds steps alone
-    ],
-    ids=str,
-)
-def test_what_costs_more_takes_longer(options: dict[str, Any]) -> None:
-    assert expected_seconds(small(**options), 10) > expected_seconds(small(), 10)
-
-
-def test_our_own_worlds_step_all_at_once() -> None:
-    toy, throwing = small(task="bit_flip"), small(task="hand_v0")
-    assert expected_seconds(toy, 10) < 1.5 * expected_seconds(throwing, 10)
-
-
-def test_narrow_products_and_few_episodes_take_less() -> None:
-    wide, fetch = small(hidden=256), small(task="gym:FetchPush-v4")
-    assert expected_seconds(wide.replace(products="bfloat16"), 10) < expected_seconds(wide, 10)
-    assert expected_seconds(fetch.replace(episodes=2), 10) < expected_seconds(fetch, 10)
+    ):
+        assert expected_seconds(small(**more), 10) > one
 
 
 @pytest.mark.parametrize(
