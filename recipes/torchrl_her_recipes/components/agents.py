@@ -7,11 +7,9 @@ from dataclasses import fields
 from typing import Literal, cast
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
-from torch import nn
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
-from torchrl.objectives import LossModule
 
 from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import Curriculum, zero_unused_inputs
@@ -53,12 +51,13 @@ def make_agent(
         ValueError: the learner cannot choose such actions, or cannot train several runs.
     """
     builder = _builder(recipe, env, curriculum)
-    builder.generators = generators
+    builder.generators, builder.rewards = generators, rewards
     actor, critics = _networks(builder, recipe, curriculum)  # the same on all devices
     builder.device, actor = device, actor.to(device)
     critics = [critic.to(device) for critic in critics]
-    exploration, options = builder.exploration(generators).to(device), recipe.learner
-    loss = builder.loss(actor, critics, rewards, generators)
+    exploration = builder.exploration().to(device)
+    options, runs = recipe.learner, recipe.run.num_runs
+    loss = builder.loss(actor, critics)
     norm = _norm_for(builder)
     norm = None if norm is None else norm.to(device)
     player = acting(actor, norm)
@@ -69,20 +68,22 @@ def make_agent(
         exploration=exploration,
         policy=TensorDictSequential(player, *([] if guide is None else [guide]), exploration),
         loss=loss,
-        optimizer=_make_adam(loss, options.learning_rate, recipe.run.num_runs),
+        optimizer=(
+            RunsAdam(loss, lr=options.learning_rate, runs=runs)
+            if runs > 1
+            else torch.optim.Adam(loss.parameters(), lr=options.learning_rate, fused=True)
+        ),
         target=make_target_updater(
-            loss, tau=options.tau, hard_interval=options.hard_update_interval, runs=recipe.run.num_runs
+            loss, tau=options.tau, hard_interval=options.hard_update_interval, runs=runs
         ),
         norm=norm,
-        average=_average_of(player, recipe),
+        average=(
+            PolicyAverage(player, decay=options.average_decay, runs=runs)
+            if options.average_decay > 0
+            else None
+        ),
         guide=guide,
     )
-
-
-def _make_adam(loss: LossModule, learning_rate: float, runs: int) -> torch.optim.Adam:
-    if runs > 1:
-        return RunsAdam(loss, lr=learning_rate, runs=runs)
-    return torch.optim.Adam(loss.parameters(), lr=learning_rate, fused=True)
 
 
 def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:
@@ -127,11 +128,6 @@ def _norm_for(builder: LearnerBuilder) -> RunningNorm | None:
     return make_norm(builder.recipe, dict(zip(builder.in_keys, builder.widths, strict=True)))
 
 
-def _average_of(policy: TensorDictModuleBase, recipe: Recipe) -> PolicyAverage | None:
-    decay = recipe.learner.average_decay
-    return PolicyAverage(policy, decay=decay, runs=recipe.run.num_runs) if decay > 0 else None
-
-
 def _guide_of(
     policy: TensorDictModuleBase,
     recipe: Recipe,
@@ -158,7 +154,8 @@ def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | 
         alone = []
         for seed in recipe.seeds:
             torch.manual_seed(seed)
-            alone.append(_in_one_list(builder.networks(1)))
+            single, others = builder.networks(1)
+            alone.append([single, *others])
         actor, critics = builder.networks(recipe.run.num_runs)
     networks = [actor, *critics]
     for network, own in zip(networks, zip(*alone, strict=True), strict=True):
@@ -166,19 +163,12 @@ def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | 
     if curriculum is not None:
         alphas = [recipe.curriculum.alpha_actor, *[recipe.curriculum.alpha_critic] * len(critics)]
         for network, alpha in zip(networks, alphas, strict=True):
-            weight = _first_layer(network).weight.data
+            first = next(own for own in network.modules() if isinstance(own, StackedLinear))
+            weight = first.weight.data
             weight.copy_(zero_unused_inputs(weight, curriculum.first_inputs, alpha=alpha))
     return actor, critics
-
-
-def _in_one_list(networks: Networks) -> list[TensorDictModule]:
-    return [networks[0], *networks[1]]
 
 
 def _builder(recipe: Recipe, env: EnvBase, curriculum: Curriculum | None) -> LearnerBuilder:
     in_keys = ("observation", "desired_goal") if curriculum is None else ("input",)
     return load_name(find_learner(recipe, env).builder)(recipe, env, in_keys)
-
-
-def _first_layer(network: nn.Module) -> StackedLinear:
-    return next(module for module in network.modules() if isinstance(module, StackedLinear))

@@ -64,10 +64,12 @@ class LearnerBuilder(ABC):
     Attributes:
         options: the recipe's group of the learner's own options.
         device: where networks and losses are.
-        generators: of each run's random numbers, for policies that draw their actions; None for torch's own.
+        generators: of each run's random numbers; None for torch's own.
+        rewards: the least and the greatest that there can be; infinite if the task's is dense.
     """
 
     device = torch.device("cpu")
+    rewards = (-1.0, 0.0)
     generators: Sequence[torch.Generator] | None = None
 
     def __init__(self, recipe: Recipe, env: EnvBase, in_keys: Sequence[str]) -> None:
@@ -85,9 +87,10 @@ class LearnerBuilder(ABC):
         """The actions of one environment."""
         return self.env.action_spec_unbatched.to(self.device)
 
-    def bounds(self, rewards: tuple[float, float]) -> tuple[float, float] | None:
+    @property
+    def bounds(self) -> tuple[float, float] | None:
         """The rewards whose returns targets are clamped to; None if they are not clamped."""
-        return rewards if getattr(self.options, "clamp_targets", True) else None
+        return self.rewards if getattr(self.options, "clamp_targets", True) else None
 
     @abstractmethod
     def networks(self, runs: int) -> Networks:
@@ -115,21 +118,12 @@ class LearnerBuilder(ABC):
         return actor.module
 
     @abstractmethod
-    def loss(
-        self,
-        actor: TensorDictModule,
-        critics: Sequence[TensorDictModule],
-        rewards: tuple[float, float],
-        generators: Sequence[torch.Generator],
-    ) -> LossModule:
+    def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         """TorchRL's loss.
 
         Args:
             actor: from :meth:`networks`.
             critics: likewise.
-            rewards: the least and the greatest that there can be; infinite if the task's is dense. See
-                :meth:`bounds` for learners with the option ``clamp_targets``.
-            generators: of each run's random numbers.
         """
 
     @property
@@ -140,15 +134,11 @@ class LearnerBuilder(ABC):
             return None
         return Cloning(weight=own.bc_weight, q_filter=own.q_filter)
 
-    def exploration(self, generators: Sequence[torch.Generator]) -> Exploration:
-        """Turns greedy into exploring actions; here for continuous ones.
-
-        Args:
-            generators: of each run's random numbers.
-        """
+    def exploration(self) -> Exploration:
+        """Turns greedy into exploring actions; here for continuous ones."""
         spec = self.action_spec
         return DecayingEpsilon(
-            spec.low, spec.high, generators=generators, **self.epsilon(), **self.action_noise()
+            spec.low, spec.high, generators=self.generators, **self.epsilon(), **self.action_noise()
         )
 
     def epsilon(self) -> dict[str, float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import LossModule
 
@@ -50,18 +49,12 @@ class DDPGBuilder(LearnerBuilder):
             **self.options.critic_shape,
         )
 
-    def loss(
-        self,
-        actor: TensorDictModule,
-        critics: Sequence[TensorDictModule],
-        rewards: tuple[float, float],
-        generators: Sequence[torch.Generator],
-    ) -> LossModule:
+    def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_ddpg_loss(
             actor,
             critics[0],
             gamma=self.options.gamma,
-            reward_range=self.bounds(rewards),
+            reward_range=self.bounds,
             action_penalty=self.options.action_penalty,
             saturation_penalty=self.options.saturation_penalty,
             reduction="none",

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import cast
 
-import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import QValueActor
@@ -33,19 +32,13 @@ class DQNBuilder(LearnerBuilder):
     def greedy(self, actor: TensorDictModule) -> nn.Module:
         return BestAction(next(each for each in actor.modules() if isinstance(each, QNet)))
 
-    def loss(
-        self,
-        actor: TensorDictModule,
-        critics: Sequence[TensorDictModule],
-        rewards: tuple[float, float],
-        generators: Sequence[torch.Generator],
-    ) -> LossModule:
+    def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_dqn_loss(
             cast(QValueActor, actor),
             gamma=self.options.gamma,
-            reward_range=self.bounds(rewards),
+            reward_range=self.bounds,
             reduction="none",
         )
 
-    def exploration(self, generators: Sequence[torch.Generator]) -> Exploration:
-        return DecayingEpsilonGreedy(self.action_spec.n, generators=generators, **self.epsilon())
+    def exploration(self) -> Exploration:
+        return DecayingEpsilonGreedy(self.action_spec.n, generators=self.generators, **self.epsilon())

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import LossModule
@@ -38,47 +37,43 @@ class SACBuilder(DDPGBuilder):
         spec = self.action_spec
         return SquashedLocation(net, spec.low.to(self.dtype), spec.high.to(self.dtype))
 
-    def loss(
-        self,
-        actor: TensorDictModule,
-        critics: Sequence[TensorDictModule],
-        rewards: tuple[float, float],
-        generators: Sequence[torch.Generator],
-    ) -> LossModule:
+    def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_sac_loss(
             actor,
             critics,
             target_critics=self.options.target_critics,
-            **self.soft(rewards, generators),
+            **self.soft,
         )
 
-    def soft(self, rewards: tuple[float, float], generators: Sequence[torch.Generator]) -> dict[str, Any]:
+    @property
+    def soft(self) -> dict[str, Any]:
         """The options that losses with a stochastic policy share."""
         return {
             "action_spec": self.action_spec,
             "critics": self.options.critics,
             "gamma": self.options.gamma,
-            "reward_range": self.bounds(rewards),
+            "reward_range": self.bounds,
             "temperature": self.options.temperature,
             "action_penalty": self.options.action_penalty,
             "runs": self.recipe.run.num_runs,
-            "generators": generators,
+            "generators": self.generators,
             "reduction": "none",
             "cloning": self.cloning,
         }
 
-    def bounds(self, rewards: tuple[float, float]) -> tuple[float, float] | None:
+    @property
+    def bounds(self) -> tuple[float, float] | None:
         """The same, but asked for where there are no bounds it is an error, since it is off by default.
 
         Raises:
             ValueError: targets are to be clamped, but rewards have no bounds.
         """
-        if self.options.clamp_targets and not all(map(math.isfinite, rewards)):
+        if self.options.clamp_targets and not all(map(math.isfinite, self.rewards)):
             raise ValueError(
                 f"clamp_targets=true has no effect on {self.recipe.task.name}, whose rewards have no bounds: "
                 "leave it out"
             )
-        return super().bounds(rewards)
+        return super().bounds
 
     def epsilon(self) -> dict[str, float]:
         """None: the policy explores by itself."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import LossModule
 
@@ -15,13 +14,7 @@ from torchrl_her_recipes.components.learners.ddpg import DDPGBuilder
 class TD3Builder(DDPGBuilder):
     """See :func:`~torchrl_her.make_td3_loss`; the networks are those of DDPG."""
 
-    def loss(
-        self,
-        actor: TensorDictModule,
-        critics: Sequence[TensorDictModule],
-        rewards: tuple[float, float],
-        generators: Sequence[torch.Generator],
-    ) -> LossModule:
+    def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_td3_loss(
             actor,
             critics,
@@ -29,10 +22,10 @@ class TD3Builder(DDPGBuilder):
             critics=self.options.critics,
             target_critics=self.options.target_critics,
             gamma=self.options.gamma,
-            reward_range=self.bounds(rewards),
+            reward_range=self.bounds,
             action_penalty=self.options.action_penalty,
             saturation_penalty=self.options.saturation_penalty,
-            generators=generators,
+            generators=self.generators,
             reduction="none",
             cloning=self.cloning,
         )

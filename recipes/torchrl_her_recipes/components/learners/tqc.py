@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import LossModule
 
@@ -19,16 +18,10 @@ class TQCBuilder(SACBuilder):
     def outputs(self) -> int:
         return int(self.options.quantiles)
 
-    def loss(
-        self,
-        actor: TensorDictModule,
-        critics: Sequence[TensorDictModule],
-        rewards: tuple[float, float],
-        generators: Sequence[torch.Generator],
-    ) -> LossModule:
+    def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_tqc_loss(
             actor,
             critics,
             dropped_quantiles=self.options.dropped_quantiles,
-            **self.soft(rewards, generators),
+            **self.soft,
         )
