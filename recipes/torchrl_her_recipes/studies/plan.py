@@ -22,7 +22,7 @@ def expected_seconds(recipe: Recipe, epochs: int) -> float:
         >>> from torchrl_her_recipes import load_preset, make_recipe
         >>> fifteen = make_recipe(load_preset("throwing"), num_runs=15)
         >>> round(expected_seconds(fifteen, fifteen.run.epochs) / 60)
-        13
+        12
     """
     steps = epochs * recipe.collection.epoch_frames * recipe.run.num_runs
     update = _UPDATE + _PRODUCT * recipe.replay.batch_size * recipe.learner.hidden_weights
