@@ -54,12 +54,21 @@ class StackedLinear(nn.Module):
 class StackedBatchNorm(nn.Module):
     """Batch normalization in which each run has its own statistics.
 
-    TorchRL's DDPG loss evaluates both critics in training mode. So the online critic's running statistics
-    move twice in each update, and the target critic's move without being copied.
+    A batch is normalized by its own statistics only where the weights learn from it, in the critic's own
+    loss; these alone move the running statistics. Where weights get no gradient, in target networks and in
+    the actor's loss, and in evaluation mode, the running statistics are used. With the statistics of the
+    batch, an actor could hardly raise the mean of the values, which the normalization takes out.
 
     Args:
-        width: of the input.
+        width: Width of the input.
         runs: R.
+
+    Example:
+        >>> norm, rows = StackedBatchNorm(2), torch.tensor([[[1.0, 4.0], [3.0, 8.0]]])
+        >>> norm(rows).detach().round(decimals=3).tolist()
+        [[[-1.0, -1.0], [1.0, 1.0]]]
+        >>> norm.requires_grad_(False)(rows).round(decimals=1).tolist()  # by running means of 0.2 and 0.6
+        [[[0.8, 2.4], [2.6, 5.2]]]
     """
 
     def __init__(self, width: int, *, runs: int = 1) -> None:
@@ -69,8 +78,12 @@ class StackedBatchNorm(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[R, rows, width] to the same."""
         runs, rows, width = x.shape
-        flat = x.transpose(0, 1).reshape(rows, runs * width)
-        return self.norm(flat).view(rows, runs, width).transpose(0, 1)
+        flat, norm = x.transpose(0, 1).reshape(rows, runs * width), self.norm
+        learns = self.training and norm.weight.requires_grad
+        flat = nn.functional.batch_norm(
+            flat, norm.running_mean, norm.running_var, norm.weight, norm.bias, learns, eps=norm.eps
+        )
+        return flat.view(rows, runs, width).transpose(0, 1)
 
 
 class StackedLayerNorm(nn.Module):

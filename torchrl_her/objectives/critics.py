@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, TQCLoss
 
 from torchrl_her.checks import check_whole
+from torchrl_her.modules.networks import StackedBatchNorm
 from torchrl_her.modules.noise import RunNoise
 
 
@@ -132,9 +133,13 @@ def as_critics(
     is handed over by itself; TorchRL then draws weights anew, which :func:`keep_weights` puts back.
 
     Raises:
-        ValueError: the list has another length than ``critics``, or that is below 1.
+        ValueError: the list has another length than ``critics``, or that is below 1; a critic has batch
+            normalization, whose statistics a stack of critics cannot move.
     """
     check_whole(critics=critics)
+    for own in [critic] if isinstance(critic, TensorDictModule) else critic:
+        if any(isinstance(layer, StackedBatchNorm) for layer in own.modules()):
+            raise ValueError("norm must be none or layer in critics of this loss, got 'batch'; DDPG has it")
     if isinstance(critic, TensorDictModule):
         return critic
     if len(critic) != critics:

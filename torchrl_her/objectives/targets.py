@@ -64,7 +64,34 @@ def clamped_td0(
     )
 
 
-class RunsHardUpdate(HardUpdate):
+class _BuffersToo(TargetNetUpdater):
+    """Moves the buffers of target networks as their weights; TorchRL's updates leave buffers unchanged."""
+
+    def step(self) -> None:
+        super().step()
+        for name in self._target_names:
+            target, source = (getattr(self.loss_module, own) for own in (name, name.removeprefix("target_")))
+            buffers = [key for key, entry in source.items(True, True) if _is_statistic(entry)]
+            if buffers:
+                self._step(source.select(*buffers), target.select(*buffers))
+
+
+def _is_statistic(entry: Tensor) -> bool:
+    return entry.is_floating_point() and not entry.requires_grad
+
+
+class BuffersSoftUpdate(SoftUpdate, _BuffersToo):
+    """A soft update of weights and buffers, which batch normalization needs.
+
+    Args:
+        loss_module: Loss with target networks.
+
+    Keyword Args:
+        tau: Share of the online networks in each step.
+    """
+
+
+class RunsHardUpdate(HardUpdate, _BuffersToo):
     """Copies the online weights of each of R runs to its target networks, by the run's own count of steps.
 
     Args:
@@ -92,7 +119,7 @@ class RunsHardUpdate(HardUpdate):
             self.counts[run] += 1
         self._due = [run for run in learning if self.counts[run] % self.interval == 0]
         if self._due:
-            TargetNetUpdater.step(self)
+            _BuffersToo.step(self)
 
     def _step(self, p_source: TensorDictBase, p_target: TensorDictBase) -> None:
         dim, runs = p_target.ndim, len(self.counts)  # a stack of N critics is [N, R, ...]
@@ -113,7 +140,7 @@ class RunsHardUpdate(HardUpdate):
 def make_target_updater(
     loss: LossModule, *, tau: float, hard_interval: int, runs: int = 1
 ) -> TargetNetUpdater:
-    """What moves the target networks of a loss, one step at a time.
+    """Returns the update of a loss's target networks, of their running statistics, too.
 
     Args:
         loss: with target networks.
@@ -126,12 +153,9 @@ def make_target_updater(
     Example:
         >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss
         >>> loss = make_ddpg_loss(make_actor((9, 2), 3), make_critic((9, 2), 3))
-        >>> type(make_target_updater(loss, tau=0.01, hard_interval=0)).__name__
-        'SoftUpdate'
+        >>> isinstance(make_target_updater(loss, tau=0.01, hard_interval=0), SoftUpdate)
+        True
     """
-    if hard_interval > 0 and runs > 1:
-        return RunsHardUpdate(loss, interval=hard_interval, runs=runs)
     if hard_interval > 0:
-        # TorchRL counts that many steps without a copy before each step with one
-        return HardUpdate(loss, value_network_update_interval=hard_interval - 1)
-    return SoftUpdate(loss, tau=tau)
+        return RunsHardUpdate(loss, interval=hard_interval, runs=runs)
+    return BuffersSoftUpdate(loss, tau=tau)

@@ -21,7 +21,7 @@ from torchrl_her.native.job import STOCHASTIC, Algorithm
 from torchrl_her.objectives.cloning import ClonesDemonstrations
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss
 from torchrl_her.objectives.sac import PenalizedSACLoss
-from torchrl_her.objectives.targets import ClampedTD0, RunsHardUpdate
+from torchrl_her.objectives.targets import BuffersSoftUpdate, ClampedTD0, RunsHardUpdate
 from torchrl_her.objectives.td3 import PenalizedTD3Loss
 from torchrl_her.objectives.tqc import PenalizedTQCLoss
 from torchrl_her.torchrl_private import has_keyword_arguments
@@ -123,7 +123,7 @@ def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | Non
     if type(loss) not in FUSED:
         return f"a {type(loss).__name__}, which is not a loss that this library makes"
     if (
-        type(target) not in (SoftUpdate, HardUpdate, RunsHardUpdate)
+        type(target) not in (SoftUpdate, BuffersSoftUpdate, HardUpdate, RunsHardUpdate)
         or target is None
         or target.loss_module is not loss
     ):

@@ -7,8 +7,9 @@ from functools import partial
 from typing import Any
 
 import torch
-from torchrl.data import TensorDictReplayBuffer
+from torchrl.data import PrioritizedSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.scheduler import LinearScheduler
 from torchrl.envs import DeviceCastTransform, EnvBase
 
 from torchrl_her.curriculum.normalization import count_inputs
@@ -131,6 +132,14 @@ def _goals(recipe: Recipe) -> dict[str, Any]:
 def _counted_by(norm: RunningNorm, state: CurriculumState | None) -> OnWrite:
     """What counts the transitions that are written."""
     return norm.update if state is None else partial(count_inputs, norm, state.progress)
+
+
+def rising_beta(sampler: Sampler, recipe: Recipe) -> list[LinearScheduler]:
+    """Returns the schedule of ``priority_beta``, a step an epoch; none if it stays."""
+    end = recipe.replay.priority_beta_end
+    if end is None or not isinstance(sampler, PrioritizedSampler):
+        return []
+    return [LinearScheduler(sampler, "beta", end, max(1, recipe.run.epochs - 1))]
 
 
 def _make_sampler(

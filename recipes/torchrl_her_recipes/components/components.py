@@ -29,6 +29,7 @@ from torchrl_her.trainers.fusing import is_plain_adam, why_not_fused
 from torchrl_her.trainers.graphs import GraphLearner, why_not_recorded
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.trainer import Trainer
+from torchrl_her_recipes.components.buffers import rising_beta
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.demonstrations import RunDemonstrations
@@ -159,7 +160,11 @@ class Components:
             collector=self.collector,
             buffer=self.buffer if shown is None else shown.mixed_with(self.buffer, recipe),
             learner=self.learner(),
-            schedules=[self.exploration, *scheduled([*goal_weights(self.buffer), *self._proposals()])],
+            schedules=[
+                self.exploration,
+                *scheduled([*goal_weights(self.buffer), *self._proposals()]),
+                *rising_beta(self.buffer.sampler, recipe),
+            ],
             runs=recipe.run.num_runs,
             epoch_frames=recipe.collection.epoch_frames,
             frames_per_update=recipe.collection.frames_per_update,

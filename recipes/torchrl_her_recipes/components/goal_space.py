@@ -206,7 +206,8 @@ def make_instructive(
     }
     if isinstance(space, KernelSpace):
         return KernelInstructiveness(space.goals, **options)
-    return Instructiveness(space.grid, space.target_at, recent=recipe.ibs.recent, **options)
+    options |= {"recent": recipe.ibs.recent, "floor_is_relative": recipe.ibs.floor_is_relative}
+    return Instructiveness(space.grid, space.target_at, **options)
 
 
 def histograms(buffer: TensorDictReplayBuffer) -> list[GoalHistogram]:

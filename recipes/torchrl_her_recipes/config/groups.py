@@ -118,6 +118,11 @@ class ReplayConfig(Group):
         0.6, "exponent of priorities, for absolute TD errors (Schaul et al.)", at_least=0
     )
     priority_beta: float = option(0.4, "exponent of importance weights (Schaul et al.)", at_least=0)
+    priority_beta_end: float | None = option(
+        None,
+        "value that priority_beta rises to linearly until the last epoch; it stays as it is if not given",
+        at_least=0,
+    )
     device: str = option(
         "learner",
         "where transitions are stored and relabeled: learner (where the networks are), cpu, cuda, ...",
@@ -192,6 +197,9 @@ class IBSConfig(Group):
     start_factor: float = option(3.0, "sigma begins at this multiple of its final value", at_least=1)
     decay: float = option(0.9, "the kernel's covariance is multiplied by this each epoch", above=0, at_most=1)
     floor: float = option(0.002, "lowest weight of a goal, as a share of the largest q*", at_least=0)
+    floor_is_relative: bool = option(
+        True, "whether floor is such a share; if false, it is compared with q* - q as it is (the thesis)"
+    )
     estimator: str = option(
         "auto",
         "what q* and q are: grid (histograms, for goals of up to three numbers), kernel (densities, for any "

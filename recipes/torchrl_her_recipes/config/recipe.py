@@ -243,9 +243,9 @@ def _drop_options_of_another_learner(below: Nested, given: Nested) -> None:
     """
     name, before = _learner_of(given, below), _learner_of(below)
     kind, former = options_of(name), LEARNERS[before].options if before in LEARNERS else None
-    known = {own.name for own in fields(kind)}
+    known: dict[str, tuple[str, ...]] = {own.name: own.metadata.get("choices", ()) for own in fields(kind)}
     if _named("learner", "auto", given, below) == "auto":
-        without = {own.name for own in fields(options_of("auto"))} - known
+        without = {own.name for own in fields(options_of("auto"))} - set(known)
         for key, value in given.get("learner", {}).items():
             if key in without:
                 raise ValueError(f"{key}={value} has no effect with learner={name}: leave it out")
@@ -253,7 +253,9 @@ def _drop_options_of_another_learner(below: Nested, given: Nested) -> None:
     below["learner"] = {
         key: value
         for key, value in below.get("learner", {}).items()
-        if key in known and (key not in defaults or value != defaults[key])
+        if key in known
+        and (not known[key] or value in known[key])
+        and (key not in defaults or value != defaults[key])
     }
 
 

@@ -57,9 +57,10 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         if algorithm.instructive is None:
             all_of("ibs", with_algo, but=("cells", "recent"))  # the goals of HER are counted, too
         elif groups.ibs.estimator == "kernel":
-            idle["ibs", "cells"] = idle["ibs", "recent"] = "with estimator=kernel"
+            for name in ("cells", "recent", "floor_is_relative"):
+                idle["ibs", name] = "with estimator=kernel"
         if algorithm.instructive == "sequential":
-            idle["ibs", "floor"] = with_algo
+            idle["ibs", "floor"] = idle["ibs", "floor_is_relative"] = with_algo
     if not algorithm.filter_achieved:
         idle["hindsight", "refill"] = with_algo
     if algorithm.hindsight and groups.hindsight.goal_sources not in (None, AUTO):
@@ -111,7 +112,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
     if groups.collection.processes == 0:
         idle["collection", "sync"] = "with processes=0"
     if groups.replay.sampler != "prioritized":
-        for name in ("priority_alpha", "priority_beta"):
+        for name in ("priority_alpha", "priority_beta", "priority_beta_end"):
             idle["replay", name] = f"with sampler={groups.replay.sampler}"
     if not groups.learner.normalize:
         for name in ("normalize_clip", "normalize_least_std"):

@@ -109,6 +109,15 @@ def test_batch_normalization_is_that_of_torch() -> None:
     assert torch.allclose(own.norm.running_mean, norm.running_mean, atol=1e-5)
 
 
+def test_where_the_weights_do_not_learn_batch_normalization_uses_and_keeps_the_running_statistics() -> None:
+    own = StackedBatchNorm(1).requires_grad_(False)
+    own.norm.running_mean.fill_(3.0)
+    own.norm.running_var.fill_(4.0)
+    assert own(torch.tensor([[[3.0], [7.0]]])).flatten().tolist() == pytest.approx([0.0, 2.0], abs=1e-4)
+    assert own.norm.running_mean.tolist() == [3.0]
+    assert own.norm.running_var.tolist() == [4.0]
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.integers(1, 3), max_size=3))
 def test_any_batch_shape(shape: list[int]) -> None:

@@ -94,9 +94,14 @@ def test_the_least_of_critics_that_are_drawn_for_each_run() -> None:
     assert seen == {(0, 1), (0, 2), (1, 2)}
 
 
-@pytest.mark.parametrize("kind", ["ddpg", "td3", "sac"])
-def test_statistics_of_batches_are_neither_used_nor_changed(kind: str) -> None:
-    loss, data = make_loss(kind, normalize=True), make_rows(kind)
+@pytest.mark.parametrize("kind", ["td3", "sac"])
+def test_batch_normalization_is_refused_where_critics_are_stacked(kind: str) -> None:
+    with pytest.raises(ValueError, match="norm must be none or layer .* got 'batch'"):
+        make_loss(kind, normalize=True)
+
+
+def test_statistics_of_batches_are_neither_used_nor_changed() -> None:
+    loss, data = make_loss("ddpg", normalize=True), make_rows("ddpg")
     before = {name: value.clone() for name, value in loss.state_dict().items()}
     together = critic_value(loss, data)
     alone = torch.cat([critic_value(loss, data[i : i + 1]) for i in range(5)])

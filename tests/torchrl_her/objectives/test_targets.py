@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
-from torchrl_her import LossLearner, make_target_updater
+from torchrl_her import LossLearner, make_actor, make_critic, make_ddpg_loss, make_target_updater
 
 from ..ddpg_data import batch, constant_loss, make_loss, rows, weights
 
@@ -120,5 +120,27 @@ def test_targets_are_copied_every_so_many_steps(interval: int) -> None:
 
 
 def test_kinds_of_target_updates() -> None:
-    assert type(make_target_updater(make_loss(), tau=0.1, hard_interval=0)) is SoftUpdate
-    assert type(make_target_updater(make_loss(), tau=0.1, hard_interval=5)) is HardUpdate
+    assert isinstance(make_target_updater(make_loss(), tau=0.1, hard_interval=0), SoftUpdate)
+    assert isinstance(make_target_updater(make_loss(), tau=0.1, hard_interval=5), HardUpdate)
+
+
+# Batch normalization
+
+MEAN = ("module", "first", "0", "norm", "running_mean")
+
+
+@pytest.mark.parametrize(
+    ("hard_interval", "expected"), [(0, [(0.3, 0.15), (0.57, 0.36)]), (2, [(0.3, 0.0), (0.57, 0.57)])]
+)
+def test_statistics_move_once_a_step_and_those_of_the_target_follow(
+    hard_interval: int, expected: list[tuple[float, float]]
+) -> None:
+    loss = make_ddpg_loss(make_actor((4, 2), 3), make_critic((4, 2), 3, norm="batch"))
+    target = make_target_updater(loss, tau=0.5, hard_interval=hard_interval)
+    learner = LossLearner(loss, torch.optim.SGD(loss.parameters(), lr=0.0), target)
+    data = rows([-1.0, -1.0])
+    data["observation"] = torch.tensor([[2.0], [4.0]]).expand(2, 4)
+    for means in expected:  # momentum 0.1, towards 3: the mean of the batch, in the critic's own loss alone
+        learner.update(data)
+        networks = (loss.value_network_params, loss.target_value_network_params)
+        assert [params[MEAN][0].item() for params in networks] == pytest.approx(list(means))
