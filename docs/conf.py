@@ -54,7 +54,7 @@ python_use_unqualified_type_names = True
 # Every reference within the project has a target; other libraries' pages are not read in.
 nitpicky = True
 nitpick_ignore_regex = [
-    ("py:.*", r"(collections|pathlib|torch|tensordict|torchrl|numpy|gymnasium)\..*"),
+    ("py:.*", r"(collections|pathlib|torch|tensordict|torchrl|numpy|gymnasium|optuna)\..*"),
     ("py:class", r"[^.]*"),  # types that are written as text
     ("py:obj", r"typing\.Literal\[.*"),
     ("py:class", r"ctypes\..*"),
@@ -66,7 +66,6 @@ nitpick_ignore_regex = [
     ("py:class", r"torchrl_her_envs\.throwing\.arrays\.Array"),
     ("py:class", r"torchrl_her_envs\.throwing\.rendering\.render\.Scene"),
     ("py:class", r"torchrl_her_recipes\.components\.curricula\.CurriculumState"),
-    ("py:class", r"torchrl_her_recipes\.config\.spaces\.Entry"),
     ("py:class", r"torchrl_her_recipes\.reports\.tidy\.Results"),
     ("py:class", r"torchrl_her_recipes\.components\.demonstrations\.RunDemonstrations"),
     ("py:class", r"torchrl_her_recipes\.studies\.(workers_local\.Workers|study\.StudyResult|plan\.Plan)"),

@@ -72,7 +72,7 @@ def tune(
     search = Search(recipe=recipe, space=space.without(given), sampler=sampler, pruner=pruner)
     home = Path(folder or f"runs/tune_{label(recipe)}")
     click.echo(f"search: {home}")
-    click.echo(f"varied: {', '.join(entry.name for entry in search.space)}")
+    click.echo(f"varied: {', '.join(search.space.ranges)}")
     workers: Any = recipes.make_workers(jobs=jobs)
     result = recipes.tune(search, home, trials=trials, minutes=minutes, workers=workers, say=_say_trial)
     return _say(result)

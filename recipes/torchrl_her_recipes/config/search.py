@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.spaces import Space, make_space
+from torchrl_her_recipes.config.shortcuts import LONG_ONLY
+from torchrl_her_recipes.config.spaces import Space
 
 Sampler = Literal["tpe", "random", "cmaes"]
 Pruner = Literal["median", "halving", "none"]
@@ -48,19 +49,19 @@ class Search:
         for name, known in (("sampler", SAMPLERS), ("pruner", PRUNERS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
-        if self.sampler == "cmaes" and sum(entry.kind != "choice" for entry in self.space) < 2:
+        numbers = [name for name, values in self.space.ranges.items() if values["kind"] != "choice"]
+        if self.sampler == "cmaes" and len(numbers) < 2:
             raise ValueError(
                 f"--sampler cmaes needs two options that are no choices, and the space {self.space.name} "
                 "has fewer: take tpe or random"
             )
         self.space.check(self.recipe)
-        own = self.space.values_of(self.recipe)
-        for entry in self.space:
-            value = own.get(entry.name, AUTO)
-            numbers = self.sampler == "cmaes" and entry.kind != "choice"
-            if numbers and value != AUTO and not entry.holds(value):
+        values = self.space.values_of(self.recipe)
+        inside = self.space.inside(values)
+        for name in numbers:
+            if self.sampler == "cmaes" and values.get(name, AUTO) != AUTO and name not in inside:
                 raise ValueError(
-                    f"--sampler cmaes needs a space with the recipe's own values, and {entry.name}={value} "
+                    f"--sampler cmaes needs a space with the recipe's own values, and {name}={values[name]} "
                     "lies outside; widen its range, or choose --sampler tpe"
                 )
 
@@ -69,55 +70,34 @@ class Search:
         return {
             "sampler": self.sampler,
             "pruner": self.pruner,
-            "space": self.space.to_plain(),
+            "space": dict(self.space.ranges),
             "recipe": self.recipe.to_dict(),
         }
 
-    @classmethod
-    def from_plain(cls, values: Mapping[str, Any]) -> Search:
-        """The search that :meth:`to_plain` was asked of.
 
-        Raises:
-            ValueError: the values are not those of a search.
-        """
-        known = ("sampler", "pruner", "space", "recipe")
-        if set(values) != set(known) or not isinstance(values["recipe"], Mapping):
-            raise ValueError(f"a search has {', '.join(known)}, got {', '.join(map(str, values))}")
-        return cls(
-            recipe=Recipe.from_dict(values["recipe"]),
-            space=make_space("of the folder", values["space"]),
-            sampler=values["sampler"],
-            pruner=values["pruner"],
-        )
+def difference(search: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+    """Returns what differs in two searches as plain values, as ``mine, not theirs``; empty if nothing does.
 
-    def difference(self, other: Search) -> str:
-        """What differs in another search, as ``mine, not theirs``; empty if nothing does.
-
-        Example:
-            >>> from torchrl_her_recipes import make_recipe, space_for
-            >>> recipe = make_recipe(task="hand_v0")
-            >>> one = Search(recipe=recipe, space=space_for(recipe))
-            >>> one.difference(Search(recipe=recipe.replace(seed=3), space=one.space))
-            'seed=0, not seed=3'
-        """
-        theirs = dict(_flat(other))
-        mine = dict(_flat(self))
-        for name in [*mine, *theirs]:
-            if mine.get(name) != theirs.get(name):
-                return f"{_shown(name, mine)}, not {_shown(name, theirs)}"
-        return ""
+    Example:
+        >>> from torchrl_her_recipes import make_recipe, space_for
+        >>> recipes = make_recipe(task="hand_v0"), make_recipe(task="hand_v0", seed=3)
+        >>> one, other = (Search(recipe=recipe, space=space_for(recipe)) for recipe in recipes)
+        >>> difference(one.to_plain(), other.to_plain())
+        'seed=0, not seed=3'
+    """
+    mine, theirs = _flat(search), _flat(other)
+    for name in {**mine, **theirs}:
+        if mine.get(name) != theirs.get(name):
+            said = (f"{name}={own[name]}" if name in own else f"no {name}" for own in (mine, theirs))
+            return ", not ".join(said)
+    return ""
 
 
-def _shown(name: str, values: Mapping[str, Any]) -> str:
-    return f"{name}={values[name]}" if name in values else f"no {name}"
-
-
-def _flat(search: Search) -> Iterator[tuple[str, Any]]:
-    yield "--sampler", search.sampler  # as on the command line; recipes have a sampler, too
-    yield "--pruner", search.pruner
-    for name, entry in search.space.to_plain().items():
-        yield f"space.{name}", entry
-    for group, options in search.recipe.to_dict().items():
+def _flat(search: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the values of a search by their names on the command line."""
+    flat = {f"--{name}": search[name] for name in ("sampler", "pruner")}
+    flat |= {f"space.{name}": values for name, values in search["space"].items()}
+    for group, options in search["recipe"].items():
         for name, value in options.items():
-            shown = f"demonstrations.{name}" if group == "demonstrations" else name
-            yield group if name == "name" else shown, value
+            flat[group if name == "name" else f"{group}.{name}" if group in LONG_ONLY else name] = value
+    return flat

@@ -2,173 +2,71 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from reprlib import Repr
 from textwrap import shorten
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.learners import BY_ACTIONS
 from torchrl_her_recipes.config.options import AUTO, what_there_is
-from torchrl_her_recipes.config.plain_files import read_yaml
+from torchrl_her_recipes.config.plain_files import read_yaml, shown
 from torchrl_her_recipes.config.recipe import Recipe, compose, drop_other_goal_sources
 from torchrl_her_recipes.config.shipped import CONF
 from torchrl_her_recipes.config.shortcuts import locate, merge, place
 from torchrl_her_recipes.config.values import as_kind
 from torchrl_her_recipes.config.without_effect import without_effect
 
-Kind = Literal["float", "log_float", "int", "log_int", "choice"]
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
 
-_KINDS = get_args(Kind)
 _SPACES = CONF / "space"
+_RANGE = ("low", "high")
+_KINDS = {"float": _RANGE, "log_float": _RANGE, "int": _RANGE, "log_int": _RANGE, "choice": ("values",)}
 _MOST = 100  # values of a choice
+_LARGEST = 1e15
 # Trials must be of the same length and start, or they could not be compared; files are the search's own.
 _SAME_FOR_ALL = ("task", "seed", "num_runs", "epochs", "epoch_frames", "checkpoint_interval", "keep_buffer")
-
-_repr = Repr()
-_repr.maxlevel, _repr.maxdict, _repr.maxlist, _repr.maxtuple, _repr.maxother = 2, 4, 4, 4, 60
-
-
-@dataclass(frozen=True, kw_only=True)
-class Entry:
-    """One option that is varied.
-
-    Args:
-        name: of the option, short or with its group.
-        kind: ``float`` or ``int``, each also as ``log_float`` and ``log_int``, which are drawn evenly in
-            their logarithm; or ``choice``.
-        low: the smallest value; of a choice None.
-        high: the largest value; of a choice None.
-        values: those of a choice.
-
-    Raises:
-        ValueError: an unknown option or kind, or a range that holds nothing; the message names it.
-    """
-
-    name: str
-    kind: Kind
-    low: float | None = None
-    high: float | None = None
-    values: tuple[Any, ...] = ()
-
-    def __post_init__(self) -> None:
-        group, own = locate(self.name)
-        if own in _SAME_FOR_ALL or (group, own) == ("task", "name"):
-            raise ValueError(f"{self.name} must be the same in all trials of a search: it cannot be varied")
-        if self.kind not in _KINDS:
-            raise ValueError(
-                f"kind of {self.name} must be one of {', '.join(_KINDS)}, got {_repr.repr(self.kind)}"
-            )
-        if self.kind == "choice":
-            self._check_choice()
-        else:
-            self._check_range()
-
-    @property
-    def ends(self) -> tuple[Any, ...]:
-        """The values that a recipe must take: both ends of the range, or all of a choice."""
-        return self.values if self.kind == "choice" else (self.low, self.high)
-
-    def holds(self, value: Any) -> bool:
-        """Whether a value is one that the search may choose.
-
-        Example:
-            >>> Entry(name="gamma", kind="float", low=0.9, high=0.99).holds(0.95)
-            True
-        """
-        if self.kind == "choice":
-            return value in self.values
-        assert self.low is not None
-        assert self.high is not None
-        return isinstance(value, int | float) and self.low <= value <= self.high
-
-    def suggest(self, trial: Any) -> Any:
-        """The value that a trial of Optuna has, or now gets."""
-        if self.kind == "choice":
-            return trial.suggest_categorical(self.name, self.values)
-        assert self.low is not None
-        assert self.high is not None
-        log = self.kind.startswith("log")
-        if self.kind.endswith("float"):
-            return trial.suggest_float(self.name, self.low, self.high, log=log)
-        return trial.suggest_int(self.name, int(self.low), int(self.high), log=log)
-
-    def to_plain(self) -> dict[str, Any]:
-        """What stands behind the name of the option in a file."""
-        if self.kind == "choice":
-            return {"kind": self.kind, "values": list(self.values)}
-        return {"kind": self.kind, "low": self.low, "high": self.high}
-
-    def _check_choice(self) -> None:
-        if self.low is not None or self.high is not None:
-            raise ValueError(f"{self.name} is a choice and has values, not low and high")
-        if not all(value is None or isinstance(value, str | int | float) for value in self.values):
-            raise ValueError(
-                f"values of {self.name} must be numbers, texts, true or false, got {_repr.repr(self.values)}"
-            )
-        if len({(type(value), value) for value in self.values}) != len(self.values):
-            raise ValueError(f"values of {self.name} must differ, got {_repr.repr(self.values)}")
-        if not 2 <= len(self.values) <= _MOST:
-            raise ValueError(f"{self.name} must have 2 to {_MOST} values, got {len(self.values)}")
-
-    def _check_range(self) -> None:
-        if self.values:
-            raise ValueError(f"{self.name} is a {self.kind} and has low and high, not values")
-        for end in ("low", "high"):
-            value = getattr(self, end)
-            if value is None:
-                raise ValueError(f"{self.name} is a {self.kind} and needs {end}")
-            if not isinstance(value, str | int | float):
-                raise ValueError(f"{end} of {self.name} must be a number, got {_repr.repr(value)}")
-            number = as_kind(f"{end} of {self.name}", value, float if "float" in self.kind else int)
-            if not math.isfinite(number) or abs(number) > 1e15:
-                raise ValueError(f"{end} of {self.name} must be finite, got {number}")
-            object.__setattr__(self, end, number)
-        assert self.low is not None
-        assert self.high is not None
-        if self.low >= self.high:
-            raise ValueError(f"low of {self.name} must be below high, got {self.low} and {self.high}")
-        if self.kind.startswith("log") and self.low <= 0:
-            raise ValueError(f"low of {self.name}, a {self.kind}, must be above 0, got {self.low}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Space:
     """The options that a search varies.
 
-    With Optuna's own ``optimize``::
+    With Optuna itself::
 
-        def objective(trial):
-            return run_score(space.recipe(recipe, space.suggest(trial)))
+        trial = study.ask(space.distributions())
+        study.tell(trial, run_score(space.recipe(recipe, trial.params)))
 
     Args:
-        name: what messages call it.
-        entries: one for each option.
+        name: Name of the space in messages.
+        ranges: Range of each option by its name, short or with its group: ``{kind: float, low: 0, high: 1}``,
+            where ``kind`` may also be ``int``, ``log_float`` or ``log_int``, or
+            ``{kind: choice, values: [64, 128]}``.
 
     Raises:
-        ValueError: there are none, or two for one option.
+        ValueError: an unknown option or kind, a range that holds nothing, or two ranges for one option.
     """
 
     name: str
-    entries: tuple[Entry, ...]
+    ranges: Mapping[str, Mapping[str, Any]]
 
     def __post_init__(self) -> None:
-        if not self.entries:
+        if not isinstance(self.ranges, Mapping) or not all(isinstance(name, str) for name in self.ranges):
+            raise ValueError(f"the space {self.name} must hold options by name, got {shown(self.ranges)}")
+        if not self.ranges:
             raise ValueError(f"the space {self.name} varies nothing")
-        places = [locate(entry.name) for entry in self.entries]
-        for home, entry in zip(places, self.entries, strict=True):
+        checked = {name: _checked(name, values) for name, values in self.ranges.items()}
+        places = [locate(name) for name in checked]
+        for home, name in zip(places, checked, strict=True):
             if places.count(home) > 1:
-                raise ValueError(f"the space {self.name} has two entries for {entry.name}")
+                raise ValueError(f"the space {self.name} has two entries for {name}")
+        object.__setattr__(self, "ranges", checked)
 
-    def __iter__(self) -> Iterator[Entry]:
-        return iter(self.entries)
-
-    def to_plain(self) -> dict[str, Any]:
-        """What a file of it holds."""
-        return {entry.name: entry.to_plain() for entry in self.entries}
+    def distributions(self) -> dict[str, BaseDistribution]:
+        """Returns Optuna's distributions by the names of the options, as ``study.ask`` takes them."""
+        return {name: _distribution(**values) for name, values in self.ranges.items()}
 
     def without(self, names: Mapping[str, Any]) -> Space:
         """The space without options whose values are given.
@@ -177,18 +75,19 @@ class Space:
             ValueError: nothing is left.
 
         Example:
-            >>> load_space("dqn").without({"learner.gamma": 0.9}).to_plain().get("gamma")
+            >>> load_space("dqn").without({"learner.gamma": 0.9}).ranges.get("gamma")
         """
         given = {locate(".".join(name.split(".")[:2])) for name in names}
-        left = tuple(entry for entry in self.entries if locate(entry.name) not in given)
+        left = {name: values for name, values in self.ranges.items() if locate(name) not in given}
         if not left:
             raise ValueError(f"all options of the space {self.name} are given: there is nothing to search")
-        return replace(self, entries=left)
+        return replace(self, ranges=left)
 
     def with_effect(self, recipe: Recipe) -> Space:
         """The space without options that have no effect on a recipe."""
         idle = _idle(recipe)
-        return replace(self, entries=tuple(own for own in self.entries if locate(own.name) not in idle))
+        left = {name: values for name, values in self.ranges.items() if locate(name) not in idle}
+        return replace(self, ranges=left)
 
     def check(self, recipe: Recipe) -> None:
         """Makes sure that a recipe takes the ends of all ranges, and all values of choices.
@@ -196,24 +95,12 @@ class Space:
         Raises:
             ValueError: it does not; the message names the option.
         """
-        for entry in self.entries:
-            for value in entry.ends:
+        for name, values in self.ranges.items():
+            for value in values.get("values") or (values["low"], values["high"]):
                 try:
-                    recipe.replace(**{entry.name: value})
+                    recipe.replace(**{name: value})
                 except ValueError as error:
                     raise ValueError(f"the space {self.name} does not fit: {error}") from error
-
-    def suggest(self, trial: Any) -> dict[str, Any]:
-        """The values that a trial of Optuna has, or now gets.
-
-        Args:
-            trial: of Optuna, or any object with its ``suggest_float``, ``suggest_int`` and
-                ``suggest_categorical``.
-
-        Returns:
-            Values by the names of the options, as :func:`~torchrl_her_recipes.make_recipe` takes them.
-        """
-        return {entry.name: entry.suggest(trial) for entry in self.entries}
 
     def recipe(self, base: Recipe, values: Mapping[str, Any]) -> Recipe:
         """A recipe with some values of the options that are varied.
@@ -230,12 +117,69 @@ class Space:
     def values_of(self, recipe: Recipe) -> dict[str, Any]:
         """A recipe's values of the options that have an effect, in the space or outside."""
         idle = _idle(recipe)
-        places = {entry.name: locate(entry.name) for entry in self.entries}
+        places = {name: locate(name) for name in self.ranges}
         return {
-            name: getattr(getattr(recipe, group), own)
-            for name, (group, own) in places.items()
-            if (group, own) not in idle
+            name: getattr(getattr(recipe, group), option)
+            for name, (group, option) in places.items()
+            if (group, option) not in idle
         }
+
+    def inside(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns those of some values that the ranges of their options include.
+
+        Example:
+            >>> load_space("ddpg").inside({"gamma": 0.95, "hidden": 100})
+            {'gamma': 0.95}
+        """
+        return {name: value for name, value in values.items() if _includes(self.ranges[name], value)}
+
+
+def _checked(name: str, values: Any) -> dict[str, Any]:
+    """Returns the range of an option, with numbers in place of text such as ``1e-4``."""
+    if (home := locate(name))[1] in _SAME_FOR_ALL or home == ("task", "name"):
+        raise ValueError(f"{name} must be the same in all trials of a search: it cannot be varied")
+    if not isinstance(values, Mapping) or "kind" not in values:
+        example = "{kind: float, low: 0, high: 1}"
+        raise ValueError(f"{name} of a space must have a kind, as in {example}, got {shown(values)}")
+    kind = values["kind"]
+    if kind not in list(_KINDS):
+        raise ValueError(f"kind of {name} must be one of {', '.join(_KINDS)}, got {shown(kind)}")
+    if set(values) != {"kind", *_KINDS[kind]}:
+        raise ValueError(f"{name} of kind {kind} must have {' and '.join(_KINDS[kind])}, got {shown(values)}")
+    if kind == "choice":
+        return {"kind": kind, "values": _checked_choice(name, values["values"])}
+    number = float if kind.endswith("float") else int
+    low, high = (as_kind(f"{end} of {name}", values[end], number) for end in _RANGE)
+    least = 0.0 if kind.startswith("log") else -_LARGEST
+    if not least < low < high < _LARGEST:
+        between = f"above {least:g} and below {_LARGEST:g}"
+        raise ValueError(f"low of {name} must be below high, and both {between}, got {low} and {high}")
+    return {"kind": kind, "low": low, "high": high}
+
+
+def _checked_choice(name: str, values: Any) -> list[Any]:
+    plain = isinstance(values, list) and all(
+        own is None or isinstance(own, str | int | float) for own in values
+    )
+    if not plain or not len(values) == len(set(map(repr, values))) in range(2, _MOST + 1):
+        needed = f"a list of 2 to {_MOST} different numbers, texts, true or false"
+        raise ValueError(f"values of {name} must be {needed}, got {shown(values)}")
+    return list(values)
+
+
+def _distribution(*, kind: str, low: Any = 0, high: Any = 0, values: Sequence[Any] = ()) -> BaseDistribution:
+    from optuna import distributions  # noqa: PLC0415  (an extra)
+
+    if kind == "choice":
+        return distributions.CategoricalDistribution(values)
+    number = distributions.FloatDistribution if kind.endswith("float") else distributions.IntDistribution
+    return number(low, high, log=kind.startswith("log"))
+
+
+def _includes(values: Mapping[str, Any], value: Any) -> bool:
+    if values["kind"] == "choice":
+        return value in values["values"]
+    return isinstance(value, int | float) and values["low"] <= value <= values["high"]
 
 
 def _idle(recipe: Recipe) -> set[tuple[str, str]]:
@@ -253,7 +197,7 @@ def space_names() -> list[str]:
 
 def space_summary(name: str) -> str:
     """The options that a space varies, in one line, as far as it holds them."""
-    return shorten(", ".join(entry.name for entry in load_space(name)), 85, placeholder=" ...")
+    return shorten(", ".join(load_space(name).ranges), 85, placeholder=" ...")
 
 
 def load_space(name: str) -> Space:
@@ -269,41 +213,13 @@ def load_space(name: str) -> Space:
         OSError: the file cannot be read.
 
     Example:
-        >>> next(iter(load_space("ddpg")))
-        Entry(name='learning_rate', kind='log_float', low=0.0002, high=0.005, values=())
+        >>> load_space("ddpg").ranges["learning_rate"]
+        {'kind': 'log_float', 'low': 0.0002, 'high': 0.005}
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else _SPACES / f"{name}.yaml"
     if not path.is_file():
         raise ValueError(f"there is no space {name!r}{what_there_is(name, space_names(), 'spaces')}")
-    return make_space(str(path) if path.parent != _SPACES else name, read_yaml(path))
-
-
-def make_space(name: str, values: Any) -> Space:
-    """A space from what a file of it holds.
-
-    Raises:
-        ValueError: it is no space.
-    """
-    if not isinstance(values, Mapping) or not all(isinstance(own, str) for own in values):
-        raise ValueError(f"the space {name} must hold options by name, got {_repr.repr(values)}")
-    return Space(name=name, entries=tuple(_entry(own, each) for own, each in values.items()))
-
-
-def _entry(name: str, values: Any) -> Entry:
-    known = ("kind", "low", "high", "values")
-    if not isinstance(values, Mapping) or "kind" not in values:
-        raise ValueError(
-            f"{name} of a space must have a kind, as in {{kind: float, low: 0, high: 1}}, "
-            f"got {_repr.repr(values)}"
-        )
-    for own in values:
-        if own not in known:
-            raise ValueError(f"{name} of a space has no {_repr.repr(own)}; it has {', '.join(known)}")
-    if not isinstance(values.get("values", []), list):
-        raise ValueError(f"values of {name} must be a list, got {_repr.repr(values['values'])}")
-    kind: Any = values["kind"]
-    ends = {end: values.get(end) for end in ("low", "high")}
-    return Entry(name=name, kind=kind, values=tuple(values.get("values", ())), **ends)
+    return Space(name=str(path) if path.parent != _SPACES else name, ranges=read_yaml(path))
 
 
 def space_for(recipe: Recipe) -> Space:

@@ -7,6 +7,8 @@ from importlib import import_module
 from numbers import Integral, Real
 from typing import Any
 
+from torchrl_her_recipes.config.plain_files import shown
+
 
 def as_kind(name: str, value: object, kind: type) -> Any:
     """A value as an option of a given type takes it.
@@ -34,7 +36,7 @@ def as_kind(name: str, value: object, kind: type) -> Any:
             if kind is float or number == int(number):
                 return kind(number)
     words = {str: "text", bool: "true or false", int: "a whole number", float: "a number"}
-    raise ValueError(f"{name} must be {words[kind]}, got {value!r}")
+    raise ValueError(f"{name} must be {words[kind]}, got {shown(value)}")
 
 
 def load_name(path: str) -> Any:

@@ -41,7 +41,7 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
         trials: that count.
         folder: of the search.
     """
-    names = [entry.name for entry in search.space]
+    names = list(search.space.ranges)
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(["trial", "state", "score", "epochs", *names, "folder"])

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import optuna
 import yaml
@@ -25,8 +24,8 @@ from tqdm import tqdm
 from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.imports import check_permitted
-from torchrl_her_recipes.config.plain_files import read_mapping
-from torchrl_her_recipes.config.search import Search
+from torchrl_her_recipes.config.plain_files import naming, parse_yaml, read_mapping
+from torchrl_her_recipes.config.search import Search, difference
 from torchrl_her_recipes.runs.callbacks import Callback, RunView
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
@@ -135,15 +134,14 @@ def tune(
 
 def _describe(search: Search, path: Path) -> None:
     """Writes the settings of a search, or compares them with those that are there."""
+    text = yaml.safe_dump(search.to_plain(), sort_keys=False)
     if not path.exists():
-        write_text(path, yaml.safe_dump(search.to_plain(), sort_keys=False))
+        write_text(path, text)
         return
-    values = read_mapping(path)
-    try:
-        there = Search.from_plain(values)
-    except ValueError as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
-    if different := there.difference(search):
+    before = read_mapping(path)
+    with naming(path):
+        different = difference(before, parse_yaml(text))
+    if different:
         raise ValueError(
             f"{path.parent} holds a search with {different}: repeat its options, or choose another folder=DIR"
         )
@@ -156,16 +154,13 @@ def _begin(search: Search, database: Path) -> Study:
         study_name=_NAME,
         direction="maximize",
         load_if_exists=True,
-        pruner=_make_pruner(search),
+        pruner=_make_pruner(search.pruner, search.recipe.run.epochs),
     )
     begun = study.get_trials(deepcopy=False)
     study.sampler = make_sampler(search.sampler, search.recipe.run.seed + len(begun))
     if not begun:
         values = search.space.values_of(search.recipe)
-        inside = {entry.name for entry in search.space if entry.holds(values.get(entry.name))}
-        study.enqueue_trial(
-            {name: value for name, value in values.items() if name in inside}, user_attrs={DEFAULT: values}
-        )
+        study.enqueue_trial(search.space.inside(values), user_attrs={DEFAULT: values})
     for trial in begun:
         if trial.state == TrialState.RUNNING:
             _repeat(study, trial)
@@ -197,11 +192,10 @@ def make_sampler(name: str, seed: int) -> optuna.samplers.BaseSampler:
     return made[name]()
 
 
-def _make_pruner(search: Search) -> optuna.pruners.BasePruner:
-    epochs = search.recipe.run.epochs
-    if search.pruner == "median":  # no earlier than two fifths of the way: success comes late
+def _make_pruner(name: str, epochs: int) -> optuna.pruners.BasePruner:
+    if name == "median":  # no earlier than two fifths of the way: success comes late
         return optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=2 * epochs // 5)
-    if search.pruner == "halving":
+    if name == "halving":
         return optuna.pruners.SuccessiveHalvingPruner(min_resource=max(epochs // 9, 1), reduction_factor=3)
     return optuna.pruners.NopPruner()
 
@@ -263,15 +257,13 @@ class _TrialRuns:
         return (trials is None or len(counted) < trials) and (end is None or time.monotonic() < end)
 
     def _start(self, threads: ThreadPoolExecutor) -> None:
-        trial = self.study.ask()
+        space, ranges = self.search.space, self.search.space.distributions()
+        waiting = self.study.get_trials(deepcopy=False, states=(TrialState.WAITING,))
+        if waiting and (default := waiting[0].user_attrs.get(DEFAULT)) is not None:
+            ranges = {name: ranges[name] for name in space.inside(default)}  # its other values lie outside
+        trial = self.study.ask(ranges)
         try:
-            space, default = self.search.space, trial.user_attrs.get(DEFAULT)
-            values = {
-                entry.name: entry.suggest(trial)
-                for entry in space
-                if default is None or entry.holds(default.get(entry.name))
-            }
-            recipe = space.recipe(self.search.recipe, values)
+            recipe = space.recipe(self.search.recipe, trial.params)
         except ValueError as error:  # values that do not go together
             self._tell(trial, TrialState.FAIL, error=str(error))
             return
@@ -279,7 +271,8 @@ class _TrialRuns:
         options = {
             "database": str(self.home / _DATABASE),
             "number": trial.number,
-            "search": self.search.to_plain(),
+            "pruner": self.search.pruner,
+            "epochs": recipe.run.epochs,
         }
         around = f"{reporting.__module__}:{reporting.__name__}"
         job = Job(label=name, recipe=recipe, folder=self.home / name, around=around, options=options)
@@ -345,17 +338,17 @@ class _Reporter(Callback):
 
 
 @contextmanager
-def reporting(*, database: str, number: int, search: Mapping[str, Any]) -> Iterator[list[Callback]]:
+def reporting(*, database: str, number: int, pruner: str, epochs: int) -> Iterator[list[Callback]]:
     """Surrounds the run of a trial in its worker process, and gives the run's callbacks.
 
     Args:
-        database: of the search.
-        number: of the trial.
-        search: as plain values.
+        database: Path of the search's database.
+        number: Number of the trial.
+        pruner: Name of the search's pruner.
+        epochs: Epochs of each trial.
     """
     storage = _storage(Path(database))
-    pruner = _make_pruner(Search.from_plain(search))
-    study = optuna.load_study(study_name=_NAME, storage=storage, pruner=pruner)
+    study = optuna.load_study(study_name=_NAME, storage=storage, pruner=_make_pruner(pruner, epochs))
     try:
         yield [_Reporter(study, number)]
     finally:

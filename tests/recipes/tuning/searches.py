@@ -9,7 +9,7 @@ from unittest import mock
 import pytest
 
 from torchrl_her_recipes import Search, make_recipe
-from torchrl_her_recipes.config.spaces import make_space
+from torchrl_her_recipes.config.spaces import Space
 from torchrl_her_recipes.tuning import search as module
 from torchrl_her_recipes.tuning.search import SearchResult, tune
 
@@ -44,7 +44,7 @@ RECIPE: dict[str, Any] = {
 def small_search(space: dict[str, Any] | None = None, *, sampler: Any = "tpe", **options: Any) -> Search:
     """A search whose trials take a tenth of a second."""
     pruner = options.pop("pruner", "median")
-    own = make_space("small", SPACE if space is None else space)
+    own = Space(name="small", ranges=SPACE if space is None else space)
     return Search(recipe=make_recipe(RECIPE, **options), space=own, sampler=sampler, pruner=pruner)
 
 

@@ -133,6 +133,9 @@ def test_what_a_search_was_begun_with_is_asked_for_again(tmp_path: Path) -> None
     ):
         with pytest.raises(ValueError, match=said):
             go_on(other, tmp_path, 1)
+    (tmp_path / "search.yaml").write_text("sampler: tpe")
+    with pytest.raises(ValueError, match="search.yaml cannot be read: it is damaged"):
+        go_on(small_search(), tmp_path, 1)
 
 
 RANGE = {"learning_rate": {"kind": "float", "low": 1e-4, "high": 1e-2}}
