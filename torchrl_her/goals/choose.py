@@ -63,6 +63,7 @@ def choose_goals(
     keep: Keep | None,
     draws: Draws,
     tries: int = 0,
+    redraw: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """Draws k goals for each transition, with replacement, by candidate times weight times filter.
 
@@ -80,10 +81,11 @@ def choose_goals(
             [m, c, g] for them. It returns which of them may be drawn, [m, c] of bool; None for all.
         draws: source of the random numbers.
         tries: worth it where lines are long, and few goals refused.
+        redraw: False to leave out goals that the filter refuses, and draw no others in their place.
 
     Returns:
-        ``(position, valid)``: [n, k] int64, positions in ``candidates.goals``, and [n] of bool, False where
-        a transition has no goal that may be drawn (its positions are then meaningless).
+        ``(position, valid)``, [n, k] each: int64, positions in ``candidates.goals``, and bool, False where a
+        position is meaningless: no goal may be drawn, or the one that was drawn is left out.
 
     Raises:
         ValueError: weights are negative or not finite.
@@ -98,15 +100,15 @@ def choose_goals(
         ...     return goals[..., 0] % 2 == 0
         >>> draws = RunDraws([torch.Generator().manual_seed(0)])
         >>> position, valid = choose_goals(candidates, 3, weights=None, keep=even, draws=draws)
-        >>> position[1].tolist(), set(position[0].tolist()) <= {0, 2}
-        ([2, 2, 2], True)
+        >>> position[1].tolist(), valid[1].tolist()
+        ([2, 2, 2], [True, True, True])
     """
     goals, table, line, *_ = candidates
     width = table.shape[1]
-    valid = torch.ones_like(line, dtype=torch.bool)
     lines = None if weights is None else goals[table]
     weight = None if weights is None or lines is None else checked_weights(weights(lines), lines)
     index = _propose(candidates, k, weight, draws)
+    valid = torch.ones_like(index, dtype=torch.bool)
     useless = weight is not None and not bool((weight > 0).all())
     begin = line * width  # of the lines in the flat table
 
@@ -122,6 +124,8 @@ def choose_goals(
 
     if keep is not None or useless:
         refused = test(slice(None), index)
+        if not redraw:
+            return table.take(begin.unsqueeze(-1) + index), ~refused
         for _ in range(tries):
             which, column = refused.nonzero(as_tuple=True)
             if len(which) == 0:
@@ -137,7 +141,8 @@ def choose_goals(
             dtype = torch.float32 if weight is None else weight.dtype
             parts = iter(draws.of(rest)((len(rest), k), dtype, line.device).split(at_once))
             drawn = [draw(likelihood, k, generator=lambda *_: next(parts)) for likelihood in likelihoods]
-            index[rest], valid[rest] = (torch.cat(part) for part in zip(*drawn, strict=True))
+            index[rest], drawable = (torch.cat(part) for part in zip(*drawn, strict=True))
+            valid[rest] = drawable.unsqueeze(-1)
     return table.take(begin.unsqueeze(-1) + index), valid
 
 

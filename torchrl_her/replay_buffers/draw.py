@@ -86,8 +86,7 @@ def draw_goals(
         keep=drawn.filter(before, keep),
         draws=drawn.draws(sources, runs),
     )
-    source = drawn.row[valid].unsqueeze(-1).expand(-1, k).flatten()
-    return source, index[valid].flatten()
+    return drawn.row.unsqueeze(-1).expand_as(index)[valid], index[valid]
 
 
 def draw_for_runs(
@@ -149,11 +148,17 @@ def draw_for_runs(
             counts = piece.sums(torch.ones_like(episodes.lengths))
         own_weights = None if weights is None else partial(weights, runs=piece.runs, counts=counts)
         index, valid = choose_goals(
-            candidates, number, weights=own_weights, keep=keep, draws=draws, tries=tries
+            candidates,
+            number,
+            weights=own_weights,
+            keep=keep,
+            draws=draws,
+            tries=tries,
+            redraw=options.redraw,
         )
         if source not in RECENT:
-            relabeled |= valid
-        parts.append((index + sum(map(len, pools)), valid.unsqueeze(-1).expand_as(index)))
+            relabeled |= valid.any(-1)
+        parts.append((index + sum(map(len, pools)), valid))
         pools.append(candidates.goals)
     index, valid = parts[0]
     if len(parts) > 1:

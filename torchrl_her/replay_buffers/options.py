@@ -61,6 +61,8 @@ class HindsightOptions:
             terminate. Where episodes go on at their goals, such transitions teach to stay there. Then only
             goals are left out that were achieved at the start of the episode as well, because nothing has
             moved yet.
+        redraw: where the filter refuses a goal that was drawn, draw another one among those that it keeps;
+            False: the goal makes no virtual transition, so there are fewer where it refuses many.
         achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved. A
             transition that terminated with a lower reward failed, as by a fall: it terminates for virtual
             goals, too, and costs as much.
@@ -101,6 +103,7 @@ class HindsightOptions:
     n_steps: int = 1
     gamma: float | None = None
     filter_achieved: bool = False
+    redraw: bool = True
     achieved_reward: float = 0.0
     exclude: Sequence[NestedKey] = ("state",)
     achieved_goal_key: NestedKey = "achieved_goal"

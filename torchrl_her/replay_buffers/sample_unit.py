@@ -363,8 +363,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         for place, source in enumerate(sources):
             part = own[number == place]
             lent, valid = self._draw(stored, row[part], source, generator)
-            if valid is not None:
-                part, lent = part[valid], lent[valid]
+            part, lent = part[valid], lent[valid]
             virtual.index_fill_(0, part.flatten(), True)
             drawn = (stored.wanted if source == "actual" else stored.after)[lent]
             goals.index_put_((part,), drawn.unsqueeze(1).expand(-1, part.shape[1], -1))
@@ -457,28 +456,33 @@ class HERSampleUnit(HindsightBase, SampleUnit):
 
     def _draw(
         self, stored: _Stored, group: Tensor, source: Strategy, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """Rows [V] whose goals a source gives, and for which groups [V] there is one; None for all.
+    ) -> tuple[Tensor, Tensor]:
+        """Rows [V] whose goals a source gives, and for which groups [V] there is one.
 
         Groups [V, L] are rows that get the same goal, which is one of their last row: single rows, or slices.
         """
         if len(group) == 0:
-            return group[:, 0], None
+            return group[:, 0], group[:, 0].bool()
         if source in RECENT:
             return self._draw_recent(stored, group, str(source), generator)
         episodes, row = stored.episodes, group[:, -1]
         place = episodes.place(row)
         begin, behind = episodes.episode(place)
         first, end = (bound + begin for bound in candidate_range(source, place - begin, behind - begin))
+        valid = torch.ones_like(row, dtype=torch.bool)
         if self.weights is not None and not self.weights.alike:
-            return self._draw_by_likelihood(stored, group, first, end, generator)
-        lent = episodes.row(draw_alike(first, end, 1, generator=generator).squeeze(-1))
+            lent, valid = self._draw_by_likelihood(stored, group, first, end, generator)
+            if self.options.redraw:
+                return lent, valid
+        else:
+            lent = episodes.row(draw_alike(first, end, 1, generator=generator).squeeze(-1))
         if not self.filter_achieved:
-            return lent, None
+            return lent, valid
         # Goals are proposed without the filter; only where it rejects one are all candidates looked at.
         kept = self._kept(stored, group, stored.after[lent].unsqueeze(1)).squeeze(1)
+        if not self.options.redraw:
+            return lent, valid & kept
         again = (~kept).nonzero().squeeze(-1)
-        valid = torch.ones_like(row, dtype=torch.bool)
         lent[again], valid[again] = self._draw_by_likelihood(
             stored, group[again], first[again], end[again], generator
         )
@@ -506,8 +510,9 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             keep=keep if self.filter_achieved else None,
             draws=RunDraws([generator]),
             tries=TRIES,
+            redraw=self.options.redraw,
         )
-        return index.squeeze(-1), valid
+        return index.squeeze(-1), valid.squeeze(-1)
 
     def _kept(self, stored: _Stored, group: Tensor, goals: Tensor) -> Tensor:
         """The filter: which of the goals [V, c, g] groups [V, L] may take, [V, c] of bool."""
@@ -537,7 +542,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             weight = keep = None
             if self.weights is not None and not self.weights.alike:
                 weight = checked_weights(self.weights(goals), goals)
-            if self.filter_achieved:
+            if self.filter_achieved and self.options.redraw:
                 keep = self._kept(stored, group[part], goals)
             drawn, valid[part] = draw(combine(steps < width, weight, keep), 1, generator=generator)
             source[part] = candidate.gather(1, drawn).squeeze(-1)

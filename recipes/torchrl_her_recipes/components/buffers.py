@@ -88,6 +88,7 @@ def make_buffer(
             n_steps=recipe.hindsight.n_steps,
             gamma=recipe.learner.gamma,
             filter_achieved=algorithm.filter_achieved,
+            redraw=recipe.hindsight.redraw,
             refill=recipe.hindsight.refill if algorithm.filter_achieved else 1,
             achieved_reward=rewards[1],
             weights=[weights for weights in own if weights is not None] or None,

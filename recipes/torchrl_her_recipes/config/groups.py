@@ -166,6 +166,10 @@ class HindsightConfig(Group):
         "where the filter leaves transitions without goals, the others get up to this many times as many",
         at_least=1,
     )
+    redraw: bool = option(
+        True,
+        "where the filter refuses a goal, draw another one that it keeps; false: store no transition for it",
+    )
     n_steps: int = option(1, "steps that a transition spans, at most (n-step returns)", at_least=1)
 
     def __post_init__(self) -> None:

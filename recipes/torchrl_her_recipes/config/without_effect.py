@@ -10,6 +10,7 @@ from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.options import AUTO
 
 WEIGHTS = ("ibs", "novelty")  # the groups of options of weights of goals
+FILTER = ("redraw", "refill")  # options that go by the filter of achieved goals
 
 
 def without_effect(groups: Any) -> dict[tuple[str, str], str]:
@@ -36,12 +37,13 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
             idle[group, name] = f"with task={task}"
     with_algo = f"with algo={algorithm.name}"
     if not algorithm.hindsight:
-        for name in ("k", "strategy", "goal_sources", "refill"):
+        for name in ("k", "strategy", "goal_sources", *FILTER):
             idle["hindsight", name] = with_algo
         for group in WEIGHTS:
             all_of(group, with_algo)
     elif not groups.hindsight.sources:
-        idle["hindsight", "strategy"] = idle["hindsight", "refill"] = "with k=0"
+        for name in ("strategy", *FILTER):
+            idle["hindsight", name] = "with k=0"
         for group in WEIGHTS:
             all_of(group, "with k=0")
     elif algorithm.weights:
@@ -62,7 +64,8 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         if algorithm.instructive == "sequential":
             idle["ibs", "floor"] = idle["ibs", "floor_is_relative"] = with_algo
     if not algorithm.filter_achieved:
-        idle["hindsight", "refill"] = with_algo
+        for name in FILTER:
+            idle["hindsight", name] = with_algo
     if algorithm.hindsight and groups.hindsight.goal_sources not in (None, AUTO):
         idle["hindsight", "k"] = idle["hindsight", "strategy"] = "with goal_sources"
     if not algorithm.curriculum:

@@ -45,6 +45,11 @@ def test_goals_are_drawn_from_where_the_recipe_says() -> None:
         assert build(small(**values)).buffer.writer.options.sources == expected
 
 
+def test_refused_goals_are_left_out_if_the_recipe_says_so() -> None:
+    assert build(small()).buffer.writer.options.redraw
+    assert not build(small(redraw=False)).buffer.writer.options.redraw
+
+
 def test_virtual_transitions_of_a_recipe_get_the_info_of_their_own_step() -> None:
     task = {"task": "gym:tests.envs.gym.costly:tests/InfoCost-v0", "task.options.info_keys": ["cost"]}
     recipe = small(**task, **{"task.options.achieved_reward": -0.5, "normalize": False})

@@ -16,6 +16,8 @@ IDLE: list[tuple[dict[str, Any], dict[str, Any]]] = [
     ({"algo": "no_hindsight"}, {"cells": 8}),
     ({"k": 0}, {"strategy": "final"}),
     ({"k": 0, "algo": "her_ibs"}, {"sigma": 0.3}),
+    ({"algo": "her"}, {"redraw": False}),
+    ({"k": 0}, {"redraw": False}),
     ({"algo": "her"}, {"sigma": 0.3}),
     ({"algo": "her"}, {"floor": 0.3}),
     ({"algo": "her_ibs_sequential"}, {"floor": 0.3}),

@@ -114,7 +114,7 @@ def test_only_goals_that_may_be_drawn_are_drawn(data: st.DataObject) -> None:
             for goal in range(int(begin[line[i]]) + first[i], int(begin[line[i]]) + end[i])
             if (not weighted or weight[goal] > 0) and (not filtered or (goal + i) % modulus == 0)
         ]
-        assert bool(valid[i]) == bool(allowed)
+        assert valid[i].tolist() == [bool(allowed)] * 3
         assert not allowed or set(own) <= set(allowed)
 
 
@@ -130,8 +130,64 @@ def test_many_refused_transitions_are_looked_at_part_by_part(monkeypatch: pytest
     candidates = Candidates(GOALS, TABLE, line, line, line + torch.tensor([4] * 9 + [2]))
     position, valid = choose_goals(candidates, 5, weights=None, keep=keep, draws=seeded())
     assert position[:9].unique().tolist() == [3]
-    assert valid.tolist() == [True] * 9 + [False]
+    assert valid.tolist() == [[True] * 5] * 9 + [[False] * 5]
     assert asked == [10, 3, 3, 3, 1]
+
+
+class Given:
+    """Random numbers that are given, one row for each transition."""
+
+    def __init__(self, *rows: list[float]) -> None:
+        self.rows = torch.tensor(rows)
+
+    def of(self, some: Tensor) -> Given:
+        raise AssertionError("nothing is drawn again")
+
+    def __call__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+        assert shape == tuple(self.rows.shape)
+        return self.rows.to(dtype)
+
+
+@pytest.mark.parametrize(
+    ("weights", "expected", "taken"),
+    [
+        # a quarter for each goal, then for each of the last two
+        (None, [[0, 2, 3, 1], [2, 3, 3, 2]], [[1, 0, 1, 1], [0, 1, 1, 0]]),
+        # weights of 0, 1, 1 and 4 add up to 1/6, 1/3 and 1; those of the last two to 1/5 and 1
+        ([0.0, 1.0, 1.0, 4.0], [[1, 3, 3, 2], [2, 3, 3, 3]], [[1, 1, 1, 0], [0, 1, 1, 1]]),
+        ([0.0, 0.0, 1.0, 0.0], [[2, 2, 2, 2], [2, 2, 2, 2]], [[0, 0, 0, 0], [0, 0, 0, 0]]),
+    ],
+)
+def test_a_refused_goal_is_left_out_and_no_other_is_drawn(
+    weights: list[float] | None, expected: list[list[int]], taken: list[list[int]]
+) -> None:
+    """The filter refuses goal 2, whoever takes it. Two transitions draw four goals each, by given numbers."""
+    line = torch.tensor([0, 0])
+    candidates = Candidates(GOALS[:4], TABLE[:1], line, torch.tensor([0, 2]), torch.tensor([4, 4]))
+    position, valid = choose_goals(
+        candidates,
+        4,
+        weights=None if weights is None else lambda goals: torch.tensor([weights]),
+        keep=lambda which, goals: goals.squeeze(-1) != 2.0,
+        draws=Given([0.1, 0.6, 0.9, 0.3], [0.1, 0.6, 0.9, 0.3]),
+        redraw=False,
+    )
+    assert position.tolist() == expected
+    assert valid.int().tolist() == taken
+
+
+def test_goals_without_weight_are_left_out_without_a_filter() -> None:
+    line = torch.tensor([0, 0])
+    candidates = Candidates(GOALS[:4], TABLE[:1], line, torch.tensor([0, 3]), torch.tensor([3, 4]))
+    _, valid = choose_goals(
+        candidates,
+        2,
+        weights=lambda goals: torch.tensor([[0.0, 0.0, 0.0, 1.0]]),
+        keep=None,
+        draws=Given([0.1, 0.6], [0.1, 0.6]),
+        redraw=False,
+    )
+    assert valid.tolist() == [[False, False], [True, True]]
 
 
 def test_what_a_run_draws_does_not_depend_on_other_runs_or_their_refusals() -> None:

@@ -29,6 +29,7 @@ OTHERS = {
     "n_steps": 1,
     "gamma": 0.9,
     "filter_achieved": True,
+    "redraw": False,
     "achieved_reward": -0.5,
     "exclude": ("state", "action"),
     "achieved_goal_key": ("goals", "got"),
@@ -262,6 +263,46 @@ def test_the_filter_works_with_a_function(make: Callable[..., Any]) -> None:
         return time, time + 1
 
     assert lent(relabeled(make, strategy=itself, filter_achieved=True)) == {(i, i) for i in range(4)}
+
+
+def late(batch: TensorDict) -> TensorDict:
+    """An episode of four steps whose achieved goal moves in the third one and the fourth: 0, 0, 0, 1, 2."""
+    goals = torch.tensor([0.0, 0.0, 0.0, 1.0, 2.0])
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = goals[:-1], goals[1:]
+    return batch
+
+
+@both
+@pytest.mark.parametrize(
+    ("source", "weighted", "kept"),
+    [
+        ("future", False, [2 / 4, 2 / 3, 1, 1]),
+        ("future", True, [5 / 7, 5 / 6, 1, 1]),
+        ("achieved", False, [2 / 4, 2 / 4, 2 / 4, 3 / 4]),
+        ("achieved", True, [5 / 7, 5 / 7, 5 / 7, 5 / 7]),
+    ],
+)
+def test_refused_goals_make_no_virtual_transitions(
+    make: Callable[..., Any], source: str, weighted: bool, kept: list[float]
+) -> None:
+    """Goals 0, 0, 1, 2 weigh 1, 1, 2, 3. Refused is 0 in the first three steps, and 1 in the last."""
+    k = 10_000
+    part = make(
+        REWARD,
+        goal_sources={source: k},
+        filter_achieved=True,
+        redraw=False,
+        weights=PreferFar() if weighted else None,
+    )
+    parts = {"writer": part} if make is HERWriter else {"sample_unit": part, "collate_fn": part.relabel}
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(50_000), batch_size=4 * k, **parts)
+    buffer.set_rng(torch.Generator().manual_seed(0))
+    buffer.extend(late(make_batch([[4]])).squeeze(0))
+    rows = buffer[:] if make is HERWriter else buffer.sample()
+    virtual = rows[rows["virtual"].squeeze(-1)]
+    step = virtual["observation"][:, 0].long()
+    assert (virtual["desired_goal"][:, 0] - virtual["achieved_goal"][:, 0]).abs().min() > 0.5
+    assert (step.bincount(minlength=4) / k).tolist() == pytest.approx(kept, abs=0.04)  # five deviations
 
 
 @both
