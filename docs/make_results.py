@@ -40,6 +40,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "n_steps": "n_steps",
     "search": str(HERE / "studies" / "search.yaml"),
     "filter_bias": "filter_bias",
+    "refused": str(HERE / "studies" / "refused.yaml"),
     "divergence": "divergence",
     "wall": "wall",
     "proposals": "proposals",
