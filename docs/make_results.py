@@ -53,7 +53,12 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "defaults": "defaults",
     "window": "window",
     "initialisation": "initialisation",
+    "bit_flip": "bit_flip",
+    "chain": "chain",
+    "treasure_hunt": "treasure_hunt",
+    "useless_action": "useless_action",
 }
+TOYS = ("chain", "treasure_hunt", "useless_action")  # make_chain_times.py and make_toy_values.py draw these
 MAPS = ("ibs", "bias")  # studies whose maps of virtual goals are drawn
 POSITIVE = ("rows_real_positive", "rows_virtual_positive", "rows_useful_virtual_positive")
 THESIS = {  # metrics of the thesis's figures beside success
@@ -71,6 +76,8 @@ def export(runs: Path) -> None:
     for name, described in STUDIES.items():
         if (runs / name).is_dir():
             command = f"torchrl-her study {described if described == name else f'docs/studies/{name}.yaml'}"
+            if name in ("treasure_hunt", "useless_action"):
+                command = f"python docs/make_toy_values.py --study {name}"
             write_results(load_study(described), runs / name, RESULTS / name, command=command)
 
 
@@ -80,16 +87,18 @@ def spread(values: Sequence[float], form: str) -> str:
     return f"**{middle:{form}}** ({low:{form}} to {high:{form}})"
 
 
+def entries(cell: Combination) -> list[str]:
+    """A combination's row of the table, without task and algorithm."""
+    success, counted = at_the_end(cell.rows, "success"), "kl" in cell.rows[0]  # are goals counted?
+    kl = spread(at_the_end(cell.rows, "kl", evaluations=1), ".2f") if counted else ""
+    return [str(cell.runs), f"{cell.frames:,}", spread(success, ".0%"), f"{min(success):.0%}", kl]
+
+
 def print_table(cells: Sequence[Combination]) -> None:
     print("| task | algorithm | runs | frames | success at the end | worst run | KL(q, q*) |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for cell in cells:
-        success, counted = at_the_end(cell.rows, "success"), "kl" in cell.rows[0]  # are goals counted?
-        kl = spread(at_the_end(cell.rows, "kl", evaluations=1), ".2f") if counted else ""
-        print(
-            f"| `{cell.task}` | `{cell.algorithm}` | {cell.runs} | {cell.frames:,} "
-            f"| {spread(success, '.0%')} | {min(success):.0%} | {kl} |"
-        )
+        print(f"| {' | '.join([f'`{cell.task}`', f'`{cell.algorithm}`', *entries(cell)])} |")
 
 
 def frames_until(rows: Rows, success: float) -> list[float]:
@@ -224,6 +233,8 @@ def main() -> None:
                 cells = [beginning_of_fetch(cells[0]), *cells]
             if name == "divergence":
                 draw_the_ends(cells, "kl", "KL(q, q*)", options.images / f"{name}.png")
+            elif name in TOYS:
+                continue
             elif name == "demonstrations":
                 draw_demonstrations(cells, options.images / f"{name}.png")
             else:

@@ -1,0 +1,33 @@
+"""The pages of results: tables of success are those of the stored numbers."""
+
+from __future__ import annotations
+
+import re
+
+from torchrl_her_recipes.reports.tidy import is_results, read_results
+
+from .test_teaching import DOCS, script
+
+
+def test_tables_of_success_are_of_the_numbers_that_are_stored() -> None:
+    """Rows with runs, frames and success are as make_results.py prints them; columns may be missing."""
+    results = script("make_results")
+    stored = [
+        ({name, cell.task, cell.algorithm}, results.entries(cell))
+        for name in results.STUDIES
+        if is_results(results.RESULTS / name)
+        for cell in read_results(results.RESULTS / name).cells
+        if cell.rows
+    ]
+    rows, outdated = 0, []
+    for page in sorted((DOCS / "results").glob("*.md")):
+        for line in page.read_text().splitlines():
+            if (row := re.fullmatch(r"\| (.*?) \| (\d+ \| [\d,]+ \| \*\*\d+%\*\* \(.*)\|", line)) is None:
+                continue
+            names = {name.strip(" `") for name in row[1].split("|")}
+            shown = [entry.strip() for entry in row[2].split("|")]
+            rows += 1
+            if not any(names <= own and shown == entries[: len(shown)] for own, entries in stored):
+                outdated.append(f"{page.name}: {line}")
+    assert rows > 60
+    assert not outdated, "run: python docs/make_results.py"
