@@ -4,23 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
+from types import SimpleNamespace
 from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
-from torchrl_her_recipes.config.groups import (
-    BehaviorConfig,
-    CollectionConfig,
-    CurriculumConfig,
-    DemonstrationsConfig,
-    EvaluationConfig,
-    Group,
-    HindsightConfig,
-    IBSConfig,
-    NoveltyConfig,
-    ReplayConfig,
-    RunConfig,
-    TaskConfig,
-)
+from torchrl_her_recipes.config import groups
+from torchrl_her_recipes.config.groups import Group
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, DDPGConfig, LearnerConfig, options_of
 from torchrl_her_recipes.config.options import AUTO, default_of, what_there_is
@@ -44,23 +33,23 @@ class Recipe:
         ValueError: a value that cannot work or that has no effect; the message names it and what is allowed.
 
     Example:
-        >>> recipe = Recipe(hindsight=HindsightConfig(algo="her"), run=RunConfig(seed=3))
+        >>> recipe = Recipe(hindsight=groups.HindsightConfig(algo="her"), run=groups.RunConfig(seed=3))
         >>> recipe.learner.learning_rate, recipe.learner.gamma
         (0.001, 'auto')
     """
 
-    task: TaskConfig = field(default_factory=TaskConfig)
-    hindsight: HindsightConfig = field(default_factory=HindsightConfig)
+    task: groups.TaskConfig = field(default_factory=groups.TaskConfig)
+    hindsight: groups.HindsightConfig = field(default_factory=groups.HindsightConfig)
     learner: LearnerConfig = field(default_factory=DDPGConfig)
-    collection: CollectionConfig = field(default_factory=CollectionConfig)
-    replay: ReplayConfig = field(default_factory=ReplayConfig)
-    ibs: IBSConfig = field(default_factory=IBSConfig)
-    novelty: NoveltyConfig = field(default_factory=NoveltyConfig)
-    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
-    behavior: BehaviorConfig = field(default_factory=BehaviorConfig)
-    demonstrations: DemonstrationsConfig = field(default_factory=DemonstrationsConfig)
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    run: RunConfig = field(default_factory=RunConfig)
+    collection: groups.CollectionConfig = field(default_factory=groups.CollectionConfig)
+    replay: groups.ReplayConfig = field(default_factory=groups.ReplayConfig)
+    ibs: groups.IBSConfig = field(default_factory=groups.IBSConfig)
+    novelty: groups.NoveltyConfig = field(default_factory=groups.NoveltyConfig)
+    curriculum: groups.CurriculumConfig = field(default_factory=groups.CurriculumConfig)
+    behavior: groups.BehaviorConfig = field(default_factory=groups.BehaviorConfig)
+    demonstrations: groups.DemonstrationsConfig = field(default_factory=groups.DemonstrationsConfig)
+    evaluation: groups.EvaluationConfig = field(default_factory=groups.EvaluationConfig)
+    run: groups.RunConfig = field(default_factory=groups.RunConfig)
 
     def __post_init__(self) -> None:
         if self.hindsight.algo == AUTO and self.curriculum.layers is not None:
@@ -95,7 +84,7 @@ class Recipe:
         """For each run the recipe of that run alone, with its seed.
 
         Example:
-            >>> [own.seeds for own in Recipe(run=RunConfig(seed=3, num_runs=2)).of_runs()]
+            >>> [own.seeds for own in Recipe(run=groups.RunConfig(seed=3, num_runs=2)).of_runs()]
             [[3], [4]]
         """
         return [replace(self, run=replace(self.run, seed=seed, num_runs=1)) for seed in self.seeds]
@@ -215,7 +204,7 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
         )
     if "epochs" in asked:
         below.get("run", {}).pop("frames", None)
-    for group, own in without_effect(_groups(over(below, given))):
+    for group, own in without_effect(SimpleNamespace(**_groups(over(below, given)))):
         if own not in given.get(group, {}) and own in below.get(group, {}):
             del below[group][own]
     return _assemble(over(below, given))
@@ -228,7 +217,7 @@ def _named(group: str, default: str, *values: Nested) -> str:
 
 def _learner_of(*values: Nested) -> str:
     """The learner that is named in the first of some values, or that ``auto`` stands for on their task."""
-    name, task = _named("learner", "auto", *values), _named("task", TaskConfig.name, *values)
+    name, task = _named("learner", "auto", *values), _named("task", groups.TaskConfig.name, *values)
     actions = get_task_spec(task).actions if isinstance(task, str) and name == "auto" else None
     return name if actions is None else BY_ACTIONS[actions]
 
@@ -294,22 +283,11 @@ def drop_other_goal_sources(given: Nested) -> None:
 
 
 def _assemble(values: Nested) -> Recipe:
-    return Recipe(**vars(_groups(values)))
+    return Recipe(**_groups(values))
 
 
-class _Groups:
-    """The groups of a recipe, before they are checked against each other."""
-
-    task: TaskConfig
-    hindsight: HindsightConfig
-    learner: LearnerConfig
-    collection: CollectionConfig
-    replay: ReplayConfig
-    demonstrations: DemonstrationsConfig
-
-
-def _groups(values: Nested) -> Any:
-    groups = _Groups()
+def _groups(values: Nested) -> dict[str, Any]:
+    made: dict[str, Any] = {}
     for group, kind in GROUPS.items():
         own = dict(values.get(group, {}))
         if group == "learner":
@@ -319,8 +297,8 @@ def _groups(values: Nested) -> Any:
             if name not in known:
                 of = f"learner={own.get('name', 'auto')}" if group == "learner" else f"the group {group}"
                 raise ValueError(f"{of} has no option {name}{what_there_is(name, known, 'options')}")
-        setattr(groups, group, kind(**own))
-    return groups
+        made[group] = kind(**own)
+    return made
 
 
 def _default(group: Group, name: str) -> Any:

@@ -6,38 +6,25 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from torchrl_her_recipes.config.groups import (
-    BehaviorConfig,
-    CollectionConfig,
-    CurriculumConfig,
-    DemonstrationsConfig,
-    EvaluationConfig,
-    Group,
-    HindsightConfig,
-    IBSConfig,
-    NoveltyConfig,
-    ReplayConfig,
-    RunConfig,
-    TaskConfig,
-)
+from torchrl_her_recipes.config import groups
 from torchrl_her_recipes.config.learners import LEARNERS, LearnerConfig
 from torchrl_her_recipes.config.options import nearest, what_there_is
 
 Nested = dict[str, dict[str, Any]]
 
-GROUPS: dict[str, type[Group]] = {
-    "task": TaskConfig,
-    "hindsight": HindsightConfig,
+GROUPS: dict[str, type[groups.Group]] = {
+    "task": groups.TaskConfig,
+    "hindsight": groups.HindsightConfig,
     "learner": LearnerConfig,  # of the learner that is chosen
-    "collection": CollectionConfig,
-    "replay": ReplayConfig,
-    "ibs": IBSConfig,
-    "novelty": NoveltyConfig,
-    "curriculum": CurriculumConfig,
-    "behavior": BehaviorConfig,
-    "demonstrations": DemonstrationsConfig,
-    "evaluation": EvaluationConfig,
-    "run": RunConfig,
+    "collection": groups.CollectionConfig,
+    "replay": groups.ReplayConfig,
+    "ibs": groups.IBSConfig,
+    "novelty": groups.NoveltyConfig,
+    "curriculum": groups.CurriculumConfig,
+    "behavior": groups.BehaviorConfig,
+    "demonstrations": groups.DemonstrationsConfig,
+    "evaluation": groups.EvaluationConfig,
+    "run": groups.RunConfig,
 }
 
 
