@@ -22,7 +22,7 @@ from torchrl_her_recipes.config.loggers import check_installed
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.best import BestPolicy
-from torchrl_her_recipes.runs.callbacks import Callback, Callbacks, RunView, Stopped
+from torchrl_her_recipes.runs.callbacks import Callback, RunView, Stopped
 from torchrl_her_recipes.runs.curriculum import layer_success, move_on, play_greedily
 from torchrl_her_recipes.runs.evaluation import measure, written
 from torchrl_her_recipes.runs.film import film_policy
@@ -236,26 +236,30 @@ def _run(
 ) -> RunResult:
     recipe = components.recipe
     loggers = [] if home is None else [LogByName(name) for name in recipe.run.log]
-    hooks = Callbacks([*callbacks, *loggers], RunView(components, trainer, rows, home))
+    hooks, view = [*callbacks, *loggers], RunView(components, trainer, rows, home)
     threads = torch.get_num_threads()
     torch.set_num_threads(recipe.run.threads)
     torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
     shown = Progress(recipe, trainer, show=progress)
     interrupted = stopped = saved = False
     with soft_interrupt() as check, ExitStack() as opened:  # also while things are saved at the end
-        for own in loggers:
-            opened.callback(own.close)
+        for logger in loggers:
+            opened.callback(logger.close)
 
         def between_batches() -> None:
             check()
-            hooks.batch()
+            wanted = [own.on_batch(view) for own in hooks]  # of all of them, also after a True
+            if any(wanted):
+                raise Stopped
 
         try:
-            hooks.start()
+            for own in hooks:
+                own.on_start(view)
             while trainer.epochs < recipe.run.epochs and not stopped:
                 seconds = rows[-1]["seconds"] if rows else 0.0
                 rows += _epoch(components, trainer, shown, between_batches, seconds, best)
-                stopped = hooks.epoch()
+                asked = [own.on_epoch(view) for own in hooks]
+                stopped = any(asked)
                 for line in notices(rows, recipe, components.bounds):
                     shown.say(line)
                 if home is not None:
@@ -278,7 +282,8 @@ def _run(
             if not saved:
                 (_save_all if has_buffer else _save)(components, trainer, home, best)
             _finish(components, trainer, rows, home, has_buffer)
-        hooks.end()
+        for own in hooks:
+            own.on_end(view)
     return RunResult(
         rows=rows,
         folder=None if home is None else home.path,
@@ -398,7 +403,11 @@ def _finish(
 def _write_results(
     components: Components, trainer: Trainer, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool
 ) -> None:
-    goals = _save_goals(components, home) if has_buffer else _saved_goals(home)
+    goals = None
+    if has_buffer:
+        goals = _save_goals(components, home)
+    elif home.goal_map.is_file():  # written when the run still had its buffer
+        goals = GoalMap.load(home.goal_map)
     if components.recipe.run.pictures:
         _draw(components, rows, goals, home)
     write_policy(home.policy, components.greedy.state_dict(), {})
@@ -427,11 +436,6 @@ def median_run(rows: list[dict[str, float]]) -> int:
     """The index of the run with the median success in the last evaluation."""
     values = last_success(rows)
     return sorted(range(len(values)), key=values.__getitem__)[len(values) // 2]
-
-
-def _saved_goals(home: RunFolder) -> GoalMap | None:
-    """The histogram of virtual goals that was written when the run still had its buffer, if there was one."""
-    return GoalMap.load(home.goal_map) if home.goal_map.is_file() else None
 
 
 def _save_goals(components: Components, home: RunFolder) -> GoalMap | None:
