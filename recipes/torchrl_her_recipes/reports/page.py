@@ -19,7 +19,7 @@ from torchrl_her_recipes.config.study import Study, read_orders
 from torchrl_her_recipes.reports.bootstrap import REPETITIONS
 from torchrl_her_recipes.reports.compare import ALL_TASKS, Difference, Final, Judged, Verdict, compare, judge
 from torchrl_her_recipes.reports.formatting import MEASURES, SIGNS, show, show_gap, show_interval, show_range
-from torchrl_her_recipes.reports.pictures import Film, draw_pictures
+from torchrl_her_recipes.reports.pictures import draw_pictures
 from torchrl_her_recipes.reports.results import LAST, Combination
 from torchrl_her_recipes.reports.tidy import Results, read_study
 from torchrl_her_recipes.runs.plots import band
@@ -90,7 +90,7 @@ def _describe(results: Results, out: Path) -> dict[str, Any]:
         "verdicts": Counter(row.verdict for row in judged),
         "failing": [row for row in judged if row.verdict is not Verdict.APART],
         "pictures": draw_pictures(cells, finals, out / "figures"),
-        "film": None if results.film is None else Film.of(*results.film),
+        "film": results.film,
     }
 
 

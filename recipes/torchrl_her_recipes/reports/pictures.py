@@ -6,7 +6,6 @@ import base64
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +20,11 @@ from torchrl_her_recipes.reports.results import Combination
 from torchrl_her_recipes.runs.plots import Rows, band, colors
 
 _MIME = {".svg": "image/svg+xml", ".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}
-_MOST_FILM = 20_000_000  # bytes
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of the page.
+    """A picture or film of the page.
 
     Attributes:
         file: that is embedded.
@@ -41,42 +39,6 @@ class Picture:
         """The whole picture as an address."""
         data = base64.b64encode(self.file.read_bytes()).decode()
         return f"data:{_MIME[self.file.suffix]};base64,{data}"
-
-
-@dataclass(frozen=True)
-class Film:
-    """A film of a policy.
-
-    Attributes:
-        uri: all of it as an address.
-        alt: what it shows, in words.
-        is_video: whether it is one for a player; otherwise it is a picture that moves.
-    """
-
-    uri: str
-    alt: str
-    is_video: bool
-
-    @classmethod
-    def of(cls, path: Path, what: str) -> Film | None:
-        """A film in a file; None if it has gone or is too large for a page.
-
-        Args:
-            path: the file.
-            what: it shows.
-        """
-        try:
-            about, content = path.stat(), path.read_bytes()
-        except OSError:  # it was removed just now
-            return None
-        if len(content) > _MOST_FILM:
-            return None
-        made = f"{datetime.fromtimestamp(about.st_mtime):%Y-%m-%d %H:%M}"
-        return cls(
-            f"data:{_MIME[path.suffix]};base64,{base64.b64encode(content).decode()}",
-            f"{what}, {made}",
-            path.suffix == ".mp4",
-        )
 
 
 def draw_pictures(

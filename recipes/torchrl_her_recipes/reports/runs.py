@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.reports.page import write_page
+from torchrl_her_recipes.reports.pictures import Picture
 from torchrl_her_recipes.reports.results import read_single
 from torchrl_her_recipes.reports.tidy import Results
 from torchrl_her_recipes.studies.seed_batches import Batches
 
 _FILMS = (".gif", ".mp4")
+_LARGEST = 20_000_000  # bytes of a film
 
 
 def read_runs(folders: Sequence[Path]) -> Results:
@@ -55,19 +58,16 @@ def write_runs_report(folders: Sequence[Path], out: Path) -> Path:
     return write_page(read_runs(folders), out)
 
 
-def _newest_film(folders: Sequence[Path]) -> tuple[Path, str] | None:
-    """Returns the newest whole film in the folders of runs, and its caption; None if there is no film."""
+def _newest_film(folders: Sequence[Path]) -> Picture | None:
+    """Returns the newest film in the folders of runs; None if there is no film that a page has room for."""
     homes = [home.path for folder in folders for home in Batches(folder).homes]
-    films = [
-        path
-        for home in homes
-        for path in home.glob("*.*")
-        if path.suffix in _FILMS and not path.stem.endswith(".part")
-    ]
-    newest = max(films, key=lambda path: path.stat().st_mtime, default=None)
+    films = [path for home in homes for path in home.glob("*.*") if path.suffix in _FILMS]
+    whole = [path for path in films if not path.stem.endswith(".part") and path.stat().st_size <= _LARGEST]
+    newest = max(whole, key=lambda path: path.stat().st_mtime, default=None)
     if newest is None:
         return None
-    return newest, f"The newest film, {newest.parent.resolve().name}/{newest.name}"
+    made = f"{datetime.fromtimestamp(newest.stat().st_mtime):%Y-%m-%d %H:%M}"
+    return Picture(newest, f"The newest film, {newest.parent.resolve().name}/{newest.name}, {made}")
 
 
 def _runs_in(folder: Path) -> list[Path]:

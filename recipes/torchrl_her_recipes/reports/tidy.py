@@ -16,6 +16,7 @@ import yaml
 
 from torchrl_her_recipes.config.plain_files import LARGEST_TABLE, naming, read_json, read_mapping, reason
 from torchrl_her_recipes.config.study import Study
+from torchrl_her_recipes.reports.pictures import Picture
 from torchrl_her_recipes.reports.results import Combination, read_combinations
 from torchrl_her_recipes.runs.arrays import read_arrays
 from torchrl_her_recipes.runs.goal_map import GoalMap
@@ -37,7 +38,7 @@ class Results:
         cells: its combinations.
         kind: what they are: of a ``"study"``, or single ``"runs"``.
         expect, published: as in :class:`~torchrl_her_recipes.Study`.
-        film: the newest film of its policies and what it shows, if there is one.
+        film: the newest film of its policies, if there is one.
     """
 
     name: str
@@ -46,7 +47,7 @@ class Results:
     kind: Literal["study", "runs"] = "study"
     expect: Mapping[str, Sequence[str]] = field(default_factory=dict)
     published: Mapping[str, Any] = field(default_factory=dict)
-    film: tuple[Path, str] | None = None
+    film: Picture | None = None
 
 
 def is_results(folder: Path) -> bool:
