@@ -50,7 +50,6 @@ from .runs.score import run_score as run_score
 from .runs.score import score as score
 from .runs.show import show_file as show_file
 from .studies.pictures import plot_virtual_goals as plot_virtual_goals
-from .studies.plan import duration as duration
 from .studies.study import plan_study as plan_study
 from .studies.study import run_study as run_study
 from .studies.sweep import SweepResult as SweepResult

@@ -13,7 +13,6 @@ from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, success_line
 from torchrl_her_recipes.config.study import load_study, study_names
 
 if TYPE_CHECKING:
-    from torchrl_her_recipes.studies.plan import Plan
     from torchrl_her_recipes.studies.study import StudyResult
 
 _FOLDER = click.Path(path_type=Path)
@@ -59,21 +58,14 @@ def study(
     home = folder or Path("runs") / (own.name + ("_quick" if quick else ""))
     to_do = recipes.plan_study(own, home)
     workers: Any = recipes.make_workers(jobs=jobs, ray=ray, gpus_per_job=gpus_per_job)
-    _say_plan(own.name, home, to_do, workers.at_once)
+    left = to_do.to_go
+    steps = f"{to_do.steps_to_go(left):,} environment steps in all"
+    click.echo(f"{own.name}: {len(left)} batched runs to go, {steps}: {home}")
+    click.echo("\n".join(to_do.table(workers.at_once)))
     if plan:
         workers.close()
         return 0
     return _say_study(recipes.run_study(own, home, workers=workers))
-
-
-def _say_plan(name: str, folder: Path, plan: Plan, at_once: int) -> None:
-    to_go = plan.to_go
-    steps = f"{plan.steps_to_go(to_go):,} environment steps in all"
-    click.echo(f"{name}: {len(to_go)} batched runs to go, {steps}: {folder}")
-    click.echo("\n".join(plan.table()))
-    if to_go:
-        together = min(at_once, len(to_go))
-        click.echo(f"about {recipes.duration(plan.wall_clock(to_go, at_once))}, {together} at once")
 
 
 def _say_study(result: StudyResult) -> int:

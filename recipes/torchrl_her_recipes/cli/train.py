@@ -94,12 +94,8 @@ def _sweep(wanted: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
     if anew:  # the same command resumes an unfinished sweep
         folder = recipes.unfinished_sweep(runs, folder.parent) or folder
     plan, workers = recipes.plan_sweep(runs, folder), recipes.make_workers(jobs=jobs)
-    to_go = plan.to_go
-    click.echo(f"sweep: {len(to_go)} of {len(runs)} runs to go: {folder}")
-    click.echo("\n".join(plan.table()))
-    if to_go:
-        together = min(workers.at_once, len(to_go))
-        click.echo(f"about {recipes.duration(plan.wall_clock(to_go, together))}, {together} at once")
+    click.echo(f"sweep: {len(plan.to_go)} of {len(runs)} runs to go: {folder}")
+    click.echo("\n".join(plan.table(workers.at_once)))
     result = recipes.run_sweep(runs, folder, workers=workers)
     for label, reason in result.failed.items():
         fail(f"{folder / label} failed: {reason}")

@@ -105,10 +105,14 @@ class Plan:
         """About how many seconds it is until some jobs are done, so many at once."""
         return wall_clock(map(self.seconds_to_go, jobs), at_once)
 
-    def table(self) -> list[str]:
-        """A line for each job: its state, and what it still takes."""
+    def table(self, at_once: int) -> list[str]:
+        """A line for each job, with its state and what it still takes; and one for all, so many at once."""
         width = max(len(job.label) for job in self.jobs)
-        return [f"  {job.label:<{width}}  {self._state(job)}" for job in self.jobs]
+        lines = [f"  {job.label:<{width}}  {self._state(job)}" for job in self.jobs]
+        if to_go := self.to_go:
+            about = duration(self.wall_clock(to_go, at_once))
+            lines.append(f"about {about}, {min(at_once, len(to_go))} at once")
+        return lines
 
     def _state(self, job: Job) -> str:
         if self.is_done(job):

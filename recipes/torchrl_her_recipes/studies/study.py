@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-
-from filelock import FileLock, Timeout
 
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.imports import check_permitted
@@ -13,26 +11,21 @@ from torchrl_her_recipes.config.study import Study, curve_label
 from torchrl_her_recipes.runs.plots import plot_comparison
 from torchrl_her_recipes.runs.run import last_success
 from torchrl_her_recipes.studies.plan import Plan
-from torchrl_her_recipes.studies.schedule import run_jobs
+from torchrl_her_recipes.studies.schedule import run_planned
 from torchrl_her_recipes.studies.seed_batches import Batches, plan_batches
-from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
+from torchrl_her_recipes.studies.sweep import SweepResult
+from torchrl_her_recipes.studies.workers_local import Workers
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyResult:
-    """What came of a study.
+class StudyResult(SweepResult):
+    """What came of a study; ``successes`` are of each combination, if all runs are done.
 
     Attributes:
         figure: the picture, if all runs are done.
-        interrupted: whether somebody stopped it. It goes on if it is run again.
-        failed: why, by the name of the batched run. The others are not held back by it.
-        successes: of the runs of each combination in their last evaluation, if all runs are done.
     """
 
     figure: Path | None
-    interrupted: bool = False
-    failed: dict[str, str] = field(default_factory=dict)
-    successes: dict[str, list[float]] = field(default_factory=dict)
 
 
 def plan_study(study: Study, folder: Path) -> Plan:
@@ -74,24 +67,13 @@ def run_study(
     """
     for _, recipe in study.cells():
         check_permitted(recipe.task.name)
-    workers = workers or LocalWorkers()
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(folder / ".lock", timeout=0):
-            plan = plan_study(study, folder)
-            outcomes = run_jobs(plan, workers, progress=progress)
-    except Timeout as error:
-        raise ValueError(f"another process is running a study in {folder}") from error
-    finally:
-        workers.close()
+    plan, came = run_planned(lambda: plan_study(study, folder), folder, "study", workers, progress=progress)
     done = not plan.to_go
+    cells = [label for label, _ in study.cells()] if done else []
     return StudyResult(
         figure=draw_study(study, folder) if done else None,
-        successes={label: last_success(Batches(folder / label).rows()) for label, _ in study.cells()}
-        if done
-        else {},
-        interrupted=any(outcome.interrupted for outcome in outcomes.values()),
-        failed={label: outcome.error for label, outcome in outcomes.items() if outcome.error},
+        successes={label: last_success(Batches(folder / label).rows()) for label in cells},
+        **came,
     )
 
 

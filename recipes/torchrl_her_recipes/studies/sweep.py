@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.recipe import Recipe
@@ -18,8 +16,8 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.run import last_success
 from torchrl_her_recipes.studies.jobs import Job
 from torchrl_her_recipes.studies.plan import Plan
-from torchrl_her_recipes.studies.schedule import run_jobs
-from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
+from torchrl_her_recipes.studies.schedule import run_planned
+from torchrl_her_recipes.studies.workers_local import Workers
 
 _NOTE = "sweep.json"  # which runs a folder is for
 
@@ -71,22 +69,17 @@ def run_sweep(
         ValueError: a run in the folder has the same name and other options, or somebody is at work in it.
         KeyboardInterrupt: by a second Ctrl-C.
     """
-    workers = workers or LocalWorkers()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder / ".lock", timeout=0):
-            plan = plan_sweep(runs, folder)
-            write_text(folder / _NOTE, json.dumps(_plain(runs)))
-            outcomes = run_jobs(plan, workers, progress=progress)
-    except Timeout as error:
-        raise ValueError(f"another process is running a sweep in {folder}") from error
-    finally:
-        workers.close()
+
+    def make_plan() -> Plan:
+        plan = plan_sweep(runs, folder)
+        write_text(folder / _NOTE, json.dumps(_plain(runs)))
+        return plan
+
+    plan, came = run_planned(make_plan, folder, "sweep", workers, progress=progress)
     done = [job for job in plan.jobs if plan.is_done(job)]
     return SweepResult(
         successes={job.label: last_success(RunFolder(job.folder).rows()) for job in done},
-        failed={label: outcome.error for label, outcome in outcomes.items() if outcome.error},
-        interrupted=any(outcome.interrupted for outcome in outcomes.values()),
+        **came,
     )
 
 

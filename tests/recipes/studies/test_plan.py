@@ -36,7 +36,8 @@ def test_what_is_done_is_left_out_and_the_longest_comes_first(tmp_path: Path) ->
     plan = Plan(jobs(tmp_path))
     assert [job.label for job in plan.to_go] == ["short"]
     assert plan.steps_to_go(plan.jobs) == 16_000
-    assert [line.split()[:2] for line in plan.table()] == [["short", "to"], ["long", "done"]]
+    assert [line.split()[:2] for line in plan.table(2)[:2]] == [["short", "to"], ["long", "done"]]
+    assert plan.table(2)[2].endswith(", 1 at once")
 
 
 def test_only_what_a_run_can_go_on_from_counts(tmp_path: Path) -> None:
@@ -45,8 +46,8 @@ def test_only_what_a_run_can_go_on_from_counts(tmp_path: Path) -> None:
     RunFolder(tmp_path / "long").describe(jobs(tmp_path)[1].recipe)
     plan = Plan(jobs(tmp_path))
     assert plan.progress == {"short": Progress(), "long": Progress(5, 4.0)}
-    assert "at epoch 5 of 10" in plan.table()[1]
-    assert "32,000 steps to go" in plan.table()[1]
+    assert "at epoch 5 of 10" in plan.table(2)[1]
+    assert "32,000 steps to go" in plan.table(2)[1]
 
 
 def test_measured_times_outweigh_expected_ones(tmp_path: Path) -> None:
