@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
@@ -38,7 +38,6 @@ def build(recipe: Recipe) -> Components:
 
     Args:
         recipe: of the run.
-            not a call of :func:`make_recipe`, named it.
 
     Raises:
         ValueError: something in the recipe cannot work or does not fit into memory, or it names a module that
@@ -59,32 +58,22 @@ def build(recipe: Recipe) -> Components:
     agent = make_agent(recipe, env, own, rewards=bounds, curriculum=curriculum, device=devices.learner)
     if behavior is not None:
         behavior.factors += make_factors(recipe, agent, state, rewards)
-    collector = (
-        ProcessCollector(
-            recipe,
-            agent.policy,
-            None if state is None else state.progress,
-            storing_device=devices.replay,
-        )
-        if processes
-        else make_collector(recipe, env, agent.policy, devices)
+    if processes:
+        progress = None if state is None else state.progress
+        collector = ProcessCollector(recipe, agent.policy, progress, storing_device=devices.replay)
+    else:
+        collector = make_collector(recipe, env, agent.policy, devices)
+    replay = partial(
+        make_buffer, recipe, task, generators, rewards=rewards, space=space, state=state, norm=agent.norm
     )
-    replay: dict[str, Any] = {
-        "rewards": rewards,
-        "space": space,
-        "state": state,
-        "norm": agent.norm,
-        "devices": devices,
-    }
     if shown is not None and recipe.demonstrations.in_batches:
-        capacity = rows_needed(recipe, shown)
-        shown.fill(make_buffer(recipe, task, generators, capacity=capacity, **replay), recipe.run.num_runs)
+        shown.fill(replay(devices=devices, capacity=rows_needed(recipe, shown)), recipe.run.num_runs)
     return Components(
         recipe=recipe,
         env=env,
         eval_env=make_played_env(recipe, evaluation_envs(recipe), eval_seeds(recipe, 0)),
         collector=collector,
-        buffer=make_buffer(recipe, task, generators, **replay),
+        buffer=replay(devices=devices),
         goal_target=None if space is None else space.target,
         generators=generators if own is generators else [*generators, *own],
         rewards=rewards,
@@ -126,11 +115,8 @@ def make_collector(
         # All of it: where the policy's is left open, every entry is copied at every step.
         places = {"device": env.device}
     else:
-        places = {
-            "env_device": env.device,
-            "policy_device": devices.learner,
-            "storing_device": devices.replay,
-        }
+        learner, replay = devices
+        places = {"env_device": env.device, "policy_device": learner, "storing_device": replay}
     return Collector(
         env,
         policy,

@@ -9,20 +9,14 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.objectives import LossModule
-from torchrl.objectives.utils import TargetNetUpdater
 
 from torchrl_her.behavior import BehaviorGoals
-from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.goals.weights import GoalWeights
-from torchrl_her.modules.averaging import PolicyAverage
-from torchrl_her.modules.exploration import Exploration
-from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.native.library import CannotCompile
 from torchrl_her.trainers.fused import FusedLearner, Products
 from torchrl_her.trainers.fusing import is_plain_adam, why_not_fused
@@ -35,11 +29,12 @@ from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.demonstrations import RunDemonstrations
 from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.goal_space import goal_weights, scheduled
+from torchrl_her_recipes.components.learner import Agent
 from torchrl_her_recipes.config.recipe import Recipe
 
 
-@dataclass
-class Components:
+@dataclass(kw_only=True)
+class Components(Agent):
     """What a run, or R independent runs side by side, consist of. Swap what you like, then run it.
 
     A loss of your own needs its own optimizer and target updater; an environment of your own, its
@@ -79,23 +74,13 @@ class Components:
     recipe: Recipe
     env: EnvBase
     eval_env: EnvBase
-    actor: TensorDictModuleBase
-    critic: TensorDictModule | None
-    exploration: Exploration
-    policy: TensorDictModuleBase
     collector: BaseCollector
     buffer: TensorDictReplayBuffer
-    loss: LossModule
-    optimizer: torch.optim.Optimizer
-    target: TargetNetUpdater | None
     goal_target: Tensor | None
     generators: list[torch.Generator]
     rewards: tuple[float, float] = (-1.0, 0.0)
     bounds: tuple[float, float] = (-math.inf, math.inf)
     curriculum: CurriculumState | None = None
-    norm: RunningNorm | None = None
-    average: PolicyAverage | None = None
-    guide: GuidedExploration | None = None
     behavior: BehaviorGoals | None = None
     virtual_env: EnvBase | None = None
     demonstrations: RunDemonstrations | None = None

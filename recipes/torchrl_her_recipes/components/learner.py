@@ -24,30 +24,17 @@ from torchrl_her_recipes.config.recipe import Recipe
 Networks = tuple[TensorDictModule, list[TensorDictModule]]
 
 
-@dataclass(frozen=True)
+@dataclass(kw_only=True)
 class Agent:
-    """The components of a run that act and learn.
-
-    Attributes:
-        actor: the greedy policy, with its normalization.
-        critic: values of (observation, goal, action); the first of several.
-        exploration: turns greedy into exploring actions.
-        policy: actor, then exploration.
-        loss: of TorchRL.
-        optimizer: over the loss module's parameters.
-        target: moves the target networks.
-        norm: statistics by which actor and sampled transitions are normalized, or None.
-        average: follows the actor, and is played and kept in its place; or None.
-        guide: begins episodes as the layer below has learned it; or None.
-    """
+    """The components of a run that act and learn; see :class:`~torchrl_her_recipes.Components`."""
 
     actor: TensorDictModuleBase
-    critic: TensorDictModule
+    critic: TensorDictModule | None
     exploration: Exploration
     policy: TensorDictModuleBase
     loss: LossModule
     optimizer: torch.optim.Optimizer
-    target: TargetNetUpdater
+    target: TargetNetUpdater | None
     norm: RunningNorm | None = None
     average: PolicyAverage | None = None
     guide: GuidedExploration | None = None
