@@ -52,10 +52,6 @@ def _path(name: str, value: str) -> tuple[str, ...]:
 def check_once(arguments: Sequence[tuple[str, str]], also: Sequence[str] = ()) -> None:
     """Refuses two values for one option, of which one would be ignored.
 
-    Args:
-        arguments: names and texts of values, as :func:`parse_override` gives them.
-        also: names besides those of options.
-
     Raises:
         ValueError: an option is given twice.
 

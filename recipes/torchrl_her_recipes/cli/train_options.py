@@ -41,10 +41,6 @@ class RunRequest:
 def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest]:
     """The runs that arguments ask for.
 
-    Args:
-        options: the arguments, ``NAME=VALUE`` each.
-        multirun: whether a comma separates the values of a sweep.
-
     Raises:
         ValueError: a mistake in an argument.
     """
@@ -74,9 +70,6 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
 def extending(options: tuple[str, ...]) -> dict[str, Any]:
     """The options that a run which goes on is given.
 
-    Args:
-        options: the arguments, ``NAME=VALUE`` each.
-
     Raises:
         ValueError: a mistake in an argument, or one that would change what the run has trained already.
     """
@@ -87,9 +80,6 @@ def extending(options: tuple[str, ...]) -> dict[str, Any]:
 
 def single(options: tuple[str, ...]) -> dict[str, Any]:
     """The values that arguments give, where each is one value.
-
-    Args:
-        options: the arguments, ``NAME=VALUE`` each.
 
     Raises:
         ValueError: a mistake in an argument.

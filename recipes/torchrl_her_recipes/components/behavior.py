@@ -36,15 +36,6 @@ def make_behavior(
 ) -> BehaviorGoals | None:
     """The transform that proposes goals, still without the factors that need networks; None without any.
 
-    Args:
-        recipe: of the runs.
-        env: of their task.
-
-    Keyword Args:
-        rewards: of a missed and of an achieved goal.
-        space: of the goals.
-        state: the curriculum, if there is one: goals are proposed in its last layer.
-
     Raises:
         ValueError: processes collect, each of which would remember its own goals alone.
     """
@@ -88,15 +79,7 @@ def make_behavior(
 
 
 def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = (-1.0, 0.0)) -> BehaviorGoals:
-    """The transform that lets episodes ask for any goals that are put into its memory, for evaluation.
-
-    Args:
-        recipe: of the runs.
-        env: of their task.
-
-    Keyword Args:
-        rewards: of a missed and of an achieved goal.
-    """
+    """The transform that lets episodes ask for any goals that are put into its memory, for evaluation."""
     task = goal_env(env)
     return BehaviorGoals(
         task_reward(env),

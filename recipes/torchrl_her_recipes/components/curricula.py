@@ -104,13 +104,7 @@ def _read_layer(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumLayer
 
 
 def make_curriculum_state(recipe: Recipe, curriculum: Curriculum, seeds: Sequence[int]) -> CurriculumState:
-    """The recipe's runs in a curriculum, all in its first layer.
-
-    Args:
-        recipe: of the runs.
-        curriculum: its curriculum.
-        seeds: of the evaluation of each run.
-    """
+    """The recipe's runs in a curriculum, all in its first layer."""
     progress = _make_progress(recipe, curriculum)
     layer_env = None
     if not progress.by_episode:

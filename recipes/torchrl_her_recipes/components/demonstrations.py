@@ -95,11 +95,6 @@ def load_demonstrations(
 ) -> RunDemonstrations | None:
     """The demonstrations that a recipe asks for, without a buffer yet; None if it asks for none.
 
-    Args:
-        recipe: of the runs.
-        env: of their task.
-        state: the curriculum, if there is one.
-
     Raises:
         ValueError: another option cannot be beside them, the file cannot be read, is of another task, holds
             too few episodes, or has nothing that episodes could start at.

@@ -168,13 +168,7 @@ def _share(recipe: Recipe, env: Any) -> float:
 
 
 def make_goal_weights(recipe: Recipe, env: Any, space: GoalSpace | KernelSpace | None) -> GoalWeights | None:
-    """The weights of one run's virtual goals; without IBS they are equal and goals are only counted.
-
-    Args:
-        recipe: of the run alone.
-        env: of its task.
-        space: of its goals; None where they are not counted.
-    """
+    """The weights of one run's virtual goals; without IBS they are equal and goals are only counted."""
     algorithm = get_algorithm(recipe.hindsight.algo)
     if algorithm.weights:
         return load_name(algorithm.weights)(recipe, env)
@@ -188,15 +182,7 @@ def make_goal_weights(recipe: Recipe, env: Any, space: GoalSpace | KernelSpace |
 def make_instructive(
     recipe: Recipe, space: GoalSpace | KernelSpace, *, subtract: bool = True
 ) -> InstructiveWeights:
-    """The weights of IBS over the goals of a task.
-
-    Args:
-        recipe: of the run.
-        space: of the goals.
-
-    Keyword Args:
-        subtract: whether they are q* - q, or q* alone.
-    """
+    """The weights of IBS over the goals of a task."""
     options: dict[str, Any] = {
         "sigma": space.sigma,
         "start_factor": recipe.ibs.start_factor,

@@ -17,14 +17,6 @@ def check_buffer_size(
 ) -> None:
     """Refuses a replay buffer that is larger than the memory of its device.
 
-    Args:
-        recipe: of the runs.
-        env: of their task; each of its transitions is a row.
-        device: where the buffer is.
-
-    Keyword Args:
-        not_stored: entries that the buffer leaves out.
-
     Raises:
         ValueError: the buffer is larger.
     """

@@ -12,12 +12,7 @@ from torchrl_her_recipes.config.recipe import Recipe
 
 
 def make_norm(recipe: Recipe, widths: Mapping[str, int]) -> RunningNorm | None:
-    """The statistics of each run, before anything was counted; None if the recipe does not normalize.
-
-    Args:
-        recipe: of the runs.
-        widths: of what the networks see.
-    """
+    """The statistics of each run, before anything was counted; None if the recipe does not normalize."""
     if not recipe.learner.normalize:
         return None
     own = recipe.learner

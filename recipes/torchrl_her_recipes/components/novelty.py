@@ -11,12 +11,7 @@ from torchrl_her_recipes.config.recipe import Recipe
 
 
 def rare_goals(recipe: Recipe, env: Any) -> RareGoals:
-    """Goals with few others around them: by a kernel in a few dimensions, by the nearest neighbors in many.
-
-    Args:
-        recipe: of the run alone.
-        env: of its task.
-    """
+    """Goals with few others around them: by a kernel in few dimensions, by nearest neighbors in many."""
     return RareGoals(
         estimator="kernel" if goal_width(env) <= MOST_DIMENSIONS else "neighbors",
         sharpness=recipe.novelty.sharpness,
@@ -25,10 +20,6 @@ def rare_goals(recipe: Recipe, env: Any) -> RareGoals:
 
 
 def network_novelty(recipe: Recipe, _env: Any) -> NetworkNovelty:
-    """Goals that are new to a network, whose first weights come from the run's seed.
-
-    Args:
-        recipe: of the run alone.
-    """
+    """Goals that are new to a network, whose first weights come from the run's seed."""
     sharpness = recipe.novelty.sharpness
     return NetworkNovelty(seed=recipe.run.seed, sharpness=1.0 if sharpness is None else sharpness)

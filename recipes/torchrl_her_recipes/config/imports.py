@@ -27,9 +27,6 @@ _everything: list[bool] = []  # not empty while all modules are permitted
 def import_modules(names: Sequence[str]) -> None:
     """Imports modules from the current folder or among the installed packages.
 
-    Args:
-        names: of the modules, as in an ``import`` statement.
-
     Raises:
         ValueError: there is no such module, or it cannot be imported.
 

@@ -52,9 +52,6 @@ for _spec in (
 def check_loggers(value: Any) -> tuple[str, ...]:
     """The names of some loggers, in their order; none for None.
 
-    Args:
-        value: a list of names, or one name.
-
     Raises:
         ValueError: there is no such logger, or it is named twice.
 

@@ -114,11 +114,6 @@ def nearest(name: object, known: Any) -> str:
 def what_there_is(name: object, known: Any, kind: str) -> str:
     """The end of a message about an unknown name: the nearest known one, and all of them.
 
-    Args:
-        name: the unknown one.
-        known: the known ones.
-        kind: what they are, in the plural.
-
     Example:
         >>> what_there_is("cherr", ["her", "cher"], "algorithms")
         '; did you mean cher? The algorithms are her, cher'

@@ -15,11 +15,6 @@ def as_kind(name: str, value: object, kind: type) -> Any:
 
     YAML reads ``1e-3`` as text, so text that spells a number is accepted for one.
 
-    Args:
-        name: of the option, for messages.
-        value: the value.
-        kind: str, bool, int or float.
-
     Raises:
         ValueError: the value is of another type.
 

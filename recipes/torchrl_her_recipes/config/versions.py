@@ -28,9 +28,6 @@ def check_versions(installed: Callable[[str], str] = metadata.version) -> None:
     Beside a torch that it does not fit, TorchRL only warns when it is imported, and fails later, in the
     middle of a run. So this is asked first, and without importing any of the three.
 
-    Args:
-        installed: gives the version of a package.
-
     Raises:
         ImportError: one of them is outside of its range, or not installed, or tensordict is not of TorchRL's
             minor release. The message names it and what to install.

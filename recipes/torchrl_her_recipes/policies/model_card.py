@@ -47,12 +47,6 @@ def check_free(path: Path) -> None:
 def write_model_card(path: Path, file: str, card: PolicyInfo, recipe: Recipe) -> None:
     """Writes the model card of a policy.
 
-    Args:
-        path: of the page.
-        file: the name of the policy's file, beside it.
-        card: what the policy expects.
-        recipe: of the run that trained it; of a single seed.
-
     Raises:
         OSError: the page cannot be written.
     """

@@ -50,10 +50,6 @@ class Seen(NamedTuple):
 class Viewer:
     """Shows policies on the same starts and goals, side by side. As a context, it closes their environments.
 
-    Args:
-        policies: The policies, all of the same task.
-        view: How they are shown.
-
     Raises:
         ValueError: The policies are of different tasks, or an environment gives no pictures.
     """

@@ -97,9 +97,6 @@ def show(viewing: Viewing, window: Window) -> None:
 class Viewing:
     """What somebody looks at: episodes, how fast they go, and whether they are paused.
 
-    Args:
-        viewer: Shows the policies.
-
     Attributes:
         paused: whether no steps are taken unless they are asked for.
         over: whether somebody has had enough.

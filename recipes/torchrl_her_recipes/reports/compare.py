@@ -103,11 +103,6 @@ def compare(
 
     Algorithms that are at their end on all tasks of the study are compared on all of them together, too.
     Those that are not at their end have no part in differences.
-
-    Args:
-        cells: of a study.
-        measure: which metric.
-        published: numbers of others, see :class:`~torchrl_her_recipes.Study`.
     """
     shown = [cell for cell in cells if values_of(cell, measure)]
     samples = [values_of(cell, measure) for cell in shown]

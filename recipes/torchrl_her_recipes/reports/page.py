@@ -50,11 +50,6 @@ def write_report(study: Study, folder: Path, out: Path) -> Path:
 def write_page(results: Results, out: Path, *, back: str | None = None) -> Path:
     """Writes a page about results that were read before.
 
-    Args:
-        results: of a study, or of runs.
-        out: where the page goes, its tables, and its pictures into `figures`.
-        back: an address that the page links to, of the pages that it belongs to.
-
     Returns:
         The page.
 

@@ -63,14 +63,7 @@ def plot_finals(
     title: str,
     palette: Mapping[str, str],
 ) -> None:
-    """Draws success at the end: each run, the interquartile mean with its interval, the published number.
-
-    Args:
-        finals: label to the success of each run, and what they have in common.
-        stem: of the pictures, without an ending.
-        title: above it.
-        palette: label to color.
-    """
+    """Draws success at the end: each run, the interquartile mean with its interval, the published number."""
     figure, axes = _panel(title, height=1.5 + 0.42 * len(finals))
     for place, (label, (values, final)) in enumerate(finals.items()):
         color = palette[label]
@@ -90,15 +83,7 @@ def plot_finals(
 
 
 def plot_share(share: np.ndarray, env: GoalEnv, stem: Path, *, limit: float, title: str) -> None:
-    """Draws one heat map of goals [n, n] over the screen, as a .svg and a .png.
-
-    Args:
-        share: of the goals in each cell.
-        env: of the task.
-        stem: of the pictures, without an ending.
-        limit: where the colors end.
-        title: above it.
-    """
+    """Draws one heat map of goals [n, n] over the screen, as a .svg and a .png."""
     figure = Figure(figsize=(2.5, 2.7), layout="constrained")
     axes = figure.subplots()
     draw_goals(axes, share, env, limit=limit)

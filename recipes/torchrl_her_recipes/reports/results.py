@@ -90,10 +90,6 @@ class Combination:
 def read_combinations(study: Study, folder: Path) -> list[Combination]:
     """All combinations of a study, with what a folder holds of them.
 
-    Args:
-        study: what was to be run.
-        folder: with a folder of each combination.
-
     Raises:
         ValueError: there is no such folder, it has none of the study's runs, or one cannot be read.
     """
@@ -119,10 +115,6 @@ def _read(label: str, planned: Recipe, options: Mapping[str, Any], batches: Batc
 
 def read_single(label: str, batches: Batches) -> Combination:
     """A run of no study; what differs are the options that are not the usual ones.
-
-    Args:
-        label: its name.
-        batches: of its seeds; one, as a rule.
 
     Raises:
         ValueError: it cannot be read.
@@ -176,11 +168,6 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 def at_the_end(rows: Sequence[dict[str, float]], name: str, *, evaluations: int = LAST) -> list[float]:
     """One metric of each run: the mean of its last evaluations.
-
-    Args:
-        rows: the table of metrics, one row an epoch and run.
-        name: of the metric.
-        evaluations: how many.
 
     Returns:
         One number for each run, in the order of the runs.

@@ -124,14 +124,7 @@ def write_results(
 
 
 def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Path) -> Path:
-    """The same for combinations that were read before.
-
-    Args:
-        about: the study's name and summary, and whatever else is to be known; the state of each
-            combination is added.
-        cells: the combinations.
-        out: where the files go.
-    """
+    """The same for combinations that were read before."""
     out.mkdir(parents=True, exist_ok=True)
     _write_table(cells, out)
     _write_goals(cells, out / _GOALS)
@@ -145,9 +138,6 @@ def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Pat
 
 def read_results(folder: Path) -> Results:
     """What :func:`write_results` wrote.
-
-    Args:
-        folder: of one study.
 
     Raises:
         ValueError: there are no results in it, or they are damaged.

@@ -33,12 +33,7 @@ class BestPolicy:
         self.state, self.is_new = state, state is not None
 
     def see(self, rows: Sequence[dict[str, float]], actor: TensorDictModuleBase) -> None:
-        """Takes a policy if its evaluation is at least as good as the best one before.
-
-        Args:
-            rows: of this evaluation, one for each run.
-            actor: the greedy policy as it was evaluated, of all runs.
-        """
+        """Takes a policy if its evaluation is at least as good as the best one before."""
         success = statistics.median(row["success"] for row in rows)
         if self.state is not None and success < self.state["success"]:
             return

@@ -26,14 +26,6 @@ def film_policy(components: Components, out: Path, *, run: int, epoch: int) -> N
 
     Environments that only give pictures if they are made for it are made anew. Drawing them may need what a
     machine lacks, such as a display: then there is a warning instead of a film.
-
-    Args:
-        components: of the runs.
-        out: the film.
-
-    Keyword Args:
-        run: which of the runs.
-        epoch: the evaluation whose episodes are shown.
     """
     recipe = components.recipe
     worlds = evaluation_envs(recipe)

@@ -121,12 +121,7 @@ class RunFolder:
         remember(self.config, recipe.task.name)
 
     def describe_best(self, epoch: int, success: float) -> None:
-        """Adds to what :meth:`describe` wrote which evaluation the best policy is of.
-
-        Args:
-            epoch: of the evaluation.
-            success: in it, the median of the runs.
-        """
+        """Adds to what :meth:`describe` wrote which evaluation the best policy is of."""
         about = read_json(self.about) | {"best": {"epoch": epoch, "success": success}}
         write_text(self.about, json.dumps(about, indent=2) + "\n")
 
@@ -168,11 +163,7 @@ class RunFolder:
         return bool(rows) and rows[-1]["epoch"] >= self.recipe().run.epochs
 
     def write_table(self, rows: Sequence[dict[str, float]]) -> None:
-        """Writes the table of metrics.
-
-        Args:
-            rows: all of them: columns may join it on the way (losses, at the first update).
-        """
+        """Writes the table of metrics."""
         columns = list(dict.fromkeys(name for row in rows for name in row))
         table = io.StringIO()
         writer = csv.DictWriter(table, columns, restval="nan")

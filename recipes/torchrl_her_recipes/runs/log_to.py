@@ -85,9 +85,6 @@ class LogByName(Callback):
 
     A logger that fails on the way does not end the run: it is opened anew after the next epoch, and told what
     it has missed.
-
-    Args:
-        name: of the logger.
     """
 
     def __init__(self, name: str) -> None:

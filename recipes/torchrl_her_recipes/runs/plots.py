@@ -41,13 +41,7 @@ _SCREEN = 300  # pixels of the picture behind a heat map
 
 
 def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
-    """Draws the curves of a run; of several ones the median, the 33rd to 67th percentile, and each of them.
-
-    Args:
-        rows: the table of metrics, one row an epoch and run.
-        path: of the picture.
-        title: above it.
-    """
+    """Draws the curves of a run; of several the median, the 33rd to 67th percentile, and each of them."""
     figure = Figure(figsize=(14, 6), layout="constrained")
     figure.suptitle(title)
     for axes, (name, label, limits) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
@@ -189,14 +183,7 @@ def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plot_goals(goals: GoalMap, env: GoalEnv, path: Path, *, title: str = "") -> None:
-    """Draws where virtual goals lie beside the target q*, in the same colors.
-
-    Args:
-        goals: q and q*.
-        env: of the task.
-        path: of the picture.
-        title: above it.
-    """
+    """Draws where virtual goals lie beside the target q*, in the same colors."""
     figure = Figure(figsize=(9.6, 4.6), layout="constrained")
     figure.suptitle(title)
     limit = max(float(goals.target.max()), 1e-9)

@@ -16,13 +16,6 @@ class Progress:
     """Shows how far a run is, on the standard error stream.
 
     On a terminal it is a bar; where that goes into a file or to another program, a line for each epoch.
-
-    Args:
-        recipe: of the run.
-        trainer: its training loop.
-
-    Keyword Args:
-        show: whether to show anything.
     """
 
     def __init__(self, recipe: Recipe, trainer: Trainer, *, show: bool) -> None:
@@ -41,11 +34,7 @@ class Progress:
         self.bar.update(self.trainer.frames - self.bar.n)
 
     def epoch(self, rows: Sequence[dict[str, float]]) -> None:
-        """Says how the evaluation of an epoch went.
-
-        Args:
-            rows: of this evaluation, one for each run.
-        """
+        """Says how the evaluation of an epoch went."""
         success = statistics.median(row["success"] for row in rows)
         self.bar.set_postfix(success=f"{success:.2f}")
         if self.lines:

@@ -17,15 +17,7 @@ _PART = 0.05  # of all steps: where there is no terminal, as much is worth a lin
 
 
 class Overview:
-    """Shows how far the jobs of a plan are, on the standard error stream.
-
-    Args:
-        plan: of the jobs; it is kept up to date.
-        workers: who does them.
-
-    Keyword Args:
-        show: whether to show anything.
-    """
+    """Shows how far the jobs of a plan are, on the standard error stream."""
 
     def __init__(self, plan: Plan, workers: Workers, *, show: bool) -> None:
         self.plan, self.workers = plan, workers
@@ -34,11 +26,7 @@ class Overview:
         self._said = self._share(self._done())
 
     def show(self, left: Sequence[Job]) -> None:
-        """Brings plan and bar up to date.
-
-        Args:
-            left: the jobs that have not ended.
-        """
+        """Brings plan and bar up to date."""
         working = self.workers.progress()
         self.plan.update(working)
         self.bar.n = done = self._done()

@@ -58,9 +58,6 @@ def duration(seconds: float) -> str:
 class Plan:
     """The jobs of a study, and how far each of them is.
 
-    Args:
-        jobs: all of them.
-
     Attributes:
         jobs: likewise.
         progress: how far each is, by label.

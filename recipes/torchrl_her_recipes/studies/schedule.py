@@ -46,11 +46,6 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
     One that fails holds no other back. The first Ctrl-C lets all of them save what they have; a later
     one ends them at once.
 
-    Args:
-        plan: what to do; it is kept up to date.
-        workers: who does it; they are closed in the end.
-        progress: whether to show a bar, or a few lines where there is no terminal.
-
     Returns:
         What came of each job, by label.
 

@@ -93,11 +93,6 @@ class Batches:
 def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
     """The jobs of one combination: the batches that there are, and those of the seeds that are missing.
 
-    Args:
-        label: of the combination.
-        recipe: of all its seeds together.
-        folder: of the study.
-
     Raises:
         ValueError: the folder has a run of other options under the same name, or one that is no batch.
     """

@@ -76,15 +76,6 @@ def in_units(
 ) -> InUnits:
     """Makes environments of a task in other units.
 
-    Args:
-        task: its name.
-        factor: of lengths.
-
-    Keyword Args:
-        num_envs: number of environments.
-        seed: of all of them; R seeds for R equal blocks.
-        dtype: of observations and goals.
-
     Example:
         >>> env = in_units("hand_v1", 1_000.0, num_envs=2)
         >>> bool(env.reset()["desired_goal"].abs().max() > 10)

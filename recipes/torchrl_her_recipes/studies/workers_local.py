@@ -41,7 +41,7 @@ class Workers(Protocol):
 
 
 class LocalWorkers:
-    """Worker processes on this machine, each of which does one job at a time.
+    """Worker processes on this machine, each of which does one job at a time; see :class:`Workers`.
 
     They are in sessions of their own: Ctrl-C reaches them by :meth:`stop` only, never in a bad moment.
 
@@ -63,7 +63,6 @@ class LocalWorkers:
         self._stopped = False
 
     def run(self, job: Job) -> Outcome:
-        """Waits for a place, does the job there, and returns when it has ended."""
         worker = self._places.get()
         try:
             if self._stopped:
@@ -79,17 +78,14 @@ class LocalWorkers:
             self._places.put(worker if worker and not worker.ended else None)
 
     def progress(self) -> dict[str, Progress]:
-        """How far the jobs are that are being done, by label."""
         return {label: read_progress(job.folder) for label, (job, _) in list(self._busy.items())}
 
     def stop(self) -> None:
-        """Tells all to save what they have and to stop; returns at once."""
         self._stopped = True
         for _, worker in list(self._busy.values()):
             worker.stop()
 
     def close(self) -> None:
-        """Ends what is still going on, the hard way."""
         self._stopped = True
         for _, worker in list(self._busy.values()):
             worker.kill()

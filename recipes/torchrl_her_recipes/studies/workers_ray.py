@@ -96,7 +96,6 @@ class RayWorkers:
         return outcome
 
     def progress(self) -> dict[str, Progress]:
-        """How far the jobs are that are being done, by label."""
         try:
             board = ray.get(self._board.read.remote())
         except RayError:  # this machine's node is gone, which run() gets to hear, too
@@ -104,7 +103,6 @@ class RayWorkers:
         return {label: board[label] for label in list(self._tasks) if label in board}
 
     def stop(self) -> None:
-        """Tells all to save what they have and to stop; returns at once."""
         self._stopped = True
         for task in list(self._tasks.values()):
             ray.cancel(task)  # which is a Ctrl-C to those that have begun
