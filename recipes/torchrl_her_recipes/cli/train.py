@@ -14,13 +14,14 @@ from torchrl_her_recipes.cli.train_options import (
     OptionsCommand,
     RunRequest,
     complete,
-    extending,
     folder_option,
     requests,
+    single,
     with_folder,
 )
 from torchrl_her_recipes.config.imports import imported_modules, needs_permission
 from torchrl_her_recipes.config.options import AUTO
+from torchrl_her_recipes.config.recipe import check_extending
 from torchrl_her_recipes.config.resolve import auto_options
 
 
@@ -54,7 +55,8 @@ def train(
     if resume is not None:
         if multirun or show:
             raise click.UsageError("--resume cannot be given together with -m or --show")
-        changes = extending(options)
+        changes = single(options)
+        check_extending(changes)
         if not resume.is_dir():
             raise ValueError(f"{resume} is no folder of a run: it has no config.yaml")
         _say_start(resume)

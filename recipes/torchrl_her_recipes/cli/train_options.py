@@ -18,7 +18,7 @@ from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
 from torchrl_her_recipes.config.learners import LEARNERS, options_of
 from torchrl_her_recipes.config.options import AUTO, default_of
 from torchrl_her_recipes.config.plain_files import naming
-from torchrl_her_recipes.config.recipe import Recipe, check_extending, make_recipe
+from torchrl_her_recipes.config.recipe import Recipe, make_recipe
 from torchrl_her_recipes.config.shipped import load_preset, preset_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, option_names
 
@@ -65,17 +65,6 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
             raise ValueError(f"the sweep has the same run twice: {shown}; give each value once")
         before.append(recipe)
         yield RunRequest(recipe, root / f"{label(recipe)}_{number}")
-
-
-def extending(options: tuple[str, ...]) -> dict[str, Any]:
-    """The options that a run which goes on is given.
-
-    Raises:
-        ValueError: a mistake in an argument, or one that would change what the run has trained already.
-    """
-    values = single(options)
-    check_extending(values)
-    return values
 
 
 def single(options: tuple[str, ...]) -> dict[str, Any]:

@@ -39,7 +39,7 @@ def make_behavior(
     Raises:
         ValueError: processes collect, each of which would remember its own goals alone.
     """
-    options, task = recipe.behavior, goal_env(env)
+    options = recipe.behavior
     if options.name == "real":
         return None
     if recipe.collection.processes > 0:
@@ -58,18 +58,16 @@ def make_behavior(
     top: dict[str, Any] = {}
     if state is not None and state.progress.by_episode:
         top = {"layer_key": "layer", "layer": len(state.curriculum) - 1}
-    behavior = BehaviorGoals(
-        task_reward(env),
+    behavior = _goals(
+        recipe,
+        env,
+        rewards,
         weights=own or None,
         update_on="proposed" if options.name == "ibs" else "achieved",
         greedy=options.name in _GREEDY,
         real_share=options.real_share,
         candidates=options.candidates,
         memory=options.goal_memory,
-        runs=recipe.run.num_runs,
-        generators=generators_of(recipe, Stream.PROPOSED_GOALS),
-        achieved_reward=rewards[1],
-        continues_after_termination=task.continues_after_termination,
         **top,
     )
     if state is not None:
@@ -80,17 +78,18 @@ def make_behavior(
 
 def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = (-1.0, 0.0)) -> BehaviorGoals:
     """The transform that lets episodes ask for any goals that are put into its memory, for evaluation."""
-    task = goal_env(env)
+    memory = evaluation_envs(recipe)
+    return _goals(recipe, env, rewards, remember=False, real_share=0.0, candidates=1, memory=memory)
+
+
+def _goals(recipe: Recipe, env: EnvBase, rewards: tuple[float, float], **options: Any) -> BehaviorGoals:
     return BehaviorGoals(
         task_reward(env),
-        remember=False,
-        real_share=0.0,
-        candidates=1,
-        memory=evaluation_envs(recipe),
         runs=recipe.run.num_runs,
         generators=generators_of(recipe, Stream.PROPOSED_GOALS),
         achieved_reward=rewards[1],
-        continues_after_termination=task.continues_after_termination,
+        continues_after_termination=goal_env(env).continues_after_termination,
+        **options,
     )
 
 

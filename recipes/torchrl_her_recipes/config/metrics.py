@@ -17,8 +17,3 @@ AXES = {name: (label, limits) for name, label, limits in PANELS} | {
     "virtual_success": ("success rate at virtual goals", (-0.02, 1.02)),
     "virtual_q_bias": ("Q of the start minus return, virtual goals", None),
 }
-
-
-def metric_names() -> list[str]:
-    """The metrics that can be drawn over environment steps."""
-    return list(AXES)

@@ -137,10 +137,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
         ValueError: it is not YAML, too large, or holds something else.
         OSError: it cannot be read.
     """
-    values = read_yaml(path)
-    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
-        raise ValueError(f"{path} cannot be read: it must hold names and values, got {shown(values)}")
-    return values
+    return _mapping(path, read_yaml(path))
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -153,7 +150,11 @@ def read_json(path: Path) -> dict[str, Any]:
     text = read_text(path)
     with naming(path):
         values = json.loads(text)
-    if not isinstance(values, dict):
+    return _mapping(path, values)
+
+
+def _mapping(path: Path, values: Any) -> dict[str, Any]:
+    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
         raise ValueError(f"{path} cannot be read: it must hold names and values, got {shown(values)}")
     return values
 
@@ -174,7 +175,7 @@ def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, floa
     text = read_text(path, largest=LARGEST_TABLE)
     try:
         rows = [
-            {name: _number(each) for name, each in row.items()}
+            {name: number(each) for name, each in row.items()}
             for row in csv.DictReader(text.splitlines(), strict=True)
         ]
     except (AttributeError, TypeError, ValueError, csv.Error) as error:  # cut short, or no numbers
@@ -185,5 +186,6 @@ def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, floa
     return rows
 
 
-def _number(text: str) -> float:
+def number(text: str) -> float:
+    """The number that a text spells: whole ones as int."""
     return int(text) if text.isdigit() else float(text)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_her_recipes.config.imports import permit_task
-from torchrl_her_recipes.config.metrics import metric_names
+from torchrl_her_recipes.config.metrics import AXES
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.plain_files import naming, read_mapping
 from torchrl_her_recipes.config.recipe import Recipe, compose
@@ -148,8 +148,8 @@ class Study:
             if long := _set_in(own, _LENGTHS):
                 raise ValueError(f"cases of {self.name} set {long[0]} in {case}: it must be the same in all")
         drawn = [self.figure] if isinstance(self.figure, str) else list(self.figure)
-        if not drawn or not set(drawn) <= set(metric_names()):
-            known = ", ".join(metric_names())
+        if not drawn or not set(drawn) <= set(AXES):
+            known = ", ".join(AXES)
             raise ValueError(f"figure of {self.name} must be some of {known}; got {self.figure!r}")
         object.__setattr__(self, "figure", drawn)
         read_orders(self.expect)  # refuses what is no order

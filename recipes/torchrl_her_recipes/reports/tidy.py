@@ -14,7 +14,14 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from torchrl_her_recipes.config.plain_files import LARGEST_TABLE, naming, read_json, read_mapping, reason
+from torchrl_her_recipes.config.plain_files import (
+    LARGEST_TABLE,
+    naming,
+    number,
+    read_json,
+    read_mapping,
+    reason,
+)
 from torchrl_her_recipes.config.study import Study
 from torchrl_her_recipes.reports.pictures import Picture
 from torchrl_her_recipes.reports.results import Combination, read_combinations
@@ -210,15 +217,11 @@ def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
             raise ValueError(f"its columns are {', '.join(names)}")
         numbers = names.index("seed")  # what comes before them says which combination
         for line in lines:
-            row = {name: _parse(line[name]) for name in names[numbers:] if line[name] != ""}
+            row = {name: number(line[name]) for name in names[numbers:] if line[name] != ""}
             tables.setdefault(line["label"], []).append(row)
         return {label: _count(rows) for label, rows in tables.items()}
     except _DAMAGE as error:
         raise ValueError(f"the table of runs in {folder} is damaged: {reason(error)}") from error
-
-
-def _parse(text: str) -> float:
-    return int(text) if text.isdigit() else float(text)
 
 
 def _count(rows: list[dict[str, float]]) -> list[dict[str, float]]:

@@ -40,13 +40,7 @@ def run_state(components: Components, trainer: Trainer, *, buffer: bool = True) 
         "recipe": components.recipe.to_dict(),
         "made_of": _made_of(components),
         "trainer": trainer.state_dict(),
-        "loss": dict(components.loss.state_dict()),
-        "optimizer": components.optimizer.state_dict(),
-        "target": None if components.target is None else components.target.state_dict(),
-        "exploration": dict(components.exploration.state_dict()),
-        "norm": None if components.norm is None else dict(components.norm.state_dict()),
-        "average": None if components.average is None else dict(components.average.state_dict()),
-        "guide": None if components.guide is None else components.guide.state_dict(),
+        **{name: dict(part.state_dict()) for name, part in _parts(components).items()},
         "guided": None if components.guide is None else components.guide.guided,
         "buffer": buffer_state_dict(components.buffer, copy=False) if buffer else None,
         "demonstrations": None if shown is None or not buffer else shown.state_dict(),
@@ -70,17 +64,9 @@ def load_run_state(components: Components, trainer: Trainer, state: dict[str, An
             raise ValueError(
                 f"the run's {name} was {was}, not {value}: give resume() components made as its were"
             )
-    components.loss.load_state_dict(state["loss"])
-    components.optimizer.load_state_dict(state["optimizer"])
-    if components.target is not None:
-        components.target.load_state_dict(state["target"])
-    components.exploration.load_state_dict(state["exploration"])
-    if components.norm is not None:
-        components.norm.load_state_dict(state["norm"])
-    if components.average is not None:
-        components.average.load_state_dict(state["average"])
+    for name, part in _parts(components).items():
+        part.load_state_dict(state[name])
     if components.guide is not None:
-        components.guide.load_state_dict(state["guide"])
         components.guide.guided = state["guided"]
     if state["buffer"] is not None:
         load_buffer_state_dict(components.buffer, state["buffer"])
@@ -113,6 +99,12 @@ def seed_epoch(components: Components, trainer: Trainer) -> None:
     begins = trainer.epochs > 0 and not trainer.in_epoch
     if begins and recipe.collection.processes == 0 and _worlds(components) is None:
         goal_env(components.env).set_seeds([derive_seed(seed, trainer.epochs) for seed in recipe.seeds])
+
+
+def _parts(components: Components) -> dict[str, Any]:
+    """The components with networks or statistics, by name, as far as there are any."""
+    names = ("loss", "optimizer", "target", "exploration", "norm", "average", "guide")
+    return {name: part for name in names if (part := getattr(components, name)) is not None}
 
 
 def _gpu_of(components: Components) -> torch.device | None:
