@@ -68,10 +68,12 @@ def build(recipe: Recipe) -> Components:
     )
     if shown is not None and recipe.demonstrations.in_batches:
         shown.fill(replay(devices=devices, capacity=rows_needed(recipe, shown)), recipe.run.num_runs)
+    played = partial(make_played_env, recipe, evaluation_envs(recipe), eval_seeds(recipe, 0))
+    virtual = recipe.evaluation.virtual_goals
     return Components(
         recipe=recipe,
         env=env,
-        eval_env=make_played_env(recipe, evaluation_envs(recipe), eval_seeds(recipe, 0)),
+        eval_env=played(),
         collector=collector,
         buffer=replay(devices=devices),
         goal_target=None if space is None else space.target,
@@ -80,16 +82,10 @@ def build(recipe: Recipe) -> Components:
         bounds=bounds,
         curriculum=state,
         behavior=behavior,
-        virtual_env=_virtual_env(recipe, task, rewards) if recipe.evaluation.virtual_goals else None,
+        virtual_env=played(behavior=make_asking(recipe, task, rewards=rewards)) if virtual else None,
         demonstrations=shown,
         **vars(agent),
     )
-
-
-def _virtual_env(recipe: Recipe, task: EnvBase, rewards: tuple[float, float]) -> EnvBase:
-    """Environments for episodes that ask for virtual goals."""
-    asking = make_asking(recipe, task, rewards=rewards)
-    return make_played_env(recipe, evaluation_envs(recipe), eval_seeds(recipe, 0), behavior=asking)
 
 
 def _shown(

@@ -20,7 +20,7 @@ from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch
 from torchrl_her.replay_buffers.layer_rules import LayerRule
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler
-from torchrl_her.replay_buffers.writer import HERWriter, OnWrite
+from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
@@ -79,6 +79,9 @@ def make_buffer(
     size = recipe.replay.buffer_size if capacity is None else capacity
     algorithm, task, runs = get_algorithm(recipe.hindsight.algo), goal_env(env), len(generators)
     rule = task_reward(env)
+    counted = None
+    if norm is not None:
+        counted = norm.update if state is None else partial(count_inputs, norm, state.progress)
     own = [make_goal_weights(each, task, space) for each in recipe.of_runs() if algorithm.hindsight]
     buffer = TensorDictReplayBuffer(
         storage=PackedStorage(runs * size, device=devices.replay),
@@ -96,7 +99,7 @@ def make_buffer(
             runs=runs,
             generators=generators,
             layers=_rules(state, rule),
-            on_write=None if norm is None else _counted_by(norm, state),
+            on_write=counted,
         ),
         sampler=_make_sampler(recipe, generators, size, devices.replay),
         priority_key="td_error",
@@ -128,11 +131,6 @@ def _goals(recipe: Recipe) -> dict[str, Any]:
     if own.goal_sources is not None:
         return {"goal_sources": own.goal_sources}
     return {"k": own.k, "strategy": own.strategy}
-
-
-def _counted_by(norm: RunningNorm, state: CurriculumState | None) -> OnWrite:
-    """What counts the transitions that are written."""
-    return norm.update if state is None else partial(count_inputs, norm, state.progress)
 
 
 def rising_beta(sampler: Sampler, recipe: Recipe) -> list[LinearScheduler]:

@@ -16,7 +16,6 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from torchrl_her.behavior import BehaviorGoals
-from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.native.library import CannotCompile
 from torchrl_her.trainers.fused import FusedLearner, Products
 from torchrl_her.trainers.fusing import is_plain_adam, why_not_fused
@@ -141,13 +140,14 @@ class Components(Agent):
     def trainer(self) -> Trainer:
         """The training loop over these components."""
         recipe, replay, shown = self.recipe, self.recipe.replay, self.demonstrations
+        proposals = [] if self.behavior is None else self.behavior.weights
         return Trainer(
             collector=self.collector,
             buffer=self.buffer if shown is None else shown.mixed_with(self.buffer, recipe),
             learner=self.learner(),
             schedules=[
                 self.exploration,
-                *scheduled([*goal_weights(self.buffer), *self._proposals()]),
+                *scheduled([*goal_weights(self.buffer), *proposals]),
                 *rising_beta(self.buffer.sampler, recipe),
             ],
             runs=recipe.run.num_runs,
@@ -158,7 +158,3 @@ class Components(Agent):
             batches_per_sample=min(replay.batches_per_sample, replay.buffer_size // replay.batch_size),
             average=self.average,
         )
-
-    def _proposals(self) -> list[GoalWeights]:
-        """The weights of proposed goals."""
-        return [] if self.behavior is None else self.behavior.weights

@@ -72,9 +72,7 @@ class RunDemonstrations:
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain data; that of the starts is a part of the collector's."""
-        return {
-            "buffer": None if self.buffer is None else buffer_state_dict(self.buffer, copy=False),
-        }
+        return {"buffer": None if self.buffer is None else buffer_state_dict(self.buffer, copy=False)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Puts back what :meth:`state_dict` gave; the progress of the curriculum was put back before."""
@@ -128,7 +126,17 @@ def load_demonstrations(
                 f"demonstrations.starts_share={options.starts_share} cannot be on {recipe.task.name}, whose "
                 "environments cannot be started at given states: leave it out"
             )
-        own.starts = _make_starts(recipe, own)
+        runs = recipe.run.num_runs
+        own.starts = DemonstrationStarts(
+            [own.shown(run) for run in range(runs)],
+            share=options.starts_share,
+            runs=runs,
+            generators=generators_of(recipe, Stream.DEMONSTRATED_STARTS),
+            width=options.starts_width,
+            stride=options.starts_stride,
+            threshold=options.starts_threshold,
+            samples=options.starts_samples,
+        )
     return own
 
 
@@ -159,20 +167,6 @@ def _scaled(own: Demonstrations, env: EnvBase) -> Demonstrations:
         return own
     action = (own.rows["action"] - low) / (high - low) * 2 - 1
     return replace(own, rows=own.rows.copy().set("action", action.to(own.rows["action"].dtype)))
-
-
-def _make_starts(recipe: Recipe, own: RunDemonstrations) -> DemonstrationStarts:
-    options, runs = recipe.demonstrations, recipe.run.num_runs
-    return DemonstrationStarts(
-        [own.shown(run) for run in range(runs)],
-        share=options.starts_share,
-        runs=runs,
-        generators=generators_of(recipe, Stream.DEMONSTRATED_STARTS),
-        width=options.starts_width,
-        stride=options.starts_stride,
-        threshold=options.starts_threshold,
-        samples=options.starts_samples,
-    )
 
 
 def rows_needed(recipe: Recipe, own: RunDemonstrations) -> int:

@@ -165,7 +165,10 @@ def _resume(
     progress: bool,
 ) -> RunResult:
     recipe = home.recipe()
-    state = _newest_state(home, keep=recipe.run.keep_checkpoints)
+    try:
+        state = load_newest_checkpoint(home.checkpoint, keep=recipe.run.keep_checkpoints)
+    except FileNotFoundError:
+        raise ValueError(f"the run in {home.path} cannot go on: {home.checkpoint.name} is missing") from None
     wanted = recipe.extended(**options) if options else recipe
     check_installed(wanted.run.log)
     has_buffer = bool(state["buffer"])
@@ -195,18 +198,6 @@ def _resume(
         return _run(
             components, trainer, home, rows, best, callbacks, has_buffer=has_buffer, progress=progress
         )
-
-
-def _newest_state(home: RunFolder, *, keep: int) -> dict[str, Any]:
-    """The newest checkpoint that is whole.
-
-    Raises:
-        ValueError: there is none.
-    """
-    try:
-        return load_newest_checkpoint(home.checkpoint, keep=keep)
-    except FileNotFoundError:
-        raise ValueError(f"the run in {home.path} cannot go on: {home.checkpoint.name} is missing") from None
 
 
 def _check_needs_no_buffer(home: RunFolder, recipe: Recipe, state: dict[str, Any]) -> None:

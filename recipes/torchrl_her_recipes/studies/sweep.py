@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -97,13 +97,9 @@ def unfinished_sweep(runs: Mapping[str, Recipe], folders: Path) -> Path | None:
     for note in sorted(folders.glob(f"*/{_NOTE}"), reverse=True):
         with suppress(ValueError, AttributeError):  # of what was torn when the power failed
             noted = {label: Recipe.from_dict(own) for label, own in json.loads(note.read_text()).items()}
-            if _plain(noted) == wanted and not _are_done(note.parent, runs):
+            if _plain(noted) == wanted and not all(RunFolder(note.parent / label).is_done for label in runs):
                 return note.parent
     return None
-
-
-def _are_done(folder: Path, runs: Iterable[str]) -> bool:
-    return all(RunFolder(folder / label).is_done for label in runs)
 
 
 def _plain(runs: Mapping[str, Recipe]) -> Any:
