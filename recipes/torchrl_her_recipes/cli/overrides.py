@@ -52,9 +52,6 @@ def _path(name: str, value: str) -> tuple[str, ...]:
 def check_once(arguments: Sequence[tuple[str, str]], also: Sequence[str] = ()) -> None:
     """Refuses two values for one option, of which one would be ignored.
 
-    Raises:
-        ValueError: an option is given twice.
-
     Example:
         >>> check_once([("seed", "1"), ("run.seed", "2")])
         Traceback (most recent call last):
@@ -85,9 +82,6 @@ def _meant(text: str) -> str:
 
 def parse_value(text: str) -> Any:
     """A value as YAML reads it; None is written ``null``, or as in Python.
-
-    Raises:
-        ValueError: it is not YAML.
 
     Example:
         >>> parse_value("3"), parse_value("{bits: 8}"), parse_value("gym:FetchReach-v4")

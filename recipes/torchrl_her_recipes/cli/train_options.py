@@ -39,11 +39,7 @@ class RunRequest:
 
 
 def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest]:
-    """The runs that arguments ask for.
-
-    Raises:
-        ValueError: a mistake in an argument.
-    """
+    """The runs that arguments ask for."""
     pairs = [parse_override(text, ARGUMENTS) for text in options]
     check_once(pairs, ARGUMENTS)
     given = dict(pairs)
@@ -68,11 +64,7 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
 
 
 def single(options: tuple[str, ...]) -> dict[str, Any]:
-    """The values that arguments give, where each is one value.
-
-    Raises:
-        ValueError: a mistake in an argument.
-    """
+    """The values that arguments give, where each is one value."""
     pairs = [parse_override(text, ARGUMENTS) for text in options]
     check_once(pairs, ARGUMENTS)
     for name, text in pairs:

@@ -46,9 +46,6 @@ def make_agent(
         rewards: the least and the greatest that there can be.
         curriculum: whose layers the networks see, or None.
         device: where it learns.
-
-    Raises:
-        ValueError: the learner cannot choose such actions, or cannot train several runs.
     """
     builder = _builder(recipe, env, curriculum)
     builder.generators, builder.rewards = generators, rewards

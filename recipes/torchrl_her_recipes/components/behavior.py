@@ -34,11 +34,7 @@ def make_behavior(
     space: GoalSpace | KernelSpace | None = None,
     state: CurriculumState | None = None,
 ) -> BehaviorGoals | None:
-    """The transform that proposes goals, still without the factors that need networks; None without any.
-
-    Raises:
-        ValueError: processes collect, each of which would remember its own goals alone.
-    """
+    """The transform that proposes goals, still without the factors that need networks; None without any."""
     options = recipe.behavior
     if options.name == "real":
         return None

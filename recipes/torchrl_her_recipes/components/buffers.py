@@ -71,9 +71,6 @@ def make_buffer(
         norm: counts what is written and normalizes what is sampled; None for raw transitions.
         devices: where the buffer is, and the learner that samples from it.
         capacity: in transitions of each run; the recipe's if None.
-
-    Raises:
-        ValueError: the device's memory cannot hold it.
     """
     check_buffer_size(recipe, env, devices.replay, not_stored=_NOT_STORED)
     size = recipe.replay.buffer_size if capacity is None else capacity

@@ -213,11 +213,7 @@ class ProcessCollector(BaseCollector):
             yield self.next()
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
-        """Random numbers follow from the recipe's seed.
-
-        Raises:
-            NotImplementedError: always.
-        """
+        """Random numbers follow from the recipe's seed."""
         raise NotImplementedError("seeds of processes that collect are those of the recipe: set its seed")
 
     def state_dict(self) -> OrderedDict:

@@ -45,11 +45,7 @@ class CurriculumState:
 
 
 def make_curriculum(recipe: Recipe, env: EnvBase) -> Curriculum | None:
-    """The curriculum that the recipe asks for: its own layers, or those of its task.
-
-    Raises:
-        ValueError: the task has no curriculum of its own, or the recipe's layers cannot work.
-    """
+    """The curriculum that the recipe asks for: its own layers, or those of its task."""
     if not get_algorithm(recipe.hindsight.algo).curriculum:
         return None
     task = goal_env(env)
@@ -68,9 +64,6 @@ def read_curriculum(layers: object, env: GoalEnv) -> Curriculum:
     Args:
         layers: a list of mappings with the options of :class:`~torchrl_her.CurriculumLayer`.
         env: its width of the state and its rewards are used.
-
-    Raises:
-        ValueError: it is no such list, or a layer that cannot work.
 
     Example:
         >>> from torchrl_her_envs import make_env

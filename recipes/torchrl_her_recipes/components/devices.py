@@ -30,11 +30,7 @@ ON_THE_CPU = Devices(CPU, CPU)
 
 
 def devices_of(recipe: Recipe) -> Devices:
-    """The devices that a recipe asks for.
-
-    Raises:
-        ValueError: one of them is not there.
-    """
+    """The devices that a recipe asks for."""
     learner = _choose(recipe) if recipe.learner.device == "auto" else recipe.learner.device
     replay = recipe.replay.device
     return Devices(

@@ -59,9 +59,6 @@ def make_task_envs(
         scaled: whether continuous actions are from -1 to 1, whatever the task's own bounds are, and failures
             are worth what the recipe says, as learners take them. Exported policies and recorded
             demonstrations have the task's own.
-
-    Raises:
-        ValueError: options that the task does not take, or a module that must not be imported.
     """
     task = recipe.task
     if foreign_module(task.name):

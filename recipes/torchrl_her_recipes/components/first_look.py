@@ -85,9 +85,6 @@ def resolved(recipe: Recipe) -> Recipe:
     Where environments are stepped one by one, random actions are played in some: if ``algo`` is ``auto``, or
     if it is open what ends an episode at its goal. What is found then is in the recipe, so that nobody who
     has it looks again.
-
-    Raises:
-        ValueError: see :func:`~torchrl_her_recipes.components.envs.make_task_envs`.
     """
     if not auto_options(recipe) and not ends_open(recipe):
         return recipe

@@ -15,11 +15,7 @@ from torchrl_her_recipes.config.recipe import Recipe
 def check_buffer_size(
     recipe: Recipe, env: EnvBase, device: torch.device, *, not_stored: Sequence[str] = ()
 ) -> None:
-    """Refuses a replay buffer that is larger than the memory of its device.
-
-    Raises:
-        ValueError: the buffer is larger.
-    """
+    """Refuses a replay buffer that is larger than the memory of its device."""
     step = env.fake_tensordict().exclude(*in_root_and_next(not_stored))
     row = sum(entry.numel() * entry.element_size() for entry in step.values(True, True)) // env.numel()
     size, runs, there = recipe.replay.buffer_size, recipe.run.num_runs, memory_of(device)

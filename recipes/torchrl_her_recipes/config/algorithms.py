@@ -182,9 +182,6 @@ def check_strategy(name: str) -> None:
 def check_goal_sources(sources: object) -> dict[str, int]:
     """Checks how many virtual goals come from where.
 
-    Raises:
-        ValueError: these are no whole numbers of at least 1 by source, or a source does not exist.
-
     Example:
         >>> check_goal_sources({"future": 2, "actual": 2})
         {'future': 2, 'actual': 2}

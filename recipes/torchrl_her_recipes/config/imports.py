@@ -27,9 +27,6 @@ _everything: list[bool] = []  # not empty while all modules are permitted
 def import_modules(names: Sequence[str]) -> None:
     """Imports modules from the current folder or among the installed packages.
 
-    Raises:
-        ValueError: there is no such module, or it cannot be imported.
-
     Example:
         >>> import_modules(["point_tusk"])
         Traceback (most recent call last):
@@ -110,9 +107,6 @@ def allow_imports() -> Iterator[None]:
 
 def check_permitted(task: str) -> None:
     """Refuses a task whose module must not be imported, since only a file named it.
-
-    Raises:
-        ValueError: nobody permitted it; the message says how.
 
     Example:
         >>> check_permitted("downloaded:make_env")

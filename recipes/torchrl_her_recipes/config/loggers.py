@@ -52,9 +52,6 @@ for _spec in (
 def check_loggers(value: Any) -> tuple[str, ...]:
     """The names of some loggers, in their order; none for None.
 
-    Raises:
-        ValueError: there is no such logger, or it is named twice.
-
     Example:
         >>> check_loggers("wandb"), check_loggers(["tensorboard", "wandb"]), check_loggers(None)
         (('wandb',), ('tensorboard', 'wandb'), ())
@@ -81,11 +78,7 @@ def _instead(name: object) -> str:
 
 
 def check_installed(names: tuple[str, ...]) -> None:
-    """Refuses loggers whose package is missing.
-
-    Raises:
-        ImportError: it is not installed; the message names the extra.
-    """
+    """Refuses loggers whose package is missing."""
     for name in names:
         needs = LOGGERS[name].needs
         if needs and find_spec(needs) is None:

@@ -49,11 +49,7 @@ def option(
 
 
 def check_options(group: Any) -> None:
-    """Turns the values of a frozen group of options into their types, and checks their ranges.
-
-    Raises:
-        ValueError: a value of another type or out of its range; the message names both.
-    """
+    """Turns the values of a frozen group of options into their types, and checks their ranges."""
     for own in fields(group):
         value = getattr(group, own.name)
         if own.default in (None, AUTO) and value == own.default:

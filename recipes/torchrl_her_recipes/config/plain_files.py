@@ -43,11 +43,7 @@ def reason(error: BaseException | str) -> str:
 
 @contextmanager
 def naming(path: Path, what: str = "cannot be read") -> Iterator[None]:
-    """Turns whatever is wrong with the content of a file into a ValueError that names the file.
-
-    Raises:
-        ValueError: something was.
-    """
+    """Turns whatever is wrong with the content of a file into a ValueError that names the file."""
     try:
         yield
     except _DAMAGE as error:
@@ -119,34 +115,19 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a YAML file.
-
-    Raises:
-        ValueError: it is not YAML, or too large for a configuration.
-        OSError: it cannot be read.
-    """
+    """The content of a YAML file."""
     text = read_text(path)
     with naming(path):
         return parse_yaml(text)
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The names and values that a YAML file holds.
-
-    Raises:
-        ValueError: it is not YAML, too large, or holds something else.
-        OSError: it cannot be read.
-    """
+    """The names and values that a YAML file holds."""
     return _mapping(path, read_yaml(path))
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The names and values that a JSON file holds.
-
-    Raises:
-        ValueError: it is not JSON, too large, or holds something else.
-        OSError: it cannot be read.
-    """
+    """The names and values that a JSON file holds."""
     text = read_text(path)
     with naming(path):
         values = json.loads(text)
@@ -167,10 +148,6 @@ def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, floa
 
     Keyword Args:
         counts: columns that each row must have, of whole numbers of at least 0.
-
-    Raises:
-        ValueError: a line is no row of the table.
-        OSError: it cannot be read.
     """
     text = read_text(path, largest=LARGEST_TABLE)
     try:

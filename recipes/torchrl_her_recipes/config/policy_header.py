@@ -17,10 +17,6 @@ _LARGEST_HEADER = 1 << 22  # bytes
 def read_header(path: Path) -> dict[str, Any]:
     """Returns the description in the header of a policy's file, without reading its weights.
 
-    Raises:
-        ValueError: The file is damaged or something else.
-        OSError: It cannot be read.
-
     Example:
         >>> from torchrl_her_recipes.config.shipped import policy_path
         >>> header = read_header(policy_path("hand_v1"))

@@ -142,9 +142,6 @@ class Recipe:
 def check_extending(values: Mapping[str, Any]) -> None:
     """Refuses options that would change what a run has trained already.
 
-    Raises:
-        ValueError: there is one; the message names it and those that may be given.
-
     Example:
         >>> check_extending({"epochs": 80})
         >>> check_extending({"gamma": 0.9})

@@ -48,9 +48,6 @@ class Order:
     def parse(cls, measure: str, text: str) -> Order:
         """Reads an order from ``a > b`` or ``a < b``.
 
-        Raises:
-            ValueError: The text has another form.
-
         Example:
             >>> order = Order.parse("kl", "her_ibs < her")
             >>> order.more, order.less
@@ -65,9 +62,6 @@ class Order:
 
 def read_orders(expect: Mapping[str, Sequence[str]]) -> list[Order]:
     """Returns the orders of a study's ``expect``, metric to orders.
-
-    Raises:
-        ValueError: There is no list of orders, or an order has another form.
 
     Example:
         >>> [order.more for order in read_orders({"success": ["cher > her"]})]

@@ -15,9 +15,6 @@ def as_kind(name: str, value: object, kind: type) -> Any:
 
     YAML reads ``1e-3`` as text, so text that spells a number is accepted for one.
 
-    Raises:
-        ValueError: the value is of another type.
-
     Example:
         >>> as_kind("learning_rate", "1e-3", float), as_kind("epochs", 2.0, int)
         (0.001, 2)
@@ -36,9 +33,6 @@ def as_kind(name: str, value: object, kind: type) -> Any:
 
 def load_name(path: str) -> Any:
     """Imports a module and returns an attribute of it, named as ``module:attribute``.
-
-    Raises:
-        ValueError: there is no such module or attribute.
 
     Example:
         >>> load_name("math:floor")(2.5)

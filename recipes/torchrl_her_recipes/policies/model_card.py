@@ -32,11 +32,7 @@ def card_path(policy: str | Path) -> Path:
 
 
 def check_free(path: Path) -> None:
-    """Refuses to replace a page that is not a model card, or that somebody has taken over.
-
-    Raises:
-        ValueError: the file exists and does not begin as written model cards do.
-    """
+    """Refuses to replace a page that is not a model card, or that somebody has taken over."""
     if path.exists() and not path.read_text(errors="replace").startswith(_MARK):
         raise ValueError(
             f"{path} exists and is no model card that export wrote: choose another --out, or --no-card "
@@ -45,11 +41,7 @@ def check_free(path: Path) -> None:
 
 
 def write_model_card(path: Path, file: str, card: PolicyInfo, recipe: Recipe) -> None:
-    """Writes the model card of a policy.
-
-    Raises:
-        OSError: the page cannot be written.
-    """
+    """Writes the model card of a policy."""
     page = Environment(undefined=StrictUndefined, autoescape=False)  # Markdown; a policy's file is checked
     page.filters |= {"quote": shlex.quote, "side": _side, "tojson": json.dumps}
     text = page.from_string(_TEMPLATE.read_text()).render(

@@ -70,9 +70,6 @@ def check_weights(
     """Refuses weights that are not those of the actor that a recipe describes.
 
     Shapes come from a file, so they are compared before memory is taken for them.
-
-    Raises:
-        ValueError: they are not.
     """
     name = recipe.learner.name
     own = {key: tuple(value.shape) for key, value in weights.items()}

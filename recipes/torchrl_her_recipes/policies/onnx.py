@@ -34,11 +34,7 @@ _OPSET = 18  # the lowest that torch's exporter writes without converting; runti
 
 
 def need_onnx() -> ModuleType:
-    """Returns the package ``onnxruntime``, if all that writing ONNX files takes is installed.
-
-    Raises:
-        ImportError: A package is missing; the message names the extra.
-    """
+    """Returns the package ``onnxruntime``, if all that writing ONNX files takes is installed."""
     try:
         # All are an extra that few need, and take a second to import.
         import onnx  # noqa: F401, PLC0415

@@ -312,11 +312,7 @@ def _check_out(path: Path, *, card: bool) -> None:
 
 
 def _path_of(source: str | Path) -> Path:
-    """Returns the path of a policy's file, or of one that comes with the package.
-
-    Raises:
-        ValueError: There is no such file, or its suffix is another one.
-    """
+    """Returns the path of a policy's file, or of one that comes with the package."""
     path = policy_path(str(source)) if str(source) in policy_names() else Path(source)
     if not path.is_file():
         if path.suffix or len(path.parts) > 1:

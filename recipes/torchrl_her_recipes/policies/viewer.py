@@ -156,11 +156,7 @@ class Viewer:
 
 
 def _check_comparable(policies: Sequence[Policy]) -> None:
-    """Refuses policies of different tasks: with the same seeds they would not have the same goals.
-
-    Raises:
-        ValueError: two tasks, or two settings of one.
-    """
+    """Refuses policies of different tasks: with the same seeds they would not have the same goals."""
     first, *others = policies
     for other in others:
         ours, theirs = _described(_task_of(first)), _described(_task_of(other))

@@ -52,9 +52,6 @@ def write_page(results: Results, out: Path, *, back: str | None = None) -> Path:
 
     Returns:
         The page.
-
-    Raises:
-        OSError: the page cannot be written.
     """
     page = _template().render(_describe(results, out), back=back, written=f"{datetime.now():%Y-%m-%d %H:%M}")
     path = out / "index.html"

@@ -88,11 +88,7 @@ class Combination:
 
 
 def read_combinations(study: Study, folder: Path) -> list[Combination]:
-    """All combinations of a study, with what a folder holds of them.
-
-    Raises:
-        ValueError: there is no such folder, it has none of the study's runs, or one cannot be read.
-    """
+    """All combinations of a study, with what a folder holds of them."""
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; `torchrl-her study {study.name}` makes its runs")
     cells = [
@@ -114,11 +110,7 @@ def _read(label: str, planned: Recipe, options: Mapping[str, Any], batches: Batc
 
 
 def read_single(label: str, batches: Batches) -> Combination:
-    """A run of no study; what differs are the options that are not the usual ones.
-
-    Raises:
-        ValueError: it cannot be read.
-    """
+    """A run of no study; what differs are the options that are not the usual ones."""
     recipes = [home.recipe() for home in batches.homes]
     made = recipes[0].replace(num_runs=sum(own.run.num_runs for own in recipes))
     differs = [f"{name}={value}" for name, value, _ in _differences(made, Recipe())]

@@ -23,9 +23,6 @@ def read_runs(folders: Sequence[Path]) -> Results:
 
     Args:
         folders: of runs, or of batches of seeds (``seeds_*``), or with such folders in them.
-
-    Raises:
-        ValueError: one of them has no run, or a run cannot be read.
     """
     paths = [path for folder in folders for path in _runs_in(folder)]
     groups = _by_recipe(paths)

@@ -68,9 +68,6 @@ def read_study(study: Study, folder: Path) -> Results:
     Args:
         study: which one.
         folder: with a folder of each combination, or with the files of :func:`write_results`.
-
-    Raises:
-        ValueError: the folder has none of the study's runs, or one cannot be read.
     """
     if not is_results(folder):
         cells = read_combinations(study, folder)
@@ -144,11 +141,7 @@ def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Pat
 
 
 def read_results(folder: Path) -> Results:
-    """What :func:`write_results` wrote.
-
-    Raises:
-        ValueError: there are no results in it, or they are damaged.
-    """
+    """What :func:`write_results` wrote."""
     path = folder / _ABOUT
     if not path.is_file():
         raise ValueError(f"{folder} holds no results: it has no {_ABOUT}")

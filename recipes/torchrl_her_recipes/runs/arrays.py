@@ -11,12 +11,7 @@ _LARGEST = 1 << 27  # bytes of all arrays of a file
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Returns the arrays that ``numpy.savez`` wrote, if they hold numbers.
-
-    Raises:
-        ValueError: the file is damaged, or too large.
-        OSError: it cannot be read.
-    """
+    """Returns the arrays that ``numpy.savez`` wrote, if they hold numbers."""
     with open(path, "rb") as file:
         try:
             with ZipFile(file) as archive:

@@ -92,11 +92,7 @@ class LogByName(Callback):
         self._teller: LogTo | None = None
 
     def on_start(self, run: RunView) -> None:
-        """Opens the logger.
-
-        Raises:
-            ValueError: that fails.
-        """
+        """Opens the logger."""
         self._kept = run.trainer.frames
         try:
             self._open(run)

@@ -66,11 +66,7 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Writes a picture, whole or not at all.
-
-    Raises:
-        OSError: it cannot be written; the one before is untouched.
-    """
+    """Writes a picture, whole or not at all."""
     with written(path) as part:
         figure.savefig(part, dpi=110)
 

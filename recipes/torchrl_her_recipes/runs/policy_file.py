@@ -23,9 +23,6 @@ def write_policy(path: Path, weights: Mapping[str, Tensor], description: Mapping
         path: The file.
         weights: ``state_dict()`` of a policy. Entries that are no tensors are left out.
         description: Plain values, which JSON can hold.
-
-    Raises:
-        OSError: The file cannot be written; the one before is untouched.
     """
     tensors = {
         name: value.detach().to("cpu", copy=True).contiguous()  # safetensors takes no views of one storage
@@ -38,12 +35,7 @@ def write_policy(path: Path, weights: Mapping[str, Tensor], description: Mapping
 
 
 def read_policy(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Returns the description and the weights of a policy's file.
-
-    Raises:
-        ValueError: The file is damaged or something else.
-        OSError: It cannot be read.
-    """
+    """Returns the description and the weights of a policy's file."""
     description = read_header(path)
     with naming(path):
         try:

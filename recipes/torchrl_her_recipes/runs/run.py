@@ -201,11 +201,7 @@ def _resume(
 
 
 def _check_needs_no_buffer(home: RunFolder, recipe: Recipe, state: dict[str, Any]) -> None:
-    """Refuses to train on without the replay buffer, or to keep one that is lost.
-
-    Raises:
-        ValueError: the run has epochs to go, or its recipe wants the buffer to be kept.
-    """
+    """Refuses to train on without the replay buffer, or to keep one that is lost."""
     done = state["trainer"]["epochs"]
     if recipe.run.epochs > done or recipe.run.keep_buffer:
         raise ValueError(

@@ -48,9 +48,6 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
 
     Returns:
         What came of each job, by label.
-
-    Raises:
-        KeyboardInterrupt: by a second Ctrl-C.
     """
     jobs = plan.to_go
     outcomes: dict[str, Outcome] = {}

@@ -91,11 +91,7 @@ class Batches:
 
 
 def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
-    """The jobs of one combination: the batches that there are, and those of the seeds that are missing.
-
-    Raises:
-        ValueError: the folder has a run of other options under the same name, or one that is no batch.
-    """
+    """The jobs of one combination: the batches that there are, and those of the seeds that are missing."""
     home = folder / label
     if (home / "config.yaml").exists():
         raise ValueError(f"{home} is the folder of a single run; choose another folder for the study")

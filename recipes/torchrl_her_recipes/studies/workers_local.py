@@ -47,9 +47,6 @@ class LocalWorkers:
 
     Args:
         at_once: how many; by default one for each core.
-
-    Raises:
-        ValueError: a number below 1.
     """
 
     def __init__(self, at_once: int | None = None) -> None:

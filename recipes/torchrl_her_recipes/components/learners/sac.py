@@ -63,11 +63,7 @@ class SACBuilder(DDPGBuilder):
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """The same, but asked for where there are no bounds it is an error, since it is off by default.
-
-        Raises:
-            ValueError: targets are to be clamped, but rewards have no bounds.
-        """
+        """The same, but asked for where there are no bounds it is an error, since it is off by default."""
         if self.options.clamp_targets and not all(map(math.isfinite, self.rewards)):
             raise ValueError(
                 f"clamp_targets=true has no effect on {self.recipe.task.name}, whose rewards have no bounds: "

@@ -33,9 +33,6 @@ def open_wandb(run: RunView, _frames: int) -> tuple[WandbRun, int]:
 
     A run that is offline (``WANDB_MODE=offline``) is told the whole table anew, and replaces what was there.
     The service takes nothing back: it keeps what it knows, and is told what comes behind.
-
-    Raises:
-        ValueError: nobody is logged in.
     """
     assert run.folder is not None
     home = run.folder.path
