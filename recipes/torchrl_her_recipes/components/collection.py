@@ -18,7 +18,7 @@ from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
 from pathlib import Path
 from queue import Empty
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -42,30 +42,13 @@ from torchrl_her_recipes.components.devices import CPU
 from torchrl_her_recipes.config.imports import imported_modules
 from torchrl_her_recipes.config.recipe import Recipe
 
+if TYPE_CHECKING:
+    from torchrl_her_recipes.components.collection_ray import NodeWorkers
+
 _SECONDS = 1.0  # between two looks at whether processes still run
 _FAILED = "a process failed: worker {} (exit code {})"
 _TRACEBACK = "Worker traceback:"  # what TorchRL's message has below that is in ``__cause__``
 _EXIT_PRIORITY = 100  # at exit, before Python waits for processes that are still there
-
-
-class Workers(Protocol):
-    """Processes that collect. They wait for orders, unless they were told to go on."""
-
-    def begin(self, beginnings: Sequence[Beginning]) -> None:
-        """Drops what they are collecting, and begins new episodes in all of them."""
-        ...
-
-    def ahead(self, weights: TensorDictBase) -> None:
-        """Lets them collect the next batch with these weights of the policy, unless they do already."""
-        ...
-
-    def take(self, weights: TensorDictBase) -> TensorDictBase:
-        """The next batch [..., T], time last; the first dimension may be that of processes."""
-        ...
-
-    def shutdown(self) -> None:
-        """Ends them."""
-        ...
 
 
 class CheckedWeightSync(SharedMemWeightSyncScheme):
@@ -85,17 +68,20 @@ class SyncWorkers(MultiSyncCollector):
         super().__init__(*args, cat_results="stack", **options)
 
     def begin(self, beginnings: Sequence[Beginning]) -> None:
+        """Drops what they are collecting, and begins new episodes in all of them."""
         if self._batch is not None:
             self._batch.result()
             self._batch = None
         self.map_fn("begin", [(own,) for own in beginnings])
 
     def ahead(self, weights: TensorDictBase) -> None:
+        """Lets them collect the next batch with these weights of the policy, unless they do already."""
         if self._batch is None:
             self.update_policy_weights_(weights)  # while no process looks at them
             self._batch = self._thread.submit(self.next)
 
     def take(self, weights: TensorDictBase) -> TensorDictBase:
+        """The next batch [..., T], time last; the first dimension may be that of processes."""
         self.ahead(weights)
         assert self._batch is not None
         batch = self._batch.result()
@@ -129,6 +115,9 @@ class AsyncWorkers(MultiAsyncCollector):
     def take(self, weights: TensorDictBase) -> TensorDictBase:
         self.update_policy_weights_(weights)
         return self.next()
+
+
+Workers: TypeAlias = "SyncWorkers | AsyncWorkers | NodeWorkers"
 
 
 class ProcessCollector(BaseCollector):

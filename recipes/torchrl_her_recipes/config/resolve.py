@@ -13,7 +13,6 @@ from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.without_effect import without_effect
 
 TERMINATION = "termination"  # the option of a task that says what ends an episode at its goal
-_GAMMA = (0.9, 0.99)  # least and greatest
 _WARMUP = 1_000  # environment steps, at least
 _EPISODES = 100  # in an epoch, where environments are stepped one by one
 _LAYER_EPOCHS = 10  # epochs after which a layer that was not asked for ends, learned or not
@@ -37,15 +36,6 @@ class EnvFacts:
     ends: str | None = None
 
 
-def _algo(_recipe: Recipe, facts: EnvFacts) -> str:
-    return "cher" if facts.layers else "filtered_her"
-
-
-def _gamma(_recipe: Recipe, facts: EnvFacts) -> float:
-    """A horizon of half an episode."""
-    return round(min(max(1 - 2 / facts.max_steps, _GAMMA[0]), _GAMMA[1]), 4)
-
-
 def _num_envs(recipe: Recipe, facts: EnvFacts) -> int:
     """Few environments that are slow, so that they learn from each episode soon; some for each process."""
     processes = max(recipe.collection.processes, 1)
@@ -61,20 +51,17 @@ def _epoch_frames(recipe: Recipe, facts: EnvFacts) -> int:
     return max(frames, own.num_envs * own.steps_per_batch)
 
 
-def _warmup_frames(recipe: Recipe, facts: EnvFacts) -> int:
-    """Until each environment has ended an episode: no transition is stored before."""
-    return max(recipe.collection.num_envs * facts.max_steps, _WARMUP)
-
-
 # In this order: later ones depend on earlier ones.
 _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
-    "algo": _algo,
+    "algo": lambda _recipe, facts: "cher" if facts.layers else "filtered_her",
     "goal_sources": lambda recipe, _facts: recipe.hindsight.sources,
-    "gamma": _gamma,
+    # a horizon of half an episode
+    "gamma": lambda _recipe, facts: round(min(max(1 - 2 / facts.max_steps, 0.9), 0.99), 4),
     "num_envs": _num_envs,
     "frames_per_update": lambda _recipe, facts: 5.0 if facts.batched else 1.0,
     "epoch_frames": _epoch_frames,
-    "warmup_frames": _warmup_frames,
+    # until each environment has ended an episode: no transition is stored before
+    "warmup_frames": lambda recipe, facts: max(recipe.collection.num_envs * facts.max_steps, _WARMUP),
 }
 
 

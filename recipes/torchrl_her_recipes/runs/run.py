@@ -376,7 +376,17 @@ def _finish(
         OSError: a file cannot be written; the message says which are missing.
     """
     try:
-        _write_results(components, trainer, rows, home, has_buffer)
+        goals = None
+        if has_buffer:
+            goals = _save_goals(components, home)
+        elif home.goal_map.is_file():  # written when the run still had its buffer
+            goals = GoalMap.load(home.goal_map)
+        if components.recipe.run.pictures:
+            _draw(components, rows, goals, home)
+        write_policy(home.policy, components.greedy.state_dict(), {})
+        if _has_ended(components, trainer):
+            for path in home.older_checkpoints:
+                path.unlink(missing_ok=True)
     except OSError as error:
         expected = [home.curves, home.video] if components.recipe.run.pictures else []
         missing = [path.name for path in (*expected, home.policy) if not path.is_file()]
@@ -385,22 +395,6 @@ def _finish(
             f"cannot write {error.filename or ' or '.join(missing)}: {why}; "
             f"{', '.join(missing)} will be written by: torchrl-her train --resume {home.path}"
         ) from error
-
-
-def _write_results(
-    components: Components, trainer: Trainer, rows: list[dict[str, float]], home: RunFolder, has_buffer: bool
-) -> None:
-    goals = None
-    if has_buffer:
-        goals = _save_goals(components, home)
-    elif home.goal_map.is_file():  # written when the run still had its buffer
-        goals = GoalMap.load(home.goal_map)
-    if components.recipe.run.pictures:
-        _draw(components, rows, goals, home)
-    write_policy(home.policy, components.greedy.state_dict(), {})
-    if _has_ended(components, trainer):
-        for path in home.older_checkpoints:
-            path.unlink(missing_ok=True)
 
 
 def _draw(
