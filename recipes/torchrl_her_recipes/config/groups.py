@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from torchrl_her_envs.registry import check_options as check_task_options
 from torchrl_her_envs.registry import check_task, get_task_spec
@@ -18,6 +18,8 @@ from torchrl_her_recipes.config.plain_files import read_yaml
 @dataclass(frozen=True, kw_only=True)
 class Group:
     """A group of options, which are checked when it is made."""
+
+    prefix: ClassVar[str] = ""  # of its options in messages
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -311,37 +313,20 @@ class BehaviorConfig(Group):
 class DemonstrationsConfig(Group):
     """Episodes that somebody else played, as `torchrl-her record` writes them."""
 
-    episodes: int = option(
-        0,
-        "how many of the file's episodes are used, the first ones; 0: none",
-        at_least=0,
-        shown_as="demonstrations.episodes",
-    )
-    file: str | None = option(None, "the file", shown_as="demonstrations.file")
+    prefix = "demonstrations."
+
+    episodes: int = option(0, "how many of the file's episodes are used, the first ones; 0: none", at_least=0)
+    file: str | None = option(None, "the file")
     share: float = option(
-        0.125,
-        "share of each batch that are demonstrations; 0: none, for starts alone",
-        at_least=0,
-        below=1,
-        shown_as="demonstrations.share",
+        0.125, "share of each batch that are demonstrations; 0: none, for starts alone", at_least=0, below=1
     )
-    bc_weight: float = option(
-        1.0,
-        "weight of behavior cloning on them, in the actor's loss",
-        at_least=0,
-        shown_as="demonstrations.bc_weight",
-    )
-    q_filter: bool = option(
-        True,
-        "whether only actions are cloned that the critic prefers to the policy's",
-        shown_as="demonstrations.q_filter",
-    )
+    bc_weight: float = option(1.0, "weight of behavior cloning on them, in the actor's loss", at_least=0)
+    q_filter: bool = option(True, "whether only actions are cloned that the critic prefers to the policy's")
     starts_share: float = option(
         0.0,
         "share of the episodes that start at states of demonstrations, at first near their ends",
         at_least=0,
         at_most=1,
-        shown_as="demonstrations.starts_share",
     )
     starts_width: int = option(4, "steps of a demonstration among which such starts are drawn", at_least=1)
     starts_stride: int = option(

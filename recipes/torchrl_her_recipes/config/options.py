@@ -38,14 +38,8 @@ def option(
         shown_as: what messages call it, if not by the field's name.
     """
     limits = {"at_least": at_least, "above": above, "at_most": at_most, "below": below}
-    metadata = {
-        "help": help,
-        "choices": choices,
-        "limits": limits,
-        "infinite": infinite,
-        "shown_as": shown_as,
-    }
-    return field(default=default, metadata=metadata)
+    about = {"help": help, "choices": choices, "infinite": infinite, "shown_as": shown_as}
+    return field(default=default, metadata={**about, "limits": limits})
 
 
 def check_options(group: Any) -> None:
@@ -54,22 +48,19 @@ def check_options(group: Any) -> None:
         value = getattr(group, own.name)
         if own.default in (None, AUTO) and value == own.default:
             continue
+        shown = own.metadata.get("shown_as") or group.prefix + own.name
         kind = _KINDS.get(str(own.type).removesuffix(" | None"))
         if kind is not None:
-            value = as_kind(_shown(own), value, kind)
+            value = as_kind(shown, value, kind)
             object.__setattr__(group, own.name, value)
-        _check_value(own, value)
+        _check_value(own, shown, value)
 
 
-def _shown(own: Field[Any]) -> str:
-    return own.metadata.get("shown_as") or own.name
-
-
-def _check_value(own: Field[Any], value: Any) -> None:
+def _check_value(own: Field[Any], shown: str, value: Any) -> None:
     choices, limits = own.metadata.get("choices", ()), own.metadata.get("limits", {})
     if choices and value not in choices:
         raise ValueError(
-            f"{_shown(own)} must be one of {', '.join(choices)}, got {value!r}{nearest(value, choices)}"
+            f"{shown} must be one of {', '.join(choices)}, got {value!r}{nearest(value, choices)}"
         )
     tests = {
         "at_least": lambda limit: value >= limit,
@@ -80,9 +71,9 @@ def _check_value(own: Field[Any], value: Any) -> None:
     given = {name: limit for name, limit in limits.items() if limit is not None}
     if not all(tests[name](limit) for name, limit in given.items()):  # NaN fails all of them
         allowed = " and ".join(f"{name.replace('_', ' ')} {limit}" for name, limit in given.items())
-        raise ValueError(f"{_shown(own)} must be {allowed}, got {value}")
+        raise ValueError(f"{shown} must be {allowed}, got {value}")
     if isinstance(value, float) and not (isfinite(value) or own.metadata.get("infinite")):
-        raise ValueError(f"{_shown(own)} must be finite, got {value}")
+        raise ValueError(f"{shown} must be finite, got {value}")
 
 
 def default_of(own: Field[Any]) -> Any:
