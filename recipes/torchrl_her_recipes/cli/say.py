@@ -19,10 +19,10 @@ INTERRUPTED = 130
 _HARDLY = 0.1  # below this success, a run has hardly learned anything
 
 
-def fail(message: str, code: int = BAD_INPUT) -> int:
+def fail(message: str) -> int:
     """Prints why a command failed, and returns its exit code."""
     click.echo(f"torchrl-her: {message}", err=True)
-    return code
+    return BAD_INPUT
 
 
 def say_warning(message: Warning | str, *_where: Any, **_more: Any) -> None:
