@@ -11,15 +11,21 @@ from torchrl_her_envs.registry import check_options as check_task_options
 from torchrl_her_envs.registry import check_task, get_task_spec
 from torchrl_her_recipes.config.algorithms import check_goal_sources, check_strategy, get_algorithm
 from torchrl_her_recipes.config.loggers import check_loggers
-from torchrl_her_recipes.config.options import AUTO, check_options, option
+from torchrl_her_recipes.config.options import AUTO, Needs, check_options, option
 from torchrl_her_recipes.config.plain_files import read_yaml
 
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """A group of options, which are checked when it is made."""
+    """A group of options, which are checked when it is made.
 
-    prefix: ClassVar[str] = ""  # of its options in messages
+    Attributes:
+        needs: Options that have an effect with some values of another one only; see ``idle_options``.
+        prefix: Prefix of its options in messages.
+    """
+
+    needs: ClassVar[Needs] = ()
+    prefix: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -62,6 +68,8 @@ class TaskConfig(Group):
 @dataclass(frozen=True, kw_only=True)
 class CollectionConfig(Group):
     """How experience is collected; numbers are for each run."""
+
+    needs: ClassVar[Needs] = (("processes", bool, "sync"),)
 
     epoch_frames: int = option(AUTO, "environment steps in an epoch; auto: 100 episodes' length", at_least=1)
     num_envs: int = option(
@@ -112,6 +120,10 @@ class CollectionConfig(Group):
 @dataclass(frozen=True, kw_only=True)
 class ReplayConfig(Group):
     """How transitions are stored and sampled."""
+
+    needs: ClassVar[Needs] = (
+        ("sampler", "prioritized".__eq__, "priority_alpha priority_beta priority_beta_end"),
+    )
 
     sampler: str = option(
         "prioritized", "prioritized or uniform sampling", choices=("prioritized", "uniform")
@@ -197,6 +209,8 @@ class HindsightConfig(Group):
 class IBSConfig(Group):
     """Goals weighted by how instructive they are (IBS)."""
 
+    needs: ClassVar[Needs] = (("estimator", "kernel".__ne__, "floor_is_relative cells recent"),)
+
     sigma: float | None = option(
         None, "width of the kernel around the real goals, as a share of the range of goals", above=0
     )
@@ -235,6 +249,11 @@ class NoveltyConfig(Group):
 @dataclass(frozen=True, kw_only=True)
 class CurriculumConfig(Group):
     """The layers that runs learn, one after the other or at once (Curriculum-HER)."""
+
+    needs: ClassVar[Needs] = (
+        ("guided_share", bool, "guided_per"),
+        ("order", "threshold".__eq__, "window success_threshold layer_epsilon"),
+    )
 
     name: str = option(
         "task",
@@ -292,6 +311,13 @@ def _read_layers(path: Path) -> Any:
 class BehaviorConfig(Group):
     """Which goals the episodes of training ask for (behavior goals)."""
 
+    needs: ClassVar[Needs] = (
+        ("name", "real".__ne__, "real_share candidates goal_memory cutoff"),
+        ("name", "uniform_achieved".__ne__, "candidates"),
+        ("name", "mega".__eq__, "cutoff"),
+        ("real_share", (1.0).__ne__, "candidates goal_memory cutoff"),
+    )
+
     name: str = option(
         "real",
         "real: those of the task. In some episodes goals that were achieved before: uniform_achieved, any of "
@@ -314,6 +340,12 @@ class DemonstrationsConfig(Group):
     """Episodes that somebody else played, as `torchrl-her record` writes them."""
 
     prefix = "demonstrations."
+    needs: ClassVar[Needs] = (
+        ("episodes", bool, "file share starts_share"),
+        ("share", bool, "bc_weight"),
+        ("bc_weight", bool, "q_filter"),
+        ("starts_share", bool, "starts_width starts_stride starts_threshold starts_samples"),
+    )
 
     episodes: int = option(0, "how many of the file's episodes are used, the first ones; 0: none", at_least=0)
     file: str | None = option(None, "the file")

@@ -7,10 +7,11 @@ and a call of :func:`register_learner`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import not_
 from typing import Any, ClassVar, Literal
 
 from torchrl_her_recipes.config.groups import Group
-from torchrl_her_recipes.config.options import AUTO, REGISTERED, option, what_there_is
+from torchrl_her_recipes.config.options import AUTO, REGISTERED, Needs, option, what_there_is
 
 Actions = Literal["continuous", "discrete"]
 
@@ -32,6 +33,13 @@ class LearnerConfig(Group):
         clones: whether its loss can clone the behavior of demonstrations.
     """
 
+    needs: ClassVar[Needs] = (
+        ("normalize", bool, "normalize_clip normalize_least_std"),
+        ("hard_update_interval", not_, "tau"),
+        ("compile", "never".__ne__, "products"),
+        ("norm", "batch".__ne__, "products"),
+        ("hidden", lambda width: width >= 32, "products"),
+    )
     has_epsilon: ClassVar[bool] = False
     clones: ClassVar[bool] = False
 
@@ -134,6 +142,11 @@ class NoiseConfig(EpsilonConfig):
     ``epsilon * (1 - uniform_share)``, and all others are greedy. With ``epsilon_start=1 epsilon_end=1`` every
     action that is not uniform has noise.
     """
+
+    needs: ClassVar[Needs] = (
+        *EpsilonConfig.needs,
+        ("uniform_share", (1.0).__ne__, "action_noise"),
+    )
 
     action_noise: float = option(
         0.1, "standard deviation of noise on exploring actions, as a share of their range", at_least=0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import MISSING, Field, field, fields
 from difflib import get_close_matches
 from math import isfinite
@@ -11,6 +12,7 @@ from torchrl_her_recipes.config.values import as_kind
 
 _KINDS = {"str": str, "bool": bool, "int": int, "float": float}
 
+Needs = tuple[tuple[str, Callable[[Any], object], str], ...]  # see `idle_options`
 AUTO = "auto"  # the value of an option that is chosen by what the task's environment is, see `.resolve`
 
 
@@ -48,12 +50,38 @@ def check_options(group: Any) -> None:
         value = getattr(group, own.name)
         if own.default in (None, AUTO) and value == own.default:
             continue
-        shown = own.metadata.get("shown_as") or group.prefix + own.name
+        shown = _shown(group, own)
         kind = _KINDS.get(str(own.type).removesuffix(" | None"))
         if kind is not None:
             value = as_kind(shown, value, kind)
             object.__setattr__(group, own.name, value)
         _check_value(own, shown, value)
+
+
+def idle_options(group: Any) -> dict[str, str]:
+    """Returns the options of a group that have no effect, with the other option that is the reason.
+
+    The group's ``needs`` are rows: an option, a function that is true of its values with which others have an
+    effect, and the names of these others.
+
+    Example:
+        >>> from torchrl_her_recipes.config.groups import CollectionConfig
+        >>> CollectionConfig.needs, idle_options(CollectionConfig(processes=0))
+        ((('processes', <class 'bool'>, 'sync'),), {'sync': 'with processes=0'})
+    """
+    idle: dict[str, str] = {}
+    shown = {own.name: _shown(group, own) for own in fields(group)}
+    for other, has_effect, names in group.needs:
+        value = getattr(group, other)
+        if other in idle or not has_effect(value):
+            text = f"{value:g}" if isinstance(value, float) else str(value).lower()
+            for name in names.split():
+                idle.setdefault(name, idle.get(other, f"with {shown[other]}={text}"))
+    return idle
+
+
+def _shown(group: Any, own: Field[Any]) -> str:
+    return own.metadata.get("shown_as") or group.prefix + own.name
 
 
 def _check_value(own: Field[Any], shown: str, value: Any) -> None:

@@ -284,6 +284,7 @@ def _assemble(values: Nested) -> Recipe:
 
 
 def _groups(values: Nested) -> dict[str, Any]:
+    """Returns the groups of a recipe, before they are checked against each other."""
     made: dict[str, Any] = {}
     for group, kind in GROUPS.items():
         own = dict(values.get(group, {}))
