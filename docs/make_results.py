@@ -36,6 +36,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "climb": str(HERE / "studies" / "climb.yaml"),
     "cher": str(HERE / "studies" / "cher.yaml"),
     "draws": str(HERE / "studies" / "draws.yaml"),
+    "thesis_agent": str(HERE / "studies" / "thesis_agent.yaml"),
     "learners": str(HERE / "studies" / "learners.yaml"),
     "n_steps": "n_steps",
     "search": str(HERE / "studies" / "search.yaml"),
