@@ -67,8 +67,10 @@ class StackedBatchNorm(nn.Module):
         >>> norm, rows = StackedBatchNorm(2), torch.tensor([[[1.0, 4.0], [3.0, 8.0]]])
         >>> norm(rows).detach().round(decimals=3).tolist()
         [[[-1.0, -1.0], [1.0, 1.0]]]
-        >>> norm.requires_grad_(False)(rows).round(decimals=1).tolist()  # by running means of 0.2 and 0.6
-        [[[0.8, 2.4], [2.6, 5.2]]]
+        >>> norm.norm.running_mean, norm.norm.running_var
+        (tensor([0.2000, 0.6000]), tensor([1.1000, 1.7000]))
+        >>> norm.requires_grad_(False)(rows)[0, 0]  # (1 - 0.2) / sqrt(1.1), (4 - 0.6) / sqrt(1.7)
+        tensor([0.7628, 2.6077])
     """
 
     def __init__(self, width: int, *, runs: int = 1) -> None:
