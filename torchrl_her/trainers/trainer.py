@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector
 from torchrl.data import TensorDictReplayBuffer
+from torchrl.data.replay_buffers.scheduler import ParameterScheduler
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -273,7 +274,10 @@ class Trainer:
         self.buffer.update_tensordict_priority(own)  # does nothing under a sampler without priorities
 
     def state_dict(self) -> dict[str, Any]:
-        """The counters, and what was measured in the epoch under way; the parts keep their own state."""
+        """The counters, what was measured in the epoch under way, and the state of TorchRL's schedulers.
+
+        All other parts keep their own state.
+        """
         counters = {
             "frames": self.frames,
             "updates": self.updates,
@@ -281,7 +285,8 @@ class Trainer:
             "outside": self._outside,
         }
         measured = None if self._measured is None else _joined(self._measured)
-        return {**counters, "credit": self._credit, "measured": measured}
+        schedules = [own.state_dict() for own in self._schedulers]
+        return {**counters, "credit": self._credit, "measured": measured, "schedules": schedules}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Puts back what :meth:`state_dict` gave."""
@@ -289,6 +294,12 @@ class Trainer:
         self._credit, self._outside = state["credit"], state["outside"]
         measured = state["measured"]
         self._measured = None if measured is None else [measured] if measured else []
+        for own, saved in zip(self._schedulers, state["schedules"], strict=True):
+            own.load_state_dict(saved)
+
+    @property
+    def _schedulers(self) -> list[ParameterScheduler]:
+        return [own for own in self.schedules if isinstance(own, ParameterScheduler)]
 
 
 def _without(value: Tensor, idle: list[int]) -> Tensor:

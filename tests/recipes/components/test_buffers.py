@@ -27,6 +27,21 @@ def test_priorities_are_schaul_s_power_of_the_absolute_td_error(learner: str) ->
     assert buffer.sampler.alpha * power == pytest.approx(0.8)
 
 
+def test_the_exponent_of_importance_weights_rises_until_the_last_epoch() -> None:
+    components = build(small(epochs=3, priority_beta=0.4, priority_beta_end=1.0))
+    betas = []
+    for schedule in 4 * components.trainer().schedules[-1:]:
+        betas.append(components.buffer.sampler.beta)
+        schedule.step()
+    assert betas == pytest.approx([0.4, 0.7, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_the_floor_of_ibs_is_relative_or_absolute_as_the_recipe_says(relative: bool) -> None:
+    (weights,) = build(small(algo="her_ibs", floor_is_relative=relative)).buffer.writer.goal_weights
+    assert weights.floor_is_relative is relative
+
+
 @pytest.mark.parametrize("n_steps", [1, 3])
 def test_steps_and_their_discount_are_the_recipe_s(n_steps: int) -> None:
     components = build(small(n_steps=n_steps, gamma=0.9))
