@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -67,17 +68,24 @@ def clamped_td0(
 class _BuffersToo(TargetNetUpdater):
     """Moves the buffers of target networks as their weights; TorchRL's updates leave buffers unchanged."""
 
+    @cached_property
+    def _buffers(self) -> dict[str, list[Any]]:
+        """The keys of buffers that are no counters, by the names of online networks that have some."""
+        found = {
+            name: [
+                key
+                for key, entry in getattr(self.loss_module, name).items(True, True)
+                if entry.is_floating_point() and not entry.requires_grad
+            ]
+            for name in self._source_names
+        }
+        return {name: keys for name, keys in found.items() if keys}
+
     def step(self) -> None:
         super().step()
-        for name in self._target_names:
-            target, source = (getattr(self.loss_module, own) for own in (name, name.removeprefix("target_")))
-            buffers = [key for key, entry in source.items(True, True) if _is_statistic(entry)]
-            if buffers:
-                self._step(source.select(*buffers), target.select(*buffers))
-
-
-def _is_statistic(entry: Tensor) -> bool:
-    return entry.is_floating_point() and not entry.requires_grad
+        for name, buffers in self._buffers.items():
+            source, target = (getattr(self.loss_module, own) for own in (name, f"target_{name}"))
+            self._step(source.select(*buffers), target.select(*buffers))
 
 
 class BuffersSoftUpdate(SoftUpdate, _BuffersToo):

@@ -20,8 +20,8 @@ _CLAMPED = "whether targets are clamped to the returns that rewards allow, where
 _TARGET_CRITICS = "so many critics, drawn at random, are asked for each step's targets; 0: all"
 
 
-def _norm(text: str, *choices: str) -> Any:
-    return option("layer", text, choices=choices)
+def _norm(*more: str, text: str = "") -> Any:
+    return option("layer", f"normalization of hidden layers{text}", choices=("none", "layer", *more))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class LearnerConfig(Group):
     hidden: int = option(256, "width of the hidden layers", at_least=1)
     depth: int = option(3, "number of hidden layers of the networks, at least 2", at_least=2)
     activation: str = option("relu", "behind each hidden layer", choices=("relu", "tanh", "elu"))
-    norm: str = _norm("normalization of hidden layers", "none", "layer")
+    norm: str = _norm()
     normalize: bool = option(
         True, "whether observations and goals are normalized, by mean and deviation of all that was written"
     )
@@ -162,12 +162,7 @@ class DDPGConfig(NoiseConfig):
 
     clones: ClassVar[bool] = True
 
-    norm: str = _norm(
-        "normalization of hidden layers: layer, in all networks; batch, in the critic, and of its input",
-        "none",
-        "layer",
-        "batch",
-    )
+    norm: str = _norm("batch", text=": layer, in all networks; batch, in the critic, and of its input")
     action_penalty: float = option(0.0, "action L2 penalty, which pulls all actions towards 0", at_least=0)
     saturation_penalty: float = option(
         0.3, "penalty on actions at the ends of tanh, from where an actor does not learn", at_least=0
@@ -179,7 +174,7 @@ class DDPGConfig(NoiseConfig):
 class TD3Config(DDPGConfig):
     """TD3."""
 
-    norm: str = _norm("normalization of hidden layers", "none", "layer")
+    norm: str = _norm()
     critics: int = option(2, _CRITICS, at_least=1)
     target_critics: int = option(0, _TARGET_CRITICS, at_least=0)
 

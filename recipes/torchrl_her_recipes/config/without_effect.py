@@ -28,11 +28,8 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
 
 def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     """Conditions on options of other groups: whether one holds, its text, and the options without effect."""
-    algorithm, learner, sources = (
-        get_algorithm(groups.hindsight.algo),
-        groups.learner,
-        groups.hindsight.sources,
-    )
+    algorithm = get_algorithm(groups.hindsight.algo)
+    learner, sources = groups.learner, groups.hindsight.sources
     takes, with_task = get_task_spec(groups.task.name).options, f"with task={groups.task.name}"
     yield "threshold" not in takes, with_task, ["task.threshold"]
     yield "termination" not in takes, with_task, ["task.failure"]  # such tasks end at their goals alone
