@@ -1,4 +1,4 @@
-"""The pages of results: tables of success are those of the stored numbers."""
+"""The pages of results: tables are those of the stored numbers."""
 
 from __future__ import annotations
 
@@ -31,3 +31,20 @@ def test_tables_of_success_are_of_the_numbers_that_are_stored() -> None:
                 outdated.append(f"{page.name}: {line}")
     assert rows > 60
     assert not outdated, "run: python docs/make_results.py"
+
+
+def test_the_scoreboard_is_as_made_again() -> None:
+    scoreboard = script("make_scoreboard")
+    text = scoreboard.PAGE.read_text()
+    assert scoreboard.page(text) == text, "run: python docs/make_scoreboard.py"
+
+
+def test_steps_to_a_level_are_those_of_each_run() -> None:
+    scoreboard = script("make_scoreboard")
+    rows = [
+        {"run": run, "frames": 10.0 * step, "success": success}
+        for run, successes in enumerate([(0.5, 0.9, 0.8), (0.1, 0.2, 0.3)])
+        for step, success in enumerate(successes)
+    ]
+    assert scoreboard.steps_to(rows, 0.9) == [10.0, float("inf")]
+    assert scoreboard.show_steps([10.0, 20.0, float("inf")], 3000.0) == "20 (not by 3,000)"

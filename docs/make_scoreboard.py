@@ -1,0 +1,148 @@
+"""Makes the tables and the figure of docs/scoreboard.md from the numbers in results/ and scoreboard.yaml.
+
+python docs/make_scoreboard.py    # replaces the tables; the rest of the page stays as it is
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+
+from torchrl_her_recipes.runs.plots import plot_comparison
+
+HERE = Path(__file__).parent
+PAGE, RESULTS, FIGURE = HERE / "scoreboard.md", HERE.parent / "results", HERE / "images" / "scoreboard.png"
+BEGIN, END = "<!-- The {}: python docs/make_scoreboard.py -->\n\n", "\n<!-- End of the {}. -->\n"
+LEVELS = (0.9, 0.95)
+
+Rows = list[dict[str, float]]
+
+
+class Curves(NamedTuple):
+    """Success of one method on one task, over environment steps.
+
+    Attributes:
+        method: name in the table.
+        rows: evaluations of all runs, each the mean of the last ``window`` ones.
+        episodes: number of episodes in such a mean.
+    """
+
+    method: str
+    rows: Rows
+    episodes: int
+
+
+def read_curves(study: str, chosen: dict[str, str], method: str, window: int, episodes: int) -> Curves:
+    """Curves of the rows of a table whose columns have the ``chosen`` entries."""
+    runs: dict[int, list[tuple[float, float]]] = {}
+    with open(RESULTS / study / "runs.csv") as file:
+        for row in csv.DictReader(file):
+            if all(row[name] == value for name, value in chosen.items()):
+                runs.setdefault(int(row["seed"]), []).append((float(row["frames"]), float(row["success"])))
+    rows = [
+        {
+            "run": run,
+            "epoch": end,
+            "frames": evaluations[end - 1][0],
+            "success": sum(value for _, value in evaluations[end - window : end]) / window,
+        }
+        for run, evaluations in runs.items()
+        for end in range(window, len(evaluations) + 1)
+    ]
+    # One of the published runs lacks an evaluation; only steps at which each run has one are drawn.
+    number = Counter(row["frames"] for row in rows)
+    return Curves(method, [row for row in rows if number[row["frames"]] == len(runs)], episodes * window)
+
+
+def ours(case: str, method: str) -> Curves:
+    """Curves of this project: evaluations of 100 episodes, in means of two."""
+    return read_curves("staying", {"case": case}, method, window=2, episodes=100)
+
+
+def theirs(method: str, task: str, name: str) -> Curves:
+    """Curves that Relay-HER's authors published: evaluations of 10 episodes, in means of four."""
+    return read_curves("relay_her", {"method": method, "task": task}, name, window=4, episodes=10)
+
+
+def boards() -> dict[str, list[Curves]]:
+    """Methods whose runs are known, by task."""
+    return {
+        "FetchPush": [
+            ours("default agent", "default agent"),
+            ours("preset fetch_push", "`preset=fetch_push`"),
+            theirs("RHER", "FetchPush", "Relay-HER"),
+            theirs("DDPG+HER", "FetchPush", "DDPG and HER, by Relay-HER's authors"),
+        ],
+        "FetchPickAndPlace": [
+            ours("default agent on FetchPickAndPlace", "default agent, seeds 0 to 2"),
+            theirs("RHER", "FetchPickAndPlace", "Relay-HER"),
+            theirs("DDPG+HER", "FetchPickAndPlace", "DDPG and HER, by Relay-HER's authors"),
+        ],
+    }
+
+
+def steps_to(rows: Rows, level: float) -> list[float]:
+    """Environment steps of each run until its mean is at a level; infinite if it never is."""
+    runs = {row["run"]: [own for own in rows if own["run"] == row["run"]] for row in rows}.values()
+    return [
+        min((row["frames"] for row in run if row["success"] >= level - 1e-6), default=np.inf) for run in runs
+    ]
+
+
+def show_steps(steps: list[float], last: float) -> str:
+    """Median and worst of steps to a level."""
+
+    def show(number: float) -> str:
+        return f"{number:,.0f}" if np.isfinite(number) else f"not by {last:,.0f}"
+
+    return f"{show(float(np.median(steps)))} ({show(max(steps))})"
+
+
+def steps_table() -> Iterator[str]:
+    """Lines of the table of steps to a level."""
+    yield "| task | method | runs | episodes in a mean | " + " | ".join(
+        f"steps to {level:.0%}" for level in LEVELS
+    )
+    for task, board in boards().items():
+        for curves in board:
+            last = max(row["frames"] for row in curves.rows)
+            levels = [show_steps(steps_to(curves.rows, level), last) for level in LEVELS]
+            runs = len({row["run"] for row in curves.rows})
+            yield f"| {task} | {curves.method} | {runs} | {curves.episodes} | " + " | ".join(levels)
+
+
+def published_table() -> Iterator[str]:
+    """Lines of the table of published figures."""
+    yield "| task | method | steps | success, % | achieved at | source"
+    for row in yaml.safe_load((HERE / "scoreboard.yaml").read_text()):
+        yield "| " + " | ".join(
+            row[name] for name in ("task", "method", "steps", "success", "rule", "source")
+        )
+
+
+def page(text: str) -> str:
+    """The page with its tables made again."""
+    for name, table in (("steps to a level", steps_table()), ("published figures", published_table())):
+        head, *lines = table
+        made = [head, "| --- " * (head.count("|") - 1) + "| ---", *lines]
+        before, rest = text.split(BEGIN.format(name))
+        text = before + BEGIN.format(name) + "".join(f"{line} |\n" for line in made)
+        text += END.format(name) + rest.split(END.format(name))[1]
+    return text
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(PAGE.read_text()))
+    plot_comparison(
+        {
+            task: {curves.method.replace("`", ""): curves.rows for curves in board}
+            for task, board in boards().items()
+        },
+        FIGURE,
+    )
