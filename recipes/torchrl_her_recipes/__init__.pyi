@@ -52,10 +52,7 @@ from .runs.show import show_file as show_file
 from .studies.pictures import plot_virtual_goals as plot_virtual_goals
 from .studies.study import plan_study as plan_study
 from .studies.study import run_study as run_study
-from .studies.sweep import SweepResult as SweepResult
-from .studies.sweep import plan_sweep as plan_sweep
-from .studies.sweep import run_sweep as run_sweep
-from .studies.sweep import unfinished_sweep as unfinished_sweep
+from .studies.study import unfinished_sweep as unfinished_sweep
 from .studies.workers import make_workers as make_workers
 from .tuning.results import search_summary as search_summary
 from .tuning.search import tune as tune

@@ -34,7 +34,6 @@ def _nothing_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         raise Reached
 
     monkeypatch.setattr(torchrl_her_recipes, "build", build)
-    monkeypatch.setattr(torchrl_her_recipes, "plan_sweep", lambda runs, _folder: build(runs))
     monkeypatch.chdir(tmp_path)
     for folder in ("docs", "benchmarks"):
         Path(folder).symlink_to(ROOT / folder)
@@ -44,7 +43,10 @@ def _nothing_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.parametrize("command", [own for own in commands("train") if own != "train -h"])
-def test_train(command: str) -> None:
+def test_train(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        torchrl_her_recipes, "plan_study", lambda runs, _folder: torchrl_her_recipes.build(runs)
+    )
     with pytest.raises(Reached):
         cli.main(shlex.split(command))
 

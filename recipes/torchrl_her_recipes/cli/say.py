@@ -6,10 +6,13 @@ import re
 import statistics
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from tqdm import tqdm
+
+if TYPE_CHECKING:  # it comes with torch
+    from torchrl_her_recipes.studies.study import StudyResult
 
 FAILED = 1
 BAD_INPUT = 2
@@ -47,6 +50,18 @@ def _message(error: BaseException) -> str:
     if isinstance(error, MemoryError):
         return "there is not enough memory: buffer_size, hidden or batch_size may be too large"
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def say_result(result: StudyResult, *, of: str = "") -> None:
+    """Prints what failed in a study or a sweep, and the success of what is done.
+
+    Args:
+        of: what stands before the names of jobs that failed.
+    """
+    for label, reason in result.failed.items():
+        fail(f"{of}{label} failed: {reason}")
+    for label, successes in result.successes.items():
+        click.echo(f"{label}: {success_line(successes)}")
 
 
 def success_line(successes: Sequence[float]) -> str:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
-from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, success_line
+from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, say_result
 from torchrl_her_recipes.config.study import load_study, study_names
-
-if TYPE_CHECKING:
-    from torchrl_her_recipes.studies.study import StudyResult
 
 _FOLDER = click.Path(path_type=Path)
 
@@ -29,7 +26,9 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 @click.option("--frames", type=click.IntRange(1), help="environment steps of each run")
 @click.option("--quick", is_flag=True, help="shrink the study to minutes")
 @click.option("--folder", type=_FOLDER, help="output folder (default: runs/NAME)")
-@click.option("--plan", is_flag=True, help="only print the runs to do and their time")
+@click.option(
+    "--plan", is_flag=True, help="only print the runs to do, and their time once some epochs are done"
+)
 @click.option("--jobs", type=click.IntRange(1), help="batched runs at once (default: one for each core)")
 @click.option("--ray", metavar="ADDRESS", help="over a Ray cluster: auto, or HOST:PORT")
 @click.option(
@@ -65,14 +64,8 @@ def study(
     if plan:
         workers.close()
         return 0
-    return _say_study(recipes.run_study(own, home, workers=workers))
-
-
-def _say_study(result: StudyResult) -> int:
-    for label, reason in result.failed.items():
-        fail(f"{label} failed: {reason}")
-    for label, successes in result.successes.items():
-        click.echo(f"{label}: {success_line(successes)}")
+    result = recipes.run_study(own, home, workers=workers)
+    say_result(result)
     if result.figure is not None:
         click.echo(result.figure)
         return 0

@@ -9,7 +9,7 @@ import click
 import yaml
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `build`
-from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail, success_line
+from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, say_result, success_line
 from torchrl_her_recipes.cli.train_options import (
     OptionsCommand,
     RunRequest,
@@ -95,14 +95,11 @@ def _sweep(wanted: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
     folder = wanted[0].folder.parent
     if anew:  # the same command resumes an unfinished sweep
         folder = recipes.unfinished_sweep(runs, folder.parent) or folder
-    plan, workers = recipes.plan_sweep(runs, folder), recipes.make_workers(jobs=jobs)
+    plan, workers = recipes.plan_study(runs, folder), recipes.make_workers(jobs=jobs)
     click.echo(f"sweep: {len(plan.to_go)} of {len(runs)} runs to go: {folder}")
     click.echo("\n".join(plan.table(workers.at_once)))
-    result = recipes.run_sweep(runs, folder, workers=workers)
-    for label, reason in result.failed.items():
-        fail(f"{folder / label} failed: {reason}")
-    for label, successes in result.successes.items():
-        click.echo(f"{label}: {success_line(successes)}")
+    result = recipes.run_study(runs, folder, workers=workers)
+    say_result(result, of=f"{folder}/")
     if every := [success for successes in result.successes.values() for success in successes]:
         left = len(runs) - len(result.successes)
         unfinished = f"; {left} of {len(runs)} did not end" if left else ""

@@ -1,32 +1,30 @@
-"""What there is to do for a study, and how long it will take."""
+"""Jobs of a study that are left, and how long they will take by the time of its epochs so far."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable
 from heapq import heapreplace
 
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.studies.jobs import Job, Progress, kept_progress
+from torchrl_her_recipes.runs.folder import RunFolder
+from torchrl_her_recipes.studies.jobs import Job, kept_progress
 
-# Seconds of a core, as a first guess: what a study's own runs take soon outweighs it.
-_FRAME = 5e-5  # an environment step of a run
-_UPDATE = 3e-4  # a gradient step of a run
-_PRODUCT = 5e-11  # each row of it and each weight between hidden layers
-_PRIOR = 30.0  # measured seconds that count as much as the guess
+# What a gradient step costs besides its products of matrices, in rows times weights of such products.
+_OVERHEAD = 1e7
 
 
-def expected_seconds(recipe: Recipe, epochs: int) -> float:
-    """About how long some epochs of a batched run take on one core.
+def relative_cost(recipe: Recipe, epochs: int) -> float:
+    """Cost of some epochs of a batched run, without a unit: gradient steps, weighted by their size.
 
     Example:
-        >>> from torchrl_her_recipes import load_preset, make_recipe
-        >>> fifteen = make_recipe(load_preset("throwing"), num_runs=15)
-        >>> round(expected_seconds(fifteen, fifteen.run.epochs) / 60)
-        12
+        >>> from torchrl_her_recipes import make_recipe
+        >>> relative_cost(make_recipe(num_runs=6), 2) / relative_cost(make_recipe(num_runs=2), 3)
+        2.0
     """
     steps = epochs * recipe.collection.epoch_frames * recipe.run.num_runs
-    update = _UPDATE + _PRODUCT * recipe.replay.batch_size * recipe.learner.hidden_weights
-    return steps * (_FRAME + update / recipe.collection.frames_per_update)
+    products = recipe.replay.batch_size * recipe.learner.hidden_weights
+    return steps / recipe.collection.frames_per_update * (_OVERHEAD + products)
 
 
 def wall_clock(seconds: Iterable[float], at_once: int) -> float:
@@ -58,29 +56,31 @@ def duration(seconds: float) -> str:
 class Plan:
     """The jobs of a study, and how far each of them is.
 
+    Args:
+        jobs: in the order of the table.
+
     Attributes:
-        jobs: likewise.
         progress: how far each is, by label.
+
+    Raises:
+        ValueError: the folder of a job holds a run with other options.
     """
 
     def __init__(self, jobs: Iterable[Job]) -> None:
         self.jobs = list(jobs)
+        for job in self.jobs:
+            if _begun(job) != job.recipe:
+                raise ValueError(f"{job.folder} holds a run with other options; choose another folder")
         self.progress = {job.label: kept_progress(job) for job in self.jobs}
-
-    def update(self, progress: Mapping[str, Progress]) -> None:
-        """Takes in how far some of them are by now."""
-        self.progress.update(progress)
 
     def is_done(self, job: Job) -> bool:
         """Whether a job has reached its last epoch."""
-        return self.progress[job.label].epochs >= job.recipe.run.epochs
+        return self._epochs_to_go(job) == 0
 
     @property
     def to_go(self) -> list[Job]:
-        """What is not done yet, the longest first: no core waits for long at the end."""
-        return sorted(
-            (job for job in self.jobs if not self.is_done(job)), key=self.seconds_to_go, reverse=True
-        )
+        """Jobs that are not done yet, the longest first: no core waits for long at the end."""
+        return sorted((job for job in self.jobs if not self.is_done(job)), key=self._cost_to_go, reverse=True)
 
     @property
     def steps(self) -> int:
@@ -94,36 +94,44 @@ class Plan:
             for job in jobs
         )
 
-    def seconds_to_go(self, job: Job) -> float:
-        """About how long a job that has not ended will still take on one core."""
-        return self._pace() * expected_seconds(job.recipe, self._epochs_to_go(job))
-
     def wall_clock(self, jobs: Iterable[Job], at_once: int) -> float:
-        """About how many seconds it is until some jobs are done, so many at once."""
-        return wall_clock(map(self.seconds_to_go, jobs), at_once)
+        """About how many seconds it is until some jobs are done; NaN until an epoch of the study is done."""
+        costs = {job.label: relative_cost(job.recipe, self.progress[job.label].epochs) for job in self.jobs}
+        if not any(costs.values()):
+            return math.nan
+        pace = sum(done.seconds for done in self.progress.values()) / sum(costs.values())
+        return pace * wall_clock(map(self._cost_to_go, jobs), at_once)
 
     def table(self, at_once: int) -> list[str]:
         """A line for each job, with its state and what it still takes; and one for all, so many at once."""
         width = max(len(job.label) for job in self.jobs)
         lines = [f"  {job.label:<{width}}  {self._state(job)}" for job in self.jobs]
         if to_go := self.to_go:
-            about = duration(self.wall_clock(to_go, at_once))
-            lines.append(f"about {about}, {min(at_once, len(to_go))} at once")
+            lines.append(f"{self.about(to_go, at_once, '{}, ')}{min(at_once, len(to_go))} at once")
         return lines
+
+    def about(self, jobs: Iterable[Job], at_once: int, text: str) -> str:
+        """A text with the time until some jobs are done in place of ``{}``; empty if it is not known yet."""
+        seconds = self.wall_clock(jobs, at_once)
+        return "" if math.isnan(seconds) else text.format(f"about {duration(seconds)}")
 
     def _state(self, job: Job) -> str:
         if self.is_done(job):
             return "done"
         epochs = self.progress[job.label].epochs
         state = f"at epoch {epochs} of {job.recipe.run.epochs}" if epochs else "to do"
-        left = f"{self.steps_to_go([job]):>14,} steps to go, about {duration(self.seconds_to_go(job))}"
-        return f"{state:<18}{left}"
+        return f"{state:<18}{self.steps_to_go([job]):>14,} steps to go{self.about([job], 1, ', {}')}"
 
     def _epochs_to_go(self, job: Job) -> int:
         return max(job.recipe.run.epochs - self.progress[job.label].epochs, 0)
 
-    def _pace(self) -> float:
-        """How much longer this study's epochs take than expected."""
-        begun = [(job.recipe, self.progress[job.label]) for job in self.jobs]
-        expected = sum(expected_seconds(recipe, done.epochs) for recipe, done in begun)
-        return (_PRIOR + sum(done.seconds for _, done in begun)) / (_PRIOR + expected)
+    def _cost_to_go(self, job: Job) -> float:
+        return relative_cost(job.recipe, self._epochs_to_go(job))
+
+
+def _begun(job: Job) -> Recipe:
+    """The recipe in a job's folder; that of the job if there is none yet, or a power failure has torn it."""
+    try:
+        return RunFolder(job.folder).recipe()
+    except ValueError:
+        return job.recipe

@@ -2,42 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing
-from pathlib import Path
-from typing import Any
 
-from filelock import FileLock, Timeout
+from tqdm import tqdm
 
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
-from torchrl_her_recipes.studies.jobs import Outcome, kept_progress
-from torchrl_her_recipes.studies.overview import Overview
+from torchrl_her_recipes.studies.jobs import Job, Outcome, kept_progress
 from torchrl_her_recipes.studies.plan import Plan
-from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
+from torchrl_her_recipes.studies.workers_local import Workers
 
 _TICK = 1.0  # seconds
-
-
-def run_planned(
-    plan_jobs: Callable[[], Plan], folder: Path, what: str, workers: Workers | None, *, progress: bool
-) -> tuple[Plan, dict[str, Any]]:
-    """Plans jobs and does them; returns the plan, and the reasons of failures and whether it was interrupted.
-
-    Raises:
-        ValueError: another process does so in the same folder.
-        KeyboardInterrupt: by a second Ctrl-C.
-    """
-    with closing(workers or LocalWorkers()) as workers:
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            with FileLock(folder / ".lock", timeout=0):
-                plan = plan_jobs()
-                outcomes = run_jobs(plan, workers, progress=progress)
-        except Timeout as error:
-            raise ValueError(f"another process is running a {what} in {folder}") from error
-    failed = {label: outcome.error for label, outcome in outcomes.items() if outcome.error}
-    return plan, {"failed": failed, "interrupted": any(own.interrupted for own in outcomes.values())}
+_BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [{elapsed}{postfix}]"
+_STOPPING = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [saving what there is]"
+_PART = 0.05  # of all steps: where there is no terminal, as much is worth a line
 
 
 def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str, Outcome]:
@@ -52,7 +32,7 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
     jobs = plan.to_go
     outcomes: dict[str, Outcome] = {}
     with (
-        closing(Overview(plan, workers, show=progress)) as overview,
+        closing(_Overview(plan, workers, show=progress)) as overview,
         ThreadPoolExecutor(max(len(jobs), 1)) as threads,
         soft_interrupt() as check,
     ):
@@ -63,7 +43,7 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
                 for future in wait(waiting, _TICK, FIRST_COMPLETED).done:
                     job = waiting.pop(future)
                     outcomes[job.label] = _outcome(future)
-                    plan.update({job.label: kept_progress(job)})
+                    plan.progress[job.label] = kept_progress(job)
                     overview.ended(job, outcomes[job.label])
                 overview.show(list(waiting.values()))
                 check()
@@ -82,3 +62,44 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
 def _outcome(future: Future[Outcome]) -> Outcome:
     error = future.exception()
     return future.result() if error is None else Outcome(error=" ".join(f"{error!r}".split()))
+
+
+class _Overview:
+    """Progress of the jobs on the standard error stream: a bar on a terminal, a few lines elsewhere."""
+
+    def __init__(self, plan: Plan, workers: Workers, *, show: bool) -> None:
+        self.plan, self.workers = plan, workers
+        self.lines = show and not sys.stderr.isatty()
+        self.bar = tqdm(total=plan.steps, unit_scale=True, bar_format=_BAR, disable=not show or self.lines)
+        self.close = self.bar.close
+        self._next = self._share() + _PART
+
+    def show(self, left: Sequence[Job]) -> None:
+        """Brings plan and bar up to date."""
+        working = self.workers.progress()
+        self.plan.progress.update(working)
+        self.bar.n = self.plan.steps - self.plan.steps_to_go(self.plan.jobs)
+        to_go = self.plan.about(left, self.workers.at_once, ", {} to go")
+        state = f"{len(working)} running, {len(left) - len(working)} waiting{to_go}"
+        self.bar.set_postfix_str(state)
+        share = self._share()
+        if left and share >= self._next:
+            self._next = share + _PART
+            self._say(f"{share:.0%} of all steps: {state}")
+
+    def ended(self, job: Job, outcome: Outcome) -> None:
+        """Says that a job has ended, and how."""
+        how = "failed" if outcome.error else "interrupted" if outcome.interrupted else "done"
+        self._say(f"{job.label}: {how}")
+
+    def stopping(self) -> None:
+        """Says that all were told to stop."""
+        self.bar.bar_format = _STOPPING
+        self._say("saving what there is")
+
+    def _say(self, line: str) -> None:
+        if self.lines:
+            tqdm.write(line, file=sys.stderr)
+
+    def _share(self) -> float:
+        return 1 - self.plan.steps_to_go(self.plan.jobs) / max(self.plan.steps, 1)

@@ -95,28 +95,17 @@ def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
     home = folder / label
     if (home / "config.yaml").exists():
         raise ValueError(f"{home} is the folder of a single run; choose another folder for the study")
-    recipes = {own.path: _begun(recipe, own.path) for own in Batches(home).homes}
-    there = {seed for own in recipes.values() for seed in own.seeds}
-    missing = [seed for seed in recipe.seeds if seed not in there]
-    for seeds in share_out(missing, most=max(_ROWS // recipe.replay.batch_size, 1)):
-        recipes[home / _name(seeds)] = recipe.replace(seed=seeds[0], num_runs=len(seeds))
+    begun = [_seeds_of(own.path) for own in Batches(home).homes]
+    missing = sorted(set(recipe.seeds).difference(*begun))
+    batches = [*begun, *share_out(missing, most=max(_ROWS // recipe.replay.batch_size, 1))]
     return [
-        Job(label=path.relative_to(folder).as_posix(), recipe=own, folder=path)
-        for path, own in recipes.items()
+        Job(
+            label=f"{label}/{_name(seeds)}",
+            recipe=recipe.replace(seed=seeds[0], num_runs=len(seeds)),
+            folder=home / _name(seeds),
+        )
+        for seeds in batches
     ]
-
-
-def _begun(recipe: Recipe, path: Path) -> Recipe:
-    """What a batch runs that was begun. One whose configuration was torn by a power failure is as planned."""
-    first, last = _seeds_of(path)
-    planned = recipe.replace(seed=first, num_runs=last - first + 1)
-    try:
-        own = RunFolder(path).recipe()
-    except ValueError:
-        own = planned
-    if own != planned:
-        raise ValueError(f"{path} holds a run with other options; choose another folder")
-    return own
 
 
 def _name(seeds: Sequence[int]) -> str:
@@ -124,12 +113,12 @@ def _name(seeds: Sequence[int]) -> str:
     return f"seeds_{'-'.join(map(str, ends))}"
 
 
-def _seeds_of(path: Path) -> tuple[int, int]:
-    """The first and the last seed of a batch, by the name of its folder."""
+def _seeds_of(path: Path) -> list[int]:
+    """The seeds of a batch, by the name of its folder."""
     match = re.fullmatch(r"seeds_(\d+)(?:-(\d+))?", path.name)
     if match is None:
         raise ValueError(f"{path} is not the name of a batch, which is for instance seeds_0-4")
-    return int(match[1]), int(match[2] or match[1])
+    return list(range(int(match[1]), int(match[2] or match[1]) + 1))
 
 
 def share_out(seeds: Sequence[int], *, most: int) -> list[list[int]]:

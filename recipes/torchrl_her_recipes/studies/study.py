@@ -1,62 +1,83 @@
-"""Runs a study: each combination as batched runs, on all cores or a cluster, and draws its figure."""
+"""Runs a study, or single runs: all that is not done yet, on all cores or a cluster."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
+from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.imports import check_permitted
+from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.study import Study, curve_label
+from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.plots import plot_comparison
 from torchrl_her_recipes.runs.run import last_success
+from torchrl_her_recipes.studies.jobs import Job
 from torchrl_her_recipes.studies.plan import Plan
-from torchrl_her_recipes.studies.schedule import run_planned
+from torchrl_her_recipes.studies.schedule import run_jobs
 from torchrl_her_recipes.studies.seed_batches import Batches, plan_batches
-from torchrl_her_recipes.studies.sweep import SweepResult
-from torchrl_her_recipes.studies.workers_local import Workers
+from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
+
+_NOTE = "sweep.json"  # the single runs that a folder is for
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyResult(SweepResult):
-    """What came of a study; ``successes`` are of each combination, if all runs are done.
+class StudyResult:
+    """The result of a study, or of single runs.
 
     Attributes:
-        figure: the picture, if all runs are done.
+        figure: the picture of a study, if all of it is done.
+        successes: of each run in its last evaluation, by the name of its combination if all runs of that are
+            done; of a single run by its own name.
+        failed: reasons by the label of the job. The others are not held back by it.
+        interrupted: whether it was stopped; it can be resumed.
     """
 
-    figure: Path | None
+    figure: Path | None = None
+    successes: dict[str, list[float]] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+    interrupted: bool = False
 
 
-def plan_study(study: Study, folder: Path) -> Plan:
+def plan_study(study: Study | Mapping[str, Recipe], folder: Path) -> Plan:
     """What there is to do, and about how long it takes.
 
     Args:
-        study: what to run.
-        folder: a folder of each combination goes into it, or is there already. Seeds that it lacks are
-            added to those that it has.
+        study: what to run; or recipes of single runs, by the names of their folders.
+        folder: a folder of each combination or single run goes into it, or is there already. Seeds that a
+            combination lacks are added to those that it has.
 
     Raises:
         ValueError: the folder has a run of other options under the same name.
     """
-    cells = ((label, resolved(recipe)) for label, recipe in study.cells())
-    return Plan(job for label, recipe in cells for job in plan_batches(label, recipe, folder))
+    if isinstance(study, Study):
+        cells = ((label, resolved(recipe)) for label, recipe in study.cells())
+        jobs = [job for label, recipe in cells for job in plan_batches(label, recipe, folder)]
+    else:
+        jobs = [Job(label=label, recipe=resolved(run), folder=folder / label) for label, run in study.items()]
+    return Plan(jobs)
 
 
 def run_study(
-    study: Study,
+    study: Study | Mapping[str, Recipe],
     folder: Path,
     *,
     workers: Workers | None = None,
     progress: bool = True,
 ) -> StudyResult:
-    """Runs what is not done yet, several at once, and draws the figure.
+    """Runs what is not done yet, several at once, and draws the figure of a study.
 
-    A combination that was interrupted goes on from its checkpoint.
+    Runs that were interrupted go on from their checkpoints.
 
     Args:
-        study: what to run.
-        folder: a folder of each combination goes into it.
+        study: what to run; or recipes of single runs, by the names of their folders.
+        folder: a folder of each combination or single run goes into it.
         workers: who does it; by default a process for each core. They are closed in the end.
         progress: whether to show a progress bar over all of it.
 
@@ -65,16 +86,49 @@ def run_study(
             a task names a module that must not be imported.
         KeyboardInterrupt: by a second Ctrl-C.
     """
-    for _, recipe in study.cells():
+    runs = dict(study.cells()) if isinstance(study, Study) else study
+    for recipe in runs.values():
         check_permitted(recipe.task.name)
-    plan, came = run_planned(lambda: plan_study(study, folder), folder, "study", workers, progress=progress)
-    done = not plan.to_go
-    cells = [label for label, _ in study.cells()] if done else []
+    with closing(workers or LocalWorkers()) as workers:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            with FileLock(folder / ".lock", timeout=0):
+                plan = plan_study(study, folder)
+                if not isinstance(study, Study):
+                    write_text(folder / _NOTE, _note(study))
+                outcomes = run_jobs(plan, workers, progress=progress)
+        except Timeout as error:
+            what = "study" if isinstance(study, Study) else "sweep"
+            raise ValueError(f"another process is running a {what} in {folder}") from error
+    left = [job.folder for job in plan.to_go]
+    done = [label for label in runs if not any(home.is_relative_to(folder / label) for home in left)]
     return StudyResult(
-        figure=draw_study(study, folder) if done else None,
-        successes={label: last_success(Batches(folder / label).rows()) for label in cells},
-        **came,
+        figure=draw_study(study, folder) if isinstance(study, Study) and not left else None,
+        successes={label: last_success(Batches(folder / label).rows()) for label in done},
+        failed={label: outcome.error for label, outcome in outcomes.items() if outcome.error},
+        interrupted=any(outcome.interrupted for outcome in outcomes.values()),
     )
+
+
+def unfinished_sweep(runs: Mapping[str, Recipe], folders: Path) -> Path | None:
+    """The newest folder of just these single runs that has some to go; None if there is none.
+
+    Args:
+        runs: recipes, by the names of their folders.
+        folders: where folders of :func:`run_study` are looked for.
+
+    Example:
+        >>> unfinished_sweep({}, Path("nowhere"))
+    """
+    for note in sorted(folders.glob(f"*/{_NOTE}"), reverse=True):
+        same = note.read_bytes() == _note(runs).encode()
+        if same and not all(RunFolder(note.parent / label).is_done for label in runs):
+            return note.parent
+    return None
+
+
+def _note(runs: Mapping[str, Recipe]) -> str:
+    return json.dumps({label: recipe.to_dict() for label, recipe in runs.items()})
 
 
 def draw_study(study: Study, folder: Path) -> Path:

@@ -8,7 +8,7 @@ import pytest
 
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.studies.jobs import Job, Progress
-from torchrl_her_recipes.studies.plan import Plan, duration, expected_seconds, wall_clock
+from torchrl_her_recipes.studies.plan import Plan, duration, relative_cost, wall_clock
 
 from ..small import small
 
@@ -50,19 +50,21 @@ def test_only_what_a_run_can_go_on_from_counts(tmp_path: Path) -> None:
     assert "32,000 steps to go" in plan.table(2)[1]
 
 
-def test_measured_times_outweigh_expected_ones(tmp_path: Path) -> None:
+def test_times_are_those_of_the_study_s_own_epochs(tmp_path: Path) -> None:
     plan = Plan(jobs(tmp_path))
-    short, long = plan.jobs
-    before = plan.seconds_to_go(short)
-    plan.update({"long": Progress(10, 1_000 * expected_seconds(long.recipe, 10))})
-    assert plan.seconds_to_go(short) > before
-    plan.update({"long": Progress(10, 0.0)})
-    assert plan.seconds_to_go(short) < before
+    assert plan.table(2)[1:] == ["  long   to do                     64,000 steps to go", "2 at once"]
+    plan.progress["long"] = Progress(5, 40.0)  # 8 s an epoch of four runs, so 2 s one of a single run
+    assert plan.wall_clock(plan.jobs, 1) == pytest.approx(40 + 20)
+    assert plan.wall_clock(plan.jobs, 2) == pytest.approx(40)
+    assert plan.table(2)[1:] == [
+        "  long   at epoch 5 of 10          32,000 steps to go, about 40 s",
+        "about 40 s, 2 at once",
+    ]
 
 
 def test_what_costs_more_takes_longer() -> None:
-    one = expected_seconds(small(), 10)
-    assert expected_seconds(small(), 20) == pytest.approx(2 * one)
+    one = relative_cost(small(), 10)
+    assert relative_cost(small(), 20) == pytest.approx(2 * one)
     for more in (
         {"num_runs": 2},
         {"frames_per_update": 5},
@@ -70,7 +72,7 @@ def test_what_costs_more_takes_longer() -> None:
         {"depth": 4},
         {"batch_size": 256},
     ):
-        assert expected_seconds(small(**more), 10) > one
+        assert relative_cost(small(**more), 10) > one
 
 
 @pytest.mark.parametrize(

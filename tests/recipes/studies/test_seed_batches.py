@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from torchrl_her_recipes import Recipe, make_recipe
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap
+from torchrl_her_recipes.studies.plan import Plan
 from torchrl_her_recipes.studies.seed_batches import Batches, plan_batches, share_out
 
 FIVE = make_recipe(algo="her", num_runs=5, epochs=2)
@@ -65,7 +66,7 @@ def test_wide_batches_are_split_and_narrow_ones_are_not(tmp_path: Path) -> None:
 def test_other_options_are_refused_whatever_the_seeds(tmp_path: Path) -> None:
     leave(tmp_path / "her" / "seeds_0-4", FIVE.replace(k=2), epochs=2)
     with pytest.raises(ValueError, match=r"her.seeds_0-4 holds a run with other options"):
-        plan_batches("her", FIVE.replace(num_runs=10), tmp_path)
+        Plan(plan_batches("her", FIVE.replace(num_runs=10), tmp_path))
 
 
 def test_batches_are_read_as_one_in_the_order_of_their_seeds(tmp_path: Path) -> None:
@@ -109,7 +110,7 @@ def test_a_batch_whose_configuration_is_torn_is_as_planned(tmp_path: Path) -> No
     home = RunFolder(tmp_path / "her" / "seeds_0-4")
     home.config.write_text("")
     home.policy.unlink()
-    (job,) = plan_batches("her", FIVE, tmp_path)
+    (job,) = Plan(plan_batches("her", FIVE, tmp_path)).jobs
     assert job.recipe == FIVE
 
 
