@@ -18,8 +18,9 @@ def relative_cost(recipe: Recipe, epochs: int) -> float:
     """Cost of some epochs of a batched run, without a unit: gradient steps, weighted by their size.
 
     Example:
-        >>> from torchrl_her_recipes import make_recipe
-        >>> relative_cost(make_recipe(num_runs=6), 2) / relative_cost(make_recipe(num_runs=2), 3)
+        >>> from torchrl_her_recipes import load_preset, make_recipe
+        >>> six, two = (make_recipe(load_preset("throwing"), num_runs=runs) for runs in (6, 2))
+        >>> relative_cost(six, 2) / relative_cost(two, 3)
         2.0
     """
     steps = epochs * recipe.collection.epoch_frames * recipe.run.num_runs
