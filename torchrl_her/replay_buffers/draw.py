@@ -7,17 +7,16 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_her.goals.choose import TRIES, Candidates, Index, choose_goals
-from torchrl_her.goals.rewards import Outcome, RewardFunction, ends_at_goals, missed
+from torchrl_her.goals.rewards import Outcome, ends_at_goals, missed
 from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 from torchrl_her.replay_buffers.episodes import Episodes
-from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of
-from torchrl_her.replay_buffers.options import HindsightOptions, Per
-from torchrl_her.replay_buffers.runs.pieces import Piece
+from torchrl_her.replay_buffers.keys import entry_of
+from torchrl_her.replay_buffers.options import Per
+from torchrl_her.replay_buffers.runs.chunk import Chunk
 from torchrl_her.replay_buffers.runs.recent import RecentGoals
 from torchrl_her.replay_buffers.runs.streams import Generators, RunDraws
 
@@ -35,8 +34,6 @@ def draw_goals(
     keep: Keep | None = None,
     per: Per = "transition",
     generator: torch.Generator | None = None,
-    runs: Tensor | None = None,
-    generators: Generators | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Draws k virtual goals for each transition, or each episode, by strategy times weights times filter.
 
@@ -56,9 +53,6 @@ def draw_goals(
             each other, to bool [...]: which of them may be drawn; None for all.
         per: whether each transition gets k goals, or each episode: those of its first transition.
         generator: source of the random numbers.
-        runs: [E] int64, ascending: which of R runs each episode is of, each with a generator of its own; None
-            for a single one.
-        generators: R of them, if there are ``runs``.
 
     Returns:
         ``(source, goal_source)``, [V] each: the transitions to be relabeled, each of them k times, and those
@@ -78,62 +72,64 @@ def draw_goals(
     if k == 0 or len(drawn.row) == 0:
         return drawn.row[:0], drawn.row[:0]
     alike = weights is None or (isinstance(weights, GoalWeights) and weights.alike)
-    sources = [generator] if generators is None else generators
     index, valid = choose_goals(
         drawn.candidates(after, episodes, strategy),
         k,
         weights=None if alike else weights,
         keep=drawn.filter(before, keep),
-        draws=drawn.draws(sources, runs),
+        draws=drawn.draws([generator], None),
     )
     return drawn.row.unsqueeze(-1).expand_as(index)[valid], index[valid]
 
 
+class DrawnGoals(NamedTuple):
+    """Virtual goals of some transitions.
+
+    Attributes:
+        source: [V] int64, the transitions to be relabeled, one after the other, each for up to k goals. Those
+            without a goal that may be drawn are left out.
+        goals: [V, g].
+        relabeled: Number of transitions of each run that got goals of their own episode.
+    """
+
+    source: Tensor
+    goals: Tensor
+    relabeled: list[int]
+
+
 def draw_for_runs(
-    rows: TensorDictBase,
-    piece: Piece,
-    reward_fn: RewardFunction,
-    options: HindsightOptions,
-    keys: TransitionKeys,
+    chunk: Chunk,
     *,
     weights: WeightsOfRuns | None,
     generators: Generators,
     recent: RecentGoals,
     times: int = 1,
-) -> tuple[Tensor, Tensor, list[int]]:
+) -> DrawnGoals:
     """Draws the virtual goals of episodes of several runs, each run with its own weights and generator.
 
     Each source is a factor of its own: its goals are drawn by candidate times weight times filter, where
     its candidates are goals of the own episode, or those that the run remembers of recent episodes.
 
     Args:
-        rows: [n], transitions of whole episodes and others.
-        piece: some episodes of them, of m runs.
-        reward_fn: maps (achieved, desired) goals to (reward, terminated); the filter asks it.
-        options: how many goals, from which sources and by which filter.
-        keys: where entries are.
+        chunk: Episodes of m runs.
 
     Keyword Args:
         weights: of all runs; None for all goals alike.
         generators: m of them.
         recent: the goals of recent episodes of all runs, those of these episodes among them.
         times: how many times as many goals as the options say are drawn in the own episode.
-
-    Returns:
-        ``(source, goals, relabeled)``. The first two are [V] and [V, g]: the transitions to be relabeled, one
-        after the other, each of them for up to k goals. Those without a goal that may be drawn are left out.
-        The third has m numbers: how many transitions of each run got goals of the own episode.
     """
+    rows, piece, reward_fn, options = chunk.rows, chunk.piece, chunk.reward_fn, chunk.options
     episodes = piece.episodes
     if options.k == 0:  # then the batch may be without goals
-        return episodes.lengths[:0], episodes.lengths[:0], [0] * len(piece.runs)
+        return DrawnGoals(episodes.lengths[:0], episodes.lengths[:0], [0] * len(piece.runs))
     drawn = _Transitions.of(episodes, options.per)
-    after = entry_of(rows, keys.next_achieved)
+    after = entry_of(rows, chunk.keys.next_achieved)
     keep = None
     if options.filter_achieved:
         rule = partial(missed, reward_fn, achieved_reward=options.achieved_reward)
-        before, ends = keys.before(rows, reward_fn), ends_at_goals(reward_fn, keys.after(rows, reward_fn))
-        starts = None if ends else before[episodes.rows[:, 0]]
+        before = chunk.before()
+        starts = None if ends_at_goals(reward_fn, chunk.after()) else before[episodes.rows[:, 0]]
         keep = drawn.filter(before, rule, starts)
     draws = drawn.draws(generators, piece.position)
     pools: list[Tensor] = []
@@ -168,7 +164,8 @@ def draw_for_runs(
         some = valid.flatten().nonzero().squeeze(-1)
         row, goals = row.index_select(0, some), goals.index_select(0, some)
     goals = (pools[0] if len(pools) == 1 else torch.cat(pools)).index_select(0, goals)
-    return row, goals, piece.sums(torch.bincount(drawn.episode[relabeled], minlength=len(episodes.lengths)))
+    relabeled_of = torch.bincount(drawn.episode[relabeled], minlength=len(episodes.lengths))
+    return DrawnGoals(row, goals, piece.sums(relabeled_of))
 
 
 class _Transitions(NamedTuple):

@@ -27,19 +27,20 @@ from torchrl_her.replay_buffers.layer_rules import LayerRule, check_layers, spli
 from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer, refuse_layers
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.runs.batches import Batch
+from torchrl_her.replay_buffers.runs.chunk import Chunk
 from torchrl_her.replay_buffers.runs.counts import (
     RunCounts,
     WriterCounts,
     real_positives,
     virtual_positives,
 )
-from torchrl_her.replay_buffers.runs.pieces import Piece, split_runs
+from torchrl_her.replay_buffers.runs.pieces import split_runs
 from torchrl_her.replay_buffers.runs.recent import RecentGoals
 from torchrl_her.replay_buffers.runs.rings import Places, Rings
-from torchrl_her.replay_buffers.runs.rows import join_copies
-from torchrl_her.replay_buffers.runs.shares import Share, real_share, virtual_share
+from torchrl_her.replay_buffers.runs.rows import join_rows
 from torchrl_her.replay_buffers.runs.storage import PackedStorage, write_slices
 from torchrl_her.replay_buffers.runs.streams import check_generators
+from torchrl_her.replay_buffers.runs.written import WrittenRows, real_rows, virtual_rows
 
 # Transitions written at once: larger pieces touch fresh memory each time, smaller ones need more calls.
 _ROWS = 1 << 17
@@ -52,8 +53,8 @@ class _Draft(NamedTuple):
     """Real and virtual transitions of some episodes that are not yet written."""
 
     runs: list[int]
-    real: Share
-    virtual: Share | None
+    real: WrittenRows
+    virtual: WrittenRows | None
     numbers: dict[str, list[int]]  # as they are counted
     weighted: bool  # whether weights are told the virtual goals
     ids: int  # how many trajectory ids they take
@@ -456,7 +457,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             recent[layer] = lately
             for piece in split_runs(part, run_of, settings, each=entries[0], together=entries[1]):
                 rule = self._rule(layer, piece.runs[0])
-                drafts.append(self._draft(batch, piece, lately, rule, first_id=first_id))
+                chunk = Chunk(rows, run, piece, rule.reward_fn, self.options, self._keys)
+                drafts.append(self._draft(chunk, lately, weighted=rule.weighted, first_id=first_id))
                 first_id += drafts[-1].ids
         self._commit(rows, drafts, places)
         self._episodes = first_id
@@ -490,40 +492,25 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             return 1
         return min(self.refill, max(1, round(counts.real / max(1, counts.relabeled))))
 
-    def _draft(
-        self, batch: Batch, piece: Piece, recent: RecentGoals, rule: LayerRule, *, first_id: int
-    ) -> _Draft:
+    def _draft(self, chunk: Chunk, recent: RecentGoals, *, weighted: bool, first_id: int) -> _Draft:
         """What is to be written of some episodes. Nothing is written or counted yet: it may be refused."""
-        rows, runs, options, keys = batch.rows, piece.runs, self.options, self._keys
-        reward_fn, own, virtual = rule.reward_fn, self.goal_weights if rule.weighted else [], None
-        source, goals, relabeled = draw_for_runs(
-            rows,
-            piece,
-            reward_fn,
-            options,
-            keys,
+        runs, virtual = chunk.piece.runs, None
+        own = self.goal_weights if weighted else []
+        drawn = draw_for_runs(
+            chunk,
             weights=self._weights_of_runs() if own and not own[runs[0]].alike else None,
             generators=[self._rng] if self.generators is None else [self.generators[run] for run in runs],
             recent=recent,
             times=self._times(runs[0]),
         )
-        real = real_share(rows, piece, options, keys, first_id=first_id + len(source))
-        numbers = {"real": real.counts, "relabeled": relabeled, **real_positives(*real, self.achieved_reward)}
-        if len(source) > 0:
-            virtual = virtual_share(
-                rows, batch.run, piece, source, goals, reward_fn, options, keys, first_id=first_id
-            )
-            positives = virtual_positives(
-                rows,
-                *virtual,
-                reward_fn,
-                keys,
-                achieved_reward=self.achieved_reward,
-                filtered=self.filter_achieved,
-            )
-            numbers |= {"virtual": virtual.counts, **positives}
-        ids = len(source) + len(piece.episodes.lengths) if options.per == "episode" else 0
-        return _Draft(runs, real, virtual, numbers, weighted=rule.weighted, ids=ids)
+        copies = len(drawn.source)
+        real = real_rows(chunk, first_id=first_id + copies)
+        numbers = {"real": real.counts, "relabeled": drawn.relabeled, **real_positives(chunk, real)}
+        if copies > 0:
+            virtual = virtual_rows(chunk, drawn.source, drawn.goals, first_id=first_id)
+            numbers |= {"virtual": virtual.counts, **virtual_positives(chunk, virtual)}
+        ids = copies + len(chunk.episodes.lengths) if self.options.per == "episode" else 0
+        return _Draft(runs, real, virtual, numbers, weighted=weighted, ids=ids)
 
     def _commit(self, rows: TensorDictBase, drafts: list[_Draft], places: Places) -> None:
         """Stores and counts real and virtual transitions, and notes where the real ones went.
@@ -534,8 +521,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         exclude = [*self._exclude, *in_root_and_next([self._keys.env_ids])]
 
         def join(draft: _Draft) -> TensorDictBase:
-            copies = draft.virtual, draft.real
-            return join_copies(rows, *copies, exclude=exclude, virtual_key=self.options.virtual_key)
+            virtual_key = self.options.virtual_key
+            return join_rows(rows, draft.virtual, draft.real, exclude=exclude, virtual_key=virtual_key)
 
         shown: list[TensorDictBase] = []
         undo: list[Callable[[], None] | None] = []
@@ -546,13 +533,13 @@ class HERWriter(HindsightBase, RoundRobinWriter):
                     undo.append(self.on_write(out, draft.runs, draft.counts))
             for draft in drafts:
                 if draft.virtual is not None and self.goal_weights and draft.weighted:
-                    goals = draft.virtual.copies.changes[self._keys.goals[0]]
+                    goals = draft.virtual.changes[self._keys.goals[0]]
                     self._weights_of_runs().update(goals, draft.runs, draft.virtual.counts)
             for place, draft in enumerate(drafts):
                 # Not all at once if nobody has to see them: that would touch fresh memory.
                 self._store(shown[place] if shown else join(draft), draft.runs, draft.counts)
                 self._counts.add(draft.runs, **draft.numbers)
-                places.note(draft.runs, draft.real.copies.root.split(draft.real.counts), draft.counts)
+                places.note(draft.runs, draft.real.root.split(draft.real.counts), draft.counts)
         except Exception:
             for back in reversed(undo):
                 if callable(back):

@@ -11,6 +11,7 @@ from torchrl_her import GoalReward, GoalWeights, HindsightOptions
 from torchrl_her.goals.weights import WeightsOfRuns
 from torchrl_her.replay_buffers import Episodes, draw_goals
 from torchrl_her.replay_buffers.draw import draw_for_runs
+from torchrl_her.replay_buffers.runs.chunk import Chunk
 from torchrl_her.replay_buffers.runs.pieces import Piece
 from torchrl_her.replay_buffers.runs.recent import RecentGoals
 
@@ -94,17 +95,11 @@ def test_each_run_draws_with_its_own_weights_and_filter() -> None:
 
     def draw(*generators: torch.Generator, k: int = 3, **changes: object) -> tuple[list[int], list[int]]:
         options = HindsightOptions(k=k, filter_achieved=True).changed(changes)
-        out = draw_for_runs(
-            rows,
-            piece,
-            GoalReward(1.5),
-            options,
-            options.transition_keys(),
-            weights=weights,
-            generators=generators,
-            recent=RecentGoals.none(6),
-        )
-        return out[0].tolist(), [int(goal) - 1 for goal in out[1]]  # goal i + 1 was achieved by transition i
+        chunk = Chunk(rows, None, piece, GoalReward(1.5), options, options.transition_keys())
+        out = draw_for_runs(chunk, weights=weights, generators=generators, recent=RecentGoals.none(6))
+        return out.source.tolist(), [
+            int(goal) - 1 for goal in out.goals
+        ]  # goal i + 1 was achieved by transition i
 
     seeded = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
     source, goal = draw(*seeded)

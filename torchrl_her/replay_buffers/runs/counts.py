@@ -6,12 +6,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_her.goals.rewards import RewardFunction, missed
-from torchrl_her.replay_buffers.copies import Copies
-from torchrl_her.replay_buffers.keys import TransitionKeys
+from torchrl_her.goals.rewards import missed
+from torchrl_her.replay_buffers.runs.chunk import Chunk
+from torchrl_her.replay_buffers.runs.written import WrittenRows
 
 
 @dataclass
@@ -87,45 +86,25 @@ class RunCounts:
         self.totals = [WriterCounts(**counts) for counts in state_dict["totals"]]
 
 
-def real_positives(real: Copies, counts: Sequence[int], achieved_reward: float) -> dict[str, list[int]]:
-    """How many real transitions achieved their goal, as :meth:`RunCounts.add` takes it.
+def real_positives(chunk: Chunk, real: WrittenRows) -> dict[str, list[int]]:
+    """Returns how many real transitions achieved their goal, as :meth:`RunCounts.add` takes it."""
+    return {"real_positive": _set(real.reward >= chunk.options.achieved_reward, real.counts)}
 
-    Args:
-        real: one run after the other.
-        counts: m numbers of transitions, of each run.
-        achieved_reward: the reward of an achieved goal.
+
+def virtual_positives(chunk: Chunk, virtual: WrittenRows) -> dict[str, list[int]]:
+    """Returns how many virtual transitions achieved their goal, as :meth:`RunCounts.add` takes it.
+
+    With the filter all of them are useful: none of their goals was achieved before.
     """
-    return {"real_positive": _set(real.reward >= achieved_reward, counts)}
-
-
-def virtual_positives(
-    rows: TensorDictBase,
-    virtual: Copies,
-    counts: Sequence[int],
-    reward_fn: RewardFunction,
-    keys: TransitionKeys,
-    *,
-    achieved_reward: float,
-    filtered: bool,
-) -> dict[str, list[int]]:
-    """How many virtual transitions achieved their goal, as :meth:`RunCounts.add` takes it.
-
-    Args:
-        rows: [n], the collected transitions of which they are copies.
-        virtual: one run after the other.
-        counts: m numbers of transitions, of each run.
-        reward_fn: maps (achieved, desired) goals to (reward, terminated).
-        keys: where entries are.
-
-    Keyword Args:
-        achieved_reward: the reward of an achieved goal.
-        filtered: whether none of their goals was achieved before; then all positive ones are useful.
-    """
-    positive = useful = virtual.reward >= achieved_reward
-    if not filtered:
-        before = keys.before(rows, reward_fn)[virtual.root]
-        useful = positive & missed(reward_fn, before, virtual.changes[keys.goals[0]], achieved_reward)
-    return {"virtual_positive": _set(positive, counts), "useful_virtual_positive": _set(useful, counts)}
+    least = chunk.options.achieved_reward
+    positive = useful = virtual.reward >= least
+    if not chunk.options.filter_achieved:
+        before = chunk.before()[virtual.root]
+        useful = positive & missed(chunk.reward_fn, before, virtual.changes[chunk.keys.goals[0]], least)
+    return {
+        "virtual_positive": _set(positive, virtual.counts),
+        "useful_virtual_positive": _set(useful, virtual.counts),
+    }
 
 
 def _set(flags: Tensor, counts: Sequence[int]) -> list[int]:

@@ -10,13 +10,13 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor
 from torch import Tensor
 
-from torchrl_her.replay_buffers.runs.shares import Share
+from torchrl_her.replay_buffers.runs.written import WrittenRows
 
 
-def join_copies(
+def join_rows(
     rows: TensorDictBase,
-    virtual: Share | None,
-    real: Share,
+    virtual: WrittenRows | None,
+    real: WrittenRows,
     *,
     exclude: Sequence[NestedKey],
     virtual_key: NestedKey | None,
@@ -32,25 +32,25 @@ def join_copies(
         exclude: entries of ``rows`` that are left out.
         virtual_key: where virtual transitions are marked, a bool [..., 1]; None for no mark.
     """
-    shares = [real] if virtual is None else [virtual, real]
+    both = [real] if virtual is None else [virtual, real]
 
     def join(parts: list[Tensor]) -> Tensor:
         """A tensor of the virtual and one of the real transitions, as one in the order of runs."""
-        split = [part.split(share.counts) for part, share in zip(parts, shares, strict=True)]
+        split = [part.split(written.counts) for part, written in zip(parts, both, strict=True)]
         return torch.cat([part for run in zip(*split, strict=True) for part in run])
 
-    changed = list(dict.fromkeys(key for copies, _ in shares for key in copies.changes))
+    changed = list(dict.fromkeys(key for written in both for key in written.changes))
     same = rows.exclude(*exclude, *changed)
-    root = join([copies.root for copies, _ in shares])
-    if all(copies.last is copies.root for copies, _ in shares):  # over single steps
+    root = join([written.root for written in both])
+    if all(written.last is written.root for written in both):  # over single steps
         out = take_rows(same, root)
     else:
         out = take_rows(same.exclude("next"), root)
-        out.set("next", take_rows(same.get("next"), join([copies.last for copies, _ in shares])))
+        out.set("next", take_rows(same.get("next"), join([written.last for written in both])))
     for key in changed:
-        out.set(key, join([copies.entry(rows, key) for copies, _ in shares]))
+        out.set(key, join([written.entry(rows, key) for written in both]))
     if virtual_key is not None:
-        marks = [torch.full_like(share.copies.root, share is virtual, dtype=torch.bool) for share in shares]
+        marks = [torch.full_like(written.root, written is virtual, dtype=torch.bool) for written in both]
         out.set(virtual_key, join(marks).unsqueeze(-1))
     return out
 

@@ -6,16 +6,26 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_her import GoalReward, HindsightOptions
-from torchrl_her.replay_buffers.copies import Copies
+from torchrl_her.replay_buffers.episodes import Episodes
+from torchrl_her.replay_buffers.runs.chunk import Chunk
 from torchrl_her.replay_buffers.runs.counts import RunCounts, WriterCounts, real_positives, virtual_positives
+from torchrl_her.replay_buffers.runs.pieces import Piece
+from torchrl_her.replay_buffers.runs.written import WrittenRows
 
-KEYS = HindsightOptions().transition_keys()
+# Transitions 0 to 3 are at 0, 1, 2, 3.
+ROWS = TensorDict({"achieved_goal": torch.arange(4.0).unsqueeze(-1)}, [4])
 
 
-def copies(reward: list[float], goals: list[float] | None = None) -> Copies:
+def chunk(**options: object) -> Chunk:
+    own = HindsightOptions().changed(options)
+    piece = Piece([0, 1], Episodes(torch.arange(4).unsqueeze(-1), torch.ones(4, dtype=torch.int64)))
+    return Chunk(ROWS, None, piece, GoalReward(0.5), own, own.transition_keys())
+
+
+def written(reward: list[float], counts: list[int], goals: list[float] | None = None) -> WrittenRows:
     root = torch.arange(len(reward))
-    changes = {} if goals is None else {KEYS.goals[0]: torch.tensor(goals).unsqueeze(-1)}
-    return Copies(root, root, changes, torch.tensor(reward))
+    changes = {} if goals is None else {"desired_goal": torch.tensor(goals).unsqueeze(-1)}
+    return WrittenRows(root, root, dict(changes), torch.tensor(reward), counts)
 
 
 def test_counts_are_emptied_and_totals_are_not() -> None:
@@ -41,20 +51,15 @@ def test_a_state_brings_the_counts_back() -> None:
 
 
 def test_positive_is_what_has_the_reward_of_an_achieved_goal() -> None:
-    real = copies([0.0, -1.0, 1.0, -1.0, -0.5])
-    assert real_positives(real, [3, 0, 2], 0.0) == {"real_positive": [2, 0, 0]}
-    assert real_positives(real, [3, 0, 2], -0.5) == {"real_positive": [2, 0, 1]}
+    real = written([0.0, -1.0, 1.0, -1.0, -0.5], [3, 0, 2])
+    assert real_positives(chunk(), real) == {"real_positive": [2, 0, 0]}
+    assert real_positives(chunk(achieved_reward=-0.5), real) == {"real_positive": [2, 0, 1]}
 
 
 def test_useful_is_what_was_not_achieved_before() -> None:
-    """Transitions 0 to 3 are at 0, 1, 2, 3; the goals of 0 and 2 are achieved where they are."""
-    rows = TensorDict({"achieved_goal": torch.arange(4.0).unsqueeze(-1)}, [4])
-    virtual = copies([0.0, 0.0, 0.0, -1.0], [0.0, 2.0, 2.0, 9.0])
-
-    def positives(filtered: bool) -> dict[str, list[int]]:
-        return virtual_positives(
-            rows, virtual, [1, 3], GoalReward(0.5), KEYS, achieved_reward=0.0, filtered=filtered
-        )
-
-    assert positives(False) == {"virtual_positive": [1, 2], "useful_virtual_positive": [0, 1]}
-    assert positives(True) == {"virtual_positive": [1, 2], "useful_virtual_positive": [1, 2]}
+    """The goals of transitions 0 and 2 are achieved where they are."""
+    virtual = written([0.0, 0.0, 0.0, -1.0], [1, 3], [0.0, 2.0, 2.0, 9.0])
+    positives = {"virtual_positive": [1, 2], "useful_virtual_positive": [0, 1]}
+    assert virtual_positives(chunk(), virtual) == positives
+    filtered = virtual_positives(chunk(filter_achieved=True), virtual)
+    assert filtered == {"virtual_positive": [1, 2], "useful_virtual_positive": [1, 2]}

@@ -7,9 +7,8 @@ import torch
 from tensordict import NestedKey, NonTensorStack, TensorDict
 from torch import Tensor
 
-from torchrl_her.replay_buffers.copies import Copies
-from torchrl_her.replay_buffers.runs.rows import join_copies, take_rows
-from torchrl_her.replay_buffers.runs.shares import Share
+from torchrl_her.replay_buffers.runs.rows import join_rows, take_rows
+from torchrl_her.replay_buffers.runs.written import WrittenRows
 
 ROWS = TensorDict(
     {
@@ -22,20 +21,19 @@ ROWS = TensorDict(
 )
 
 
-def share(
+def written(
     root: list[int], counts: list[int], last: list[int] | None = None, **changes: list[list[float]]
-) -> Share:
+) -> WrittenRows:
     index = torch.tensor(root)
     own: dict[NestedKey, Tensor] = {key: torch.tensor(value) for key, value in changes.items()}
-    return Share(
-        Copies(index, index if last is None else torch.tensor(last), own, torch.zeros(len(root))), counts
-    )
+    ends = index if last is None else torch.tensor(last)
+    return WrittenRows(index, ends, own, torch.zeros(len(root)), counts)
 
 
 def test_the_virtual_ones_of_each_run_come_before_its_real_ones() -> None:
     """Run 0 has transitions 0 and 1, and a copy of 1; run 1 has transition 2, and two copies of it."""
-    virtual = share([1, 2, 2], [1, 2], goal=[[5.0], [6.0], [7.0]])
-    out = join_copies(ROWS, virtual, share([0, 1, 2], [2, 1]), exclude=["state"], virtual_key="virtual")
+    virtual = written([1, 2, 2], [1, 2], goal=[[5.0], [6.0], [7.0]])
+    out = join_rows(ROWS, virtual, written([0, 1, 2], [2, 1]), exclude=["state"], virtual_key="virtual")
     assert set(out.keys(True, True)) == {"x", "goal", ("next", "y"), "virtual"}
     assert out["x"].tolist() == [11.0, 10.0, 11.0, 12.0, 12.0, 12.0]
     assert out["goal"].flatten().tolist() == [5.0, -7.0, -7.0, 6.0, 7.0, -7.0]
@@ -44,15 +42,15 @@ def test_the_virtual_ones_of_each_run_come_before_its_real_ones() -> None:
 
 
 def test_next_is_that_of_the_last_step() -> None:
-    virtual = share([0], [1], [2], goal=[[5.0]])
-    out = join_copies(ROWS, virtual, share([0, 1], [2], [1, 2]), exclude=[], virtual_key=None)
+    virtual = written([0], [1], [2], goal=[[5.0]])
+    out = join_rows(ROWS, virtual, written([0, 1], [2], [1, 2]), exclude=[], virtual_key=None)
     assert out["x"].tolist() == [10.0, 10.0, 11.0]
     assert out["next", "y"].tolist() == [22, 21, 22]
     assert "virtual" not in out.keys()
 
 
 def test_real_ones_alone() -> None:
-    out = join_copies(ROWS, None, share([2, 0], [1, 1]), exclude=[], virtual_key="virtual")
+    out = join_rows(ROWS, None, written([2, 0], [1, 1]), exclude=[], virtual_key="virtual")
     assert out["x"].tolist() == [12.0, 10.0]
     assert not out["virtual"].any()
 

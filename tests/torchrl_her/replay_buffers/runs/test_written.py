@@ -7,8 +7,9 @@ from tensordict import TensorDict
 
 from torchrl_her import GoalReward, HindsightOptions
 from torchrl_her.replay_buffers.episodes import Episodes
+from torchrl_her.replay_buffers.runs.chunk import Chunk
 from torchrl_her.replay_buffers.runs.pieces import Piece
-from torchrl_her.replay_buffers.runs.shares import real_share, virtual_share
+from torchrl_her.replay_buffers.runs.written import real_rows, virtual_rows
 
 from ...her_data import make_batch
 
@@ -21,7 +22,11 @@ PIECE = Piece(
     Episodes(torch.tensor([[0, 1, 1], [4, 5, 6]]), torch.tensor([2, 3])),
     torch.tensor([0, 1]),
 )
-REWARD = GoalReward(0.5)
+
+
+def chunk(**options: object) -> Chunk:
+    own = HindsightOptions().changed(options)
+    return Chunk(ROWS, RUN, PIECE, GoalReward(0.5), own, own.transition_keys())
 
 
 def test_a_piece_counts_by_runs() -> None:
@@ -33,30 +38,28 @@ def test_a_piece_counts_by_runs() -> None:
 
 
 def test_single_transitions() -> None:
-    options = HindsightOptions()
-    keys = options.transition_keys()
-    real = real_share(ROWS, PIECE, options, keys, first_id=0)
-    assert real.copies.root.tolist() == [0, 1, 4, 5, 6]
+    own = chunk()
+    real = real_rows(own, first_id=0)
+    assert real.root.tolist() == [0, 1, 4, 5, 6]
     assert real.counts == [2, 3]
-    assert real.copies.changes == {}
+    assert real.changes == {}
     # Transition 0 for the goal that 1 achieved, and 5 and 6 for the one that 6 achieved.
     source, goals = torch.tensor([0, 5, 6]), ROWS["next", "achieved_goal"][[1, 6, 6]]
-    virtual = virtual_share(ROWS, RUN, PIECE, source, goals, REWARD, options, keys, first_id=0)
+    virtual = virtual_rows(own, source, goals, first_id=0)
     assert virtual.counts == [1, 2]
-    assert virtual.copies.changes["desired_goal"][:, 0].tolist() == [2.0, 1003.0, 1003.0]
-    assert virtual.copies.reward.tolist() == [-1.0, -1.0, 0.0]
-    assert keys.trajectory not in virtual.copies.changes
+    assert virtual.changes["desired_goal"][:, 0].tolist() == [2.0, 1003.0, 1003.0]
+    assert virtual.reward.tolist() == [-1.0, -1.0, 0.0]
+    assert own.keys.trajectory not in virtual.changes
 
 
 def test_whole_episodes_have_ids() -> None:
     """Two copies of the second episode: one up to its second state, one up to its end."""
-    options = HindsightOptions(per="episode")
-    keys = options.transition_keys()
+    own = chunk(per="episode")
     source, goals = torch.tensor([4, 4]), ROWS["next", "achieved_goal"][[5, 6]]
-    virtual = virtual_share(ROWS, RUN, PIECE, source, goals, REWARD, options, keys, first_id=10)
-    assert virtual.copies.root.tolist() == [4, 5, 4, 5, 6]
+    virtual = virtual_rows(own, source, goals, first_id=10)
+    assert virtual.root.tolist() == [4, 5, 4, 5, 6]
     assert virtual.counts == [0, 5]
-    assert virtual.copies.changes[keys.trajectory].tolist() == [10, 10, 11, 11, 11]
-    real = real_share(ROWS, PIECE, options, keys, first_id=12)
-    assert real.copies.changes[keys.trajectory].tolist() == [12, 12, 13, 13, 13]
+    assert virtual.changes[own.keys.trajectory].tolist() == [10, 10, 11, 11, 11]
+    real = real_rows(own, first_id=12)
+    assert real.changes[own.keys.trajectory].tolist() == [12, 12, 13, 13, 13]
     assert real.counts == [2, 3]

@@ -1,0 +1,174 @@
+"""The transitions that a writer stores, made of those that were collected: real ones and virtual ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from torchrl_her.goals.rewards import ask_reward
+from torchrl_her.replay_buffers.episodes import Episodes
+from torchrl_her.replay_buffers.keys import entry_of, stored_as
+from torchrl_her.replay_buffers.n_steps import STEPS_KEY, n_step_return, windows
+from torchrl_her.replay_buffers.runs.chunk import Chunk
+
+
+@dataclass(frozen=True)
+class WrittenRows:
+    """Real or virtual transitions [m] of some runs: copies of collected ones, except for some entries.
+
+    Attributes:
+        root: [m] int64, positions of the collected transitions whose root they have, one run after the other.
+        last: [m] int64, positions of those whose ``next`` they have; the same tensor as ``root`` if
+            transitions are over single steps.
+        changes: Entries that differ, [m, ...] each.
+        reward: [m], of the last step.
+        counts: Numbers of transitions of each run, which sum to m.
+    """
+
+    root: Tensor
+    last: Tensor
+    changes: dict[NestedKey, Tensor]
+    reward: Tensor
+    counts: list[int]
+
+    def entry(self, rows: TensorDictBase, key: NestedKey) -> Tensor:
+        """An entry of these transitions, [m, ...]."""
+        if key not in self.changes:
+            order = self.last if isinstance(key, tuple) and key[0] == "next" else self.root
+            return entry_of(rows, key).index_select(0, order)
+        return self.changes[key]
+
+    def like(self, rows: TensorDictBase) -> WrittenRows:
+        """Returns these transitions with changes in the types and shapes of the collected entries.
+
+        Raises:
+            ValueError: an entry cannot hold a value.
+        """
+        changes = dict(self.changes)
+        for key, value in self.changes.items():
+            if (entry := rows.get(key, None)) is not None:
+                # The discounted sum of whole numbers is none.
+                summed = STEPS_KEY in changes and value.is_floating_point()
+                changes[key] = value.view(-1, *entry.shape[1:]) if summed else stored_as(value, entry, key)
+        return replace(self, changes=changes)
+
+
+def real_rows(chunk: Chunk, *, first_id: int) -> WrittenRows:
+    """Returns all transitions of a chunk, for the goals that were wanted.
+
+    Where whole episodes are written, those that were ended from outside are truncated, so that samplers of
+    slices see their end.
+
+    Args:
+        chunk: Episodes of m runs.
+        first_id: Trajectory id of the first episode, if whole ones are written; that of the next one is
+            higher by 1.
+    """
+    rows, episodes, keys, options = chunk.rows, chunk.episodes, chunk.keys, chunk.options
+    root, counts = episodes.rows[episodes.inside], chunk.piece.sums(episodes.lengths)
+    reward = entry_of(rows, keys.reward).reshape(-1, 1)
+    if options.n_steps > 1 and options.gamma is not None:
+        window, inside = _windows(chunk, root)
+        done = entry_of(rows, keys.done).reshape(-1, 1)
+        out = n_step_return(reward[window], done[window], inside, options.gamma)
+        last = _at(window, out.last)
+        changes: dict[NestedKey, Tensor] = {keys.reward: out.reward, STEPS_KEY: out.steps}
+    else:
+        last, changes = root, {}
+        if options.per == "episode":
+            done, truncated = (entry_of(rows, key)[root].view(-1, 1) for key in (keys.done, keys.truncated))
+            cut = torch.zeros_like(done).index_fill_(0, episodes.lengths.cumsum(0) - 1, True) & ~done
+            ids = _episode_numbers(episodes) + first_id
+            changes = {keys.truncated: truncated | cut, keys.done: done | cut, keys.trajectory: ids}
+    return WrittenRows(root, last, changes, reward.flatten().index_select(0, last), counts).like(rows)
+
+
+def virtual_rows(chunk: Chunk, source: Tensor, goals: Tensor, *, first_id: int) -> WrittenRows:
+    """Returns transitions of a chunk for other goals, each for its own.
+
+    Over several steps, a transition ends where it terminates: by the reward function, or because the episode
+    did so although its goal was not achieved. What such a failure cost besides the goal's reward is kept.
+    Copies of whole episodes end where the reward function terminates them, and are truncated at the
+    episode's end otherwise.
+
+    Args:
+        chunk: Episodes of m runs.
+        source: [V] int64, the transitions that are copied, or the first ones of whole episodes that are.
+        goals: [V, g], the goal of each copy.
+        first_id: Trajectory id of the first copy, if whole episodes are written.
+    """
+    make = _virtual_episodes if chunk.options.per == "episode" else _virtual_transitions
+    root, last, changes, reward = make(chunk, source, goals, first_id)
+    counts = chunk.piece.counts(root, chunk.run)
+    return WrittenRows(root, last, changes, reward.flatten(), counts).like(chunk.rows)
+
+
+_Parts = tuple[Tensor, Tensor, dict[NestedKey, Tensor], Tensor]  # of WrittenRows
+
+
+def _virtual_transitions(chunk: Chunk, source: Tensor, goals: Tensor, _first_id: int) -> _Parts:
+    rows, keys, options = chunk.rows, chunk.keys, chunk.options
+    achieved, (failed, cost) = chunk.after(), chunk.failures()
+    truncated = entry_of(rows, keys.truncated)
+    if options.n_steps == 1 or options.gamma is None:
+        reward, terminated = ask_reward(chunk.reward_fn, achieved[source], goals)
+        reward, terminated = reward + cost[source], terminated | failed[source]
+        changes = keys.changes(goals, reward, terminated, truncated.index_select(0, source))
+        return source, source, changes, reward
+    window, inside = _windows(chunk, source)
+    wanted = goals.unsqueeze(1).expand(-1, window.shape[1], -1)
+    reward, terminated = ask_reward(chunk.reward_fn, achieved[window], wanted)
+    reward = reward + cost[window]
+    out = n_step_return(reward, terminated | failed[window], inside, options.gamma)
+    last = _at(window, out.last)
+    changes = keys.changes(goals, out.reward, out.terminated, truncated.index_select(0, last))
+    return source, last, {**changes, STEPS_KEY: out.steps}, _at(reward.squeeze(-1), out.last)
+
+
+def _virtual_episodes(chunk: Chunk, source: Tensor, goals: Tensor, first_id: int) -> _Parts:
+    rows, episodes, keys = chunk.rows, chunk.episodes, chunk.keys
+    number = _by_row(chunk, _episode_numbers(episodes))[source]
+    table, inside = episodes.rows[number], episodes.inside[number]
+    wanted = goals.unsqueeze(1).expand(-1, table.shape[1], -1)
+    reward, terminated = ask_reward(chunk.reward_fn, chunk.after()[table], wanted)
+    failed, cost = chunk.failures()
+    reward, terminated = reward + cost[table], terminated | failed[table]
+    ended = terminated.squeeze(-1).cumsum(-1) - terminated.squeeze(-1).to(torch.int64)
+    used = inside & (ended == 0)
+    stop = used.clone()
+    stop[:, :-1] &= ~used[:, 1:]
+    root, reward, terminated = table[used], reward[used].view(-1, 1), terminated[used].view(-1, 1)
+    truncated = entry_of(rows, keys.truncated)[root].view(-1, 1) | (stop[used].view(-1, 1) & ~terminated)
+    copy = torch.arange(len(source), device=table.device).unsqueeze(-1).expand_as(table)
+    changes = keys.changes(wanted[used], reward, terminated, truncated)
+    changes |= {keys.truncated: truncated, keys.trajectory: copy[used] + first_id}
+    return root, root, changes, reward
+
+
+def _episode_numbers(episodes: Episodes) -> Tensor:
+    """Which episode each of the transitions ``episodes.rows[episodes.inside]`` belongs to, [n]."""
+    number = torch.arange(len(episodes.lengths), device=episodes.rows.device)
+    return number.repeat_interleave(episodes.lengths)
+
+
+def _by_row(chunk: Chunk, numbers: Tensor) -> Tensor:
+    """Numbers of the transitions ``rows[inside]`` at the positions of these rows, [n]; 0 at other rows."""
+    episodes = chunk.episodes
+    return episodes.rows.new_zeros(len(chunk.rows)).index_copy_(0, episodes.rows[episodes.inside], numbers)
+
+
+def _windows(chunk: Chunk, source: Tensor) -> tuple[Tensor, Tensor]:
+    """For transitions [V], the positions [V, m] of up to n steps from them on; which are in the episode."""
+    episodes = chunk.episodes
+    real = episodes.rows[episodes.inside]  # one episode after the other: a place is a position in here
+    place = _by_row(chunk, torch.arange(len(real), device=real.device))
+    end = episodes.lengths.cumsum(0)[_episode_numbers(episodes)]
+    places, inside = windows(place[source], end[place[source]], chunk.options.n_steps)
+    return real[places], inside
+
+
+def _at(window: Tensor, index: Tensor) -> Tensor:
+    return window.gather(-1, index.unsqueeze(-1)).squeeze(-1)
