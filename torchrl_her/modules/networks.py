@@ -67,24 +67,30 @@ class StackedBatchNorm(nn.Module):
         >>> norm, rows = StackedBatchNorm(2), torch.tensor([[[1.0, 4.0], [3.0, 8.0]]])
         >>> norm(rows).detach().round(decimals=3).tolist()
         [[[-1.0, -1.0], [1.0, 1.0]]]
-        >>> norm.norm.running_mean, norm.norm.running_var
-        (tensor([0.2000, 0.6000]), tensor([1.1000, 1.7000]))
+        >>> norm.running_mean, norm.running_var
+        (tensor([[[0.2000, 0.6000]]]), tensor([[[1.1000, 1.7000]]]))
         >>> norm.requires_grad_(False)(rows)[0, 0]  # (1 - 0.2) / sqrt(1.1), (4 - 0.6) / sqrt(1.7)
         tensor([0.7628, 2.6077])
     """
 
+    running_mean: Tensor
+    running_var: Tensor
+
     def __init__(self, width: int, *, runs: int = 1) -> None:
         super().__init__()
-        self.norm = nn.BatchNorm1d(runs * width)
+        self.weight = nn.Parameter(torch.ones(runs, 1, width))
+        self.bias = nn.Parameter(torch.zeros(runs, 1, width))
+        self.register_buffer("running_mean", torch.zeros(runs, 1, width))
+        self.register_buffer("running_var", torch.ones(runs, 1, width))
 
     def forward(self, x: Tensor) -> Tensor:
         """[R, rows, width] to the same."""
         runs, rows, width = x.shape
-        flat, norm = x.transpose(0, 1).reshape(rows, runs * width), self.norm
-        learns = self.training and norm.weight.requires_grad
-        flat = nn.functional.batch_norm(
-            flat, norm.running_mean, norm.running_var, norm.weight, norm.bias, learns, eps=norm.eps
-        )
+        flat = x.transpose(0, 1).reshape(rows, runs * width)
+        own = (self.running_mean, self.running_var, self.weight, self.bias)
+        mean, variance, weight, bias = (each.view(-1) for each in own)
+        learns = self.training and self.weight.requires_grad
+        flat = nn.functional.batch_norm(flat, mean, variance, weight, bias, learns)
         return flat.view(rows, runs, width).transpose(0, 1)
 
 
@@ -277,10 +283,7 @@ def stack_runs(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
         >>> pair.load_state_dict(stack_runs([ActorNet(3, 1).state_dict() for _ in range(2)]))
         <All keys matched successfully>
     """
-    first = states[0]
-    return {
-        key: torch.cat([state[key] for state in states]) if first[key].ndim else first[key] for key in first
-    }
+    return {key: torch.cat([state[key] for state in states]) for key in states[0]}
 
 
 def take_run(state: Mapping[str, Tensor], run: int, runs: int) -> dict[str, Tensor]:
@@ -291,7 +294,7 @@ def take_run(state: Mapping[str, Tensor], run: int, runs: int) -> dict[str, Tens
         run: the run's number, from 0.
         runs: R.
     """
-    return {key: value.chunk(runs)[run].clone() if value.ndim else value for key, value in state.items()}
+    return {key: value.chunk(runs)[run].clone() for key, value in state.items()}
 
 
 def make_actor(

@@ -33,10 +33,21 @@ class Activation(IntEnum):
     ELU = 3
 
 
-class Layer(ctypes.Structure):
-    """One layer: its widths, and how many of its inputs come in here (the action, in a critic)."""
+class Norm(IntEnum):
+    """How a layer's outputs are normalized, before the activation."""
 
-    _fields_ = [(name, ctypes.c_int) for name in ("inputs", "outputs", "joined", "activation", "normalized")]
+    PLAIN = 0
+    LAYERNORM = 1
+    BATCHNORM = 2
+
+
+class Layer(ctypes.Structure):
+    """One layer: its widths, and how many of its inputs come in here (the action, in a critic).
+
+    A layer of no inputs normalizes the network's input.
+    """
+
+    _fields_ = [(name, ctypes.c_int) for name in ("inputs", "outputs", "joined", "activation", "norm")]
 
 
 @dataclass(frozen=True)

@@ -49,16 +49,18 @@ inline Matrix matrix(Arena& arena, int rows, int columns) {
 }
 
 enum Activation { kNone, kRelu, kTanh, kElu };
+enum Norm { kPlain, kLayerNorm, kBatchNorm };
 
 // As Python describes a layer. `joined`: how many of the inputs come in here, behind the outputs of the layer before.
+// A layer of no inputs has no product: it is the normalization of the network's input.
 struct Layer {
-    int inputs, outputs, joined, activation, normalized;
+    int inputs, outputs, joined, activation, norm;
 };
 
-constexpr real kNormEpsilon = 1e-5;  // that of torch's LayerNorm
+constexpr real kNormEpsilon = 1e-5, kMomentum = 0.1;  // as in torch
 constexpr int kLeastPaired = 32;     // width of layers between which products may be of numbers in bfloat16
 
-// A parameter [rows, columns] with all that a step changes.
+// A parameter [rows, columns] with all that a step changes. Running statistics have no moments, and no gradient.
 struct Parameter {
     int rows, columns;
     real *value, *target, *first_moment, *second_moment;
@@ -67,9 +69,10 @@ struct Parameter {
 
 // What a forward pass leaves for the backward pass.
 struct Pass {
+    bool learns;                     // whether parameters get gradients; if so, batches have their own statistics
     std::vector<Matrix> values;      // the input, and each layer's output
     std::vector<Matrix> normalized;  // before scale and shift
-    std::vector<real*> spread;       // 1 / standard deviation of each row
+    std::vector<real*> spread;       // 1 / standard deviation of each row, or of each column of a batch
 };
 
 // The sum of term(0), ..., term(n - 1), lane by lane, so that it is one of vectors.
@@ -90,7 +93,8 @@ class Network {
     Network(const Layer* layers, int count, bool bfloat16)
         : layers_(layers, layers + count), bfloat16_(bfloat16 && sizeof(real) == sizeof(float)) {}
 
-    std::vector<Parameter> parameters;  // of each layer: weight, bias and, if normalized, scale and shift
+    // Of each layer: weight, bias; if normalized, scale, shift; of batches, running mean and variance.
+    std::vector<Parameter> parameters;
     bool uses_targets = false;
 
     // Begins a step: forgets what was made of older weights.
@@ -104,16 +108,16 @@ class Network {
     }
 
     // A pass of an input [rows, inputs], which several networks may share.
-    Pass pass(Matrix input) {
+    Pass pass(Matrix input, bool learns = false) {
         const int rows = input.rows;
-        Pass pass;
-        pass.values.push_back(input);
+        Pass pass{learns, {input}, {}, {}};
         for (size_t i = 0; i < layers_.size(); ++i) {
+            const int outputs = layers_[i].outputs, norm = layers_[i].norm;
             const int joined = i + 1 < layers_.size() ? layers_[i + 1].joined : 0;
-            pass.values.push_back(matrix(*arena_, rows, padded(layers_[i].outputs) + joined));
-            pass.values.back().columns = layers_[i].outputs + joined;
-            pass.normalized.push_back(layers_[i].normalized ? matrix(*arena_, rows, layers_[i].outputs) : Matrix{});
-            pass.spread.push_back(layers_[i].normalized ? arena_->take(rows) : nullptr);
+            pass.values.push_back(matrix(*arena_, rows, padded(outputs) + joined));
+            pass.values.back().columns = outputs + joined;
+            pass.normalized.push_back(norm ? matrix(*arena_, rows, outputs) : Matrix{});
+            pass.spread.push_back(norm ? arena_->take(norm == kLayerNorm ? rows : outputs) : nullptr);
         }
         return pass;
     }
@@ -129,9 +133,10 @@ class Network {
                 for (int r = 0; r < rows; ++r)
                     for (int c = 0; c < layer.joined; ++c)
                         in[r][layer.inputs - layer.joined + c] = joined[r * joined_row + c];
-            const bool relu = layer.activation == kRelu && !layer.normalized;
+            const bool relu = layer.activation == kRelu && !layer.norm;
             const long width = padded(layer.outputs);
-            if (paired(i))
+            if (layer.inputs == 0) {  // nothing to multiply
+            } else if (paired(i))
                 multiply(Product<Pair>{columns_paired(in, layer.inputs), pairs(layer.inputs), 1, weight_pairs(i), width,
                                        out.data, out.row, pairs(layer.inputs), bias(i), relu},
                          rows, layer.outputs);
@@ -139,26 +144,28 @@ class Network {
                 multiply(Product<real>{in.data, in.row, 1, weight(i), width, out.data, out.row, layer.inputs, bias(i),
                                        relu},
                          rows, layer.outputs);
-            if (layer.normalized) normalize(i, pass);
+            if (layer.norm == kLayerNorm) normalize(i, pass);
+            if (layer.norm == kBatchNorm) normalize_batch(i, pass);
             if (!relu) activate(layer, out);
         }
         return pass.values.back();
     }
 
-    // Gradients of all parameters (if `learns`), from the gradient in the output, which is overwritten.
+    // Gradients of all parameters (if the pass learns), from the gradient in the output, which is overwritten.
     // `joined_slope` [rows, padded], if not null, gets the gradient in the joined input.
-    void backward(const Pass& pass, Matrix slope, bool learns, Matrix* joined_slope = nullptr) {
+    void backward(const Pass& pass, Matrix slope, Matrix* joined_slope = nullptr) {
         for (int i = int(layers_.size()) - 1; i >= 0; --i) {
             const Layer& layer = layers_[i];
             const int own = layer.inputs - layer.joined;
             activation_slope(layer, pass.values[i + 1], slope);
-            if (layer.normalized) normalization_slope(i, pass, slope, learns);
-            if (learns) weight_slope(i, pass.values[i], slope);
+            if (layer.norm) normalization_slope(i, pass, slope);
+            if (layer.inputs == 0) return;
+            if (pass.learns) weight_slope(i, pass.values[i], slope);
             if (layer.joined && joined_slope)
                 multiply(Product<real>{slope.data, slope.row, 1, transposed(i, own, layer.joined), padded(layer.joined),
                                        joined_slope->data, joined_slope->row, layer.outputs, nullptr, false},
                          slope.rows, layer.joined);
-            const bool done = i == 0 || (layer.joined && !learns);  // nothing before the joint is asked for
+            const bool done = i == 0 || (layer.joined && !pass.learns);  // nothing before the joint is asked for
             if (done) return;
             Matrix before = matrix(*arena_, slope.rows, own);
             if (paired(i))
@@ -176,7 +183,7 @@ class Network {
     double gradient_square() const {
         double sum = 0;
         for (const Parameter& p : parameters)
-            for (int r = 0; r < p.rows; ++r) {
+            for (int r = 0; r < p.rows && p.gradient.data; ++r) {
                 const real* g = p.gradient[r];
                 sum += sum_of(p.columns, [g](int c) { return g[c] * g[c]; });
             }
@@ -191,7 +198,7 @@ class Network {
     std::vector<Pair*> weight_pairs_, transposed_pairs_;
 
     bool paired(int layer) const {
-        const bool hidden = layer > 0 && layer + 1 < int(layers_.size());
+        const bool hidden = layer > 0 && layers_[layer - 1].inputs > 0 && layer + 1 < int(layers_.size());
         return bfloat16_ && hidden && std::min(layers_[layer].inputs, layers_[layer].outputs) >= kLeastPaired;
     }
     const Pair* columns_paired(Matrix in, int columns) {
@@ -205,10 +212,11 @@ class Network {
         return out;
     }
 
+    enum { kWeight, kBias, kScale, kShift, kMean, kVariance };
+
     const Parameter& parameter(int layer, int which) const {
-        int first = 0;
-        for (int i = 0; i < layer; ++i) first += layers_[i].normalized ? 4 : 2;
-        return parameters[first + which];
+        for (int i = 0; i < layer; ++i) which += 2 * (layers_[i].inputs > 0) + 2 * layers_[i].norm;
+        return parameters[layers_[layer].inputs ? which : which - kScale];
     }
     Parameter& parameter(int layer, int which) {
         return const_cast<Parameter&>(static_cast<const Network*>(this)->parameter(layer, which));
@@ -228,11 +236,11 @@ class Network {
         }
         return kept[layer];
     }
-    const real* weight(int layer) { return padded_rows(parameter(layer, 0), weights_, layer); }
-    const real* bias(int layer) { return padded_rows(parameter(layer, 1), biases_, layer); }
+    const real* weight(int layer) { return padded_rows(parameter(layer, kWeight), weights_, layer); }
+    const real* bias(int layer) { return padded_rows(parameter(layer, kBias), biases_, layer); }
 
     const Pair* weight_pairs(int layer) {
-        const Parameter& p = parameter(layer, 0);
+        const Parameter& p = parameter(layer, kWeight);
         if (!weight_pairs_[layer]) weight_pairs_[layer] = rows_paired(value(p), p.columns, p.rows, p.columns);
         return weight_pairs_[layer];
     }
@@ -248,7 +256,7 @@ class Network {
     }
     // The transpose [outputs, padded] of some rows of a weight.
     real* transposed(int layer, int first, int count) {
-        const Parameter& p = parameter(layer, 0);
+        const Parameter& p = parameter(layer, kWeight);
         real* out = arena_->take(long(p.columns) * padded(count));
         transpose(value(p) + long(first) * p.columns, count, p.columns, out);
         return out;
@@ -259,7 +267,7 @@ class Network {
     }
     const Pair* back_pairs(int layer, int own) {
         if (!transposed_pairs_[layer]) {
-            const Parameter& p = parameter(layer, 0);
+            const Parameter& p = parameter(layer, kWeight);
             const Pair* rows = columns_paired({const_cast<real*>(value(p)), own, p.columns, p.columns}, p.columns);
             transposed_pairs_[layer] = arena_->take_pairs(long(pairs(p.columns)) * padded(own));
             transpose(rows, own, pairs(p.columns), transposed_pairs_[layer]);
@@ -270,7 +278,7 @@ class Network {
     void normalize(int layer, Pass& pass) {
         const int n = layers_[layer].outputs;
         const Matrix out = pass.values[layer + 1], kept = pass.normalized[layer];
-        const real *scale = value(parameter(layer, 2)), *shift = value(parameter(layer, 3));
+        const real *scale = value(parameter(layer, kScale)), *shift = value(parameter(layer, kShift));
         for (int r = 0; r < out.rows; ++r) {
             real *y = out[r], *x = kept[r];
             const real mean = sum_of(n, [y](int c) { return y[c]; }) / n;
@@ -284,27 +292,70 @@ class Network {
         }
     }
 
-    void normalization_slope(int layer, const Pass& pass, Matrix slope, bool learns) {
+    // By the statistics of the batch where the pass learns, which move the running ones; by these elsewhere.
+    void normalize_batch(int layer, Pass& pass) {
         const int n = layers_[layer].outputs;
-        Parameter &scale = parameter(layer, 2), &shift = parameter(layer, 3);
-        if (learns)
+        const Matrix out = pass.values[layer + 1], in = layers_[layer].inputs ? out : pass.values[layer];
+        const int rows = out.rows;
+        const real *mean = value(parameter(layer, kMean)), *variance = value(parameter(layer, kVariance));
+        if (pass.learns) {
+            const Matrix own = matrix(*arena_, 2, n);
+            real *__restrict sum = own[0], *__restrict squares = own[1];
+            std::fill_n(sum, 2 * own.row, real(0));
+            for (int r = 0; r < rows; ++r)
+                for (int c = 0; c < n; ++c) sum[c] += in[r][c];
+            for (int c = 0; c < n; ++c) sum[c] /= rows;
+            for (int r = 0; r < rows; ++r)
+                for (int c = 0; c < n; ++c) squares[c] += (in[r][c] - sum[c]) * (in[r][c] - sum[c]);
+            real *running_mean = parameter(layer, kMean).value, *running_variance = parameter(layer, kVariance).value;
+            for (int c = 0; c < n; ++c) {
+                running_mean[c] += kMomentum * (sum[c] - running_mean[c]);
+                running_variance[c] += kMomentum * (squares[c] / (rows - 1) - running_variance[c]);
+                squares[c] /= rows;
+            }
+            mean = sum, variance = squares;
+        }
+        real* __restrict spread = pass.spread[layer];
+        for (int c = 0; c < n; ++c) spread[c] = 1 / std::sqrt(variance[c] + kNormEpsilon);
+        const real *scale = value(parameter(layer, kScale)), *shift = value(parameter(layer, kShift));
+        for (int r = 0; r < rows; ++r) {
+            real *__restrict x = pass.normalized[layer][r], *y = out[r];
+            for (int c = 0; c < n; ++c) x[c] = (in[r][c] - mean[c]) * spread[c];
+            for (int c = 0; c < n; ++c) y[c] = x[c] * scale[c] + shift[c];
+        }
+    }
+
+    void normalization_slope(int layer, const Pass& pass, Matrix slope) {
+        const int n = layers_[layer].outputs;
+        const bool of_batch = layers_[layer].norm == kBatchNorm;
+        Parameter &scale = parameter(layer, kScale), &shift = parameter(layer, kShift);
+        if (pass.learns)
             for (Parameter* p : {&scale, &shift}) {
                 p->gradient = matrix(*arena_, 1, n);
                 std::fill_n(p->gradient.data, n, real(0));
             }
-        const real* factor = value(scale);
+        real *__restrict in_scale = scale.gradient.data, *__restrict in_shift = shift.gradient.data;
+        const real *factor = value(scale), *spreads = pass.spread[layer];
         for (int r = 0; r < slope.rows; ++r) {
             real* s = slope[r];
-            const real *x = pass.normalized[layer][r], spread = pass.spread[layer][r];
-            if (learns) {
-                real *__restrict in_scale = scale.gradient.data, *__restrict in_shift = shift.gradient.data;
+            const real* x = pass.normalized[layer][r];
+            if (pass.learns) {
                 for (int c = 0; c < n; ++c) in_scale[c] += s[c] * x[c];
                 for (int c = 0; c < n; ++c) in_shift[c] += s[c];
             }
+            if (of_batch) continue;
+            const real spread = spreads[r];
             for (int c = 0; c < n; ++c) s[c] *= factor[c];
             const real mean = sum_of(n, [s](int c) { return s[c]; }) / n;
             const real along = sum_of(n, [s, x](int c) { return s[c] * x[c]; }) / n;
             for (int c = 0; c < n; ++c) s[c] = spread * (s[c] - mean - x[c] * along);
+        }
+        for (int r = 0; r < slope.rows && of_batch; ++r) {
+            real* s = slope[r];
+            const real *x = pass.normalized[layer][r], rows = real(slope.rows);
+            if (pass.learns)
+                for (int c = 0; c < n; ++c) s[c] -= (in_shift[c] + x[c] * in_scale[c]) / rows;
+            for (int c = 0; c < n; ++c) s[c] *= factor[c] * spreads[c];
         }
     }
 
@@ -336,7 +387,7 @@ class Network {
 
     void weight_slope(int layer, Matrix in, Matrix slope) {
         const Layer& own = layers_[layer];
-        Parameter &weight = parameter(layer, 0), &bias = parameter(layer, 1);
+        Parameter &weight = parameter(layer, kWeight), &bias = parameter(layer, kBias);
         weight.gradient = matrix(*arena_, own.inputs, own.outputs);
         bias.gradient = matrix(*arena_, 1, own.outputs);
         Matrix& out = weight.gradient;
@@ -362,14 +413,14 @@ struct Adam {
     real size, spread, beta2, rest1, rest2, epsilon;
 };
 
-// One step of Adam in place, with clipped gradients, and the soft update of the targets behind it.
+// One step of Adam in place, with clipped gradients if there are any, and the soft update of the targets behind it.
 inline void adam_step(Parameter& p, const Adam& adam, real clip, real tau) {
     for (int r = 0; r < p.rows; ++r) {
         const long begin = long(r) * p.columns;
         const real* __restrict gradient = p.gradient[r];
         real *__restrict m = p.first_moment + begin, *__restrict v = p.second_moment + begin;
         real *__restrict w = p.value + begin, *__restrict t = p.target ? p.target + begin : nullptr;
-        for (int c = 0; c < p.columns; ++c) {
+        for (int c = 0; c < p.columns && m; ++c) {
             const real g = gradient[c] * clip;
             m[c] += (g - m[c]) * adam.rest1;
             v[c] = v[c] * adam.beta2 + g * g * adam.rest2;

@@ -16,7 +16,7 @@ enum Algorithm { kDdpg, kTd3, kSac, kDqn, kTqc };
 
 struct Tensors {
     int rows, columns;
-    real *value, *target, *first_moment, *second_moment;  // of all runs; target may be null
+    real *value, *target, *first_moment, *second_moment;  // of all runs; target and moments may be null
     float* steps;  // Adam's counts [counts], or null
 };
 
@@ -112,13 +112,9 @@ class Learner {
 
     Parameter parameter(const Tensors& own) const {
         const long at = long(run_) * own.rows * own.columns;
-        return {own.rows,
-                own.columns,
-                own.value + at,
-                own.target ? own.target + at : nullptr,
-                own.first_moment + at,
-                own.second_moment + at,
-                {}};
+        const auto of_run = [at](real* all) { return all ? all + at : nullptr; };
+        return {own.rows,          own.columns, of_run(own.value), of_run(own.target), of_run(own.first_moment),
+                of_run(own.second_moment), {}};
     }
 
     real& loss(int which) { return job_.losses[(long(which) * job_.steps + step_ - job_.first_step) * job_.runs + run_]; }
@@ -252,7 +248,7 @@ class Learner {
         real* priorities = job_.priorities + first_;
         double value_loss = 0;
         for (int n = 1; n <= job_.critics; ++n) {
-            Pass pass = networks_[n].pass(seen_);
+            Pass pass = networks_[n].pass(seen_, true);
             const Matrix out = networks_[n].forward(pass, action, actions);
             Matrix slope = matrix(arena_, batch, 1);
             for (int b = 0; b < batch; ++b) {
@@ -262,7 +258,7 @@ class Learner {
                 value_loss += square * weights_[b];
                 slope[b][0] = 2 * error * weights_[b] / batch;
             }
-            networks_[n].backward(pass, slope, true);
+            networks_[n].backward(pass, slope);
         }
         loss(1) = real(value_loss / batch);
     }
@@ -295,7 +291,7 @@ class Learner {
         real* priorities = job_.priorities + first_;
         double value_loss = 0;
         for (int n = 1; n <= job_.critics; ++n) {
-            Pass pass = networks_[n].pass(seen_);
+            Pass pass = networks_[n].pass(seen_, true);
             const Matrix out = networks_[n].forward(pass, action, actions);
             const int quantiles = out.columns;
             const real pairs = real(quantiles) * kept;
@@ -319,7 +315,7 @@ class Learner {
                 priorities[b] = n == 1 ? distances / pairs : std::max(priorities[b], distances / pairs);
                 value_loss += costs / pairs * weights_[b];
             }
-            networks_[n].backward(pass, slope, true);
+            networks_[n].backward(pass, slope);
         }
         loss(1) = real(value_loss / batch);
     }
@@ -328,7 +324,7 @@ class Learner {
     void learn_actions() {
         const int batch = job_.batch, actions = job_.actions, followed = job_.target_critics ? job_.critics : 1;
         Network& actor = networks_[0];
-        Pass acted = actor.pass(seen_);
+        Pass acted = actor.pass(seen_, true);
         const Matrix action = actor.forward(acted);
         Matrix action_slope = matrix(arena_, batch, actions);
         double sum = 0, squares = 0;
@@ -340,7 +336,7 @@ class Learner {
                 slope[b][0] = -weights_[b] / (real(batch) * followed);
                 sum += value[b][0] * weights_[b] / followed;
             }
-            networks_[n].backward(valued, slope, false, &own);
+            networks_[n].backward(valued, slope, &own);
             if (n > 1)
                 for (int b = 0; b < batch; ++b)
                     for (int a = 0; a < actions; ++a) action_slope[b][a] += own[b][a];
@@ -361,13 +357,13 @@ class Learner {
                     action_slope[b][a] += 2 * saturation * std::copysign(excess, own) / (1 - own * own);
             }
         loss(0) = real(squares * price + excesses * saturation - sum / batch);
-        actor.backward(acted, action_slope, true);
+        actor.backward(acted, action_slope);
     }
 
     void learn_stochastic_actions() {
         const int batch = job_.batch, actions = job_.actions;
         Network& actor = networks_[0];
-        Pass acted = actor.pass(seen_);
+        Pass acted = actor.pass(seen_, true);
         const Matrix out = actor.forward(acted);
         const real* noise = noise_of(job_.own_noise);
         const Draw drawn = draw(out, noise);
@@ -398,7 +394,7 @@ class Learner {
                 slope[b][0] = least == n ? -weights_[b] / batch : 0;
                 if (least == n) actor_loss -= values[n][b][0] * weights_[b];
             }
-            networks_[n + 1].backward(passes[n], slope, false, &own);
+            networks_[n + 1].backward(passes[n], slope, &own);
             for (int b = 0; b < batch; ++b)
                 for (int a = 0; a < actions; ++a) action_slope[b][a] += own[b][a];
         }
@@ -423,7 +419,7 @@ class Learner {
         loss(2) = real(*temperature_.value * temperature_slope / batch);
         temperature_.gradient = matrix(arena_, 1, 1);
         temperature_.gradient.data[0] = real(temperature_slope / batch);
-        actor.backward(acted, slope, true);
+        actor.backward(acted, slope);
     }
 
     // Double DQN, van Hasselt et al., 2016: the online network chooses the next action.
@@ -436,7 +432,7 @@ class Learner {
         for (int b = 0; b < batch; ++b)
             wanted[b] = valued[b][std::max_element(preferred[b], preferred[b] + job_.actions) - preferred[b]];
         make_targets(wanted);
-        Pass pass = values.pass(seen_);
+        Pass pass = values.pass(seen_, true);
         const Matrix out = values.forward(pass);
         Matrix slope = matrix(arena_, batch, job_.actions);
         double sum = 0;
@@ -449,7 +445,7 @@ class Learner {
             sum += error * error * weights_[b];
         }
         loss(0) = real(sum / batch);
-        values.backward(pass, slope, true);
+        values.backward(pass, slope);
     }
 
     // Clips the gradients of the actor, of all critics together and of the temperature; then Adam and targets.

@@ -70,12 +70,12 @@ class _BuffersToo(TargetNetUpdater):
 
     @cached_property
     def _buffers(self) -> dict[str, list[Any]]:
-        """The keys of buffers that are no counters, by the names of online networks that have some."""
+        """The keys of buffers, by the names of online networks that have some."""
         found = {
             name: [
                 key
                 for key, entry in getattr(self.loss_module, name).items(True, True)
-                if entry.is_floating_point() and not entry.requires_grad
+                if not entry.requires_grad
             ]
             for name in self._source_names
         }

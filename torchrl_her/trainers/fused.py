@@ -19,7 +19,7 @@ from torchrl.objectives import HardUpdate, LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 from torchrl.objectives.utils import TargetNetUpdater
 
-from torchrl_her.native.job import STOCHASTIC, Layer, structures
+from torchrl_her.native.job import STOCHASTIC, Layer, Norm, structures
 from torchrl_her.native.steps import load_steps
 from torchrl_her.trainers.fused_call import FusedCall
 from torchrl_her.trainers.fused_layers import layers_of
@@ -41,8 +41,8 @@ class FusedLearner:
     Args:
         loss: as :func:`~torchrl_her.make_ddpg_loss`, :func:`~torchrl_her.make_td3_loss`,
             :func:`~torchrl_her.make_sac_loss`, :func:`~torchrl_her.make_tqc_loss` or
-            :func:`~torchrl_her.make_dqn_loss` makes it, with networks of this library, without batch
-            normalization, in float32 or float64, on the CPU.
+            :func:`~torchrl_her.make_dqn_loss` makes it, with networks of this library in float32 or
+            float64, on the CPU.
         optimizer: a plain ``torch.optim.Adam`` over the loss module's parameters.
         target: of the loss.
         max_grad_norm: to which the gradients of each network of each run are clipped separately; all
@@ -116,11 +116,11 @@ class FusedLearner:
 
         Raises:
             ValueError: the rows are not those of R runs, not a whole number of batches, not on the CPU, carry
-                a mask of TorchRL's losses or do not fit the networks; or the loss or its optimizer were
-                changed to what this learner cannot do.
+                a mask of TorchRL's losses or do not fit the networks; a batch of one row is to be
+                normalized; or the loss or its optimizer were changed to what this learner cannot do.
         """
         check_rows(rows, steps, self.runs)
-        self._check(rows)
+        self._check(rows, steps)
         check_idle(self.optimizer, self.target, idle)
         call = self._call(rows, steps)
         call.set_idle(idle)
@@ -199,8 +199,10 @@ class FusedLearner:
         assert layers is not None  # asked by why_not_fused
         return (Layer * len(layers))(*layers)
 
-    def _check(self, rows: TensorDictBase) -> None:
+    def _check(self, rows: TensorDictBase, steps: int) -> None:
         """What may change after the learner was made."""
+        if rows.numel() == steps * self.runs and any(own.norm == Norm.BATCHNORM for own in self._critic):
+            raise ValueError("batches must have at least 2 rows for batch normalization, got 1")
         if self.loss.reduction not in ("mean", "none"):
             raise ValueError(f"reduction={self.loss.reduction!r} cannot be fused: use LossLearner")
         if not all(parameter.requires_grad for parameter in self._weights.parameters):

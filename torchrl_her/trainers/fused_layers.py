@@ -6,20 +6,27 @@ from collections.abc import Sequence
 
 from torch import nn
 
-from torchrl_her.modules.networks import ActorNet, CriticNet, StackedLayerNorm, StackedLinear
+from torchrl_her.modules.networks import (
+    ActorNet,
+    CriticNet,
+    StackedBatchNorm,
+    StackedLayerNorm,
+    StackedLinear,
+)
 from torchrl_her.modules.q_actor import QNet
 from torchrl_her.modules.stochastic_actor import StochasticActorNet
-from torchrl_her.native.job import Activation, Layer
+from torchrl_her.native.job import Activation, Layer, Norm
 
 _NETWORKS = (ActorNet, CriticNet, QNet, StochasticActorNet)
 _ACTIVATIONS = {nn.ReLU: Activation.RELU, nn.Tanh: Activation.TANH, nn.ELU: Activation.ELU}
+_NORMS = {StackedLayerNorm: Norm.LAYERNORM, StackedBatchNorm: Norm.BATCHNORM}
 
 
 def layers_of(net: nn.Module) -> list[Layer] | None:
     """The layers of one of this library's networks, from its input on; None if it has others.
 
-    The parameters of the layers, in the same order, are ``net.named_parameters()``: weight and bias, and
-    behind them scale and shift of a layer normalization.
+    The tensors of the layers, in the same order, are those of ``net.state_dict()``: weight and bias, behind
+    them scale and shift of a normalization, and the running mean and variance of one of batches.
 
     Args:
         net: exactly one of this library's types, since a subclass may compute something else.
@@ -38,10 +45,12 @@ def layers_of(net: nn.Module) -> list[Layer] | None:
         if type(module) is StackedLinear:
             inputs, outputs = module.weight.shape[-2:]
             joined = inputs - layers[-1].outputs if layers else 0
-            layers.append(Layer(inputs, outputs, joined, Activation.NONE, 0))
+            layers.append(Layer(inputs, outputs, joined, Activation.NONE, Norm.PLAIN))
             fresh = True
-        elif type(module) is StackedLayerNorm and fresh and not layers[-1].normalized:
-            layers[-1].normalized = 1
+        elif type(module) is StackedBatchNorm and not layers and _is_plain(module):
+            layers.append(Layer(0, module.weight.shape[-1], 0, Activation.NONE, Norm.BATCHNORM))
+        elif type(module) in _NORMS and fresh and not layers[-1].norm and _is_plain(module):
+            layers[-1].norm = _NORMS[type(module)]
         elif type(module) in _ACTIVATIONS and fresh and _is_plain(module):
             layers[-1].activation, fresh = _ACTIVATIONS[type(module)], False
         else:
@@ -49,18 +58,21 @@ def layers_of(net: nn.Module) -> list[Layer] | None:
     return layers
 
 
-def parameter_shapes(layers: Sequence[Layer]) -> list[tuple[int, int]]:
-    """The last two dimensions of the parameters that layers have, in order.
+def tensor_shapes(layers: Sequence[Layer]) -> list[tuple[int, int]]:
+    """The last two dimensions of the parameters and running statistics that layers have, in order.
 
     Example:
-        >>> parameter_shapes(layers_of(ActorNet(4, 2, hidden=8, depth=2, norm="layer")))[:4]
+        >>> tensor_shapes(layers_of(ActorNet(4, 2, hidden=8, depth=2, norm="layer")))[:4]
         [(4, 8), (1, 8), (1, 8), (1, 8)]
     """
     shapes = []
     for layer in layers:
-        shapes += [(layer.inputs, layer.outputs), *[(1, layer.outputs)] * (3 if layer.normalized else 1)]
+        product = [(layer.inputs, layer.outputs), (1, layer.outputs)] if layer.inputs else []
+        shapes += [*product, *[(1, layer.outputs)] * (2 * layer.norm)]
     return shapes
 
 
 def _is_plain(module: nn.Module) -> bool:
+    if isinstance(module, StackedBatchNorm):
+        return module.training
     return not isinstance(module, nn.ELU) or module.alpha == 1.0

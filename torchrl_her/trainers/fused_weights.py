@@ -21,7 +21,8 @@ _STATE = ("exp_avg", "exp_avg_sq", "step")  # what Adam keeps of a parameter
 class FusedWeights:
     """The weights of a loss, network by network, as memory that the steps work on.
 
-    A stack of N critics has parameters [N, R, ...]; for the steps these are N networks.
+    A stack of N critics has parameters [N, R, ...]; for the steps these are N networks. Running statistics
+    have targets, but no moments.
 
     Args:
         loss: one that can be fused.
@@ -30,7 +31,7 @@ class FusedWeights:
 
     Attributes:
         parameters: of the actor, the critics and SAC's temperature.
-        actor_tensors, critic_tensors: how many of them an actor and a critic have.
+        actor_tensors, critic_tensors: how many parameters and running statistics an actor and a critic have.
         critics: N.
     """
 
@@ -44,7 +45,9 @@ class FusedWeights:
         stacked = hasattr(loss, "num_qvalue_nets")
         self.actor_tensors, self.critic_tensors = len(actor), len(critic)
         temperature = [(loss.log_alpha, None)] if is_stochastic else []
-        self.parameters: list[nn.Parameter] = [own for own, _ in (*actor, *critic, *temperature)]
+        self.parameters: list[nn.Parameter] = [
+            own for own, _ in (*actor, *critic, *temperature) if isinstance(own, nn.Parameter)
+        ]
         # Each tensor of each network: which parameter, its target, and which of how many critics in it.
         self._places = [
             *((own, delayed, 0, 1) for own, delayed in actor),
@@ -78,7 +81,7 @@ class FusedWeights:
                 (own.data_ptr(), [state[name] for name in _STATE])
                 for own, state in zip(self.parameters, states, strict=True)
             ]
-            rows = [self._row(*place, self._optimizer.state[place[0]]) for place in self._places]
+            rows = [self._row(*place) for place in self._places]
             kind = self._kinds.tensors
             self._table = (kind * len(rows))(*(kind(*row) for row in rows))
         return self._table
@@ -86,7 +89,7 @@ class FusedWeights:
     def _check(self, states: Sequence[State]) -> None:
         """Raises a ValueError for memory that the steps must not touch."""
         for parameter, target, *_ in self._places:
-            moments = (self._optimizer.state[parameter][name] for name in _STATE[:2])
+            moments = (self._state(parameter).get(name) for name in _STATE[:2])
             for tensor in (parameter, target, *moments):
                 if tensor is None:
                     continue
@@ -107,6 +110,10 @@ class FusedWeights:
         """How many steps Adam has made: of each run, or of all together."""
         return self._optimizer.state[self.parameters[0]]["step"].flatten().tolist()
 
+    def _state(self, tensor: Tensor) -> State:
+        """What Adam keeps of a parameter; nothing of running statistics."""
+        return self._optimizer.state.get(tensor, {})
+
     def _start(self, parameter: nn.Parameter) -> State:
         """The first state of a parameter, as Adam itself makes it at its first step."""
         if isinstance(self._optimizer, RunsAdam):
@@ -116,20 +123,17 @@ class FusedWeights:
         state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter.data) for _ in range(2))
         return state
 
-    @staticmethod
-    def _row(
-        parameter: nn.Parameter, target: Tensor | None, critic: int, critics: int, state: State
-    ) -> Sequence[Any]:
-        height, width = parameter.shape[-2:] if parameter.ndim > 1 else (1, 1)
-        offset = critic * (parameter.numel() // critics)
-        tensors = (parameter, target, state["exp_avg"], state["exp_avg_sq"])
-        counter = state["step"].data_ptr() if critic == 0 else None  # a stack of critics has one
+    def _row(self, own: Tensor, target: Tensor | None, critic: int, critics: int) -> Sequence[Any]:
+        height, width = own.shape[-2:] if own.ndim > 1 else (1, 1)
+        offset, state = critic * (own.numel() // critics), self._state(own)
+        tensors = (own, target, state.get("exp_avg"), state.get("exp_avg_sq"))
+        counter = _address(state.get("step"), 0) if critic == 0 else None  # a stack of critics has one
         return height, width, *(_address(each, offset) for each in tensors), counter
 
 
-def _tensors(loss: LossModule, network: str, *, delayed: bool) -> list[tuple[nn.Parameter, Tensor | None]]:
-    """A network's parameters and their targets, in the order of its layers."""
-    names = [name for name, _ in getattr(loss, network).named_parameters()]
+def _tensors(loss: LossModule, network: str, *, delayed: bool) -> list[tuple[Tensor, Tensor | None]]:
+    """A network's parameters and running statistics with their targets, in the order of its layers."""
+    names = getattr(loss, network).state_dict()
     online = getattr(loss, f"{network}_params").flatten_keys(".")
     if not delayed:
         return [(online[name], None) for name in names]

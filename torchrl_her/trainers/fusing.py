@@ -14,10 +14,10 @@ from torchrl.objectives import DQNLoss, HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import TD0Estimator
 
-from torchrl_her.modules.networks import ActorNet, CriticNet
+from torchrl_her.modules.networks import ActorNet, CriticNet, StackedBatchNorm
 from torchrl_her.modules.q_actor import QNet
 from torchrl_her.modules.stochastic_actor import StochasticActorNet
-from torchrl_her.native.job import STOCHASTIC, Algorithm
+from torchrl_her.native.job import STOCHASTIC, Algorithm, Norm
 from torchrl_her.objectives.cloning import ClonesDemonstrations
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss
 from torchrl_her.objectives.sac import PenalizedSACLoss
@@ -26,7 +26,7 @@ from torchrl_her.objectives.td3 import PenalizedTD3Loss
 from torchrl_her.objectives.tqc import PenalizedTQCLoss
 from torchrl_her.torchrl_private import has_keyword_arguments
 from torchrl_her.trainers.adam import RunsAdam
-from torchrl_her.trainers.fused_layers import layers_of, parameter_shapes
+from torchrl_her.trainers.fused_layers import layers_of, tensor_shapes
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,11 @@ def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | Non
         or target.loss_module is not loss
     ):
         return "targets that do not follow this loss by a SoftUpdate or HardUpdate"
-    return next(_obstacles(loss, FUSED[type(loss)]), None)
+    fused = FUSED[type(loss)]
+    has_statistics = any(isinstance(module, StackedBatchNorm) for module in _modules(loss, fused))
+    if has_statistics and type(target) is SoftUpdate:
+        return "running statistics that this SoftUpdate does not move, but that of make_target_updater does"
+    return next(_obstacles(loss, fused), None)
 
 
 def is_plain_adam(optimizer: torch.optim.Optimizer, loss: LossModule | None = None) -> bool:
@@ -208,9 +212,11 @@ def _strange_networks(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
         if type(net) is not kind:
             yield f"a {type(net).__name__} as network of {name}"
         elif (layers := layers_of(net)) is None:
-            yield f"other layers than those of a plain {kind.__name__} without batch normalization"
-        elif [tuple(p.shape[-2:]) for p in net.parameters()] != parameter_shapes(layers):
+            yield f"other layers than those of a plain {kind.__name__} in training mode"
+        elif [tuple(own.shape[-2:]) for own in net.state_dict().values()] != tensor_shapes(layers):
             yield f"parameters beside those of the layers in {name}"
+        elif fused.algorithm is not Algorithm.DDPG and any(own.norm == Norm.BATCHNORM for own in layers):
+            yield f"batch normalization in {name} of a {type(loss).__name__}"
         elif kind is CriticNet and fused.algorithm is not Algorithm.TQC and layers[-1].outputs != 1:
             yield f"critics with {layers[-1].outputs} outputs"
         inner = module[0] if isinstance(module, TensorDictSequential) else module

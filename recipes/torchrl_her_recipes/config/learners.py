@@ -37,7 +37,6 @@ class LearnerConfig(Group):
         ("normalize", bool, "normalize_clip normalize_least_std"),
         ("hard_update_interval", not_, "tau"),
         ("compile", "never".__ne__, "products"),
-        ("norm", "batch".__ne__, "products"),
         ("hidden", lambda width: width >= 32, "products"),
     )
     has_epsilon: ClassVar[bool] = False

@@ -44,7 +44,6 @@ IDLE: list[tuple[dict[str, Any], dict[str, Any]]] = [
     ({"processes": 0}, {"sync": False}),
     ({"compile": "never"}, {"products": "bfloat16"}),
     ({"dtype": "float64"}, {"products": "bfloat16"}),
-    ({"norm": "batch"}, {"products": "bfloat16"}),
     ({"hidden": 31}, {"products": "bfloat16"}),
     ({}, {"demonstrations.file": "demos.pt"}),
     ({}, {"demonstrations.share": 0.3}),

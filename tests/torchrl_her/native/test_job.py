@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from enum import IntEnum
 from pathlib import Path
 
 import pytest
 import torch
 
 import torchrl_her.native
-from torchrl_her.native import Activation, Algorithm, Layer, structures
+from torchrl_her.native import Activation, Algorithm, Layer, Norm, structures
 
 SOURCES = "".join(
     (Path(torchrl_her.native.__file__).parent / name).read_text(encoding="utf-8")
@@ -38,8 +39,10 @@ def test_the_layer_has_the_same_order() -> None:
     assert [name for name, _ in Layer._fields_] == fields_in_c("Layer")
 
 
-@pytest.mark.parametrize(("name", "kind"), [("Algorithm", Algorithm), ("Activation", Activation)])
-def test_words_have_the_same_numbers(name: str, kind: type[Algorithm] | type[Activation]) -> None:
+@pytest.mark.parametrize(
+    ("name", "kind"), [("Algorithm", Algorithm), ("Activation", Activation), ("Norm", Norm)]
+)
+def test_words_have_the_same_numbers(name: str, kind: type[IntEnum]) -> None:
     body = re.search(rf"enum {name} \{{(.*?)\}};", SOURCES)
     assert body is not None
     assert [word.strip().removeprefix("k").upper() for word in body[1].split(",")] == [

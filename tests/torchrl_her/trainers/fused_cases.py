@@ -25,7 +25,7 @@ from torchrl_her import (
 from torchrl_her.modules import RunNoise
 
 WIDTHS, ACTIONS = (4, 2), 3
-ALGORITHMS = ("ddpg", "td3", "sac", "redq", "tqc", "dqn")
+ALGORITHMS = ("ddpg", "normalized", "td3", "sac", "redq", "tqc", "dqn")
 QUANTILES = 5
 
 
@@ -44,9 +44,9 @@ def make_loss(
     """A loss with small networks and random numbers of its own; actions have three different ranges.
 
     ``bounded`` says whether targets are clamped, in place of what is usual for the algorithm; ``redq`` is SAC
-    with targets of two critics at random.
+    with targets of two critics at random, ``normalized`` DDPG with batch normalization in the critic.
     """
-    usual = algorithm in ("ddpg", "td3", "dqn")
+    usual = algorithm in ("ddpg", "normalized", "td3", "dqn")
     clamped: dict[str, Any] = {
         "reward_range": (-0.02, 0.0) if (usual if bounded is None else bounded) else None
     }
@@ -59,8 +59,9 @@ def make_loss(
         actor = make_q_actor(WIDTHS, ACTIONS, **options)[0].to(dtype)
         return make_dqn_loss(actor, reduction="none", **clamped)
     outputs = QUANTILES if algorithm == "tqc" else 1
-    critic = make_critic(WIDTHS, ACTIONS, outputs=outputs, **options).to(dtype)
-    if algorithm == "ddpg":
+    of_critic = options | ({"norm": "batch"} if algorithm == "normalized" else {})
+    critic = make_critic(WIDTHS, ACTIONS, outputs=outputs, **of_critic).to(dtype)
+    if algorithm in ("ddpg", "normalized"):
         actor = make_actor(WIDTHS, ACTIONS, **options).to(dtype)
         costs = {"action_penalty": penalty, "saturation_penalty": saturation_penalty}
         return make_ddpg_loss(actor, critic, reduction="none", **costs, **clamped)

@@ -13,7 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
+from torchrl.objectives import HardUpdate, LossModule
 
 from tests.torchrl_her.trainers.fused_cases import ALGORITHMS, make_loss, make_rows, twin
 from torchrl_her import (
@@ -29,7 +29,9 @@ from torchrl_her.trainers.runs import run_dims
 
 
 def make_learner(kind: type, loss: LossModule, *, runs: int = 1, hard: int = 0, norm: float = 0.5) -> Any:
-    target = HardUpdate(loss, value_network_update_interval=hard - 1) if hard else SoftUpdate(loss, tau=0.1)
+    target: Any = HardUpdate(loss, value_network_update_interval=hard - 1)
+    if not hard:
+        target = make_target_updater(loss, tau=0.1, hard_interval=0)
     options = {"runs": runs} if kind is LossLearner else {}
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
     return kind(loss, optimizer, target, max_grad_norm=norm, **options)
@@ -49,7 +51,9 @@ def check_equal(
     first: Learner, second: Learner, rows: Callable[[int], TensorDict], steps: int, **kinds: Any
 ) -> None:
     """Some updates of both; what is measured, the priorities, weights, targets and moments."""
-    close: dict[str, Any] = {"rtol": 0.0, "atol": 1e-12, "check_dtype": False} | kinds
+    # Before a batch normalization the true gradient of a bias is 0: Adam magnifies what rounding makes of it.
+    atol = 1e-9 if any("running" in name for name in first.loss.state_dict()) else 1e-12
+    close: dict[str, Any] = {"rtol": 0.0, "atol": atol, "check_dtype": False} | kinds
     key = first.loss.tensor_keys.priority
     for seed in range(3):
         own = [rows(seed), rows(seed)]
@@ -135,6 +139,8 @@ def test_networks_of_any_shape(
 ) -> None:
     torch.manual_seed(seed)
     shape: dict[str, Any] = {"hidden": hidden, "depth": depth, "activation": activation, "norm": norm}
+    if algorithm == "normalized":
+        batch = max(batch, 4)  # two rows are normalized to 1 and -1: what is left is rounding
     first, second = both(make_loss(algorithm, runs=runs, critics=critics, **shape), runs=runs)
     # A layer normalization of a single unit, or of units that are nearly alike, magnifies rounding errors.
     check_equal(first, second, lambda own: make_rows(algorithm, (runs, 2 * batch), seed + own), 2, atol=1e-9)
@@ -202,7 +208,7 @@ def test_a_run_is_the_same_beside_others(algorithm: str) -> None:
 def test_idle_runs_stay_as_they_are_from_the_first_step_on(algorithm: str) -> None:
     loss = make_loss(algorithm, runs=3)
     optimizer = RunsAdam(loss, lr=1e-2, runs=3)
-    learner = FusedLearner(loss, optimizer, SoftUpdate(loss, tau=0.1))
+    learner = FusedLearner(loss, optimizer, make_target_updater(loss, tau=0.1, hard_interval=0))
     before = {name: value.clone() for name, value in loss.state_dict().items()}
     learner.update(make_rows(algorithm, (3, 8)), idle=[1])
     for name, value in loss.state_dict().items():
@@ -230,9 +236,10 @@ def test_a_run_that_was_idle_learns_as_with_torchrl_s_loss(algorithm: str, hard:
             rows = make_rows(algorithm, (3, 24), number)
             learning = [run for run in range(3) if run not in idle]
             measured.append([values[:, learning] for values in learner.update(rows, 3, idle=idle).values()])
-    torch.testing.assert_close(measured[:4], measured[4:], atol=1e-12, rtol=0)
+    close = {"atol": 1e-9 if algorithm == "normalized" else 1e-12, "rtol": 0.0}
+    torch.testing.assert_close(measured[:4], measured[4:], **close)
     for name, value in losses[0].state_dict().items():
-        torch.testing.assert_close(value, losses[1].state_dict()[name], atol=1e-12, rtol=0)
+        torch.testing.assert_close(value, losses[1].state_dict()[name], **close)
 
 
 def test_idle_runs_need_counts_of_their_own() -> None:
@@ -247,13 +254,14 @@ def test_idle_runs_need_counts_of_their_own() -> None:
         learner.update(rows, idle=[1])
 
 
-def test_a_checkpoint_in_between_changes_nothing() -> None:
-    first, second = both(make_loss("td3"))
+@pytest.mark.parametrize("algorithm", ["td3", "normalized"])
+def test_a_checkpoint_in_between_changes_nothing(algorithm: str) -> None:
+    first, second = both(make_loss(algorithm))
     for learner in (first, second):
-        learner.update(make_rows("td3", (1, 8)))
+        learner.update(make_rows(algorithm, (1, 8)))
         learner.optimizer.load_state_dict(deepcopy(learner.optimizer.state_dict()))  # has new tensors now
         learner.loss.load_state_dict(deepcopy(learner.loss.state_dict()))
-    check_equal(first, second, lambda seed: make_rows("td3", (1, 8), seed), 1)
+    check_equal(first, second, lambda seed: make_rows(algorithm, (1, 8), seed), 1)
     assert second.optimizer.state_dict()["state"][0]["step"] == 4
 
 
@@ -350,6 +358,11 @@ def test_actions_that_there_are_not_are_refused() -> None:
     rows["action"][0, 3] = 3
     with pytest.raises(ValueError, match=r"actions must be from 0 to 2, got \["):
         make_learner(FusedLearner, make_loss("dqn")).update(rows)
+
+
+def test_a_batch_of_one_row_has_no_statistics() -> None:
+    with pytest.raises(ValueError, match="at least 2 rows for batch normalization, got 1"):
+        make_learner(FusedLearner, make_loss("normalized", runs=2)).update(make_rows("ddpg", (2, 3)), 3)
 
 
 def test_rows_must_be_a_whole_number_of_batches() -> None:

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import LossModule
 
-from tests.torchrl_her.trainers.fused_cases import make_loss, make_rows, twin
-from torchrl_her import FusedLearner, LossLearner
+from tests.torchrl_her.trainers.fused_cases import ALGORITHMS, make_loss, make_rows, twin
+from torchrl_her import FusedLearner, LossLearner, make_target_updater
 from torchrl_her.modules.networks import StackedLinear
 
 HIDDEN, BATCH = 40, 25  # neither of them a multiple of a vector, and an odd number of rows
@@ -59,10 +59,11 @@ def slopes_of(learner: Any, rows: Any) -> Tensor:
 
 def make(kind: Callable[..., Any], loss: LossModule, **options: Any) -> Any:
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
-    return kind(loss, optimizer, SoftUpdate(loss, tau=0.1), max_grad_norm=1e9, **options)
+    target = make_target_updater(loss, tau=0.1, hard_interval=0)
+    return kind(loss, optimizer, target, max_grad_norm=1e9, **options)
 
 
-@pytest.mark.parametrize("algorithm", ["ddpg", "td3", "sac", "redq", "tqc", "dqn"])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("norm", ["none", "layer"])
 def test_factors_between_hidden_layers_are_rounded(
     algorithm: str, norm: str, monkeypatch: pytest.MonkeyPatch

@@ -9,16 +9,16 @@ from typing import Any
 import pytest
 import torch
 from torchrl.data import Bounded
-from torchrl.objectives import DDPGLoss, HardUpdate, LossModule, SoftUpdate, ValueEstimators
+from torchrl.objectives import DDPGLoss, LossModule, SoftUpdate, ValueEstimators
 
 from tests.torchrl_her.trainers.fused_cases import ALGORITHMS, make_loss
 from torchrl_her import (
     FusedLearner,
     make_actor,
     make_critic,
-    make_ddpg_loss,
     make_sac_loss,
     make_stochastic_actor,
+    make_target_updater,
     make_tqc_loss,
 )
 from torchrl_her.objectives import PenalizedDDPGLoss, clamped_td0
@@ -26,12 +26,10 @@ from torchrl_her.trainers import is_plain_adam, why_not_fused
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-@pytest.mark.parametrize("update", [lambda loss: SoftUpdate(loss, tau=0.1), lambda loss: HardUpdate(loss)])
-def test_all_losses_of_this_library_can_be_fused(
-    algorithm: str, update: Callable[[LossModule], SoftUpdate | HardUpdate]
-) -> None:
+@pytest.mark.parametrize("hard", [0, 2])
+def test_all_losses_of_this_library_can_be_fused(algorithm: str, hard: int) -> None:
     loss = make_loss(algorithm, norm="layer", activation="elu", depth=2)
-    assert why_not_fused(loss, update(loss)) is None
+    assert why_not_fused(loss, make_target_updater(loss, tau=0.1, hard_interval=hard)) is None
 
 
 def test_only_a_plain_adam_is_fused() -> None:
@@ -158,10 +156,18 @@ def test_critics_of_quantiles_are_those_of_tqc_alone() -> None:
     assert why_not_fused(loss, SoftUpdate(loss, tau=0.1)) is None
 
 
+def test_batch_normalization_must_learn_and_its_targets_must_follow() -> None:
+    loss = make_loss("normalized")
+    assert "running statistics that this SoftUpdate" in str(why_not_fused(loss, SoftUpdate(loss, tau=0.1)))
+    loss.value_network.eval()
+    target = make_target_updater(loss, tau=0.1, hard_interval=0)
+    assert "a plain CriticNet in training mode" in str(why_not_fused(loss, target))
+    values = make_loss("dqn", norm="batch")
+    target = make_target_updater(values, tau=0.1, hard_interval=0)
+    assert why_not_fused(values, target) == "batch normalization in value_network of a DQNLoss"
+
+
 def test_other_networks_targets_and_losses_are_refused() -> None:
-    normalized = make_critic((4, 2), 3, norm="batch")
-    loss = make_ddpg_loss(make_actor((4, 2), 3), normalized)
-    assert "without batch normalization" in str(why_not_fused(loss, SoftUpdate(loss, tau=0.1)))
     loss = make_loss("ddpg")
     assert why_not_fused(loss, SoftUpdate(make_loss("ddpg"), tau=0.1)) is not None
     assert why_not_fused(loss, None) is not None
