@@ -7,11 +7,11 @@ from .config.algorithms import ALGORITHMS as ALGORITHMS
 from .config.algorithms import Algorithm as Algorithm
 from .config.algorithms import get_algorithm as get_algorithm
 from .config.algorithms import register_algorithm as register_algorithm
+from .config.behavior import BEHAVIOR as BEHAVIOR
+from .config.behavior import Proposed as Proposed
 from .config.imports import allow_imports as allow_imports
 from .config.learners import LEARNERS as LEARNERS
 from .config.learners import LearnerConfig as LearnerConfig
-from .config.learners import LearnerSpec as LearnerSpec
-from .config.learners import register_learner as register_learner
 from .config.loggers import LOGGERS as LOGGERS
 from .config.loggers import LoggerSpec as LoggerSpec
 from .config.loggers import register_logger as register_logger

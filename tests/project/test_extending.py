@@ -1,4 +1,4 @@
-"""The page on extending: each of its five examples runs as it is written, from its files to its last line."""
+"""The page on extending: each of its six examples runs as it is written, from its files to its last line."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from torchrl_her_envs import registry
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config import imports
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
+from torchrl_her_recipes.config.behavior import BEHAVIOR
 from torchrl_her_recipes.config.learners import LEARNERS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "extending.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL))
-REGISTRIES: tuple[dict, ...] = (STRATEGIES, registry._SPECS, ALGORITHMS, LEARNERS)
+REGISTRIES: tuple[dict, ...] = (STRATEGIES, registry._SPECS, ALGORITHMS, LEARNERS, BEHAVIOR)
 
 
 def blocks(section: str) -> tuple[dict[str, str], list[str]]:
@@ -52,8 +53,15 @@ def registered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None
             del sys.modules[name]
 
 
-def test_the_page_has_five_examples_and_names_them_all() -> None:
-    assert list(SECTIONS) == ["A goal strategy", "Weights", "A task", "A learner", "A study"]
+def test_the_page_has_six_examples_and_names_them_all() -> None:
+    assert list(SECTIONS) == [
+        "A goal strategy",
+        "Weights",
+        "A task",
+        "A learner",
+        "Behavior goals",
+        "A study",
+    ]
     for section in SECTIONS:
         assert f"(#{section.lower().replace(' ', '-')})" in PAGE
         files, uses = blocks(section)
@@ -89,6 +97,6 @@ def test_the_command_of_the_page_knows_the_task(tmp_path: Path, capsys: pytest.C
     for name, text in blocks("A task")[0].items():
         (tmp_path / name).write_text(text)
     invalidate_caches()
-    (command,) = re.findall(r"`torchrl-her (--import .*?)`", PAGE)
+    (command,) = re.findall(r"`torchrl-her (--import point_task .*?)`", PAGE)
     assert main([*command.split(), "--show"]) == 0
     assert "name: point" in capsys.readouterr().out

@@ -6,6 +6,7 @@ import click
 
 from torchrl_her_envs.registry import GYM, get_task_spec, task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
+from torchrl_her_recipes.config.behavior import BEHAVIOR
 from torchrl_her_recipes.config.learners import LEARNERS
 from torchrl_her_recipes.config.policy_header import read_header
 from torchrl_her_recipes.config.shipped import policy_names, policy_path, preset_names, preset_summary
@@ -14,7 +15,7 @@ from torchrl_her_recipes.config.study import load_study, study_names
 
 
 @click.command(
-    "list", short_help="tasks, algorithms, learners, studies, policies, spaces of searches, presets"
+    "list", short_help="tasks, algorithms, learners, behavior goals, studies, policies, spaces, presets"
 )
 def listing() -> int:
     """List what there is."""
@@ -23,7 +24,8 @@ def listing() -> int:
         | {f"{GYM}ID": "any gymnasium environment with goals, by its id (gym:my_module:MyEnv-v0)"}
         | {"my_module:make_env": "a TorchRL environment of your own, by its function or class"},
         "algorithms": {name: algorithm.summary for name, algorithm in ALGORITHMS.items()},
-        "learners": {name: spec.summary for name, spec in LEARNERS.items()},
+        "learners": LEARNERS.summaries(),
+        "behavior goals": BEHAVIOR.summaries(),
         "studies": {name: load_study(name).summary for name in study_names()},
         "trained policies": {
             name: f"{read_header(policy_path(name))['info']['success']:.0%} success"

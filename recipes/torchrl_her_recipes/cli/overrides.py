@@ -8,10 +8,9 @@ from typing import Any
 
 from torchrl_her_envs.registry import task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
-from torchrl_her_recipes.config.learners import LEARNERS
 from torchrl_her_recipes.config.plain_files import parse_yaml
 from torchrl_her_recipes.config.shipped import preset_names
-from torchrl_her_recipes.config.shortcuts import GROUPS, locate
+from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, locate
 
 ARGUMENTS = ("preset", "folder")  # besides options; names, even if YAML reads something else in them
 _OPENING, _CLOSING = "[{(", "]})"
@@ -72,7 +71,7 @@ def _meant(text: str) -> str:
     for name, known in (
         ("task", task_names()),
         ("algo", ALGORITHMS),
-        ("learner", LEARNERS),
+        *KINDS.items(),
         ("preset", preset_names()),
     ):
         if text in known:

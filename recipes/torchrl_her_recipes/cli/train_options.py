@@ -15,12 +15,11 @@ from torchrl_her_envs.registry import task_names
 from torchrl_her_recipes.cli.overrides import ARGUMENTS, check_once, parse_override, split_sweep, sweep
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
-from torchrl_her_recipes.config.learners import LEARNERS, options_of
-from torchrl_her_recipes.config.options import AUTO, default_of
+from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe, make_recipe
 from torchrl_her_recipes.config.shipped import load_preset, preset_names
-from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, option_names
+from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, LONG_ONLY, choices_of, option_names
 
 folder_option = click.option("--folder", metavar="DIR", help="output folder")
 
@@ -104,27 +103,25 @@ class OptionsCommand(click.Command):
         with formatter.section("Besides options"):
             formatter.write_dl([("preset=NAME", presets), ("folder=DIR", folder)])
         for group, kind in GROUPS.items():
-            kind = options_of("ddpg") if group == "learner" else kind
-            rows = [
-                (_written(group, own.name, default_of(own)), own.metadata["help"]) for own in fields(kind)
-            ]
-            if group == "learner":
-                rows += _of_other_learners()
-            doc = (GROUPS[group].__doc__ or "").splitlines()[0].rstrip(".")
+            doc = (kind.__doc__ or "").splitlines()[0].rstrip(".")
             with formatter.section(f"{group}: {doc[0].lower()}{doc[1:]}"):
-                formatter.write_dl(rows)
+                formatter.write_dl(list(_rows(group)))
 
 
-def _of_other_learners() -> Iterator[tuple[str, str]]:
-    """The options that the default learner does not have, or has with another default; and who has them."""
-    known = {(own.name, default_of(own)) for own in fields(options_of("ddpg"))}
-    learners: dict[tuple[str, str], list[str]] = {}  # of an option as it is written, with its default
-    for spec in LEARNERS.values():
-        for own in fields(spec.options):
-            if (own.name, default_of(own)) not in known:
-                shown = _written("learner", own.name, default_of(own)), own.metadata["help"]
-                learners.setdefault(shown, []).append(spec.name)
-    for (written, help), names in learners.items():
+def _rows(group: str) -> Iterator[tuple[str, str]]:
+    """The options of a group and their help, with the choices that have them if the default has not."""
+    if kind := KINDS.get(group):
+        known = f"one of {', '.join(kind)}; `torchrl-her list` describes them"
+        yield _written(group, "name", kind.default), known
+    first, *_ = choices = choices_of(group)
+    plain = {_written(group, own.name, own.default): own.metadata["help"] for own in fields(choices[first])}
+    yield from plain.items()
+    others: dict[tuple[str, str], list[str]] = {}
+    for name, choice in choices.items():
+        for own in fields(choice):
+            if (written := _written(group, own.name, own.default)) not in plain:
+                others.setdefault((written, own.metadata["help"]), []).append(name)
+    for (written, help), names in others.items():
         yield written, f"{help} ({', '.join(names)})"
 
 
@@ -144,7 +141,7 @@ def complete(_context: click.Context, _parameter: click.Parameter, incomplete: s
         return [CompletionItem(f"{name}={own}") for own in _values().get(name, []) if own.startswith(begun)]
     short = {group: names for group, names in options.items() if group not in LONG_ONLY}
     known = [own for names in short.values() for own in names if own != "name"]
-    names = ["task", "algo", "learner", "curriculum", *ARGUMENTS, *known]
+    names = ["task", "algo", "curriculum", *KINDS, *ARGUMENTS, *known]
     if "." in name:
         names = [f"{group}.{own}" for group, own_names in options.items() for own in own_names]
     return [CompletionItem(f"{own}=") for own in dict.fromkeys(names) if own.startswith(name)]
@@ -152,12 +149,11 @@ def complete(_context: click.Context, _parameter: click.Parameter, incomplete: s
 
 def _values() -> dict[str, list[str]]:
     """The values of options that are names or one of a few choices."""
-    kinds = [options_of("ddpg") if group == "learner" else kind for group, kind in GROUPS.items()]
-    choices = {own.name: list(own.metadata["choices"]) for kind in kinds for own in fields(kind)}
-    return choices | {
+    classes = [next(iter(choices_of(group).values())) for group in GROUPS]
+    choices = {own.name: list(own.metadata["choices"]) for kind in classes for own in fields(kind)}
+    return {**choices, **{group: list(kind) for group, kind in KINDS.items()}} | {
         "task": task_names(),
         "algo": list(ALGORITHMS),
-        "learner": ["auto", *LEARNERS],
         "preset": preset_names(),
         "strategy": list(STRATEGIES),
     }

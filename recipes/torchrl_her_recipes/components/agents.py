@@ -22,8 +22,8 @@ from torchrl_her_recipes.components.curricula import is_guided
 from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.learner import Agent, LearnerBuilder, Networks
 from torchrl_her_recipes.components.normalization import acting, make_norm
-from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, Actions, LearnerSpec
-from torchrl_her_recipes.config.options import default_of
+from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, Actions, LearnerConfig
+from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
 
@@ -83,7 +83,7 @@ def make_agent(
     )
 
 
-def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:
+def find_learner(recipe: Recipe, env: EnvBase) -> type[LearnerConfig]:
     """The learner of a recipe; "auto" is DDPG where actions are continuous, and DQN where they are discrete.
 
     Raises:
@@ -91,25 +91,23 @@ def find_learner(recipe: Recipe, env: EnvBase) -> LearnerSpec:
             with it.
     """
     actions: Actions = "discrete" if isinstance(env.action_spec, Categorical) else "continuous"
-    name = BY_ACTIONS[actions] if recipe.learner.name == "auto" else recipe.learner.name
-    spec = LEARNERS[name]
-    if spec.actions != actions:
+    learner = LEARNERS[BY_ACTIONS[actions]] if recipe.learner.name == AUTO else type(recipe.learner)
+    if learner.actions != actions:
         fitting = " or ".join(each.name for each in LEARNERS.values() if each.actions == actions)
         raise ValueError(
-            f"learner={name} must not be used on {recipe.task.name}, which has {actions} actions: "
+            f"learner={learner.name} must not be used on {recipe.task.name}, which has {actions} actions: "
             f"choose {fitting}"
         )
-    if not spec.stacks and recipe.run.num_runs > 1:
+    if not learner.stacks and recipe.run.num_runs > 1:
         raise ValueError(
-            f"num_runs must be 1 with learner={name}, which cannot train several runs side by side, "
+            f"num_runs must be 1 with learner={learner.name}, which cannot train several runs side by side, "
             f"got {recipe.run.num_runs}; sweep over seeds instead"
         )
-    known = {own.name for own in fields(spec.options)}
     for own in fields(recipe.learner):  # "auto" has the options of DDPG
         value = getattr(recipe.learner, own.name)
-        if own.name not in known and value != default_of(own):
-            raise ValueError(f"{own.name}={value} has no effect with learner={name}: leave it out")
-    return spec
+        if not hasattr(learner, own.name) and value != own.default:
+            raise ValueError(f"{own.name}={value} has no effect with learner={learner.name}: leave it out")
+    return learner
 
 
 def make_player(
@@ -168,4 +166,4 @@ def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | 
 
 def _builder(recipe: Recipe, env: EnvBase, curriculum: Curriculum | None) -> LearnerBuilder:
     in_keys = ("observation", "desired_goal") if curriculum is None else ("input",)
-    return load_name(find_learner(recipe, env).builder)(recipe, env, in_keys)
+    return load_name(find_learner(recipe, env).maker)(recipe, env, in_keys)

@@ -12,7 +12,7 @@ from torchrl_her.behavior import BehaviorGoals
 from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import goal_env, reward_bounds, reward_range
 from torchrl_her_recipes.components.agents import make_agent
-from torchrl_her_recipes.components.behavior import make_asking, make_behavior, make_factors
+from torchrl_her_recipes.components.behavior import make_asking, make_behavior
 from torchrl_her_recipes.components.buffers import make_buffer
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.components import Components
@@ -49,15 +49,15 @@ def build(recipe: Recipe) -> Components:
     curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
     state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
     rewards, bounds = reward_range(goal_env(task)), reward_bounds(goal_env(task))
-    behavior = make_behavior(recipe, task, rewards=rewards, space=space, state=state)
     shown = load_demonstrations(recipe, task, state)
-    env = _shown(recipe, task, state, behavior, None if shown is None else shown.starts)
+    played = partial(make_played_env, recipe, evaluation_envs(recipe), eval_seeds(recipe, 0))
+    eval_env = played()
     devices = devices_of(recipe)
     generators = make_generators(recipe.seeds, devices.replay)
     own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
-    agent = make_agent(recipe, env, own, rewards=bounds, curriculum=curriculum, device=devices.learner)
-    if behavior is not None:
-        behavior.factors += make_factors(recipe, agent, state, rewards)
+    agent = make_agent(recipe, eval_env, own, rewards=bounds, curriculum=curriculum, device=devices.learner)
+    behavior = make_behavior(recipe, task, agent, rewards=rewards, space=space, state=state)
+    env = _shown(recipe, task, state, behavior, None if shown is None else shown.starts)
     if processes:
         progress = None if state is None else state.progress
         collector = ProcessCollector(recipe, agent.policy, progress, storing_device=devices.replay)
@@ -68,12 +68,11 @@ def build(recipe: Recipe) -> Components:
     )
     if shown is not None and recipe.demonstrations.in_batches:
         shown.fill(replay(devices=devices, capacity=rows_needed(recipe, shown)), recipe.run.num_runs)
-    played = partial(make_played_env, recipe, evaluation_envs(recipe), eval_seeds(recipe, 0))
     virtual = recipe.evaluation.virtual_goals
     return Components(
         recipe=recipe,
         env=env,
-        eval_env=played(),
+        eval_env=eval_env,
         collector=collector,
         buffer=replay(devices=devices),
         goal_target=None if space is None else space.target,

@@ -1,19 +1,14 @@
-"""The behavior goals that a recipe asks for."""
+"""The goals that training proposes before an episode: makers of the choices in :mod:`..config.behavior`."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from torchrl.envs import EnvBase
 
-from torchrl_her.behavior import (
-    BehaviorGoals,
-    DiscoverScore,
-    GoalFactor,
-    GoalValues,
-    InverseDensity,
-    ValueCutoff,
-)
+from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalValues, InverseDensity, ValueCutoff
 from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top
@@ -21,22 +16,26 @@ from torchrl_her_recipes.components.envs import evaluation_envs, task_reward
 from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_instructive
 from torchrl_her_recipes.components.learner import Agent
 from torchrl_her_recipes.components.streams import Stream, generators_of
+from torchrl_her_recipes.config.behavior import IBS, Discover, Mega, Proposed, UniformAchieved
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.values import load_name
 
-_GREEDY = ("mega", "discover")
+MakeGoals = Callable[..., BehaviorGoals]
+MakeValues = Callable[[], GoalValues]
 
 
 def make_behavior(
     recipe: Recipe,
     env: EnvBase,
+    agent: Agent,
     *,
-    rewards: tuple[float, float] = (-1.0, 0.0),
-    space: GoalSpace | KernelSpace | None = None,
-    state: CurriculumState | None = None,
+    rewards: tuple[float, float],
+    space: GoalSpace | KernelSpace | None,
+    state: CurriculumState | None,
 ) -> BehaviorGoals | None:
-    """The transform that proposes goals, still without the factors that need networks; None without any."""
-    options = recipe.behavior
-    if options.name == "real":
+    """Returns the transform that proposes goals; None if episodes ask for the task's goals alone."""
+    options, runs = recipe.behavior, recipe.run.num_runs
+    if not isinstance(options, Proposed):
         return None
     if recipe.collection.processes > 0:
         raise ValueError(
@@ -48,26 +47,19 @@ def make_behavior(
             f"goal_memory={options.goal_memory} must be at least num_envs={recipe.collection.num_envs}, "
             "whose goals come at once"
         )
-    own = []
-    if options.name == "ibs" and space is not None:
-        own = [make_instructive(recipe, space) for _ in recipe.seeds]
-    top: dict[str, Any] = {}
+    given: dict[str, Any] = {"real_share": options.real_share, "memory": options.goal_memory}
     if state is not None and state.progress.by_episode:
-        top = {"layer_key": "layer", "layer": len(state.curriculum) - 1}
-    behavior = _goals(
-        recipe,
-        env,
-        rewards,
-        weights=own or None,
-        update_on="proposed" if options.name == "ibs" else "achieved",
-        greedy=options.name in _GREEDY,
-        real_share=options.real_share,
-        candidates=options.candidates,
-        memory=options.goal_memory,
-        **top,
+        given |= {"layer_key": "layer", "layer": len(state.curriculum) - 1}
+    pad = None if state is None else ZeroPad(state.curriculum, at_the_top(state.curriculum, runs))
+    values = partial(
+        GoalValues, agent.loss, agent.actor, runs=runs, before_actor=pad, before_critic=agent.norm
+    )
+    goals = partial(_goals, recipe, env, rewards, **given)
+    behavior: BehaviorGoals = load_name(options.maker)(
+        options, goals, recipe=recipe, rewards=rewards, space=space, values=values
     )
     if state is not None:
-        for run in range(recipe.run.num_runs):
+        for run in range(runs):
             behavior.set_active(state.at_the_top(run), run=run)
     return behavior
 
@@ -89,34 +81,43 @@ def _goals(recipe: Recipe, env: EnvBase, rewards: tuple[float, float], **options
     )
 
 
-def make_factors(
-    recipe: Recipe, agent: Agent, state: CurriculumState | None, rewards: tuple[float, float]
-) -> list[GoalFactor]:
-    """The factors of proposed goals that ask the agent's networks."""
-    name, runs = recipe.behavior.name, recipe.run.num_runs
-    if name not in _GREEDY:
-        return []
-    values = GoalValues(
-        agent.loss,
-        agent.actor,
-        runs=runs,
-        before_actor=None if state is None else ZeroPad(state.curriculum, at_the_top(state.curriculum, runs)),
-        before_critic=agent.norm,
-    )
-    if name == "mega":
-        return [InverseDensity(), ValueCutoff(values, runs=runs, **_cutoff(recipe, rewards))]
-    several = getattr(recipe.learner, "critics", 1) > 1  # their disagreement shows what is new
-    return [*([] if several else [InverseDensity()]), DiscoverScore(values, runs=runs)]
+def make_uniform(_options: UniformAchieved, goals: MakeGoals, **_: Any) -> BehaviorGoals:
+    """Proposes any achieved goal."""
+    return goals()
 
 
-def _cutoff(recipe: Recipe, rewards: tuple[float, float]) -> dict[str, float]:
-    """The cut-off of values, which the recipe gives for rewards of -1 and 0, for the rewards of the task."""
-    (missed, achieved), gamma = rewards, recipe.learner.gamma
+def make_ibs(options: IBS, goals: MakeGoals, *, recipe: Recipe, space: Any, **_: Any) -> BehaviorGoals:
+    """Proposes goals in proportion to q* - q, where q counts proposed goals."""
+    weights = [make_instructive(recipe, space) for _ in recipe.seeds]
+    return goals(weights=weights, update_on="proposed", candidates=options.candidates)
+
+
+def make_mega(
+    options: Mega, goals: MakeGoals, *, recipe: Recipe, rewards: Any, values: MakeValues, **_: Any
+) -> BehaviorGoals:
+    """Proposes the rarest achieved goal that the critic believes in."""
+    cutoffs = scaled_cutoffs(options.cutoff, recipe.learner.gamma, rewards)
+    factors = [InverseDensity(), ValueCutoff(values(), runs=recipe.run.num_runs, **cutoffs)]
+    return goals(factors=factors, greedy=True, candidates=options.candidates)
+
+
+def scaled_cutoffs(cutoff: float, gamma: float, rewards: tuple[float, float]) -> dict[str, float]:
+    """Returns the arguments of ``ValueCutoff`` for a cutoff that is given for rewards of -1 and 0."""
+    missed, achieved = rewards
 
     def value(cutoff: float) -> float:
         reached = min(1.0, max(0.0, 1.0 + cutoff * (1.0 - gamma)))  # gamma^d of a goal that takes d steps
         return missed * (1.0 - reached) / (1.0 - gamma) + achieved * reached
 
-    first = value(recipe.behavior.cutoff)
-    floor = value(-1.0 / (1.0 - gamma))
-    return {"cutoff": first, "floor": floor, "step": abs(value(-1.0) - value(0.0))}
+    floor, step = value(-1.0 / (1.0 - gamma)), abs(value(-1.0) - value(0.0))
+    return {"cutoff": value(cutoff), "floor": floor, "step": step}
+
+
+def make_discover(
+    options: Discover, goals: MakeGoals, *, recipe: Recipe, values: MakeValues, **_: Any
+) -> BehaviorGoals:
+    """Proposes the achievable and new goal that leads farthest towards the task's goal."""
+    several = getattr(recipe.learner, "critics", 1) > 1  # their disagreement shows what is new
+    score = DiscoverScore(values(), runs=recipe.run.num_runs)
+    factors = [score] if several else [InverseDensity(), score]
+    return goals(factors=factors, greedy=True, candidates=options.candidates)

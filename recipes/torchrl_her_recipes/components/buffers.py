@@ -28,7 +28,6 @@ from torchrl_her_recipes.components.envs import task_reward
 from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_goal_weights
 from torchrl_her_recipes.components.memory import check_buffer_size
 from torchrl_her_recipes.config.algorithms import get_algorithm
-from torchrl_her_recipes.config.learners import priority_power
 from torchrl_her_recipes.config.recipe import Recipe
 
 # Entries of a collected batch that no loss reads: not stored.
@@ -147,7 +146,7 @@ def _make_sampler(
     # Alpha is Schaul's, for absolute TD errors; most of TorchRL's losses give their squares.
     return RunsPrioritizedSampler(
         capacity,
-        alpha=options.priority_alpha / priority_power(recipe.learner.name),
+        alpha=options.priority_alpha / recipe.learner.priority_power,
         beta=options.priority_beta,
         runs=len(generators),
         generators=generators,

@@ -116,7 +116,7 @@ def load_demonstrations(
     recorded = _scaled(every.first(options.episodes), env).to(getattr(torch, recipe.run.dtype))
     own = RunDemonstrations(recorded, env, state)
     if options.as_starts:
-        if recipe.behavior.name != "real":
+        if recipe.behavior.maker:
             raise ValueError(
                 f"demonstrations.starts_share={options.starts_share} and behavior={recipe.behavior.name} "
                 "both choose the goals of episodes: leave one of them out"

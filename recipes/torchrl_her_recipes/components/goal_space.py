@@ -80,13 +80,13 @@ def goal_space(recipe: Recipe, env: EnvBase) -> GoalSpace | KernelSpace | None:
             start states, or a grid is asked for and they have too many coordinates for one.
     """
     task, algorithm = goal_env(env), recipe.hindsight.algo
-    proposed = recipe.behavior.name == "ibs"
+    proposed = recipe.behavior.instructive
     instructive = proposed or get_algorithm(algorithm).instructive
     if instructive and task.starts_near_goals:
+        user = f"behavior={recipe.behavior.name}" if proposed else algorithm
         raise ValueError(
-            f"{'behavior=ibs' if proposed else algorithm} must not be used on {recipe.task.name}: its goals "
-            "lie around its start states, so the goals that it would prefer are achieved without doing "
-            "anything; choose a throwing task"
+            f"{user} must not be used on {recipe.task.name}: its goals lie around its start states, so the "
+            "goals that it would prefer are achieved without doing anything; choose a throwing task"
         )
     box = task.goal_box()
     if instructive and _without_grid(recipe, task):

@@ -308,34 +308,6 @@ def _read_layers(path: Path) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BehaviorConfig(Group):
-    """Which goals the episodes of training ask for (behavior goals)."""
-
-    needs: ClassVar[Needs] = (
-        ("name", "real".__ne__, "real_share candidates goal_memory cutoff"),
-        ("name", "uniform_achieved".__ne__, "candidates"),
-        ("name", "mega".__eq__, "cutoff"),
-        ("real_share", (1.0).__ne__, "candidates goal_memory cutoff"),
-    )
-
-    name: str = option(
-        "real",
-        "real: those of the task. In some episodes goals that were achieved before: uniform_achieved, any of "
-        "them; ibs, instructive ones; mega, rare ones; discover, achievable ones towards the task's goal",
-        choices=("real", "uniform_achieved", "ibs", "mega", "discover"),
-        shown_as="behavior",
-    )
-    real_share: float = option(
-        0.5, "share of the episodes that ask for the task's own goals nevertheless", at_least=0, at_most=1
-    )
-    candidates: int = option(100, "achieved goals of which one is proposed", at_least=1)
-    goal_memory: int = option(50_000, "newest achieved goals that are remembered", at_least=1)
-    cutoff: float = option(
-        -3.0, "mega proposes no goal of a lower value, at first", shown_as="behavior.cutoff"
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
 class DemonstrationsConfig(Group):
     """Episodes that somebody else played, as `torchrl-her record` writes them."""
 

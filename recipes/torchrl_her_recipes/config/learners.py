@@ -1,8 +1,4 @@
-"""The learners by name: the options of each, and where its builder is found.
-
-A learner is one module with its options and its builder (see :mod:`torchrl_her_recipes.components.learners`),
-and a call of :func:`register_learner`.
-"""
+"""The learners by name; each has its options here and its builder in :mod:`..components.learners`."""
 
 from __future__ import annotations
 
@@ -10,11 +6,12 @@ from dataclasses import dataclass
 from operator import not_
 from typing import Any, ClassVar, Literal
 
-from torchrl_her_recipes.config.groups import Group
-from torchrl_her_recipes.config.options import AUTO, REGISTERED, Needs, option, what_there_is
+from torchrl_her_recipes.config.choices import Choice, Kind
+from torchrl_her_recipes.config.options import AUTO, Needs, option
 
 Actions = Literal["continuous", "discrete"]
 
+_MAKERS = "torchrl_her_recipes.components.learners"
 _CRITICS = "how many critics there are; targets have the least of their values"
 _CLAMPED = "whether targets are clamped to the returns that rewards allow, where rewards have bounds"
 _TARGET_CRITICS = "so many critics, drawn at random, are asked for each step's targets; 0: all"
@@ -25,10 +22,13 @@ def _norm(*more: str, text: str = "") -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnerConfig(Group):
-    """The learner and its networks.
+class LearnerConfig(Choice):
+    """The learner and its networks. Its maker is a ``LearnerBuilder``.
 
     Attributes:
+        actions: which actions it can choose among.
+        stacks: whether several runs can be trained side by side in one program.
+        priority_power: its loss gives this power of the absolute TD error as a priority.
         has_epsilon: whether a share epsilon of the actions explores.
         clones: whether its loss can clone the behavior of demonstrations.
     """
@@ -39,6 +39,9 @@ class LearnerConfig(Group):
         ("compile", "never".__ne__, "products"),
         ("hidden", lambda width: width >= 32, "products"),
     )
+    actions: ClassVar[Actions] = "continuous"
+    stacks: ClassVar[bool] = True
+    priority_power: ClassVar[int] = 2
     has_epsilon: ClassVar[bool] = False
     clones: ClassVar[bool] = False
 
@@ -47,11 +50,6 @@ class LearnerConfig(Group):
         """How many weights there are between hidden layers, of the actor and all critics."""
         return (self.depth - 1) * self.hidden**2 * (1 + getattr(self, "critics", 1))
 
-    name: str = option(
-        "auto",
-        "auto: ddpg, or dqn where actions are discrete; or a learner of `torchrl-her list`",
-        shown_as="learner",
-    )
     device: str = option("cpu", "where the networks are: cpu, cuda, cuda:1, ..., or auto")
     gamma: float = option(
         AUTO, "discount factor; auto: 1 - 2 / steps of an episode, from 0.9 to 0.99", above=0, below=1
@@ -108,6 +106,9 @@ class LearnerConfig(Group):
         return self.critic_shape | ({"norm": "none"} if self.norm == "batch" else {})
 
 
+LEARNERS = Kind("learner", LearnerConfig, default="auto")
+
+
 @dataclass(frozen=True, kw_only=True)
 class EpsilonConfig(LearnerConfig):
     """A learner with a deterministic policy: a share epsilon of its actions explores."""
@@ -124,13 +125,6 @@ class EpsilonConfig(LearnerConfig):
             raise ValueError(
                 f"epsilon_end={self.epsilon_end} must not be above epsilon_start={self.epsilon_start}"
             )
-
-
-@dataclass(frozen=True, kw_only=True)
-class DQNConfig(EpsilonConfig):
-    """DQN."""
-
-    clamp_targets: bool = option(True, _CLAMPED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,10 +149,13 @@ class NoiseConfig(EpsilonConfig):
     )
 
 
+@LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class DDPGConfig(NoiseConfig):
-    """DDPG."""
+    """Deterministic policy gradients (Lillicrap et al., 2016)."""
 
+    name = "ddpg"
+    maker = f"{_MAKERS}.ddpg:DDPGBuilder"
     clones: ClassVar[bool] = True
 
     norm: str = _norm("batch", text=": layer, in all networks; batch, in the critic, and of its input")
@@ -169,9 +166,13 @@ class DDPGConfig(NoiseConfig):
     clamp_targets: bool = option(True, _CLAMPED)
 
 
+@LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class TD3Config(DDPGConfig):
-    """TD3."""
+    """Two critics and smoothed targets (Fujimoto et al., 2018)."""
+
+    name = "td3"
+    maker = f"{_MAKERS}.td3:TD3Builder"
 
     norm: str = _norm()
     critics: int = option(2, _CRITICS, at_least=1)
@@ -186,6 +187,7 @@ class TD3Config(DDPGConfig):
 class EntropyConfig(LearnerConfig):
     """A learner whose policy is stochastic and explores by itself."""
 
+    priority_power = 1
     clones: ClassVar[bool] = True
 
     temperature: float = option(0.1, "the temperature that learning begins with", above=0)
@@ -197,9 +199,13 @@ class EntropyConfig(LearnerConfig):
     )
 
 
+@LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class SACConfig(EntropyConfig):
-    """SAC."""
+    """Soft actor-critic with a learned temperature (Haarnoja et al., 2018)."""
+
+    name = "sac"
+    maker = f"{_MAKERS}.sac:SACBuilder"
 
     critics: int = option(2, _CRITICS, at_least=1)
     target_critics: int = option(0, _TARGET_CRITICS, at_least=0)
@@ -209,17 +215,24 @@ class SACConfig(EntropyConfig):
         _check_target_critics(self.target_critics, self.critics)
 
 
+@LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class REDQConfig(SACConfig):
-    """SAC with many critics, of which targets take a few."""
+    """SAC with ten critics, targets of two of them at random (Chen et al., 2021)."""
+
+    name = "redq"
 
     critics: int = option(10, _CRITICS, at_least=1)
     target_critics: int = option(2, _TARGET_CRITICS, at_least=0)
 
 
+@LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class TQCConfig(EntropyConfig):
-    """TQC."""
+    """SAC whose critics give quantiles, the greatest left out (Kuznetsov et al., 2020)."""
+
+    name = "tqc"
+    maker = f"{_MAKERS}.tqc:TQCBuilder"
 
     critics: int = option(2, "how many critics there are; targets have all of their quantiles", at_least=1)
     quantiles: int = option(25, "quantiles of the return that each critic gives", at_least=1)
@@ -240,120 +253,24 @@ def _check_target_critics(target_critics: int, critics: int) -> None:
         raise ValueError(f"target_critics={target_critics} must be at most critics={critics}")
 
 
+@LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
-class LearnerSpec:
-    """A learner that recipes can name.
+class DQNConfig(EpsilonConfig):
+    """Double DQN, for discrete actions (van Hasselt et al., 2016)."""
 
-    Args:
-        name: the name.
-        summary: one line for people.
-        builder: where its :class:`~torchrl_her_recipes.components.learner.LearnerBuilder` is found, as
-            ``module:Class``; it is imported when the learner is first built.
-        options: its group of options, a subclass of :class:`LearnerConfig`.
-        actions: which actions it can choose among.
-        stacks: whether several runs can be trained side by side in one program.
-        priority_power: its loss gives this power of the absolute TD error as a priority.
-    """
+    name = "dqn"
+    maker = f"{_MAKERS}.dqn:DQNBuilder"
+    actions = "discrete"
 
-    name: str
-    summary: str
-    builder: str
-    options: type[LearnerConfig]
-    actions: Actions = "continuous"
-    stacks: bool = True
-    priority_power: int = 2
+    clamp_targets: bool = option(True, _CLAMPED)
 
 
-_BUILDERS = "torchrl_her_recipes.components.learners"
-LEARNERS: dict[str, LearnerSpec] = {}
+@LEARNERS.register
+@dataclass(frozen=True, kw_only=True)
+class AutoConfig(DDPGConfig):
+    """DDPG, or DQN where actions are discrete."""
 
+    name = "auto"
 
-def register_learner(spec: LearnerSpec) -> None:
-    """Makes a learner known by its name.
-
-    Raises:
-        ValueError: the name is taken.
-    """
-    if spec.name in LEARNERS or spec.name == "auto":
-        raise ValueError(f"there is a learner {spec.name!r} already")
-    LEARNERS[spec.name] = spec
-
-
-for _spec in (
-    LearnerSpec(
-        name="ddpg",
-        summary="deterministic policy gradients (Lillicrap et al., 2016)",
-        builder=f"{_BUILDERS}.ddpg:DDPGBuilder",
-        options=DDPGConfig,
-    ),
-    LearnerSpec(
-        name="td3",
-        summary="two critics and smoothed targets (Fujimoto et al., 2018)",
-        builder=f"{_BUILDERS}.td3:TD3Builder",
-        options=TD3Config,
-    ),
-    LearnerSpec(
-        name="sac",
-        summary="soft actor-critic with a learned temperature (Haarnoja et al., 2018)",
-        builder=f"{_BUILDERS}.sac:SACBuilder",
-        options=SACConfig,
-        priority_power=1,
-    ),
-    LearnerSpec(
-        name="redq",
-        summary="SAC with ten critics, targets of two of them at random (Chen et al., 2021)",
-        builder=f"{_BUILDERS}.sac:SACBuilder",
-        options=REDQConfig,
-        priority_power=1,
-    ),
-    LearnerSpec(
-        name="tqc",
-        summary="SAC whose critics give quantiles, the greatest left out (Kuznetsov et al., 2020)",
-        builder=f"{_BUILDERS}.tqc:TQCBuilder",
-        options=TQCConfig,
-        priority_power=1,
-    ),
-    LearnerSpec(
-        name="dqn",
-        summary="double DQN, for discrete actions (van Hasselt et al., 2016)",
-        builder=f"{_BUILDERS}.dqn:DQNBuilder",
-        options=DQNConfig,
-        actions="discrete",
-    ),
-):
-    register_learner(_spec)
 
 BY_ACTIONS: dict[Actions, str] = {"continuous": "ddpg", "discrete": "dqn"}
-
-
-def check_learner(name: str) -> None:
-    """Refuses a learner that does not exist.
-
-    Raises:
-        ValueError: it does not exist; the message lists those that do.
-    """
-    if name != "auto" and name not in LEARNERS:
-        known = ["auto", *LEARNERS]
-        raise ValueError(f"unknown learner {name!r}{what_there_is(name, known, 'learners')}{REGISTERED}")
-
-
-def priority_power(name: str) -> int:
-    """The power of the absolute TD error that a learner's loss gives as a priority.
-
-    Example:
-        >>> priority_power("ddpg"), priority_power("sac")
-        (2, 1)
-    """
-    check_learner(name)
-    return LEARNERS[BY_ACTIONS["continuous"] if name == "auto" else name].priority_power
-
-
-def options_of(name: str) -> type[LearnerConfig]:
-    """The class of a learner's options; for ``auto`` that of DDPG, which it usually stands for.
-
-    Example:
-        >>> options_of("sac").__name__
-        'SACConfig'
-    """
-    check_learner(name)
-    return LEARNERS[BY_ACTIONS["continuous"] if name == "auto" else name].options

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import MISSING, Field, field, fields
+from dataclasses import Field, field, fields
 from difflib import get_close_matches
 from math import isfinite
 from typing import Any
@@ -102,14 +102,6 @@ def _check_value(own: Field[Any], shown: str, value: Any) -> None:
         raise ValueError(f"{shown} must be {allowed}, got {value}")
     if isinstance(value, float) and not (isfinite(value) or own.metadata.get("infinite")):
         raise ValueError(f"{shown} must be finite, got {value}")
-
-
-def default_of(own: Field[Any]) -> Any:
-    """The default value of a field."""
-    if own.default is not MISSING:
-        return own.default
-    assert own.default_factory is not MISSING
-    return own.default_factory()
 
 
 REGISTERED = "; one of your own must be registered by a module, as in torchrl-her --import MODULE"

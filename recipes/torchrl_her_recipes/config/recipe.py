@@ -9,11 +9,11 @@ from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config import groups
-from torchrl_her_recipes.config.groups import Group
+from torchrl_her_recipes.config.behavior import BEHAVIOR, Behavior
 from torchrl_her_recipes.config.imports import permit_task
-from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, DDPGConfig, LearnerConfig, options_of
-from torchrl_her_recipes.config.options import AUTO, default_of, what_there_is
-from torchrl_her_recipes.config.shortcuts import GROUPS, LONG_ONLY, Nested, over, place
+from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, LearnerConfig
+from torchrl_her_recipes.config.options import AUTO
+from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, LONG_ONLY, Nested, over, place
 from torchrl_her_recipes.config.without_effect import without_effect
 
 # What a run that goes on may set anew, since it leaves what was trained as it is.
@@ -40,13 +40,13 @@ class Recipe:
 
     task: groups.TaskConfig = field(default_factory=groups.TaskConfig)
     hindsight: groups.HindsightConfig = field(default_factory=groups.HindsightConfig)
-    learner: LearnerConfig = field(default_factory=DDPGConfig)
+    learner: LearnerConfig = field(default_factory=LEARNERS)
     collection: groups.CollectionConfig = field(default_factory=groups.CollectionConfig)
     replay: groups.ReplayConfig = field(default_factory=groups.ReplayConfig)
     ibs: groups.IBSConfig = field(default_factory=groups.IBSConfig)
     novelty: groups.NoveltyConfig = field(default_factory=groups.NoveltyConfig)
     curriculum: groups.CurriculumConfig = field(default_factory=groups.CurriculumConfig)
-    behavior: groups.BehaviorConfig = field(default_factory=groups.BehaviorConfig)
+    behavior: Behavior = field(default_factory=BEHAVIOR)
     demonstrations: groups.DemonstrationsConfig = field(default_factory=groups.DemonstrationsConfig)
     evaluation: groups.EvaluationConfig = field(default_factory=groups.EvaluationConfig)
     run: groups.RunConfig = field(default_factory=groups.RunConfig)
@@ -57,16 +57,10 @@ class Recipe:
         if self.run.frames is not None and self.collection.epoch_frames != AUTO:
             epochs = -(-self.run.frames // self.collection.epoch_frames)
             object.__setattr__(self, "run", replace(self.run, frames=None, epochs=epochs))
-        wanted = options_of(self.learner.name)
-        if type(self.learner) is not wanted:
-            got = type(self.learner).__name__
-            raise ValueError(
-                f"learner={self.learner.name} takes a {wanted.__name__}, got a {got}: "
-                "name the learner in its options, as in SACConfig(name='sac')"
-            )
         for (group, name), why in without_effect(self).items():
-            value = getattr(getattr(self, group), name)
-            if value not in (None, _default(getattr(self, group), name)):
+            section = getattr(self, group)
+            value = getattr(section, name)
+            if value not in (None, getattr(type(section), name)):
                 shown = f"{group}.{name}" if group in LONG_ONLY else name
                 raise ValueError(f"{shown}={value} has no effect {why}: leave it out")
 
@@ -114,7 +108,8 @@ class Recipe:
 
     def to_dict(self) -> Nested:
         """All values, by group and name."""
-        return asdict(self)
+        named = {group: {"name": getattr(self, group).name} for group in KINDS}
+        return {group: named.get(group, {}) | asdict(own) for group, own in vars(self).items()}
 
     def changed(self) -> Nested:
         """The values that are not the defaults, by group and name.
@@ -125,7 +120,8 @@ class Recipe:
         """
         kept: Nested = {}
         for group, own in self.to_dict().items():
-            defaults = {each.name: default_of(each) for each in fields(getattr(self, group))}
+            defaults = {each.name: each.default for each in fields(getattr(self, group))}
+            defaults |= {"name": KINDS[group].default} if group in KINDS else {}
             kept[group] = {name: value for name, value in own.items() if value != defaults[name]}
         return {group: own for group, own in kept.items() if own}
 
@@ -136,7 +132,10 @@ class Recipe:
         Raises:
             ValueError: a group or an option that does not exist, or a value that cannot work.
         """
-        return _assemble(place(values))
+        placed = place(values)
+        return _assemble(
+            placed | {group: kind.stored(placed.get(group, {})) for group, kind in KINDS.items()}
+        )
 
 
 def check_extending(values: Mapping[str, Any]) -> None:
@@ -188,7 +187,7 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     """The same recipe as :func:`make_recipe`, where no value was named by the user."""
     given = place(values)
     below = place(base or {})
-    _drop_options_of_another_learner(below, given)
+    _drop_options_of_other_choices(below, given)
     _drop_options_of_another_task(below, given)
     _drop_another_curriculum(below, given)
     drop_other_goal_sources(given)
@@ -207,42 +206,41 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     return _assemble(over(below, given))
 
 
-def _named(group: str, default: str, *values: Nested) -> str:
-    """The name that the first of some values has for a group."""
-    return next((own[group]["name"] for own in values if own.get(group, {}).get("name")), default)
+def _chosen(group: str, *values: Nested) -> str:
+    """Returns the name that the first of some values has for a group."""
+    names = (own.get(group, {}).get("name") for own in values)
+    return next(filter(None, names), KINDS[group].default if group in KINDS else groups.TaskConfig.name)
 
 
-def _learner_of(*values: Nested) -> str:
-    """The learner that is named in the first of some values, or that ``auto`` stands for on their task."""
-    name, task = _named("learner", "auto", *values), _named("task", groups.TaskConfig.name, *values)
-    actions = get_task_spec(task).actions if isinstance(task, str) and name == "auto" else None
+def _meant(group: str, *values: Nested) -> str:
+    """Returns a group's choice, and for ``auto`` the one that it stands for on the task."""
+    name, task = _chosen(group, *values), _chosen("task", *values)
+    actions = get_task_spec(task).actions if isinstance(task, str) and name == AUTO else None
     return name if actions is None else BY_ACTIONS[actions]
 
 
-def _drop_options_of_another_learner(below: Nested, given: Nested) -> None:
-    """Leaves those options of the base's learner that the one that is asked for takes as well.
+def _drop_options_of_other_choices(below: Nested, given: Nested) -> None:
+    """Leaves those options of the base's choices that the choices that are asked for take as well.
 
-    What is merely a default of the base's learner is left out, too: the other one may have its own.
+    What is merely a default of the base's choice is left out, too: the other one may have its own.
 
     Raises:
         ValueError: an option is asked for that ``auto`` does not have on this task.
     """
-    name, before = _learner_of(given, below), _learner_of(below)
-    kind, former = options_of(name), LEARNERS[before].options if before in LEARNERS else None
-    known: dict[str, tuple[str, ...]] = {own.name: own.metadata.get("choices", ()) for own in fields(kind)}
-    if _named("learner", "auto", given, below) == "auto":
-        without = {own.name for own in fields(options_of("auto"))} - set(known)
-        for key, value in given.get("learner", {}).items():
-            if key in without:
-                raise ValueError(f"{key}={value} has no effect with learner={name}: leave it out")
-    defaults = {} if former in (None, kind) else {own.name: default_of(own) for own in fields(former)}
-    below["learner"] = {
-        key: value
-        for key, value in below.get("learner", {}).items()
-        if key in known
-        and (not known[key] or value in known[key])
-        and (key not in defaults or value != defaults[key])
-    }
+    for group, kind in KINDS.items():
+        asked = kind.find(_chosen(group, given, below))
+        choice, former = kind.find(_meant(group, given, below)), kind.get(_meant(group, below))
+        for key, value in given.get(group, {}).items():
+            if hasattr(asked, key) and not hasattr(choice, key):
+                raise ValueError(f"{key}={value} has no effect with {group}={choice.name}: leave it out")
+        allowed = {own.name: own.metadata.get("choices", ()) for own in fields(choice)}
+        below[group] = {
+            key: value
+            for key, value in below.get(group, {}).items()
+            if hasattr(choice, key)
+            and (not allowed.get(key) or value in allowed[key])
+            and (former is choice or value != getattr(former, key, kind))
+        }
 
 
 def _drop_options_of_another_task(below: Nested, given: Nested) -> None:
@@ -285,19 +283,4 @@ def _assemble(values: Nested) -> Recipe:
 
 def _groups(values: Nested) -> dict[str, Any]:
     """Returns the groups of a recipe, before they are checked against each other."""
-    made: dict[str, Any] = {}
-    for group, kind in GROUPS.items():
-        own = dict(values.get(group, {}))
-        if group == "learner":
-            kind = options_of(str(own.get("name", "auto")))
-        known = [each.name for each in fields(kind)]
-        for name in own:
-            if name not in known:
-                of = f"learner={own.get('name', 'auto')}" if group == "learner" else f"the group {group}"
-                raise ValueError(f"{of} has no option {name}{what_there_is(name, known, 'options')}")
-        made[group] = kind(**own)
-    return made
-
-
-def _default(group: Group, name: str) -> Any:
-    return next(default_of(own) for own in fields(group) if own.name == name)
+    return {group: kind(**values.get(group, {})) for group, kind in GROUPS.items()}

@@ -7,25 +7,28 @@ from dataclasses import fields
 from typing import Any
 
 from torchrl_her_recipes.config import groups
-from torchrl_her_recipes.config.learners import LEARNERS, LearnerConfig
+from torchrl_her_recipes.config.behavior import BEHAVIOR
+from torchrl_her_recipes.config.choices import Kind
+from torchrl_her_recipes.config.learners import LEARNERS
 from torchrl_her_recipes.config.options import nearest, what_there_is
 
 Nested = dict[str, dict[str, Any]]
 
-GROUPS: dict[str, type[groups.Group]] = {
+GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
     "task": groups.TaskConfig,
     "hindsight": groups.HindsightConfig,
-    "learner": LearnerConfig,  # of the learner that is chosen
+    "learner": LEARNERS,
     "collection": groups.CollectionConfig,
     "replay": groups.ReplayConfig,
     "ibs": groups.IBSConfig,
     "novelty": groups.NoveltyConfig,
     "curriculum": groups.CurriculumConfig,
-    "behavior": groups.BehaviorConfig,
+    "behavior": BEHAVIOR,
     "demonstrations": groups.DemonstrationsConfig,
     "evaluation": groups.EvaluationConfig,
     "run": groups.RunConfig,
 }
+KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)}
 
 
 LONG_ONLY = ("demonstrations",)  # its options are always named with it: of what would ``file`` be?
@@ -39,11 +42,17 @@ class Entries(dict[str, Any]):
     """Some entries of a mapping, as ``task.options.bits=8`` gives them: the other entries stay."""
 
 
+def choices_of(group: str) -> dict[str, type[groups.Group]]:
+    """Returns the classes that a group may have by name, the default first; "" names a single one."""
+    kind = GROUPS[group]
+    return {kind.default: kind[kind.default], **kind} if isinstance(kind, Kind) else {"": kind}
+
+
 def option_names() -> dict[str, list[str]]:
-    """The options of each group; of the learner's, those of all learners."""
-    names = {group: [own.name for own in fields(kind)] for group, kind in GROUPS.items()}
-    every = [own.name for spec in LEARNERS.values() for own in fields(spec.options)]
-    names["learner"] = list(dict.fromkeys([*names["learner"], *every]))
+    """Returns the options of each group, for a kind of choices those of all of them."""
+    names = {group: ["name"] if group in KINDS else [] for group in GROUPS}
+    for group, known in names.items():
+        known += dict.fromkeys(own.name for kind in choices_of(group).values() for own in fields(kind))
     return names
 
 

@@ -48,7 +48,7 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
         unread = floor | set(_options(groups, "novelty"))
     elif algorithm.hindsight and sources:
         unread -= {"ibs.cells", "ibs.recent"}  # virtual goals are counted without weights, too
-    if groups.behavior.name == "ibs":  # its goals are weighted by IBS, whatever virtual ones are
+    if groups.behavior.instructive:  # whatever the weights of virtual goals are
         unread -= set(_options(groups, "ibs"))
     yield True, with_algo, unread
     relabeling = ["hindsight.strategy", *of_filter, "evaluation.virtual_goals"]
@@ -64,6 +64,8 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     yield greedy, "with epsilon_start=0", noise
     cloning = ["demonstrations.bc_weight", "demonstrations.q_filter"]
     yield not learner.clones, f"with learner={learner.name}", cloning
+    others = set(_options(groups, "behavior")) - {"behavior.real_share"}
+    yield getattr(groups.behavior, "real_share", 0.0) == 1.0, "with real_share=1", others
     processes = groups.collection.processes
     yield processes > 0, f"with processes={processes}", ["demonstrations.starts_share"]
     on_gpu = not learner.device.startswith(("cpu", "auto"))

@@ -92,7 +92,7 @@ def check_weights(
 
 def _builder(info: PolicyInfo, recipe: Recipe) -> LearnerBuilder:
     shown = cast(EnvBase, _Shown(info))
-    return load_name(find_learner(recipe, shown).builder)(recipe, shown, KEYS)
+    return load_name(find_learner(recipe, shown).maker)(recipe, shown, KEYS)
 
 
 def _with_norm(actor: TensorDictModule, info: PolicyInfo, recipe: Recipe) -> TensorDictModuleBase:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import torch
 from torchrl_her_recipes import Recipe, build, load_preset, make_recipe, run
 from torchrl_her_recipes.components.agents import find_learner, make_agent, make_player
 from torchrl_her_recipes.components.envs import make_task_envs
-from torchrl_her_recipes.config.learners import LEARNERS
+from torchrl_her_recipes.config.learners import SACConfig
 
 from ..small import SMALL, small
 
@@ -40,7 +39,7 @@ def test_auto_follows_the_actions(options: dict[str, Any], name: str) -> None:
         ),
         (
             {"task": "hand_v0", "learner": "dqn"},
-            "continuous actions: choose ddpg or td3 or sac or redq or tqc",
+            "continuous actions: choose ddpg or td3 or sac or redq or tqc or auto",
         ),
     ],
 )
@@ -124,7 +123,7 @@ def test_targets_cannot_be_clamped_where_rewards_have_no_bounds(monkeypatch: pyt
 
 
 def test_a_learner_may_be_for_one_run_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(LEARNERS, "sac", replace(LEARNERS["sac"], stacks=False))
+    monkeypatch.setattr(SACConfig, "stacks", False)
     recipe = small(task="hand_v0", learner="sac", num_runs=2)
     with pytest.raises(ValueError, match="num_runs must be 1 with learner=sac"):
         find_learner(recipe, make_task_envs(recipe, 2, [0, 1]))

@@ -19,17 +19,16 @@ from ..small import overrides, small
 
 MODULE = '''
 from dataclasses import dataclass
-from torchrl_her_recipes import LearnerSpec, option, register_learner
+from torchrl_her_recipes import LEARNERS, option
 from torchrl_her_recipes.config.learners import TD3Config
 
+@LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class OwnConfig(TD3Config):
-    """Options of one's own."""
+    """TD3 again."""
+    name = "own_td3"
+    stacks = False
     patience: float = option(1.0, "an option of this learner", above=0)
-
-builder = "torchrl_her_recipes.components.learners.td3:TD3Builder"
-spec = LearnerSpec(name="own_td3", summary="TD3 again", builder=builder, options=OwnConfig, stacks=False)
-register_learner(spec)
 '''
 
 

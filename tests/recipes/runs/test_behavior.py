@@ -14,7 +14,7 @@ from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalFactor, Inver
 from torchrl_her.curriculum import EpisodeLayers, LayerOutcomes, TeacherStudent
 from torchrl_her.replay_buffers import rows_of_run
 from torchrl_her_recipes import Components, Recipe, build, make_recipe, resume, run
-from torchrl_her_recipes.components.behavior import _cutoff
+from torchrl_her_recipes.components.behavior import scaled_cutoffs
 from torchrl_her_recipes.runs.curriculum import move_on
 
 from ..small import assert_same, small, stop_after
@@ -204,7 +204,7 @@ def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
     achievable = behavior.factors[1]
     assert isinstance(achievable, ValueCutoff)
     assert (achievable.first, achievable.floor, achievable.step) == pytest.approx((-3.0, -50.0, 1.0))
-    assert _cutoff(recipe("mega", gamma=0.98), (0.0, 1.0)) == pytest.approx(
+    assert scaled_cutoffs(-3.0, 0.98, (0.0, 1.0)) == pytest.approx(
         {"cutoff": 0.94, "floor": 0.0, "step": 0.02}  # gamma^d of a goal that is 3 steps' worth away
     )
 
@@ -215,11 +215,14 @@ def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"behavior.cutoff": -5.0}, "cutoff=-5.0 has no effect with behavior=real"),
-        ({"behavior": "ibs", "behavior.cutoff": -5.0}, "cutoff=-5.0 has no effect with behavior=ibs"),
-        ({"behavior": "goid"}, "behavior must be one of real, uniform_achieved, ibs, mega, discover"),
+        ({"behavior.cutoff": -5.0}, "behavior=real has no option cutoff; behavior=mega has it"),
+        (
+            {"behavior": "ibs", "behavior.cutoff": -5.0},
+            "behavior=ibs has no option cutoff; behavior=mega",
+        ),
+        ({"behavior": "mga"}, "behavior must be one of real, .*, discover, got 'mga'; did you mean mega"),
         ({"behavior": "mega", "behavior.real_share": 2.0}, "real_share must be at least 0 and at most 1"),
-        ({"behavior": "mega", "behavior.cutoff": float("nan")}, "behavior.cutoff must be finite, got nan"),
+        ({"behavior": "mega", "behavior.cutoff": float("nan")}, "cutoff must be finite, got nan"),
         ({"order": "all_at_once"}, "order=all_at_once has no effect with algo=her"),
         (
             {"algo": "cher", "order": "all_at_once", "window": 5},
@@ -230,7 +233,10 @@ def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
             {"algo": "cher", "learner": "sac", "order": "all_at_once", "success_threshold": 0.5},
             "success_threshold=0.5 has no effect with order=all_at_once",
         ),
-        ({"behavior": "uniform_achieved", "candidates": 7}, "candidates=7 has no effect with behavior=unif"),
+        (
+            {"behavior": "uniform_achieved", "candidates": 7},
+            "behavior=uniform_achieved has no option c",
+        ),
         ({"behavior": "mega", "real_share": 1.0, "candidates": 7}, "candidates=7 has no effect with real_sh"),
         ({"algo": "no_hindsight", "virtual_goals": True}, "virtual_goals=True has no effect with algo=no_h"),
         ({"behavior": "ibs", "estimator": "kernel", "cells": 5}, "cells=5 has no effect with estimator=kern"),

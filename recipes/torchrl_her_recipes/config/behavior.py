@@ -1,0 +1,93 @@
+"""Behavior goals by name: the options of each, whose makers are in :mod:`..components.behavior`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from torchrl_her_recipes.config.choices import Choice, Kind
+from torchrl_her_recipes.config.options import option
+
+_MAKERS = "torchrl_her_recipes.components.behavior"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Behavior(Choice):
+    """Which goals the episodes of training ask for (behavior goals).
+
+    Attributes:
+        instructive: whether goals are weighted by IBS, with the options of the group ``ibs``.
+    """
+
+    instructive: ClassVar[bool] = False
+
+
+BEHAVIOR = Kind("behavior", Behavior, default="real")
+
+
+@BEHAVIOR.register
+@dataclass(frozen=True, kw_only=True)
+class Real(Behavior):
+    """The task's own goals."""
+
+    name = "real"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Proposed(Behavior):
+    """Base class: goals that were achieved before, in some of the episodes.
+
+    The maker takes the options and ``goals``, which makes :class:`~torchrl_her.behavior.BehaviorGoals` from
+    ``weights``, ``factors`` and the like, and returns its result. By keyword it also takes ``recipe``,
+    ``rewards`` (of a missed and of an achieved goal), ``space`` (of the task's goals, or None) and
+    ``values``, which makes the :class:`~torchrl_her.behavior.GoalValues` of the agent.
+    """
+
+    real_share: float = option(
+        0.5, "share of the episodes that ask for the task's own goals nevertheless", at_least=0, at_most=1
+    )
+    goal_memory: int = option(50_000, "newest achieved goals that are remembered", at_least=1)
+
+
+@BEHAVIOR.register
+@dataclass(frozen=True, kw_only=True)
+class UniformAchieved(Proposed):
+    """Any achieved goal."""
+
+    name = "uniform_achieved"
+    maker = f"{_MAKERS}:make_uniform"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OneOfSome(Proposed):
+    candidates: int = option(100, "achieved goals of which one is proposed", at_least=1)
+
+
+@BEHAVIOR.register
+@dataclass(frozen=True, kw_only=True)
+class IBS(_OneOfSome):
+    """Instructive goals: weights q* - q."""
+
+    name = "ibs"
+    maker = f"{_MAKERS}:make_ibs"
+    instructive = True
+
+
+@BEHAVIOR.register
+@dataclass(frozen=True, kw_only=True)
+class Mega(_OneOfSome):
+    """Rare goals that the critic believes in (Pitis et al., 2020)."""
+
+    name = "mega"
+    maker = f"{_MAKERS}:make_mega"
+
+    cutoff: float = option(-3.0, "lowest value of a proposed goal at first, for rewards of -1 and 0")
+
+
+@BEHAVIOR.register
+@dataclass(frozen=True, kw_only=True)
+class Discover(_OneOfSome):
+    """Achievable goals towards the task's goal (Diaz-Bone et al., 2025)."""
+
+    name = "discover"
+    maker = f"{_MAKERS}:make_discover"

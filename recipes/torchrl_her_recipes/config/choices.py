@@ -1,0 +1,73 @@
+"""Choices of a recipe: sections that do one of several things, each a class with options of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
+
+from torchrl_her_recipes.config.groups import Group
+from torchrl_her_recipes.config.options import REGISTERED, nearest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice(Group):
+    """One of the things that a section can do, with its options; its docstring begins with a summary.
+
+    Attributes:
+        name: Name that recipes take.
+        maker: The function or class that makes it, as ``module:name``; it is imported when a run is built.
+    """
+
+    name: ClassVar[str] = ""
+    maker: ClassVar[str] = ""
+
+
+C = TypeVar("C", bound=Choice)
+
+
+class Kind(dict[str, type[C]]):
+    """The choices of a section by name. A call makes the options of one: ``kind(name="mega", cutoff=-5.0)``.
+
+    Args:
+        section: Name of the section.
+        base: Base class of the choices.
+        default: Name of the choice of a recipe that names none.
+    """
+
+    def __init__(self, section: str, base: type[C], *, default: str) -> None:
+        super().__init__()
+        self.section, self.default, self.__doc__ = section, default, base.__doc__
+
+    def __call__(self, *, name: str | None = None, **values: Any) -> C:
+        choice = self.find(name or self.default)
+        for option in values:
+            if not hasattr(choice, option):
+                homes = " or ".join(home for home in self if hasattr(self[home], option))
+                problem = f"{self.section}={choice.name} has no option {option}"
+                raise ValueError(f"{problem}; {self.section}={homes} has it")
+        return choice(**values)
+
+    def register(self, choice: type[C]) -> type[C]:
+        """Makes a choice known by its name; decorates its class."""
+        if choice.name in self:
+            raise ValueError(f"there is a {self.section} {choice.name!r} already")
+        self[choice.name] = choice
+        return choice
+
+    def find(self, name: object) -> type[C]:
+        """Returns the choice of a name."""
+        if str(name) not in self:
+            hint = nearest(name, self) or REGISTERED
+            raise ValueError(f"{self.section} must be one of {', '.join(self)}, got {name!r}{hint}")
+        return self[str(name)]
+
+    def summaries(self) -> dict[str, str]:
+        """Returns the first line of each choice's docstring."""
+        return {name: str(choice.__doc__).split("\n")[0].rstrip(".") for name, choice in self.items()}
+
+    def stored(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns values of a file without options of other choices that are at their defaults."""
+        choice = self.find(values.get("name") or self.default)
+        defaults = {option: [getattr(other, option, self) for other in self.values()] for option in values}
+        return {k: v for k, v in values.items() if hasattr(choice, k) or v not in defaults[k]}

@@ -1,0 +1,81 @@
+"""Choices of a recipe: one's own, options of others, and files that name these."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+
+from torchrl_her_recipes import BEHAVIOR, LEARNERS, Proposed, Recipe, build, load_policy, make_recipe, option
+from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.config.behavior import Behavior, Mega, Real
+from torchrl_her_recipes.config.choices import Kind
+from torchrl_her_recipes.config.shipped import policy_path
+
+from ..small import small
+
+MEGA = {"name": "mega", "real_share": 0.5, "goal_memory": 50_000, "candidates": 100, "cutoff": -5.0}
+
+
+def test_a_recipe_has_the_options_of_its_choice_alone() -> None:
+    recipe = make_recipe(behavior="mega", cutoff=-5)
+    assert (
+        recipe == make_recipe(behavior={"name": "mega", "cutoff": -5}) == Recipe(behavior=Mega(cutoff=-5.0))
+    )
+    assert recipe.to_dict()["behavior"] == MEGA
+    assert recipe.changed() == {"behavior": {"name": "mega", "cutoff": -5.0}}
+    assert Recipe.from_dict(recipe.to_dict()) == recipe
+    assert Recipe().to_dict()["behavior"] == {"name": "real"}
+
+
+def test_another_choice_takes_those_options_of_a_base_that_it_has() -> None:
+    base = {"behavior": {**MEGA, "real_share": 0.25}}
+    assert make_recipe(base, behavior="ibs").changed() == {"behavior": {"name": "ibs", "real_share": 0.25}}
+    assert make_recipe(base, behavior="real") == Recipe()
+
+
+def test_files_may_have_defaults_of_other_choices() -> None:
+    stored = {"name": "real", "real_share": 0.5, "candidates": 100, "goal_memory": 50_000, "cutoff": -3.0}
+    assert Recipe.from_dict({"behavior": stored}) == Recipe()
+    assert load_policy(policy_path("hand_v1")).recipe.behavior == Real()
+    with pytest.raises(ValueError, match="behavior=real has no option cutoff; behavior=mega has it"):
+        Recipe.from_dict({"behavior": {**stored, "cutoff": -4.0}})
+
+
+def test_a_name_is_taken_once() -> None:
+    kind = Kind("behavior", Behavior, default="real")
+    assert kind.register(Real) is Real
+    with pytest.raises(ValueError, match="there is a behavior 'real' already"):
+        kind.register(Real)
+
+
+def test_a_name_that_resembles_no_other_may_be_one_of_a_module() -> None:
+    with pytest.raises(ValueError, match="got 'xyz'; one of your own must be registered by a module"):
+        make_recipe(behavior="xyz")
+
+
+@pytest.mark.parametrize("kind", [LEARNERS, BEHAVIOR])
+def test_every_choice_has_a_summary(kind: Kind, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["list"])
+    listed = capsys.readouterr().out
+    for name, summary in kind.summaries().items():
+        assert f"  {name:<20} {summary}\n" in listed
+    assert not any(
+        "(*" in summary for summary in kind.summaries().values()
+    )  # the signature, without a docstring
+
+
+def test_a_maker_that_does_not_exist_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class Lost(Proposed):
+        """A choice without its maker."""
+
+        name = "lost"
+        maker = "lost_module:make"
+        depth: int = option(3, "how far", at_least=1)
+
+    monkeypatch.setitem(BEHAVIOR, "lost", Lost)
+    recipe = small(task="hand_v0", algo="her", behavior="lost", **{"behavior.depth": 5, "goal_memory": 100})
+    assert recipe.behavior == Lost(depth=5, goal_memory=100)
+    with pytest.raises(ValueError, match="'lost_module:make' must name an attribute of a module"):
+        build(recipe)
