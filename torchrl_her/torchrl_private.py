@@ -31,7 +31,7 @@ def is_full(storage: Storage) -> bool:
 
 
 def revision_of(storage: Storage) -> int:
-    """What is another number after each write."""
+    """Returns a number that differs after each write."""
     return storage._mutation_revision
 
 
@@ -69,7 +69,7 @@ def generator_of(part: Storage | Sampler) -> torch.Generator | None:
 
 
 def unit_of(buffer: ReplayBuffer) -> Any:
-    """What expands the rows that a buffer has drawn; None if there is no such thing."""
+    """Returns the function that expands the rows that a buffer has drawn; None if it has none."""
     return getattr(buffer, "_sample_unit", None)
 
 
@@ -97,12 +97,12 @@ def next_row(writer: Writer) -> int | None:
 
 
 def carrier_of(collector: BaseCollector) -> TensorDictBase | None:
-    """The step with which a collector goes on; None if it keeps none."""
+    """Returns the step with which a collector resumes; None if it keeps none."""
     return getattr(collector, "_carrier", None)
 
 
 def set_carrier(collector: BaseCollector, carrier: TensorDictBase) -> None:
-    """Lets a collector go on with another step."""
+    """Lets a collector resume with another step."""
     collector._carrier = carrier
 
 

@@ -22,7 +22,7 @@ _ALIKE = 0.6  # the least similarity, from 0 to 1, at which another name is sugg
 
 @dataclass(frozen=True, kw_only=True)
 class TaskSpec:
-    """What is known of a task before its environment is made.
+    """Facts about a task that are known before its environment is made.
 
     Args:
         name: what :func:`make_env` calls it; without a colon.
@@ -90,7 +90,7 @@ def task_names() -> list[str]:
 
 
 def get_task_spec(name: str) -> TaskSpec:
-    """What is known of a task.
+    """Returns the facts about a task.
 
     Args:
         name: one of :func:`task_names`, ``gym:ID`` for an environment of gymnasium's, or
@@ -110,7 +110,7 @@ def get_task_spec(name: str) -> TaskSpec:
 
 
 def module_of(name: str) -> str:
-    """The module that the name of a task asks to import: of somebody else, or of one's own.
+    """Returns the module, other than this package's, that the name of a task imports.
 
     Returns:
         Its name, or nothing for tasks of this package and for what gymnasium itself knows.

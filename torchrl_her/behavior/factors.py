@@ -1,4 +1,4 @@
-"""What makes an achieved goal worth asking for: factors of how likely it is to be proposed."""
+"""Factors of how likely an achieved goal is to be proposed."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class GoalCandidates(NamedTuple):
 
 
 class GoalFactor:
-    """One factor of how likely a goal is to be proposed. Subclass it for a measure of your own.
+    """Factor of how likely a goal is to be proposed. Subclass it for a measure of your own.
 
     The base class finds all goals alike.
 

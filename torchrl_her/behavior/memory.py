@@ -100,7 +100,7 @@ class AchievedGoals:
         return self._at(0, index)
 
     def observations(self, index: Tensor) -> Tensor:
-        """What was observed [..., o] when they were achieved."""
+        """The observations [..., o] in which the goals at some places [...] were achieved."""
         return self._at(1, index)
 
     def clear(self, run: int) -> None:

@@ -1,4 +1,4 @@
-"""What a loss's own networks think of goals: how well each can be achieved from where an episode begins."""
+"""Values of goals by a loss's own networks: how well each can be achieved from where an episode begins."""
 
 from __future__ import annotations
 

@@ -196,7 +196,7 @@ class GuidedExploration(TensorDictModuleBase):
         return self.guided
 
     def _look(self, state: Tensor, layer: Tensor) -> tuple[Tensor, ...]:
-        """What some layers show, one for each row: the network's input, the achieved and the desired goal."""
+        """Returns the network's input, the achieved and the desired goal by the layer of each row."""
         index = self._columns.to(state.device)[layer.flatten().clamp(min=0)]
         entries = take_columns(self.curriculum.extend(state), index)
         goal = self.curriculum.goal_width

@@ -27,7 +27,7 @@ _LISTS = ("observation", "achieved_goal", "desired_goal")
 
 @dataclass(frozen=True, kw_only=True)
 class CurriculumLayer:
-    """One layer of a curriculum: which entries of the state it sees, achieves and wants achieved.
+    """Layer of a curriculum: the entries of the state that it observes, achieves and desires.
 
     Args:
         name: for messages and reports.

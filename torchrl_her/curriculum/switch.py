@@ -1,4 +1,4 @@
-"""What happens to the buffer, weights and exploration of a run when it begins a layer."""
+"""The beginning of a layer: buffer, weights of goals and exploration of a run start anew."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Demonstrations: whole episodes that somebody else played, and the file that they are kept in."""
+"""Demonstrations: whole episodes that another policy played, and their file."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ class Demonstrations:
         return self.select(range(count))
 
     def to(self, dtype: torch.dtype) -> Demonstrations:
-        """The same with floating-point entries of this type; states stay as they are."""
+        """Returns the demonstrations with floating-point entries of this type; states stay as they are."""
         return replace(self, rows=self.rows.apply(lambda x: x.to(dtype) if x.is_floating_point() else x))
 
     @classmethod

@@ -111,7 +111,7 @@ class MixedReplay:
 
     @property
     def writer(self) -> Any:
-        """That of the own buffer."""
+        """Writer of the run's own buffer."""
         return self.own.writer
 
     @property

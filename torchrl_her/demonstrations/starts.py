@@ -212,7 +212,7 @@ class _Outcomes(Transform):
 
 
 def usable(demonstrations: Demonstrations) -> Demonstrations:
-    """Those that episodes can start at: they have physical states and achieve their goal.
+    """Selects the demonstrations that have physical states and achieve their goal.
 
     Raises:
         ValueError: there are none.

@@ -31,7 +31,7 @@ class Draws(Protocol):
         """Numbers of a shape [n, k]."""
 
     def of(self, some: Tensor) -> Self:
-        """Those of some of the transitions."""
+        """Returns the random numbers for the transitions at the positions ``some``."""
 
 
 class Candidates(NamedTuple):
@@ -51,7 +51,7 @@ class Candidates(NamedTuple):
     end: Tensor
 
     def of(self, some: Tensor) -> Candidates:
-        """Those of some of the transitions, in order."""
+        """Returns the candidates of the transitions at the positions ``some``, in order."""
         return self._replace(line=self.line[some], first=self.first[some], end=self.end[some])
 
 

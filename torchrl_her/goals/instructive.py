@@ -1,4 +1,4 @@
-"""What all weights of IBS have in common: the schedule of the kernel's sigma, and their options."""
+"""Base of all IBS weights: the schedule of the kernel's sigma, and their options."""
 
 from __future__ import annotations
 

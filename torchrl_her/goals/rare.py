@@ -127,7 +127,7 @@ class RareGoals(GoalWeights):
         )
 
     def _look(self) -> _Reference:
-        """What densities are estimated from, until the memory changes."""
+        """Points that densities are estimated from, until the memory changes."""
         assert self.goals is not None
         samples = self.goals[spread_evenly(len(self.goals), self.samples, self.goals.device)].double()
         scale = goal_scale(samples)
@@ -144,7 +144,7 @@ class RareGoals(GoalWeights):
 
 
 class _Reference(NamedTuple):
-    """What densities are estimated from.
+    """Points that densities are estimated from.
 
     Attributes:
         samples: [n, g] of float64, goals divided by their scale.

@@ -189,7 +189,7 @@ def _arguments(achieved: Outcome, desired_goal: Tensor) -> Any:
 
 
 def ask_reward(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
-    """What a reward function says of goals [..., g]: (reward, terminated), each [..., 1], checked.
+    """Calls a reward function for goals [..., g] and checks its (reward, terminated), each [..., 1].
 
     Raises:
         ValueError: it does not give one finite reward and one bool for each pair of goals.

@@ -49,7 +49,7 @@ def check_goal_sources(sources: GoalSources) -> dict[Strategy, int]:
 
 
 def sources_name(sources: GoalSources) -> str:
-    """What to call goal sources in a report.
+    """Returns the name of goal sources for a report.
 
     Example:
         >>> sources_name({"future": 2, "actual": 2})

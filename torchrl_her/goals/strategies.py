@@ -90,7 +90,7 @@ def get_strategy(strategy: Strategy) -> StrategyFunction:
 
 
 def strategy_name(strategy: Strategy) -> str:
-    """What to call a strategy in a report: its name, or that of its function.
+    """Returns the name of a strategy, or of its function, for a report.
 
     Example:
         >>> strategy_name("final"), strategy_name(future)

@@ -1,4 +1,4 @@
-"""What is written in C++ and compiled for this machine: gradient steps, and trees of priorities."""
+"""C++ code that is compiled for this machine: gradient steps, and trees of priorities."""
 
 from torchrl_her.native.job import Activation, Algorithm, Layer, Norm, structures
 from torchrl_her.native.library import CannotCompile, load_library

@@ -1,4 +1,4 @@
-"""What the compiled gradient steps are handed: the structures of ``steps.cpp``, field by field."""
+"""Arguments of the compiled gradient steps: the structures of ``steps.cpp``, field by field."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STOCHASTIC = (Algorithm.SAC, Algorithm.TQC)  # whose actors draw from a distribu
 
 
 class Activation(IntEnum):
-    """What follows a layer."""
+    """Function that follows a layer."""
 
     NONE = 0
     RELU = 1
@@ -34,7 +34,7 @@ class Activation(IntEnum):
 
 
 class Norm(IntEnum):
-    """How a layer's outputs are normalized, before the activation."""
+    """Normalization of a layer's outputs, before the activation."""
 
     PLAIN = 0
     LAYERNORM = 1
@@ -42,7 +42,7 @@ class Norm(IntEnum):
 
 
 class Layer(ctypes.Structure):
-    """One layer: its widths, and how many of its inputs come in here (the action, in a critic).
+    """Layer of a network: its widths, and how many of its inputs come in here (the action, in a critic).
 
     A layer of no inputs normalizes the network's input.
     """

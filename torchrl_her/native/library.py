@@ -103,7 +103,7 @@ def _version(compiler: Sequence[str]) -> str:
 
 
 def _processor() -> str:
-    """What tells processors apart that need other instructions: a cache may be shared by several machines."""
+    """Describes the processor: a cache may be shared by machines that need other instructions."""
     flags = ""
     info = Path("/proc/cpuinfo")
     if info.exists():

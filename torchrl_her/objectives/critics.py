@@ -127,7 +127,7 @@ def checked_subset(target_critics: int, critics: int) -> int:
 def as_critics(
     critic: TensorDictModule | Sequence[TensorDictModule], critics: int
 ) -> TensorDictModule | list[TensorDictModule]:
-    """One critic that others are made like, or all of them in a list, as TorchRL's losses take them.
+    """Returns one critic that others are made like, or a list of all, as TorchRL's losses take them.
 
     TorchRL registers the weights of a list of one critic as buffers, which are not trained. So a single one
     is handed over by itself; TorchRL then draws weights anew, which :func:`keep_weights` puts back.

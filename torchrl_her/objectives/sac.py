@@ -75,7 +75,7 @@ class PenalizedSACLoss(SACLoss):
         return loss + (penalty if loss.ndim else penalty.mean()), {"log_prob": log_prob.detach()}
 
     def _value_for_actor(self, values: Tensor) -> Tensor:
-        """What the actor makes as great as possible [...], from the outputs [N, ..., 1] of N critics."""
+        """Returns the value [...] that the actor maximizes, from the outputs [N, ..., 1] of N critics."""
         return (values.mean(0) if self.target_critics else values.amin(0)).squeeze(-1)
 
     def _draw(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:

@@ -97,7 +97,7 @@ class PenalizedTD3Loss(TD3Loss):
         return least_of_some(values, self.target_critics, self.noise)
 
     def _act(self, tensordict: TensorDictBase, params: TensorDictParams) -> TensorDictBase:
-        """What an actor sees, and its action."""
+        """Returns the inputs of an actor, and its action."""
         with params.to_module(self.actor_network, preserve_module_state=False):
             return self.actor_network(tensordict.select(*self.actor_network.in_keys, strict=False))
 

@@ -26,7 +26,7 @@ class Episodes:
         return torch.arange(self.rows.shape[1], device=self.rows.device) < self.lengths.unsqueeze(-1)
 
     def split(self, size: int) -> list[Episodes]:
-        """The same episodes in order, at most ``size`` at a time."""
+        """Splits the episodes, in order, into parts of at most ``size``."""
         starts = range(0, len(self.lengths), size)
         return [Episodes(self.rows[i : i + size], self.lengths[i : i + size]) for i in starts]
 

@@ -144,7 +144,7 @@ def failures(
 
 
 def under_next(key: NestedKey) -> NestedKey:
-    """The same key under ``next``.
+    """Returns the key of the same entry under ``next``.
 
     Example:
         >>> under_next("reward"), under_next(("agent", "reward"))

@@ -11,7 +11,7 @@ STEPS_KEY = "steps_to_next_obs"  # as TorchRL's MultiStep writes it, and as its 
 
 
 class NStepReturn(NamedTuple):
-    """What a transition over several steps holds.
+    """Return, end and last step of transitions over several steps.
 
     Attributes:
         reward: [..., 1], the discounted sum.

@@ -161,7 +161,7 @@ class HindsightOptions:
         return {name: getattr(self, f"recent_{name}") for name in RECENT if name in self.sources}
 
     def changed(self, changes: dict[str, Any]) -> HindsightOptions:
-        """The same options, some of them changed. Goal sources take the place of ``k`` and ``strategy``.
+        """Returns the options with changes. Goal sources take the place of ``k`` and ``strategy``.
 
         Without the sources that there were, ``k`` and ``strategy`` are the defaults, unless they are given.
 
@@ -211,7 +211,7 @@ def _twice(sources: GoalSources, **given: Any) -> str:
 
 
 class _Option(Generic[T]):
-    """One of the options, to be read and set as an attribute of what they belong to."""
+    """Option that is read and set as an attribute of its writer or sample unit."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
@@ -229,7 +229,7 @@ class _Option(Generic[T]):
 
 
 class HindsightBase:
-    """What relabeling in a writer and relabeling while sampling have in common.
+    """Base of relabeling in a writer and of relabeling while sampling.
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).

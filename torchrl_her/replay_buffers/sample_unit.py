@@ -61,7 +61,7 @@ from torchrl_her.torchrl_private import (
 
 
 class _Stored(NamedTuple):
-    """What was read from a storage, and in which state it was then."""
+    """Entries that were read from a storage, and the state that it was in then."""
 
     storage: Storage
     state: tuple[int, int]
@@ -74,7 +74,7 @@ class _Stored(NamedTuple):
 
 
 class _Ahead(NamedTuple):
-    """What transitions over several steps hold."""
+    """Contents of transitions over several steps."""
 
     next: TensorDictBase  # [B], of the last step
     returns: NStepReturn  # for the goals that were chosen
@@ -491,7 +491,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _draw_recent(
         self, stored: _Stored, group: Tensor, source: str, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """The same for goals that were wanted or achieved in the newest episodes."""
+        """Draws goals that were wanted or achieved in the newest episodes."""
         goals, newest = stored.after, stored.episodes.newest
         if source == "actual":
             goals, newest = stored.wanted, stored.episodes.newest_episodes
@@ -528,7 +528,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _draw_by_likelihood(
         self, stored: _Stored, group: Tensor, first: Tensor, end: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """The same as ``_draw``, computed from all candidates of each group, ``first`` to ``end``."""
+        """Draws like ``_draw``, but from all candidates of each group, ``first`` to ``end``."""
         source, valid = torch.empty_like(first), torch.ones_like(first, dtype=torch.bool)
         if len(group) == 0:
             return source, valid

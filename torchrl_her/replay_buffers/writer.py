@@ -337,7 +337,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         return index
 
     def end_episodes(self) -> None:
-        """Tells that all environments were reset, so that episodes which are held back do not go on.
+        """Marks all environments as reset: episodes that are held back end here.
 
         They are written with the next batch. Call it after ``collector.reset()``.
         """
@@ -465,7 +465,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         return places.rows(self._rings.cursors, self.capacity)[held:], left, recent
 
     def _no_goals(self, runs: int) -> list[RecentGoals]:
-        """Nothing remembered, of each layer."""
+        """Returns an empty memory of goals for each layer."""
         return [RecentGoals.none(runs) for _ in range(max(1, len(self.layers)))]
 
     def _by_layer(
@@ -493,7 +493,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         return min(self.refill, max(1, round(counts.real / max(1, counts.relabeled))))
 
     def _draft(self, chunk: Chunk, recent: RecentGoals, *, weighted: bool, first_id: int) -> _Draft:
-        """What is to be written of some episodes. Nothing is written or counted yet: it may be refused."""
+        """Returns the transitions of some episodes. Nothing is written or counted yet."""
         runs, virtual = chunk.piece.runs, None
         own = self.goal_weights if weighted else []
         drawn = draw_for_runs(

@@ -68,7 +68,7 @@ class RunsAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """One step of each run, with its own bias corrections."""
+        """Makes one step for each run, with its own bias corrections."""
         for group in self.param_groups:
             parameters = [own for own in group["params"] if own.grad is not None]
             states = [self.state[own] or self.start(own) for own in parameters]

@@ -46,7 +46,7 @@ class CheckpointError(ValueError):
 
 
 class _Stream:
-    """What torch.save writes to: a file, and the checksum of what went into it."""
+    """Sink of ``torch.save``: a file, and the checksum of what went into it."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.file, self.hash = file, hashlib.sha256()

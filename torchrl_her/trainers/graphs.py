@@ -127,7 +127,7 @@ class GraphLearner(LossLearner):
 
 
 class _Recorded:
-    """What is called for the first time as it is, then recorded, and from then on launched.
+    """Function that is called as it is at first, then recorded, and launched from then on.
 
     Args:
         call: always computes the same of rows of the same shape.
@@ -160,7 +160,7 @@ class _Recorded:
             return self._out.clone()
 
     def _call_on_another_stream(self, rows: TensorDictBase) -> TensorDictBase:
-        """As CUDA asks for before something is recorded."""
+        """Warms up as CUDA requires before a recording."""
         stream = torch.cuda.Stream(self._device)
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream), _uncaptured():

@@ -18,7 +18,7 @@ WEIGHT = "priority_weight"  # of importance sampling, as TorchRL's samplers and 
 
 
 class Learner(Protocol):
-    """What the training loop needs of an algorithm: gradient steps of each run."""
+    """Algorithm as the training loop uses it: gradient steps of each run."""
 
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
         """Learns from transitions (rows), and writes their new priorities into them.

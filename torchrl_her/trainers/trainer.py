@@ -34,7 +34,7 @@ class Schedule(Protocol):
 
 
 class Replay(Protocol):
-    """What the training loop needs of a replay buffer: TorchRL's own, or one that mixes several."""
+    """Replay buffer as the training loop uses it: TorchRL's own, or one that mixes several."""
 
     @property
     def writer(self) -> Any:
@@ -65,7 +65,7 @@ class Replay(Protocol):
 
 @runtime_checkable
 class CollectsAhead(Protocol):
-    """A collector that can collect while somebody learns."""
+    """Collector that can collect during the gradient steps."""
 
     def collect_ahead(self) -> None:
         """Begins to collect the next batch, with the policy as it is now."""
@@ -303,7 +303,7 @@ class Trainer:
 
 
 def _without(value: Tensor, idle: list[int]) -> Tensor:
-    """What was measured [S, R], marked where runs were idle."""
+    """Returns measurements [S, R], marked where runs were idle."""
     return value.index_fill(1, torch.tensor(idle, dtype=torch.int64, device=value.device), _IDLE)
 
 

@@ -1,1 +1,1 @@
-"""What all environments share."""
+"""Parts that all environments share."""

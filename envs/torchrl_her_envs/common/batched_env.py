@@ -69,7 +69,7 @@ class BatchedEnv(TaskTraits, EnvBase):
 
     @abstractmethod
     def _show(self) -> dict[str, Tensor]:
-        """What the agent sees: ``state``, ``observation``, ``achieved_goal`` and ``desired_goal``."""
+        """Returns ``state``, ``observation``, ``achieved_goal`` and ``desired_goal`` of all environments."""
 
     @abstractmethod
     def _check_action(self, action: Tensor) -> None:

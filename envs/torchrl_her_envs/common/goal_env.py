@@ -1,4 +1,4 @@
-"""What every environment with goals offers, whichever family it belongs to: throwing, toy or gymnasium's."""
+"""The interface of every environment with goals: throwing, toy, gymnasium's or a user's own."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class GoalEnv(Protocol):
 
 
 class TaskTraits:
-    """What an environment says about its task: a base class whose members are defaults to override."""
+    """Base class with traits of an environment's task; its members are defaults to override."""
 
     @property
     def task_name(self) -> str:

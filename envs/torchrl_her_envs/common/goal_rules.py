@@ -1,4 +1,4 @@
-"""What is found out about the rewards and ends of an environment that is not of this package."""
+"""Rewards and ends of an environment that is not of this package, found by trying."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def check_termination(word: str) -> Termination:
 
 
 class GoalEnds:
-    """What ends an episode at its goal: the rule, and what the environment itself was seen to do there.
+    """Rule for the ends of episodes at goals, and what the environment itself was seen to do there.
 
     Args:
         name: of the environment, for messages.

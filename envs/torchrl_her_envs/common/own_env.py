@@ -301,12 +301,12 @@ class OwnGoalEnv(TaskTraits, EnvBase):
 
     @property
     def goal_ends(self) -> GoalEnds:
-        """What ends an episode at its goal, and what the environment was seen to do there."""
+        """Rule for the ends of episodes at goals, and what the environment was seen to do there."""
         return self.rules.ends
 
     @property
     def ends(self) -> Ends:
-        """What ends an episode at its goal, see :class:`~torchrl_her_envs.common.goal_rules.GoalEnds`."""
+        """Rule for the ends of episodes, see :class:`~torchrl_her_envs.common.goal_rules.GoalEnds`."""
         return self.rules.ends.rule
 
     @property
@@ -445,7 +445,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         return torch.cat(entries) if self._whole else torch.stack(entries)
 
     def _entries(self, key: str) -> Sequence[str]:
-        """Its own names of observation or goal."""
+        """Returns the environment's own names of observation or goal."""
         names = self._names[key]
         return [names] if isinstance(names, str) else names
 
@@ -564,7 +564,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         raise ValueError(f"{self._name}'s actions must be Bounded or Categorical, got {action}")
 
     def action_limits(self) -> tuple[Tensor, Tensor]:
-        """Those of the environment's own spec."""
+        """Returns the bounds of the environment's own spec."""
         space = self._envs[0].action_spec_unbatched.space
         return space.low.flatten(), space.high.flatten()
 

@@ -26,7 +26,7 @@ def _mix(z: np.ndarray) -> np.ndarray:
 
 
 def env_keys(seed: int, num_envs: int) -> np.ndarray:
-    """One 64-bit key for each environment of a batch.
+    """Returns a 64-bit key for each environment of a batch.
 
     Args:
         seed: any non-negative integer below 2**64.
@@ -44,7 +44,7 @@ def env_keys(seed: int, num_envs: int) -> np.ndarray:
 
 
 def block_keys(seeds: Sequence[int], num_envs: int) -> np.ndarray:
-    """One key for each environment of a batch that is made of R equal blocks, each as if it were alone.
+    """Returns a key for each environment of a batch of R equal blocks, each as if it were alone.
 
     Args:
         seeds: R of them.
@@ -66,7 +66,7 @@ def block_keys(seeds: Sequence[int], num_envs: int) -> np.ndarray:
 
 
 def as_seeds(seed: int | Sequence[int]) -> list[int]:
-    """One seed, or several, as a list.
+    """Returns one or several seeds as a list.
 
     Raises:
         TypeError: a seed that is not an integer.

@@ -85,7 +85,7 @@ _OWN_ID = (
 
 
 def _wrong_options(id: str, options: dict[str, Any]) -> str:
-    """What to say if an environment does not take some of the options; nothing if that cannot be told."""
+    """Returns the message about options that an environment does not take; empty if this is unknown."""
     known = gymnasium.registry.get(id.partition(":")[2] or id)
     if known is None or known.entry_point is None:
         return ""
@@ -199,7 +199,7 @@ def goals_to_try(env: gymnasium.Env, layout: Layout) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class Trial:
-    """What some steps of random actions showed.
+    """Outcomes of some steps of random actions.
 
     Attributes:
         achieved, desired: [n, g] goals after each step.

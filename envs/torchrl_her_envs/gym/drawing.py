@@ -27,7 +27,7 @@ def choose_renderer() -> None:
 
 
 def cannot_draw(name: str, error: Exception) -> str:
-    """What to say if an environment cannot be drawn, in one line."""
+    """Returns a message of one line about an environment that cannot be drawn."""
     hint = ""
     if "mujoco" in sys.modules:
         by = os.environ.get(_DRAWN_BY)

@@ -284,7 +284,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
 
     @property
     def ends(self) -> Ends:
-        """What ends an episode at its goal, see :class:`~torchrl_her_envs.common.goal_rules.GoalEnds`."""
+        """Rule for the ends of episodes, see :class:`~torchrl_her_envs.common.goal_rules.GoalEnds`."""
         return self.goal_ends.rule
 
     @property
@@ -463,7 +463,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         return np.clip(Layout(space, "action").unflatten(rows), space.low, space.high)
 
     def action_limits(self) -> tuple[Tensor, Tensor]:
-        """Those of the space."""
+        """Returns the bounds of the action space."""
         space = cast(spaces.Box, self._env.single_action_space)
         return torch.as_tensor(space.low).flatten(), torch.as_tensor(space.high).flatten()
 

@@ -144,7 +144,7 @@ class GoalFunction:
         return answer.item()
 
     def hint(self, info: Collection[str]) -> str:
-        """What to say of infos that lack what the function reads besides the keys that are named."""
+        """Returns the message about infos that lack what the function reads besides the named keys."""
         if not self.lacking:
             return ""
         keys = sorted(self.lacking)

@@ -14,7 +14,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class _Leaf:
-    """One array of a nested dictionary: the keys that lead to it, its shape and type."""
+    """Array of a nested dictionary: the keys that lead to it, its shape and type."""
 
     path: tuple[str, ...]
     shape: tuple[int, ...]

@@ -57,7 +57,7 @@ class GoalRules:
 
 
 class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
-    """One environment of a task.
+    """Gymnasium environment of a task.
 
     Observations are a dict of ``observation``, ``achieved_goal`` and ``desired_goal`` (float32), actions
     are in [-1, 1], the reward is 0 where the goal is achieved and -1 elsewhere: see
@@ -122,7 +122,7 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One step of 0.04 s.
+        """Makes one step of 0.04 s.
 
         Raises:
             ValueError: an action that is not finite.

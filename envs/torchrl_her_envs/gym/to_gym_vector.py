@@ -117,7 +117,7 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         return _dict(self._core.show()), {}
 
     def step(self, actions: np.ndarray) -> Step:
-        """One step of 0.04 s in all environments.
+        """Makes one step of 0.04 s in all environments.
 
         Raises:
             ResetNeeded: an environment must be reset first.

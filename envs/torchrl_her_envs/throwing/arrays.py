@@ -1,4 +1,4 @@
-"""What lets one rule serve numbers, NumPy arrays and tensors: functions and constants of their kind."""
+"""Functions and constants that let one rule serve numbers, NumPy arrays and tensors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _OF_NUMBERS = SimpleNamespace(cos=math.cos, sin=math.sin, __name__="numbers")
 
 
 def functions_of(values: Any) -> Any:
-    """What has the functions for such values: ``numpy``, ``torch``, or for a number a few of ``math``'s.
+    """Returns the module of functions for values: ``numpy``, ``torch``, or some of ``math``'s for a number.
 
     Use only functions that all have by one name, with positional arguments.
 

@@ -32,7 +32,7 @@ _HELD_FROM_THE_START = {"held": 1.0, "away": 0.0, "mixed": 0.5}
 
 
 class Shown(NamedTuple):
-    """What the agent sees: ``state`` is the observation [N, ...] with the desired goal [N, 2] behind it.
+    """Entries that the agent sees: ``state`` is the observation [N, ...] with the goal [N, 2] behind it.
 
     Each is an array of its own, so whoever gets them may keep or change them.
     """
@@ -267,7 +267,7 @@ class ThrowingCore:
     # What is seen, and what it says
 
     def show(self) -> Shown:
-        """What the agent sees now."""
+        """Returns the present observations of the agent."""
         state = self.show_state()
         return Shown(state, state[:, :-2].copy(), state[:, self.achieved_index].copy(), state[:, -2:].copy())
 

@@ -36,7 +36,7 @@ class Effector(Protocol):
         ...
 
     def move_one(self, joints: list[float], change: list[float]) -> list[float]:
-        """The same of one."""
+        """Returns the joints of one hand or arm after a change; see :meth:`move`."""
         ...
 
     def grip(self, joints: Array) -> Array:
@@ -44,7 +44,7 @@ class Effector(Protocol):
         ...
 
     def grip_one(self, joints: list[float]) -> list[float]:
-        """The same of one."""
+        """Returns the position of the grip of one hand or arm."""
         ...
 
     def skeleton(self, joints: Array) -> Array:

@@ -177,7 +177,7 @@ class _Limits:
 
 
 class _Space:
-    """One Chipmunk space with the sides and the wall of one world, and as many balls as were needed at once.
+    """Chipmunk space with the sides and the wall of one world, and as many balls as were needed at once.
 
     Args:
         world: the constants of the world.

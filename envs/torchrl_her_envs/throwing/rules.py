@@ -1,4 +1,4 @@
-"""One time step of a throwing task: who holds the ball, and how hands, arms and balls move.
+"""The time step of a throwing task: who holds the ball, and how hands, arms and balls move.
 
 The rules are written once, for one world in plain numbers as for many in arrays. Numbers are several times as
 fast for one world, arrays for many.
@@ -34,7 +34,7 @@ class Bodies(NamedTuple):
 
 
 class Kind(Protocol):
-    """What is done differently with numbers and with arrays."""
+    """Operations that differ between numbers and arrays."""
 
     def move(self, joints: Any, action: Any) -> Any:
         """The joints after an action of one step."""
@@ -53,7 +53,7 @@ class Kind(Protocol):
         ...
 
     def pick(self, condition: Any, one: Any, other: Any) -> Any:
-        """One point where a condition holds, the other elsewhere."""
+        """Selects one point where a condition holds, the other elsewhere."""
         ...
 
 
@@ -102,7 +102,7 @@ def reward_of(achieved: Any) -> Any:
 
 
 class Numbers:
-    """One world in plain numbers; ``world`` is its index among those of the physics."""
+    """World in plain numbers; ``world`` is its index among those of the physics."""
 
     world = 0
 

@@ -1,4 +1,4 @@
-"""What a throwing or reaching task is, the constants of its physics, and the table of the eleven tasks."""
+"""Throwing and reaching tasks: their parts, the constants of their physics, and the table of all eleven."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ class WorldConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One task: who moves, where the ball starts, whether there is a wall, what the goal is.
+    """Task: who moves, where the ball starts, whether there is a wall, what the goal is.
 
     Args:
         name: the name that ``make_env`` takes.

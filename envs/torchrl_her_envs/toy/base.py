@@ -1,4 +1,4 @@
-"""What the toy environments share: states are places on a lattice, and a goal is a place too."""
+"""The base of the toy environments: states are places on a lattice, and a goal is a place too."""
 
 from __future__ import annotations
 

@@ -47,6 +47,6 @@ class LatticeGoals:
         return self.from_uniform(torch.rand(n, len(self.low), dtype=torch.float64, generator=generator))
 
     def scaled(self, factor: float, shift: float) -> LatticeGoals:
-        """The same lattice in coordinates ``factor * x + shift``, with a positive factor."""
+        """Returns the lattice in coordinates ``factor * x + shift``, with a positive factor."""
         low, high = (self.low * factor + shift).tolist(), (self.high * factor + shift).tolist()
         return LatticeGoals(low, high, count=self.count)

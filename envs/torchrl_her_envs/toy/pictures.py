@@ -63,7 +63,7 @@ class Sheet:
 
 
 def draw(width: int, on: Callable[[Sheet], None]) -> Tensor:
-    """A picture [height, width, 3] of uint8 of what somebody draws on a sheet.
+    """Returns the picture [height, width, 3] of uint8 that a function draws on a sheet.
 
     Raises:
         ValueError: ``width`` is below 1.

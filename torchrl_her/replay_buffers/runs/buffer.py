@@ -46,7 +46,7 @@ def bounds_of_run(buffer: ReplayBuffer, run: int) -> tuple[int, int]:
 
 
 def empty_run(buffer: ReplayBuffer, run: int = 0) -> None:
-    """Empties one run's block: rows, priorities, counts, weights of goals, open episodes. Others go on.
+    """Empties one run's block: rows, priorities, counts, weights of goals and open episodes.
 
     Args:
         buffer: of several runs, or of a single one, which is emptied as a whole.

@@ -70,7 +70,7 @@ class RunCounts:
                     setattr(counts, name, getattr(counts, name) + own[position])
 
     def empty(self, run: int) -> None:
-        """Counts a run from 0 again; its totals go on."""
+        """Counts a run from 0 again; its totals are kept."""
         self.counts[run] = WriterCounts()
 
     def state_dict(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ Goals = tuple[Tensor | None, ...]
 
 @dataclass(frozen=True)
 class RecentGoals:
-    """What each of R runs remembers: the goals wanted in recent episodes, and those achieved in them.
+    """Goals that were wanted and achieved in recent episodes of each of R runs.
 
     Attributes:
         goals: for ``"actual"`` and ``"achieved"``, those of each run, [m, g] with the newest last; None for
@@ -54,7 +54,7 @@ class RecentGoals:
         *,
         sizes: Mapping[str, int],
     ) -> RecentGoals:
-        """What is remembered after some episodes.
+        """Returns the memory after some episodes.
 
         Args:
             rows: [n], transitions.
@@ -84,7 +84,7 @@ class RecentGoals:
         return RecentGoals(out)
 
     def without_run(self, run: int) -> RecentGoals:
-        """What the other runs remember."""
+        """Returns the memory without one run's goals."""
         return RecentGoals({name: (*own[:run], None, *own[run + 1 :]) for name, own in self.goals.items()})
 
     def lines(self, name: str, runs: Sequence[int]) -> tuple[Tensor, Episodes]:
@@ -105,7 +105,7 @@ class RecentGoals:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Sequence[Tensor | None]]) -> RecentGoals:
-        """What was remembered when :meth:`state_dict` was called."""
+        """Restores the memory from a :meth:`state_dict`."""
         return cls({name: tuple(state[name]) for name in RECENT})
 
 

@@ -274,10 +274,10 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         self._sizes[run], self._most[run] = 0, 1.0
 
     def add(self, index: Tensor | int) -> None:
-        """Nothing is to be done: :meth:`mark_update` was told."""
+        """Does nothing: :meth:`mark_update` has already set the new rows' priorities."""
 
     def extend(self, index: Tensor | tuple[Tensor, ...]) -> None:
-        """Nothing is to be done: :meth:`mark_update` was told."""
+        """Does nothing: :meth:`mark_update` has already set the new rows' priorities."""
 
     def state_dict(self) -> dict[str, Any]:
         """The powers of the priorities of the rows that are filled, as tensors and plain data."""

@@ -16,7 +16,7 @@ _TOPS = 32  # nodes without a parent, at most
 
 
 class SumTrees:
-    """One tree for each of R runs, all of them drawn from and updated in the same few tensor operations.
+    """Trees of R runs, all drawn from and updated in the same few tensor operations.
 
     Each run has up to ``capacity`` leaves of at least 0, the sums of each 16 of them, of each 16 sums, and so
     on. A draw goes down from the top: at each node it takes the child in which its random number lies.
@@ -130,7 +130,7 @@ class SumTrees:
         return leaf, leaves.view(-1).index_select(0, node).view(u.shape)
 
     def _native(self) -> Any:
-        """The same in C++, for trees in ordinary memory; None if it cannot be had."""
+        """Returns the trees in C++, for ordinary memory; None if they are not available."""
         return load_trees() if self.native and self._levels[0].device.type == "cpu" else None
 
     def _pointers(self) -> tuple[Any, Any, int, int]:

@@ -19,7 +19,7 @@ _NO_DISPLAY = (
 
 
 class Command(Enum):
-    """What somebody asks for with a key; the value is what the keys are called."""
+    """Request that a user makes with a key; the value is what the keys are called."""
 
     PAUSE = "space: pause"
     STEP = "n or right arrow: one step"
@@ -72,7 +72,7 @@ class KeyWindow:
 
     @property
     def title(self) -> str:
-        """What stands above the picture."""
+        """Line above the picture."""
         return self._pygame.display.get_caption()[0]
 
     @title.setter
@@ -101,7 +101,7 @@ class KeyWindow:
         pygame.display.flip()
 
     def commands(self) -> list[Command]:
-        """What was asked for since the last call; closing the window is ``QUIT``."""
+        """Returns the requests since the last call; closing the window is ``QUIT``."""
         pygame, asked = self._pygame, []
         for event in pygame.event.get():
             if event.type == pygame.QUIT:

@@ -19,7 +19,7 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 class LiveEpisodes:
-    """One greedy episode in each of several environments, as long as somebody asks for the next step.
+    """Greedy episode in each of several environments, played step by step on request.
 
     The picture of an environment whose episode is over stays as it was, with a green border if it achieved
     its goal in some step and a red one if not. The environment itself begins a new episode, which is not

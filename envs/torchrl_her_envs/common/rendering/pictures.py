@@ -1,4 +1,4 @@
-"""What is done to finished pictures: size, caption, border, and many of them in one."""
+"""Finished pictures: size, caption, border, and many of them in one."""
 
 from __future__ import annotations
 

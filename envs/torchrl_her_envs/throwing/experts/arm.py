@@ -1,4 +1,4 @@
-"""What a scripted controller knows of the arm: how to turn to a point, and how to throw."""
+"""The arm as a scripted controller uses it: how to turn to a point, and how to throw."""
 
 from __future__ import annotations
 

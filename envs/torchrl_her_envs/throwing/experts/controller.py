@@ -24,7 +24,7 @@ _LET_GO = 0.9  # ... and one that is let go: a little more, so that rounding nev
 
 
 class Skill(Protocol):
-    """What a controller must know of a hand or an arm, in meters, radians and seconds."""
+    """Skill of a hand or an arm that a controller combines, in meters, radians and seconds."""
 
     effector: Effector
 
@@ -43,7 +43,7 @@ class Skill(Protocol):
 
 @dataclass
 class _Seen:
-    """What a controller reads from B states: joints [B, J], points and velocities [B, 2], flags [B]."""
+    """Inputs of a controller from B states: joints [B, J], points and velocities [B, 2], flags [B]."""
 
     joints: Tensor
     ball: Tensor

@@ -1,4 +1,4 @@
-"""What a scripted controller knows of the hand: how to go to a point, and how to throw."""
+"""The hand as a scripted controller uses it: how to go to a point, and how to throw."""
 
 from __future__ import annotations
 

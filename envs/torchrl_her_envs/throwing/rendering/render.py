@@ -21,7 +21,7 @@ _TEXT = 0.045  # of the screen: height of a caption
 
 
 class Scene(Protocol):
-    """What a picture shows of a :class:`~torchrl_her_envs.ThrowingEnv`, or of its core."""
+    """Contents of a picture of a :class:`~torchrl_her_envs.ThrowingEnv`, or of its core."""
 
     task: Task
     world: WorldConfig
@@ -80,7 +80,7 @@ def render(
 
 
 def _draw_stage(env: Scene, size: int) -> Canvas:
-    """What all pictures of a task share: the screen, the regions and the wall."""
+    """Draws the parts that all pictures of a task share: the screen, the regions and the wall."""
     canvas = Canvas(size, background=palette.OUTSIDE)
     canvas.box((0.0, 0.0), (1.0, 1.0), fill=palette.PAPER, edge=palette.FRAME, width=_LINE)
     _draw_reach(canvas, env)
@@ -115,7 +115,7 @@ def _draw_goals(canvas: Canvas, env: Scene) -> None:
 
 
 def _draw_world(canvas: Canvas, env: Scene, world: int, trail: Sequence[Tensor]) -> None:
-    """What differs from one environment to the next, drawn from the back to the front."""
+    """Draws the parts that differ from one environment to the next, from the back to the front."""
     now, size, closed = env.worlds, env.world.size, bool(env.worlds.closed[world])
     grip = _point(now.grip[world] / size)
     if env.task.throws:
