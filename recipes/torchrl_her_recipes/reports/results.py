@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +119,7 @@ def read_single(label: str, batches: Batches) -> Combination:
 
 def _differences(made: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
     """The options of a recipe that are not those of another one, and their values in both."""
-    ours, theirs = dict(_flat(asdict(made))), dict(_flat(asdict(usual)))
+    ours, theirs = dict(_flat(made.to_dict())), dict(_flat(usual.to_dict()))
     return [(name, value, theirs.get(name)) for name, value in ours.items() if value != theirs.get(name)]
 
 

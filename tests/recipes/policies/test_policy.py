@@ -252,7 +252,7 @@ def _no_weights(state: dict[str, Any]) -> None:
             _no_widths,
             "its info is damaged: PolicyInfo.__init__() missing 1 required keyword",
         ),
-        (_other_learner, "unknown learner 'theirs'"),
+        (_other_learner, "learner must be one of ddpg, td3, sac, redq, tqc, dqn, auto, got 'theirs'"),
         (_no_weights, "these are not the weights of an actor of learner="),
     ],
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ def write_run(
     recipe = dict(study.cells())[label]
     home = folder / label
     home.mkdir(parents=True)
-    (home / "config.yaml").write_text(yaml.safe_dump(asdict(recipe)))
+    (home / "config.yaml").write_text(yaml.safe_dump(recipe.to_dict()))
     rows = [
         {
             "run": run,

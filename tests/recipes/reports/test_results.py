@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_her_recipes.reports.results import at_the_end, read_combinations
+from torchrl_her_recipes import Recipe, make_recipe
+from torchrl_her_recipes.reports.results import _differences, at_the_end, read_combinations
 
 from .small_study import STUDY, write_run
 
@@ -42,3 +43,8 @@ def test_a_folder_without_the_study_s_runs_is_refused(tmp_path: Path) -> None:
         read_combinations(STUDY, tmp_path)
     with pytest.raises(ValueError, match="there is no folder .*none"):
         read_combinations(STUDY, tmp_path / "none")
+
+
+def test_another_learner_is_a_difference() -> None:
+    differences = _differences(make_recipe(learner="sac"), Recipe())
+    assert ("learner.name", "sac", "auto") in differences
