@@ -19,21 +19,21 @@ from machine import describe, publish, table
 from torchrl_her import save_checkpoint
 from torchrl_her.replay_buffers import sizes_of
 from torchrl_her_recipes import Recipe, build, load_preset, make_recipe
-from torchrl_her_recipes.runs.state import run_state
+from torchrl_her_recipes.runs.state import parts_of, run_state
 
 
 def measure(recipe: Recipe, folder: Path) -> list[str]:
     """Trains without evaluations, with the checkpoints of a run; a row of the table."""
     components = build(recipe)
     trainer, path = components.trainer(), folder / "checkpoint.pt"
-    trained, saved = 0.0, []
+    parts, trained, saved = parts_of(components, trainer), 0.0, []
     while trainer.epochs < recipe.run.epochs:
         began = time.perf_counter()
         trainer.epoch()
         trained += time.perf_counter() - began
         if trainer.epochs % recipe.run.checkpoint_interval == 0:
             began = time.perf_counter()
-            save_checkpoint(run_state(components, trainer), path, keep=recipe.run.keep_checkpoints)
+            save_checkpoint(run_state(parts), path, keep=recipe.run.keep_checkpoints)
             saved.append(time.perf_counter() - began)
     trained -= trainer.learner.compile_seconds  # once in the life of a machine
     rows = statistics.mean(sizes_of(components.buffer))

@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "play_greedily": "evaluation",
             "measure": "evaluation",
             "save_checkpoint": "checkpoints",
-            "_save_goals": "map of goals",
+            "goal_map": "map of goals",
             "plot_curves": "pictures",
             "plot_goals": "pictures",
             "film_policy": "pictures",

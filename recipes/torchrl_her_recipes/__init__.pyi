@@ -46,8 +46,8 @@ from .runs.log_to import LogTo as LogTo
 from .runs.run import RunResult as RunResult
 from .runs.run import resume as resume
 from .runs.run import run as run
-from .runs.score import run_score as run_score
-from .runs.score import score as score
+from .runs.run import run_score as run_score
+from .runs.scores import score as score
 from .runs.show import show_file as show_file
 from .studies.pictures import plot_virtual_goals as plot_virtual_goals
 from .studies.study import plan_study as plan_study

@@ -34,7 +34,7 @@ from torchrl_her_recipes.policies.network import load_network
 from torchrl_her_recipes.policies.onnx import SUFFIX, need_onnx, write_onnx
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.policy_file import read_policy, write_policy
-from torchrl_her_recipes.runs.run import median_run
+from torchrl_her_recipes.runs.scores import median_run
 
 _MEASURED = 1 << 41  # seeds that no training uses: of the episodes that measure a policy,
 _COMPARED = 1 << 42  # and of those on whose states an ONNX file is compared with it

@@ -22,21 +22,12 @@ from torchrl_her_recipes.runs.notices import saturation
 
 @torch.no_grad()
 def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor]:
-    """What greedy episodes of each run show, [R] each.
+    """What greedy episodes of each run show of the policy and the critics, [R] each.
 
     ``q`` is the value of the first action as the loss's own critics see it (see
     :func:`~torchrl_her.objectives.critic_value`), and ``q_bias`` is that minus the return of the policy that
     played: the average of the actor, if there is one. Both are missing if the loss has no such critics.
     """
-    means = measure_rollout(components, rollout)
-    if components.behavior is not None:
-        means["proposed_success"] = components.behavior.success()
-    return means | {"epsilon": components.exploration.epsilon}
-
-
-@torch.no_grad()
-def measure_rollout(components: Components, rollout: TensorDictBase) -> dict[str, Tensor]:
-    """What greedy episodes of each run show of the policy and the critics, [R] each."""
     recipe, judged_by = components.recipe, judging(components.eval_env)
     there = success(rollout, **judged_by)
     # An episode that is cut off at its goal is taken to stay there.

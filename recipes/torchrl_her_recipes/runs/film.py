@@ -6,6 +6,7 @@ import warnings
 from contextlib import closing
 from pathlib import Path
 
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_her_envs.common.goal_env import goal_env
@@ -13,40 +14,36 @@ from torchrl_her_envs.common.rendering.recording import record_episodes
 from torchrl_her_envs.common.rendering.video import write_video
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.components.assembly import eval_seeds
-from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import make_played_env
 from torchrl_her_recipes.components.envs import evaluation_envs
+from torchrl_her_recipes.config.recipe import Recipe
 
 FPS = 12  # half the true speed of the throwing tasks, as a throw takes half a second
 _FILMED = 6  # environments
 
 
-def film_policy(components: Components, out: Path, *, run: int, epoch: int) -> None:
+def film_policy(
+    recipe: Recipe, env: EnvBase, player: TensorDictModuleBase, out: Path, *, run: int, epoch: int
+) -> None:
     """Films greedy episodes of one of the runs, if its environment gives pictures.
 
     Environments that only give pictures if they are made for it are made anew. Drawing them may need what a
     machine lacks, such as a display: then there is a warning instead of a film.
     """
-    recipe = components.recipe
     worlds = evaluation_envs(recipe)
     shown = min(_FILMED, worlds)
-    if goal_env(components.eval_env).can_render:
-        _film(components, components.eval_env, out, run * worlds, shown)
+    if goal_env(env).can_render:
+        _film(player, env, out, run * worlds, shown)
     elif get_task_spec(recipe.task.name).for_pictures:
         try:
-            env = make_played_env(recipe, shown, eval_seeds(recipe, epoch), pictures=True)
-            with closing(env):
-                if goal_env(env).can_render:
-                    _film(components, env, out, run * shown, shown)
+            drawn = make_played_env(recipe, shown, eval_seeds(recipe, epoch), pictures=True)
+            with closing(drawn):
+                if goal_env(drawn).can_render:
+                    _film(player, drawn, out, run * shown, shown)
         except Exception as error:  # whatever a renderer raises: the run itself is done
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"no {out.name}: the environment could not be drawn: {reason}", stacklevel=2)
 
 
-def _film(components: Components, env: EnvBase, out: Path, first: int, count: int) -> None:
-    frames = record_episodes(
-        env,
-        components.player,
-        worlds=range(first, first + count),
-    )
-    write_video(frames, out, fps=FPS)
+def _film(player: TensorDictModuleBase, env: EnvBase, out: Path, first: int, count: int) -> None:
+    write_video(record_episodes(env, player, worlds=range(first, first + count)), out, fps=FPS)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
+from torchrl.envs import EnvBase
 
 from torchrl_her.curriculum.switch import set_layer_goals
 from torchrl_her.goals.sources import sources_name
@@ -22,102 +26,116 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.collection_worker import derive_seed
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
+from torchrl_her_recipes.config.recipe import Recipe
+
+_NETWORKS = ("loss", "optimizer", "target", "exploration", "norm", "average", "guide")
+_ROWS = ("buffer", "demonstrations")  # nearly all of a checkpoint
 
 
-def run_state(components: Components, trainer: Trainer, *, buffer: bool = True) -> dict[str, Any]:
-    """All that a run is, as tensors and plain data. Rows are the buffer's own: save it at once.
+@dataclass(frozen=True)
+class Part:
+    """A part of a run whose state is read and put back by functions."""
+
+    state_dict: Callable[[], Any]
+    load_state_dict: Callable[[Any], object]
+
+
+def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
+    """All parts of a run that have a state, by name, in the order in which they are loaded."""
+    buffer, collector, state = components.buffer, components.collector, components.curriculum
+    guide, generators, device = components.guide, components.generators, place_of(components.loss)
+    worlds = _worlds(components.env, components.recipe)
+
+    def check_made_of(made_of: dict[str, str]) -> None:
+        for name, value in _made_of(components).items():
+            if value != made_of[name]:
+                raise ValueError(
+                    f"the run's {name} was {made_of[name]}, not {value}: give resume() components made as "
+                    "its were"
+                )
+
+    def load_progress(progress: dict[str, Any]) -> None:
+        assert state is not None
+        state.progress.load_state_dict(progress)
+        for run in range(0 if state.progress.by_episode else state.progress.runs):
+            set_layer_goals(buffer.writer, state.progress.layer_of(run), run=run)
+
+    def begin_episodes(_state: dict[str, Any]) -> None:
+        if trainer.in_epoch:  # the episodes of such environments cannot be resumed
+            collector.reset()
+            if isinstance(buffer.writer, HERWriter):
+                buffer.writer.end_episodes()
+
+    found = {
+        "made_of": Part(partial(_made_of, components), check_made_of),
+        **{name: getattr(components, name) for name in _NETWORKS},
+        "guided": None if guide is None else Part(lambda: guide.guided, partial(setattr, guide, "guided")),
+        "buffer": Part(
+            partial(buffer_state_dict, buffer, copy=False), partial(load_buffer_state_dict, buffer)
+        ),
+        "generators": Part(
+            lambda: [own.get_state() for own in generators],
+            lambda states: [own.set_state(state) for own, state in zip(generators, states, strict=True)],
+        ),
+        # For losses that draw, as SAC's.
+        "torch_generator": Part(torch.get_rng_state, torch.set_rng_state),
+        "cuda_generator": None
+        if device.type != "cuda"
+        else Part(
+            partial(torch.cuda.get_rng_state, device), partial(torch.cuda.set_rng_state, device=device)
+        ),
+        "progress": None if state is None else Part(state.progress.state_dict, load_progress),
+        "demonstrations": components.demonstrations,  # they are those of the layers, from the progress
+        "collector": Part(
+            partial(collector_state_dict, collector), partial(load_collector_state_dict, collector)
+        ),
+        "trainer": trainer,
+        "worlds": Part(dict, begin_episodes)
+        if worlds is None
+        else Part(worlds.world_state_dict, worlds.load_world_state_dict),
+    }
+    return {name: part for name, part in found.items() if part is not None}
+
+
+def run_state(parts: dict[str, Any], *, buffer: bool = True) -> dict[str, Any]:
+    """The states of parts, as tensors and plain data. Rows are the buffer's own: save it at once.
 
     Args:
-        components: of the run.
-        trainer: its training loop.
+        parts: of :func:`parts_of`.
 
     Keyword Args:
-        buffer: whether with the replay buffer and that of demonstrations, which are nearly all of it. Without
-            them a run cannot go on.
+        buffer: whether with the replay buffer and that of demonstrations, without which a run cannot go on.
     """
-    shown = components.demonstrations
-    return {
-        "recipe": components.recipe.to_dict(),
-        "made_of": _made_of(components),
-        "trainer": trainer.state_dict(),
-        **{name: dict(part.state_dict()) for name, part in _parts(components).items()},
-        "guided": None if components.guide is None else components.guide.guided,
-        "buffer": buffer_state_dict(components.buffer, copy=False) if buffer else None,
-        "demonstrations": None if shown is None or not buffer else shown.state_dict(),
-        "generators": [generator.get_state() for generator in components.generators],
-        "torch_generator": torch.get_rng_state(),  # for losses that draw, as SAC's
-        "cuda_generator": None if (gpu := _gpu_of(components)) is None else torch.cuda.get_rng_state(gpu),
-        "worlds": None if (worlds := _worlds(components)) is None else worlds.world_state_dict(),
-        "progress": None if components.curriculum is None else components.curriculum.progress.state_dict(),
-        "collector": collector_state_dict(components.collector),
-    }
+    return {name: part.state_dict() if buffer or name not in _ROWS else None for name, part in parts.items()}
 
 
-def load_run_state(components: Components, trainer: Trainer, state: dict[str, Any]) -> None:
-    """Puts freshly built components where :func:`run_state` was taken; their buffer stays empty without one.
+def load_run_state(parts: dict[str, Any], state: dict[str, Any]) -> None:
+    """Puts freshly built parts where :func:`run_state` was taken; their buffer stays empty without one.
 
     Raises:
-        ValueError: the components are of other types or have other settings than those of the run.
+        ValueError: the state is of other parts, or these are of other types or have other settings.
     """
-    for name, value in _made_of(components).items():
-        if value != (was := state["made_of"][name]):
-            raise ValueError(
-                f"the run's {name} was {was}, not {value}: give resume() components made as its were"
-            )
-    for name, part in _parts(components).items():
-        part.load_state_dict(state[name])
-    if components.guide is not None:
-        components.guide.guided = state["guided"]
-    if state["buffer"] is not None:
-        load_buffer_state_dict(components.buffer, state["buffer"])
-    for generator, own in zip(components.generators, state["generators"], strict=True):
-        generator.set_state(own)
-    torch.set_rng_state(state["torch_generator"])
-    gpu, own = _gpu_of(components), state["cuda_generator"]
-    if gpu is not None and own is not None:
-        torch.cuda.set_rng_state(own, gpu)
-    if components.curriculum is not None:
-        components.curriculum.progress.load_state_dict(state["progress"])
-        progress = components.curriculum.progress
-        for run in range(0 if progress.by_episode else components.recipe.run.num_runs):
-            set_layer_goals(components.buffer.writer, progress.layer_of(run), run=run)
-    if components.demonstrations is not None and state["demonstrations"] is not None:
-        components.demonstrations.load_state_dict(state["demonstrations"])
-    load_collector_state_dict(components.collector, state["collector"])
-    trainer.load_state_dict(state["trainer"])
-    if (worlds := _worlds(components)) is not None:
-        worlds.load_world_state_dict(state["worlds"])
-    elif trainer.in_epoch:  # such environments cannot go on with their episodes
-        components.collector.reset()
-        if isinstance(components.buffer.writer, HERWriter):
-            components.buffer.writer.end_episodes()
+    if others := sorted(parts.keys() ^ state.keys()):
+        raise ValueError(
+            f"it has other parts ({', '.join(others)}): resume it with the version of torchrl-her and the "
+            "components that it was written with"
+        )
+    for name, part in parts.items():
+        if state[name] is not None:
+            part.load_state_dict(state[name])
 
 
-def seed_epoch(components: Components, trainer: Trainer) -> None:
+def seed_epoch(env: EnvBase, recipe: Recipe, trainer: Trainer) -> None:
     """Seeds environments whose state no checkpoint holds, so that a resumed run plays the same epoch."""
-    recipe = components.recipe
     begins = trainer.epochs > 0 and not trainer.in_epoch
-    if begins and recipe.collection.processes == 0 and _worlds(components) is None:
-        goal_env(components.env).set_seeds([derive_seed(seed, trainer.epochs) for seed in recipe.seeds])
+    if begins and recipe.collection.processes == 0 and _worlds(env, recipe) is None:
+        goal_env(env).set_seeds([derive_seed(seed, trainer.epochs) for seed in recipe.seeds])
 
 
-def _parts(components: Components) -> dict[str, Any]:
-    """The components with networks or statistics, by name, as far as there are any."""
-    names = ("loss", "optimizer", "target", "exploration", "norm", "average", "guide")
-    return {name: part for name in names if (part := getattr(components, name)) is not None}
-
-
-def _gpu_of(components: Components) -> torch.device | None:
-    """Where the networks are, if that is a GPU."""
-    device = place_of(components.loss)
-    return device if device.type == "cuda" and torch.cuda.is_initialized() else None
-
-
-def _worlds(components: Components) -> BatchedEnv | None:
+def _worlds(env: EnvBase, recipe: Recipe) -> BatchedEnv | None:
     """The environment below all transforms, if it is one of ours and collects here."""
-    worlds = goal_env(components.env)
-    here = components.recipe.collection.processes == 0
-    return worlds if here and isinstance(worlds, BatchedEnv) else None
+    worlds = goal_env(env)
+    return worlds if recipe.collection.processes == 0 and isinstance(worlds, BatchedEnv) else None
 
 
 def _made_of(components: Components) -> dict[str, str]:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import Compose, EnvBase
 
 from torchrl_her.behavior import BehaviorGoals
 from torchrl_her.replay_buffers.runs.buffer import bounds_of_run
 from torchrl_her_recipes.components.assembly import eval_seeds
 from torchrl_her_recipes.components.components import Components
+from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.runs.curriculum import play_greedily
-from torchrl_her_recipes.runs.evaluation import measure_rollout
+from torchrl_her_recipes.runs.evaluation import measure
 
 _TRIES = 8  # rows that are looked at for each goal, since some are real
 _NAMES = ("success", "q", "q_bias")
@@ -30,7 +32,7 @@ def at_virtual_goals(components: Components, epoch: int) -> dict[str, Tensor]:
     found = torch.tensor(ask_for_virtual_goals(components, env, epoch))
     played = play_greedily(components, env, epoch)
     # The environment's own word is about its own goals.
-    shown = measure_rollout(components, played.exclude(("next", "is_success")))
+    shown = measure(components, played.exclude(("next", "is_success")))
     return {f"virtual_{name}": shown[name].masked_fill(~found, torch.nan) for name in _NAMES if name in shown}
 
 
@@ -46,7 +48,7 @@ def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> l
     number, (width, seen) = asking.memory.capacity, widths
     every = torch.zeros(components.recipe.run.num_runs, number, width)
     for run, seed in enumerate(eval_seeds(components.recipe, epoch)):
-        goals = _virtual_goals(components, run, number, seed)
+        goals = _virtual_goals(components.buffer, components.curriculum, run, number, seed)
         found.append(len(goals) > 0)
         if found[-1]:
             every[run] = goals[torch.arange(number) % len(goals)]
@@ -58,14 +60,15 @@ def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> l
     return found
 
 
-def _virtual_goals(components: Components, run: int, number: int, seed: int) -> Tensor:
+def _virtual_goals(
+    buffer: TensorDictReplayBuffer, state: CurriculumState | None, run: int, number: int, seed: int
+) -> Tensor:
     """Virtual goals [n, g] of the full task that a run's rows have, about so many; none if there are none."""
-    state, none = components.curriculum, torch.empty(0, 1)
-    begin, end = bounds_of_run(components.buffer, run)
+    begin, end = bounds_of_run(buffer, run)
     if begin == end or (state is not None and not state.at_the_top(run)):
-        return none
+        return torch.empty(0, 1)
     generator = torch.Generator().manual_seed(seed)
-    rows = components.buffer.storage[torch.randint(begin, end, (_TRIES * number,), generator=generator)]
+    rows = buffer.storage[torch.randint(begin, end, (_TRIES * number,), generator=generator)]
     fits = rows.get("virtual").squeeze(-1)
     if state is not None and state.progress.by_episode:
         fits = fits & (rows.get("layer").squeeze(-1) == len(state.curriculum) - 1)

@@ -17,7 +17,7 @@ from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.study import Study, curve_label
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.plots import plot_comparison
-from torchrl_her_recipes.runs.run import last_success
+from torchrl_her_recipes.runs.scores import last_success
 from torchrl_her_recipes.studies.jobs import Job
 from torchrl_her_recipes.studies.plan import Plan
 from torchrl_her_recipes.studies.schedule import run_jobs

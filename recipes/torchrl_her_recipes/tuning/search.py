@@ -29,7 +29,7 @@ from torchrl_her_recipes.config.search import Search, difference
 from torchrl_her_recipes.runs.callbacks import Callback, RunView
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
-from torchrl_her_recipes.runs.score import score
+from torchrl_her_recipes.runs.scores import score
 from torchrl_her_recipes.studies.jobs import Job, Outcome
 from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
 from torchrl_her_recipes.tuning.results import DEFAULT, folder_of, write_pictures, write_results

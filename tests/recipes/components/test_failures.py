@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule
 
 from torchrl_her_recipes import build, make_recipe
 from torchrl_her_recipes.components.envs import make_task_envs
-from torchrl_her_recipes.runs.evaluation import measure_rollout
+from torchrl_her_recipes.runs.evaluation import measure
 
 TASK = "gym:tests/Cliff-v0"
 GAMMA = 0.9
@@ -149,7 +149,7 @@ def test_targets_are_clamped_to_it_and_returns_have_it() -> None:
     assert components.bounds == (-1.0, 0.0)  # of rewards; values are from WORTH on
     leftwards = TensorDictModule(lambda seen: -torch.ones_like(seen), ["observation"], ["action"])
     left = components.eval_env.rollout(12, leftwards, break_when_any_done=False)
-    measured = measure_rollout(components, left)
+    measured = measure(components, left)
     assert measured["success"].item() == 0.0
     assert measured["return"].item() == pytest.approx(WORTH)
     components.close()

@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import pandas as pd
@@ -15,7 +16,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchrl_her import load_checkpoint
+from torchrl_her import load_checkpoint, save_checkpoint
 from torchrl_her_recipes import (
     Callback,
     Components,
@@ -162,7 +163,7 @@ def test_ctrl_c_saves_what_there_is(tmp_path: Path) -> None:
 def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_state, "_worlds", lambda components: None)
+    monkeypatch.setattr(run_state, "_worlds", lambda _env, _recipe: None)
     recipe = small(epochs=2)
     run(press_ctrl_c(build(recipe), 25), tmp_path / "run", progress=False)
     held = load_checkpoint(tmp_path / "run" / "checkpoint.pt")["buffer"]["writer"]["held"]
@@ -321,7 +322,7 @@ def test_a_default_run_is_small_when_it_has_finished_and_ends_as_one_that_keeps_
     for name, keep in (("kept", True), ("small", False)):
         run(build(small(**options, keep_buffer=keep)), tmp_path / name, progress=False)
     kept, own = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("kept", "small"))
-    apart = {"buffer", "demonstrations", "recipe"}
+    apart = {"buffer", "demonstrations"}
     assert_same(
         *({name: value for name, value in state.items() if name not in apart} for state in (kept, own))
     )
@@ -441,6 +442,21 @@ def test_a_full_disk_at_the_end_says_what_is_missing(tmp_path: Path) -> None:
         run(build(small(epochs=1)), tmp_path, progress=False)
     resume(tmp_path, progress=False)
     assert (tmp_path / "policy.safetensors").is_file()
+
+
+def test_a_checkpoint_with_other_parts_is_refused_in_one_line(
+    ended: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copytree(ended, tmp_path / "run")
+    path = tmp_path / "run" / "checkpoint.pt"
+    state = load_checkpoint(path)
+    del state["worlds"]
+    save_checkpoint({**state, "recipe": {}}, path)
+    assert cli.main(["train", "--resume", str(tmp_path / "run"), "epochs=3"]) == 2
+    assert capsys.readouterr().err == (
+        f"torchrl-her: {path} is not of this run: it has other parts (recipe, worlds): resume it with the "
+        "version of torchrl-her and the components that it was written with\n"
+    )
 
 
 def test_parts_that_were_swapped_must_be_given_to_resume(tmp_path: Path) -> None:

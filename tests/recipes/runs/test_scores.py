@@ -23,8 +23,8 @@ from torchrl_her_recipes import (
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config.policy_header import read_header
 from torchrl_her_recipes.runs import run as running
-from torchrl_her_recipes.runs.best import BestPolicy
 from torchrl_her_recipes.runs.policy_file import read_policy
+from torchrl_her_recipes.runs.scores import BestPolicy
 
 from ..small import assert_same, small
 

@@ -1,0 +1,95 @@
+"""How good runs are: their last evaluation, the score that searches maximize, the best policy."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+LAST = 5  # evaluations
+
+
+def last_success(rows: list[dict[str, float]]) -> list[float]:
+    """Success of each run in the last evaluation."""
+    return [row["success"] for row in rows if row["epoch"] == rows[-1]["epoch"]]
+
+
+def median_run(rows: list[dict[str, float]]) -> int:
+    """The index of the run with the median success in the last evaluation."""
+    values = last_success(rows)
+    return sorted(range(len(values)), key=values.__getitem__)[len(values) // 2]
+
+
+def score(rows: Sequence[dict[str, float]], *, last: int = LAST) -> float:
+    """The median over the runs of their mean success in the last evaluations: what searches maximize.
+
+    Args:
+        rows: the table of metrics, with a row for each epoch and run.
+        last: how many evaluations; all, as long as there are fewer.
+
+    Returns:
+        From 0 to 1; 0 if there was no evaluation.
+
+    Raises:
+        ValueError: ``last`` is below 1.
+
+    Example:
+        >>> good = [{"run": 0, "epoch": 1, "success": 0.5}, {"run": 0, "epoch": 2, "success": 1.0}]
+        >>> bad = [{"run": 1, "epoch": 1, "success": 0.0}, {"run": 1, "epoch": 2, "success": 0.5}]
+        >>> score(good), score(good + bad), score(good + bad, last=1)
+        (0.75, 0.5, 0.75)
+    """
+    if last < 1:
+        raise ValueError(f"last must be at least 1, got {last}")
+    counted = sorted({row["epoch"] for row in rows})[-last:]
+    successes: dict[float, list[float]] = {}
+    for row in rows:
+        if row["epoch"] in counted:
+            successes.setdefault(row["run"], []).append(row["success"])
+    return statistics.median(map(statistics.fmean, successes.values())) if successes else 0.0
+
+
+class BestPolicy:
+    """The policy of the evaluation with the best success so far; of several as good ones, the last.
+
+    Of several runs side by side the median counts, and the policies of all of them are kept.
+
+    Attributes:
+        state: the weights ``actor``, and the ``epoch`` and ``success`` of the evaluation; None before the
+            first one.
+        is_new: whether the state has to be written: set to False when that is done.
+
+    Example:
+        >>> from torchrl_her.modules import make_actor
+        >>> actor, best = make_actor([3, 2], 2), BestPolicy()
+        >>> for epoch, success in ((1, 0.5), (2, 0.8), (3, 0.8), (4, 0.6)):
+        ...     best.see([{"run": 0, "epoch": epoch, "success": success}], actor)
+        >>> best.state["epoch"], best.state["success"]
+        (3, 0.8)
+    """
+
+    def __init__(self) -> None:
+        self.state: dict[str, Any] | None = None
+        self.is_new = False
+
+    def state_dict(self) -> dict[str, Any] | None:
+        """Returns ``state``."""
+        return self.state
+
+    def load_state_dict(self, state: dict[str, Any] | None) -> None:
+        """Takes what :meth:`state_dict` gave."""
+        self.state, self.is_new = state, state is not None
+
+    def see(self, rows: Sequence[dict[str, float]], actor: TensorDictModuleBase) -> None:
+        """Takes a policy if its evaluation is at least as good as the best one before."""
+        success = statistics.median(row["success"] for row in rows)
+        if self.state is not None and success < self.state["success"]:
+            return
+        weights = {
+            name: value.detach().to("cpu", copy=True) if isinstance(value, Tensor) else value
+            for name, value in actor.state_dict().items()  # copies, which gradient steps leave alone
+        }
+        self.load_state_dict({"actor": weights, "epoch": int(rows[0]["epoch"]), "success": success})
