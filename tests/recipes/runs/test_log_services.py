@@ -88,6 +88,7 @@ def test_after_a_kill_and_a_resumption_each_step_is_there_once(tmp_path: Path) -
 
     rows = resume(tmp_path, options={"keep_checkpoints": 1, "pictures": True}, progress=False).rows
     success = {step: row["success"] for step, row in zip(STEPS, rows, strict=True)}
+    wandb.teardown()  # waits for its process, which writes the file
 
     history = wandb_history(tmp_path)
     assert {step: row["success/run_0"] for step, row in history.items()} == success
