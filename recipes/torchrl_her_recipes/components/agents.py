@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import torch
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
@@ -15,12 +15,12 @@ from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import Curriculum, zero_unused_inputs
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.networks import StackedLinear, stack_runs
-from torchrl_her.modules.normalization import RunningNorm
+from torchrl_her.objectives.cloning import Cloning
 from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her.trainers.adam import RunsAdam
 from torchrl_her_recipes.components.curricula import is_guided
 from torchrl_her_recipes.components.devices import CPU, place_of
-from torchrl_her_recipes.components.learner import Agent, LearnerBuilder, Networks
+from torchrl_her_recipes.components.learner import Agent, AgentShape, LearnerBuilder, Networks
 from torchrl_her_recipes.components.normalization import acting, make_norm
 from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, Actions, LearnerConfig
 from torchrl_her_recipes.config.options import AUTO
@@ -47,15 +47,18 @@ def make_agent(
         curriculum: whose layers the networks see, or None.
         device: where it learns.
     """
-    builder = _builder(recipe, env, curriculum)
-    builder.generators, builder.rewards = generators, rewards
+    own = recipe.demonstrations
+    cloning = (
+        Cloning(weight=own.bc_weight, q_filter=own.q_filter) if own.in_batches and own.bc_weight else None
+    )
+    shape = shape_of(recipe, env, curriculum, rewards=rewards)
+    builder = find_builder(recipe.learner, shape, generators=generators, cloning=cloning)
     actor, critics = _networks(builder, recipe, curriculum)  # the same on all devices
-    builder.device, actor = device, actor.to(device)
-    critics = [critic.to(device) for critic in critics]
+    actor, critics = actor.to(device), [critic.to(device) for critic in critics]
     exploration = builder.exploration().to(device)
-    options, runs = recipe.learner, recipe.run.num_runs
+    options, runs = recipe.learner, shape.runs
     loss = builder.loss(actor, critics)
-    norm = _norm_for(builder)
+    norm = make_norm(options, shape.widths, runs=runs)
     norm = None if norm is None else norm.to(device)
     player = acting(actor, norm)
     guide = _guide_of(player, recipe, curriculum, generators)
@@ -83,44 +86,60 @@ def make_agent(
     )
 
 
-def find_learner(recipe: Recipe, env: EnvBase) -> type[LearnerConfig]:
-    """The learner of a recipe; "auto" is DDPG where actions are continuous, and DQN where they are discrete.
+def shape_of(
+    recipe: Recipe, env: EnvBase, curriculum: Curriculum | None, *, rewards: tuple[float, float] = (-1.0, 0.0)
+) -> AgentShape:
+    """Returns the inputs and outputs of a recipe's networks, as the environment has them."""
+    in_keys = ("observation", "desired_goal") if curriculum is None else ("input",)
+    return AgentShape(
+        task=recipe.task.name,
+        widths={key: env.observation_spec[key].shape[-1] for key in in_keys},
+        action_spec=env.action_spec_unbatched,
+        rewards=rewards,
+        runs=recipe.run.num_runs,
+        dtype=getattr(torch, recipe.run.dtype),
+    )
+
+
+def find_learner(options: LearnerConfig, shape: AgentShape) -> type[LearnerConfig]:
+    """Returns the learner of options; "auto" is DDPG if actions are continuous, and DQN if they are discrete.
 
     Raises:
         ValueError: it cannot choose such actions, cannot train several runs, or an option has no effect
             with it.
     """
-    actions: Actions = "discrete" if isinstance(env.action_spec, Categorical) else "continuous"
-    learner = LEARNERS[BY_ACTIONS[actions]] if recipe.learner.name == AUTO else type(recipe.learner)
+    actions: Actions = "discrete" if isinstance(shape.action_spec, Categorical) else "continuous"
+    learner = LEARNERS[BY_ACTIONS[actions]] if options.name == AUTO else type(options)
     if learner.actions != actions:
         fitting = " or ".join(each.name for each in LEARNERS.values() if each.actions == actions)
         raise ValueError(
-            f"learner={learner.name} must not be used on {recipe.task.name}, which has {actions} actions: "
+            f"learner={learner.name} must not be used on {shape.task}, which has {actions} actions: "
             f"choose {fitting}"
         )
-    if not learner.stacks and recipe.run.num_runs > 1:
+    if not learner.stacks and shape.runs > 1:
         raise ValueError(
             f"num_runs must be 1 with learner={learner.name}, which cannot train several runs side by side, "
-            f"got {recipe.run.num_runs}; sweep over seeds instead"
+            f"got {shape.runs}; sweep over seeds instead"
         )
-    for own in fields(recipe.learner):  # "auto" has the options of DDPG
-        value = getattr(recipe.learner, own.name)
-        if not hasattr(learner, own.name) and value != own.default:
-            raise ValueError(f"{own.name}={value} has no effect with learner={learner.name}: leave it out")
+    for field in fields(options):  # "auto" has the options of DDPG
+        value = getattr(options, field.name)
+        if not hasattr(learner, field.name) and value != field.default:
+            raise ValueError(f"{field.name}={value} has no effect with learner={learner.name}: leave it out")
     return learner
+
+
+def find_builder(options: LearnerConfig, shape: AgentShape, **given: Any) -> LearnerBuilder:
+    """Returns the builder of the learner of options, made with further arguments of its own."""
+    return load_name(find_learner(options, shape).maker)(options, shape, **given)
 
 
 def make_player(
     recipe: Recipe, env: EnvBase, *, curriculum: Curriculum | None = None
 ) -> TensorDictModuleBase:
     """The greedy policy with its normalization, whose weights and statistics can be loaded."""
-    builder = _builder(recipe, env, curriculum)
-    actor, _ = _networks(builder, recipe, curriculum)
-    return acting(actor, _norm_for(builder))
-
-
-def _norm_for(builder: LearnerBuilder) -> RunningNorm | None:
-    return make_norm(builder.recipe, dict(zip(builder.in_keys, builder.widths, strict=True)))
+    shape = shape_of(recipe, env, curriculum)
+    actor, _ = _networks(find_builder(recipe.learner, shape), recipe, curriculum)
+    return acting(actor, make_norm(recipe.learner, shape.widths, runs=shape.runs))
 
 
 def _guide_of(
@@ -162,8 +181,3 @@ def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | 
             weight = first.weight.data
             weight.copy_(zero_unused_inputs(weight, curriculum.first_inputs, alpha=alpha))
     return actor, critics
-
-
-def _builder(recipe: Recipe, env: EnvBase, curriculum: Curriculum | None) -> LearnerBuilder:
-    in_keys = ("observation", "desired_goal") if curriculum is None else ("input",)
-    return load_name(find_learner(recipe, env).maker)(recipe, env, in_keys)

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
-from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
@@ -19,7 +18,6 @@ from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import DecayingEpsilon, Exploration
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.objectives.cloning import Cloning
-from torchrl_her_recipes.config.recipe import Recipe
 
 Networks = tuple[TensorDictModule, list[TensorDictModule]]
 
@@ -40,44 +38,55 @@ class Agent:
     guide: GuidedExploration | None = None
 
 
-class LearnerBuilder(ABC):
-    """Builds a learner for a recipe and an environment; a subclass for each learner.
-
-    Args:
-        recipe: of the run, or of several.
-        env: tells the widths of observations, goals and actions.
-        in_keys: the entries that the networks see.
+@dataclass(frozen=True, kw_only=True)
+class AgentShape:
+    """Inputs and outputs of the networks of some runs side by side.
 
     Attributes:
-        options: the recipe's group of the learner's own options.
-        device: where networks and losses are.
-        generators: of each run's random numbers; None for torch's own.
-        rewards: the least and the greatest that there can be; infinite if the task's is dense.
+        task: Name of the task, for messages.
+        widths: Widths of the entries that networks read, in their order.
+        action_spec: Actions of one environment.
+        rewards: Least and greatest reward; infinite if the task's reward is dense.
+        runs: Number of runs.
+        dtype: Type of the weights.
     """
 
-    device = torch.device("cpu")
-    rewards = (-1.0, 0.0)
-    generators: Sequence[torch.Generator] | None = None
+    task: str
+    widths: dict[str, int]
+    action_spec: Any
+    rewards: tuple[float, float] = (-1.0, 0.0)
+    runs: int = 1
+    dtype: torch.dtype = torch.float32
 
-    def __init__(self, recipe: Recipe, env: EnvBase, in_keys: Sequence[str]) -> None:
-        self.recipe, self.env, self.in_keys = recipe, env, in_keys
-        self.options: Any = recipe.learner
-        self.dtype: torch.dtype = getattr(torch, recipe.run.dtype)
 
-    @property
-    def widths(self) -> list[int]:
-        """Widths of the entries that the networks see."""
-        return [self.env.observation_spec[key].shape[-1] for key in self.in_keys]
+class LearnerBuilder(ABC):
+    """Builds networks, exploration and loss of a learner; a subclass for each learner.
 
-    @property
-    def action_spec(self) -> Any:
-        """The actions of one environment."""
-        return self.env.action_spec_unbatched.to(self.device)
+    Args:
+        options: Options of the learner.
+        shape: Inputs and outputs of its networks.
+
+    Keyword Args:
+        generators: Sources of random numbers, one for each run; None for torch's own.
+        cloning: How the loss clones demonstrations; None if it does not.
+    """
+
+    def __init__(
+        self,
+        options: Any,
+        shape: AgentShape,
+        *,
+        generators: Sequence[torch.Generator] | None = None,
+        cloning: Cloning | None = None,
+    ) -> None:
+        self.options, self.shape, self.generators, self.cloning = options, shape, generators, cloning
+        self.in_keys, self.widths = list(shape.widths), list(shape.widths.values())
+        self.action_spec, self.dtype = shape.action_spec, shape.dtype
 
     @property
     def bounds(self) -> tuple[float, float] | None:
         """The rewards whose returns targets are clamped to; None if they are not clamped."""
-        return self.rewards if getattr(self.options, "clamp_targets", True) else None
+        return self.shape.rewards if getattr(self.options, "clamp_targets", True) else None
 
     @abstractmethod
     def networks(self, runs: int) -> Networks:
@@ -98,7 +107,7 @@ class LearnerBuilder(ABC):
         """
         if list(actor.out_keys) != ["action"]:
             raise ValueError(
-                f"a policy of learner={self.recipe.learner.name} cannot be exported: its actor writes "
+                f"a policy of learner={self.options.name} cannot be exported: its actor writes "
                 f"{', '.join(map(str, actor.out_keys))} and not the action alone; override "
                 f"{type(self).__name__}.greedy"
             )
@@ -112,14 +121,6 @@ class LearnerBuilder(ABC):
             actor: from :meth:`networks`.
             critics: likewise.
         """
-
-    @property
-    def cloning(self) -> Cloning | None:
-        """How the loss clones demonstrations; None if it does not."""
-        own = self.recipe.demonstrations
-        if not own.in_batches or own.bc_weight == 0:
-            return None
-        return Cloning(weight=own.bc_weight, q_filter=own.q_filter)
 
     def exploration(self) -> Exploration:
         """Turns greedy into exploring actions; here for continuous ones."""

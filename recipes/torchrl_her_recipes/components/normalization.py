@@ -1,4 +1,4 @@
-"""Normalization of what the networks of a recipe see."""
+"""Normalization of the inputs of networks."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizedPolicy
-from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.learners import LearnerConfig
 
 
-def make_norm(recipe: Recipe, widths: Mapping[str, int]) -> RunningNorm | None:
-    """The statistics of each run, before anything was counted; None if the recipe does not normalize."""
-    if not recipe.learner.normalize:
+def make_norm(options: LearnerConfig, widths: Mapping[str, int], *, runs: int) -> RunningNorm | None:
+    """The statistics of each run, before anything was counted; None if the learner does not normalize."""
+    if not options.normalize:
         return None
-    own = recipe.learner
     return RunningNorm(
-        dict(widths), runs=recipe.run.num_runs, clip=own.normalize_clip, least_std=own.normalize_least_std
+        dict(widths), runs=runs, clip=options.normalize_clip, least_std=options.normalize_least_std
     )
 
 

@@ -5,32 +5,22 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded, Categorical, TensorSpec
 
 from torchrl_her.modules.normalization import RunningNorm, normalize
 from torchrl_her.modules.normalized import NormalizedPolicy
-from torchrl_her_recipes.components.agents import find_learner
-from torchrl_her_recipes.components.learner import LearnerBuilder
+from torchrl_her_recipes.components.agents import find_builder
+from torchrl_her_recipes.components.learner import AgentShape, LearnerBuilder
 from torchrl_her_recipes.components.normalization import acting, make_norm
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.values import load_name
 from torchrl_her_recipes.policies.info import KEYS, PolicyInfo
 
 _CONSTANTS = ("mean", "std", "limit")  # of the normalization of an entry
-
-
-class _Shown:
-    """What builders of learners ask of an environment, as a policy's info says it."""
-
-    def __init__(self, info: PolicyInfo) -> None:
-        self.observation_spec = Composite({key: Unbounded(info.widths[key]) for key in KEYS})
-        self.action_spec = self.action_spec_unbatched = _action_spec(info)
 
 
 def _action_spec(info: PolicyInfo) -> TensorSpec:
@@ -50,10 +40,16 @@ def load_network(info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor]
     Raises:
         ValueError: these are not the weights of such an actor. Nothing of its size was made then.
     """
-    builder = _builder(info, recipe)
-    check_weights(info, recipe, weights, builder)
+    shape = AgentShape(
+        task=info.task,
+        widths={key: info.widths[key] for key in KEYS},
+        action_spec=_action_spec(info),
+        dtype=getattr(torch, recipe.run.dtype),
+    )
+    builder = find_builder(recipe.learner, shape)
+    check_weights(builder, weights)
     actor = builder.player(1)
-    player = _with_norm(actor, info, recipe)
+    player = _with_norm(builder, actor)
     player.load_state_dict(dict(weights))
     net = builder.greedy(actor)
     scaled = {*info.low} != {-1.0} or {*info.high} != {1.0}
@@ -64,22 +60,18 @@ def load_network(info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor]
     return acting(greedy, norm).requires_grad_(False)
 
 
-def check_weights(
-    info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor], builder: LearnerBuilder
-) -> None:
-    """Refuses weights that are not those of the actor that a recipe describes.
+def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> None:
+    """Refuses weights that are not those of a builder's actor.
 
     Shapes come from a file, so they are compared before memory is taken for them.
     """
-    name = recipe.learner.name
+    name = builder.options.name
     own = {key: tuple(value.shape) for key, value in weights.items()}
-    if recipe.learner.depth > len(weights):
+    if builder.options.depth > len(weights):
         raise ValueError(f"these are not the weights of an actor of learner={name}")
     with torch.device("meta"):  # shapes alone
         actor = builder.player(1)
-        wanted = {
-            key: tuple(value.shape) for key, value in _with_norm(actor, info, recipe).state_dict().items()
-        }
+        wanted = {key: tuple(value.shape) for key, value in _with_norm(builder, actor).state_dict().items()}
     if own != wanted:
         odd = next(key for key in {**wanted, **own} if own.get(key) != wanted.get(key))
         raise ValueError(
@@ -90,13 +82,8 @@ def check_weights(
         raise ValueError(f"weights must be finite, got others in {odd[0]}")
 
 
-def _builder(info: PolicyInfo, recipe: Recipe) -> LearnerBuilder:
-    shown = cast(EnvBase, _Shown(info))
-    return load_name(find_learner(recipe, shown).maker)(recipe, shown, KEYS)
-
-
-def _with_norm(actor: TensorDictModule, info: PolicyInfo, recipe: Recipe) -> TensorDictModuleBase:
-    return acting(actor, make_norm(recipe, info.widths))
+def _with_norm(builder: LearnerBuilder, actor: TensorDictModule) -> TensorDictModuleBase:
+    return acting(actor, make_norm(builder.options, builder.shape.widths, runs=1))
 
 
 class ScaledActions(nn.Module):

@@ -20,7 +20,7 @@ from torchrl_her.modules.networks import take_run
 from torchrl_her.trainers.metrics import reached, success
 from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env
-from torchrl_her_recipes.components.agents import find_learner
+from torchrl_her_recipes.components.agents import find_learner, shape_of
 from torchrl_her_recipes.components.curricula import make_curriculum
 from torchrl_her_recipes.components.envs import judging, make_task_envs
 from torchrl_her_recipes.config.imports import permit_task
@@ -138,7 +138,7 @@ class Policy(TensorDictModuleBase):
             dtype=recipe.run.dtype,
             normalize_clip=recipe.learner.normalize_clip if recipe.learner.normalize else None,
             algorithm=recipe.hindsight.algo,
-            learner=find_learner(recipe, env).name,
+            learner=find_learner(recipe.learner, shape_of(recipe, env, None)).name,
             seed=recipe.run.seed + chosen,
             frames=int(rows[-1]["frames"]),
             versions=present_versions(),

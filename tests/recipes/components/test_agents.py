@@ -8,13 +8,18 @@ from typing import Any
 
 import pytest
 import torch
+from torchrl.envs import EnvBase
 
 from torchrl_her_recipes import Recipe, build, load_preset, make_recipe, run
-from torchrl_her_recipes.components.agents import find_learner, make_agent, make_player
+from torchrl_her_recipes.components.agents import find_learner, make_agent, make_player, shape_of
 from torchrl_her_recipes.components.envs import make_task_envs
-from torchrl_her_recipes.config.learners import SACConfig
+from torchrl_her_recipes.config.learners import LearnerConfig, SACConfig
 
 from ..small import SMALL, small
+
+
+def learner_of(recipe: Recipe, env: EnvBase) -> type[LearnerConfig]:
+    return find_learner(recipe.learner, shape_of(recipe, env, None))
 
 
 @pytest.mark.parametrize(
@@ -27,7 +32,7 @@ from ..small import SMALL, small
 )
 def test_auto_follows_the_actions(options: dict[str, Any], name: str) -> None:
     recipe = small(**options)
-    assert find_learner(recipe, make_task_envs(recipe, 1, [0])).name == name
+    assert learner_of(recipe, make_task_envs(recipe, 1, [0])).name == name
 
 
 @pytest.mark.parametrize(
@@ -46,14 +51,14 @@ def test_auto_follows_the_actions(options: dict[str, Any], name: str) -> None:
 def test_what_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:
     recipe = small(**options)
     with pytest.raises(ValueError, match=message):
-        find_learner(recipe, make_task_envs(recipe, 1, [0]))
+        learner_of(recipe, make_task_envs(recipe, 1, [0]))
 
 
 def test_an_option_of_ddpg_is_refused_where_auto_turns_out_to_be_dqn() -> None:
     """Where the name of the task does not tell its actions, this is known when the environment is made."""
     recipe = Recipe.from_dict({"task": {"name": "bit_flip"}, "learner": {"action_penalty": 0.5}})
     with pytest.raises(ValueError, match="action_penalty=0.5 has no effect with learner=dqn: leave it out$"):
-        find_learner(recipe, make_task_envs(recipe, 1, [0]))
+        learner_of(recipe, make_task_envs(recipe, 1, [0]))
 
 
 def test_the_weights_of_a_run_depend_on_its_own_seed_alone() -> None:
@@ -126,7 +131,7 @@ def test_a_learner_may_be_for_one_run_only(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(SACConfig, "stacks", False)
     recipe = small(task="hand_v0", learner="sac", num_runs=2)
     with pytest.raises(ValueError, match="num_runs must be 1 with learner=sac"):
-        find_learner(recipe, make_task_envs(recipe, 2, [0, 1]))
+        learner_of(recipe, make_task_envs(recipe, 2, [0, 1]))
 
 
 @pytest.mark.parametrize("compile", ["always", "never"])

@@ -16,6 +16,7 @@ from torchrl_her.modules.stochastic_actor import (
     make_stochastic_actor,
 )
 from torchrl_her.objectives.sac import make_sac_loss
+from torchrl_her_recipes.components.devices import place_of
 from torchrl_her_recipes.components.learners.ddpg import DDPGBuilder
 
 
@@ -42,20 +43,19 @@ class SACBuilder(DDPGBuilder):
             actor,
             critics,
             target_critics=self.options.target_critics,
-            **self.soft,
+            **self.soft(actor),
         )
 
-    @property
-    def soft(self) -> dict[str, Any]:
-        """The options that losses with a stochastic policy share."""
+    def soft(self, actor: TensorDictModule) -> dict[str, Any]:
+        """Returns the options that losses with a stochastic policy share."""
         return {
-            "action_spec": self.action_spec,
+            "action_spec": self.action_spec.to(place_of(actor)),
             "critics": self.options.critics,
             "gamma": self.options.gamma,
             "reward_range": self.bounds,
             "temperature": self.options.temperature,
             "action_penalty": self.options.action_penalty,
-            "runs": self.recipe.run.num_runs,
+            "runs": self.shape.runs,
             "generators": self.generators,
             "reduction": "none",
             "cloning": self.cloning,
@@ -64,9 +64,9 @@ class SACBuilder(DDPGBuilder):
     @property
     def bounds(self) -> tuple[float, float] | None:
         """The same, but asked for where there are no bounds it is an error, since it is off by default."""
-        if self.options.clamp_targets and not all(map(math.isfinite, self.rewards)):
+        if self.options.clamp_targets and not all(map(math.isfinite, self.shape.rewards)):
             raise ValueError(
-                f"clamp_targets=true has no effect on {self.recipe.task.name}, whose rewards have no bounds: "
+                f"clamp_targets=true has no effect on {self.shape.task}, whose rewards have no bounds: "
                 "leave it out"
             )
         return super().bounds

@@ -8,6 +8,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.objectives import LossModule
 
 from torchrl_her.objectives.td3 import make_td3_loss
+from torchrl_her_recipes.components.devices import place_of
 from torchrl_her_recipes.components.learners.ddpg import DDPGBuilder
 
 
@@ -18,7 +19,7 @@ class TD3Builder(DDPGBuilder):
         return make_td3_loss(
             actor,
             critics,
-            action_spec=self.action_spec,
+            action_spec=self.action_spec.to(place_of(actor)),
             critics=self.options.critics,
             target_critics=self.options.target_critics,
             gamma=self.options.gamma,

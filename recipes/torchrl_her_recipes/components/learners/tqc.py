@@ -23,5 +23,5 @@ class TQCBuilder(SACBuilder):
             actor,
             critics,
             dropped_quantiles=self.options.dropped_quantiles,
-            **self.soft,
+            **self.soft(actor),
         )
