@@ -80,7 +80,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
         # For losses that draw, as SAC's.
         "torch_generator": Part(torch.get_rng_state, torch.set_rng_state),
         "cuda_generator": None
-        if device.type != "cuda"
+        if device.type != "cuda" or not torch.cuda.is_initialized()
         else Part(
             partial(torch.cuda.get_rng_state, device), partial(torch.cuda.set_rng_state, device=device)
         ),
