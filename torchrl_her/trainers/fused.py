@@ -200,7 +200,7 @@ class FusedLearner:
         return (Layer * len(layers))(*layers)
 
     def _check(self, rows: TensorDictBase, steps: int) -> None:
-        """What may change after the learner was made."""
+        """Checks for changes since the learner was made."""
         if rows.numel() == steps * self.runs and any(own.norm == Norm.BATCHNORM for own in self._critic):
             raise ValueError("batches must have at least 2 rows for batch normalization, got 1")
         if self.loss.reduction not in ("mean", "none"):

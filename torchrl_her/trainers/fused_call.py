@@ -1,4 +1,4 @@
-"""One update as compiled gradient steps see it: transitions, random numbers and settings as memory."""
+"""The arguments of a compiled update: transitions, random numbers and settings as memory."""
 
 from __future__ import annotations
 

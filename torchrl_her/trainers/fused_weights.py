@@ -111,7 +111,7 @@ class FusedWeights:
         return self._optimizer.state[self.parameters[0]]["step"].flatten().tolist()
 
     def _state(self, tensor: Tensor) -> State:
-        """What Adam keeps of a parameter; nothing of running statistics."""
+        """Returns the moments that Adam keeps of a parameter; none for running statistics."""
         return self._optimizer.state.get(tensor, {})
 
     def _start(self, parameter: nn.Parameter) -> State:

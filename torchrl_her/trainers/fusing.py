@@ -105,7 +105,7 @@ FUSED: dict[type[LossModule], FusedLoss] = {
 
 
 def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | None:
-    """What :class:`~torchrl_her.FusedLearner` would get wrong, for messages; None if nothing.
+    """Returns what :class:`~torchrl_her.FusedLearner` would get wrong, for messages; None if nothing.
 
     Args:
         loss: any loss module.

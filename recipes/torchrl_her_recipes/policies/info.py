@@ -1,4 +1,4 @@
-"""What an exported policy expects, and where it comes from: plain values that need no network."""
+"""Inputs, outputs and origin of an exported policy: plain values that need no network."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WHOLE = ("bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16,
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyInfo:
-    """What an exported policy reads and writes, and what made it.
+    """Inputs and outputs of an exported policy, and the run that made it.
 
     Attributes:
         task: that it is for.
@@ -130,7 +130,7 @@ class PolicyInfo:
             raise ValueError(f"its info is damaged: {error}") from error
 
     def expects(self) -> str:
-        """What it reads and writes, in words.
+        """Describes inputs and outputs in words.
 
         Example:
             >>> from torchrl_her_recipes import load_policy

@@ -32,7 +32,7 @@ def card_path(policy: str | Path) -> Path:
 
 
 def check_free(path: Path) -> None:
-    """Refuses to replace a page that is not a model card, or that somebody has taken over."""
+    """Refuses to replace a page that is not a model card, or that a user has edited."""
     if path.exists() and not path.read_text(errors="replace").startswith(_MARK):
         raise ValueError(
             f"{path} exists and is no model card that export wrote: choose another --out, or --no-card "

@@ -140,7 +140,7 @@ class TensorPolicy(nn.Module):
                     self.register_buffer(f"{key}_{name}", value)
 
     def normalized(self, *inputs: Tensor) -> list[Tensor]:
-        """What the network sees of an observation and a desired goal."""
+        """Returns the network's input for an observation and a desired goal."""
         if not self.normalizes:
             return list(inputs)
         constants = [[getattr(self, f"{key}_{name}") for name in _CONSTANTS] for key in KEYS]

@@ -30,7 +30,7 @@ Player = Callable[[TensorDictBase], TensorDictBase]
 
 @dataclass(frozen=True)
 class Recorded:
-    """What was recorded.
+    """Result of a recording.
 
     Attributes:
         demonstrations: what the file holds.

@@ -79,7 +79,7 @@ class Viewer:
 
     @property
     def running(self) -> bool:
-        """Whether an episode still goes on."""
+        """Whether an episode is still open."""
         return any(own.running for own in self._episodes)
 
     @property
@@ -112,7 +112,7 @@ class Viewer:
         ]
 
     def start(self) -> None:
-        """Begins episodes with the next goals; episodes that go on are given up, and do not count."""
+        """Begins episodes with the next goals; open episodes are given up and do not count."""
         if self._round >= 0:
             self._before = self.seen
         self._round += 1
@@ -120,7 +120,7 @@ class Viewer:
             own.start(seed=self.view.seed + self._round)
 
     def step(self) -> None:
-        """Takes a step with each policy whose episodes go on."""
+        """Takes a step with each policy whose episodes are open."""
         for own in self._episodes:
             own.step()
 

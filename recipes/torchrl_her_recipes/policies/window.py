@@ -22,7 +22,7 @@ _KEYS = "space: pause    n: one step    r: next goals    + -: speed    q: quit"
 
 
 class Window(Protocol):
-    """What pictures are shown in."""
+    """Window that shows pictures."""
 
     def show(self, picture: np.ndarray) -> None: ...
     def commands(self) -> list[Command]: ...
@@ -95,11 +95,11 @@ def show(viewing: Viewing, window: Window) -> None:
 
 
 class Viewing:
-    """What somebody looks at: episodes, how fast they go, and whether they are paused.
+    """State of a viewing: episodes, their speed, and whether they are paused.
 
     Attributes:
         paused: whether no steps are taken unless they are asked for.
-        over: whether somebody has had enough.
+        over: whether the user has quit.
     """
 
     def __init__(self, viewer: Viewer) -> None:
@@ -114,7 +114,7 @@ class Viewing:
         return _RATES[self._rate]
 
     def handle(self, command: Command) -> None:
-        """Does what somebody asks for."""
+        """Carries out a user's request."""
         if command is Command.QUIT:
             self.over = True
         elif command is Command.PAUSE:

@@ -1,4 +1,4 @@
-"""What the combinations of a study reached, how they differ, and whether expected orders hold."""
+"""Results of a study's combinations, their differences, and whether expected orders hold."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _COUNTED = ("kl", "rows_")  # metrics that sum up all of a run: the last one sta
 
 @dataclass(frozen=True)
 class Final:
-    """What one algorithm reached on one task, or on all: a row of the table."""
+    """Result of one algorithm on one task, or on all: a row of the table."""
 
     measure: str
     task: str
@@ -88,7 +88,7 @@ class Judged:
 
 
 def values_of(cell: Combination, measure: str) -> list[float]:
-    """What each of its runs reached; those without a number are left out."""
+    """Returns the result of each run; runs without a number are left out."""
     if not cell.has(measure):
         return []
     last = 1 if measure.startswith(_COUNTED) else LAST
@@ -99,7 +99,7 @@ def values_of(cell: Combination, measure: str) -> list[float]:
 def compare(
     cells: Sequence[Combination], measure: str, published: Mapping[str, Any]
 ) -> tuple[list[Final], list[Difference]]:
-    """What all combinations reached, and how each two algorithms differ on the same task.
+    """Returns the results of all combinations, and the differences of each two algorithms on the same task.
 
     Algorithms that are at their end on all tasks of the study are compared on all of them together, too.
     Those that are not at their end have no part in differences.
@@ -189,7 +189,7 @@ def _judge(cells: Sequence[Combination], order: Order, task: str, found: Sequenc
 
 
 def _verdict(gap: Interval, *, rising: bool, apart: bool) -> Verdict:
-    """What an interval of a difference says of an order."""
+    """Verdict on an order by the interval of a difference."""
     if math.isnan(gap.low):
         return Verdict.OPEN
     above, below = gap.low > 0, gap.high < 0
@@ -201,7 +201,7 @@ def _verdict(gap: Interval, *, rising: bool, apart: bool) -> Verdict:
 
 
 def _why(cells: Sequence[Combination], order: Order, task: str) -> str:
-    """What is lacking for an order to be judged."""
+    """Returns the reason why an order cannot be judged yet."""
     lacking = [
         f"{cell.label} is {cell.state}"
         for cell in cells

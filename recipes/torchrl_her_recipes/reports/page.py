@@ -122,7 +122,7 @@ def _averaged(cells: Sequence[Combination]) -> str:
 
 
 def _shares(rows: Sequence[Final]) -> dict[tuple[str, str], tuple[float, float | None]]:
-    """What each algorithm leaves of HER's divergence on the same task: here, and as published."""
+    """Share of HER's divergence that each algorithm leaves on the same task: here, and as published."""
     her = {row.task: row for row in rows if row.algorithm == "her" and row.iqm > 0}
     shares = {}
     for row in rows:
@@ -172,7 +172,7 @@ def _about(cell: Combination) -> dict[str, Any]:
 
 
 def _points(cell: Combination) -> list[dict[str, Any]]:
-    """What its curves are made of."""
+    """Rows of the page's curves."""
     names = ("frames", "percentile_33", "median", "percentile_67")
     return [
         {"task": cell.task, "algorithm": cell.algorithm, "measure": measure}

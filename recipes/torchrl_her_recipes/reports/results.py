@@ -1,4 +1,4 @@
-"""What there is of a study: its combinations, how far each of them is, and what its runs reached."""
+"""Combinations of a study, their progress, and the results of their runs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LAST = 3  # evaluations whose mean is what a run reached in the end
 
 @dataclass(frozen=True, kw_only=True)
 class Combination:
-    """One combination of a study, and what there is of its runs so far.
+    """Combination of a study, and the results of its runs so far.
 
     It holds plain values, so that it can come from the folders of runs as well as from files of results.
 
@@ -159,7 +159,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def at_the_end(rows: Sequence[dict[str, float]], name: str, *, evaluations: int = LAST) -> list[float]:
-    """One metric of each run: the mean of its last evaluations.
+    """Returns a metric of each run: the mean of its last evaluations.
 
     Returns:
         One number for each run, in the order of the runs.

@@ -19,7 +19,7 @@ _LARGEST = 20_000_000  # bytes of a film
 
 
 def read_runs(folders: Sequence[Path]) -> Results:
-    """What there is of some runs; those that differ in nothing but their seeds are one algorithm on the page.
+    """Reads some runs; those that differ only in their seeds are one algorithm on the page.
 
     Args:
         folders: of runs, or of batches of seeds (``seeds_*``), or with such folders in them.
@@ -68,7 +68,7 @@ def _newest_film(folders: Sequence[Path]) -> Picture | None:
 
 
 def _runs_in(folder: Path) -> list[Path]:
-    """The folders of runs that somebody means by a folder."""
+    """Finds the folders of runs in a folder."""
     if Batches(folder).homes:
         return [folder]
     found = [path for path in sorted(folder.iterdir()) if path.is_dir() and Batches(path).homes]

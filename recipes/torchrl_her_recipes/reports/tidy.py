@@ -37,7 +37,7 @@ _KEPT = ("task", "algorithm", "options", "done", "epochs", "planned", "seconds",
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """What there is of a study.
+    """Results of a study.
 
     Attributes:
         name: of the study.
@@ -63,7 +63,7 @@ def is_results(folder: Path) -> bool:
 
 
 def read_study(study: Study, folder: Path) -> Results:
-    """What there is of a study, from the folders of its runs or from the files made of them.
+    """Reads the results of a study, from the folders of its runs or from the files made of them.
 
     Args:
         study: which one.
@@ -128,7 +128,7 @@ def write_results(
 
 
 def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Path) -> Path:
-    """The same for combinations that were read before."""
+    """Writes the results of combinations that were read before."""
     out.mkdir(parents=True, exist_ok=True)
     _write_table(cells, out)
     _write_goals(cells, out / _GOALS)
@@ -141,7 +141,7 @@ def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Pat
 
 
 def read_results(folder: Path) -> Results:
-    """What :func:`write_results` wrote."""
+    """Reads the files of :func:`write_results`."""
     path = folder / _ABOUT
     if not path.is_file():
         raise ValueError(f"{folder} holds no results: it has no {_ABOUT}")

@@ -23,7 +23,7 @@ _ORPHAN = 300.0  # seconds that a worker whose study was killed has to save its 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One batched run of a study.
+    """Batched run of a study.
 
     Args:
         label: names it within the study.
@@ -72,7 +72,7 @@ class Progress(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came of a job.
+    """Outcome of a job.
 
     Attributes:
         interrupted: whether it was stopped; it can go on.
@@ -86,7 +86,7 @@ class Outcome:
 
 
 def can_resume(folder: Path) -> bool:
-    """Whether a run's folder has a checkpoint to go on from, and says of which run."""
+    """Checks whether a folder has a checkpoint of this job's run."""
     home = RunFolder(folder)
     return home.config.exists() and bool(home.checkpoints)
 
@@ -121,7 +121,7 @@ def kept_progress(job: Job) -> Progress:
 
 
 def run_job(job: Job) -> Outcome:
-    """Does a job, or goes on with it from its checkpoint. Ctrl-C ends it at the next good moment.
+    """Does a job, or resumes it from its checkpoint. Ctrl-C ends it at the next good moment.
 
     Whatever goes wrong is an outcome; the whole story of it is left in ``error.txt``.
     """

@@ -1,4 +1,4 @@
-"""A task with momentum that goes on at its goal, to see whether an agent stays where it has arrived."""
+"""A puck with momentum whose episodes do not end at the goal: tests whether an agent stays there."""
 
 from __future__ import annotations
 

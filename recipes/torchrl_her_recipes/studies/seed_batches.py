@@ -19,7 +19,7 @@ _ROWS = 1_280  # of a batch's gradient step: more runs side by side are no faste
 
 
 class Batches:
-    """What a folder holds of one combination: its folders ``seeds_*``, or itself if it is that of a run.
+    """Folders of one combination: ``seeds_*`` in it, or the folder itself if it is that of a run.
 
     What is read are the batches that have come to their end; as long as none has, those that are under
     way, up to the last epoch that all of them have reached.
@@ -46,7 +46,7 @@ class Batches:
 
     @cached_property
     def shown(self) -> list[RunFolder]:
-        """Those of them that are read."""
+        """Returns the folders that are read."""
         return self._done or [home for home in self.homes if home.rows()]
 
     @property
@@ -56,7 +56,7 @@ class Batches:
 
     @property
     def recipe(self) -> Recipe | None:
-        """What was run, with all seeds together; None if there is nothing to read.
+        """Joins the recipes of all seeds; None if there is nothing to read.
 
         Raises:
             ValueError: a configuration cannot be read.

@@ -46,7 +46,7 @@ class StudyResult:
 
 
 def plan_study(study: Study | Mapping[str, Recipe], folder: Path) -> Plan:
-    """What there is to do, and about how long it takes.
+    """Jobs of a study, and about how long they take.
 
     Args:
         study: what to run; or recipes of single runs, by the names of their folders.

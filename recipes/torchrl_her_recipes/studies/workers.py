@@ -1,4 +1,4 @@
-"""Who does the jobs of a study: chosen by what the user asks for."""
+"""Workers for the jobs of a study, chosen by the options of the user."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who does the jobs of a study: worker processes on this machine, or anything with the same few methods."""
+"""Workers on this machine for the jobs of a study, and the interface of any workers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COMMAND = [sys.executable, "-P", "-m", "torchrl_her_recipes.studies.worker_main
 
 
 class Workers(Protocol):
-    """What :func:`torchrl_her_recipes.studies.schedule.run_jobs` asks of those who do the jobs."""
+    """Interface of workers, as :func:`torchrl_her_recipes.studies.schedule.run_jobs` uses them."""
 
     @property
     def at_once(self) -> int:

@@ -1,4 +1,4 @@
-"""Who does the jobs of a study: the nodes of a Ray cluster. Needs the extra `cluster`.
+"""Workers on the nodes of a Ray cluster for the jobs of a study. Needs the extra `cluster`.
 
 Nothing is asked of the nodes but this package: no shared disk. A job is done in a temporary folder of
 whichever node has a core free, and its files come home when it ends.
@@ -168,5 +168,5 @@ def _reporting(job: Job, board: Any) -> Iterator[None]:
 
 
 def _begun(job: Job) -> dict[str, bytes]:
-    """The files that a job goes on from, if there are any."""
+    """Returns the files that a job resumes from, if there are any."""
     return pack(job.folder, checkpoints=True) if can_resume(job.folder) else {}

@@ -1,4 +1,4 @@
-"""Searches for good options: trials by Optuna, several at once, in a folder that a search goes on in."""
+"""Searches for good options: trials by Optuna, several at once, in a folder that resumes."""
 
 from importlib.util import find_spec
 

@@ -83,7 +83,7 @@ def tune(
     say: Callable[[str], None] = lambda _line: None,
     progress: bool = True,
 ) -> SearchResult:
-    """Searches for good options, or goes on with a search in the same folder.
+    """Searches for good options, or resumes the search of a folder.
 
     Runs of trials that were cut short go on from their checkpoints.
 
@@ -177,7 +177,7 @@ def _storage(database: Path) -> RDBStorage:
 
 
 def make_sampler(name: str, seed: int) -> optuna.samplers.BaseSampler:
-    """One of Optuna's samplers.
+    """Makes one of Optuna's samplers.
 
     Raises:
         ImportError: it needs a package that is not installed.
@@ -207,7 +207,7 @@ def _counted(study: Study) -> list[FrozenTrial]:
 
 
 def _repeat(study: Study, trial: FrozenTrial | Trial, *, attempt: int = 0) -> None:
-    """Ends a trial that was cut short; another one with its values goes on with its run."""
+    """Ends a trial that was cut short; another one with its values resumes its run."""
     kept = {name: value for name, value in trial.user_attrs.items() if name == DEFAULT}
     Trial(study, trial._trial_id).set_user_attr(_REPEATED, True)
     study.tell(trial.number, state=TrialState.FAIL)
