@@ -43,7 +43,7 @@ def learning_steps(length: int, layers: int, algo: str) -> list[int]:
         [[6], [5, 1], [1, 1, 1, 1, 1, 1]]
     """
     algorithm = get_algorithm(algo)
-    if not algorithm.hindsight:
+    if not algorithm.virtual:
         return [length]
     hidden = 0 if algorithm.curriculum else length - length // layers
     return [hidden + 1] + [1] * (length - hidden - 1)

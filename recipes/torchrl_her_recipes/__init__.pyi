@@ -26,6 +26,8 @@ from .config.spaces import space_for as space_for
 from .config.study import Study as Study
 from .config.study import load_study as load_study
 from .config.study import study_names as study_names
+from .config.weights import WEIGHTS as WEIGHTS
+from .config.weights import Weights as Weights
 from .policies.info import PolicyInfo as PolicyInfo
 from .policies.policy import Policy as Policy
 from .policies.policy import export_policy as export_policy

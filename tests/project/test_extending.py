@@ -18,10 +18,11 @@ from torchrl_her_recipes.config import imports
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.behavior import BEHAVIOR
 from torchrl_her_recipes.config.learners import LEARNERS
+from torchrl_her_recipes.config.weights import WEIGHTS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "extending.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL))
-REGISTRIES: tuple[dict, ...] = (STRATEGIES, registry._SPECS, ALGORITHMS, LEARNERS, BEHAVIOR)
+REGISTRIES: tuple[dict, ...] = (STRATEGIES, registry._SPECS, ALGORITHMS, LEARNERS, BEHAVIOR, WEIGHTS)
 
 
 def blocks(section: str) -> tuple[dict[str, str], list[str]]:

@@ -12,6 +12,7 @@ from torchrl_her_recipes.config.policy_header import read_header
 from torchrl_her_recipes.config.shipped import policy_names, policy_path, preset_names, preset_summary
 from torchrl_her_recipes.config.spaces import space_names, space_summary
 from torchrl_her_recipes.config.study import load_study, study_names
+from torchrl_her_recipes.config.weights import WEIGHTS
 
 
 @click.command(
@@ -25,6 +26,7 @@ def listing() -> int:
         | {"my_module:make_env": "a TorchRL environment of your own, by its function or class"},
         "algorithms": {name: algorithm.summary for name, algorithm in ALGORITHMS.items()},
         "learners": LEARNERS.summaries(),
+        "weights of virtual goals": WEIGHTS.summaries(),
         "behavior goals": BEHAVIOR.summaries(),
         "studies": {name: load_study(name).summary for name in study_names()},
         "trained policies": {

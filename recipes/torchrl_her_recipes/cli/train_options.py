@@ -149,7 +149,7 @@ def complete(_context: click.Context, _parameter: click.Parameter, incomplete: s
 
 def _values() -> dict[str, list[str]]:
     """The values of options that are names or one of a few choices."""
-    classes = [next(iter(choices_of(group).values())) for group in GROUPS]
+    classes = [kind for group in GROUPS for kind in reversed(choices_of(group).values())]
     choices = {own.name: list(own.metadata["choices"]) for kind in classes for own in fields(kind)}
     return {**choices, **{group: list(kind) for group, kind in KINDS.items()}} | {
         "task": task_names(),

@@ -28,7 +28,7 @@ from torchrl_her_recipes.components.demonstrations import load_demonstrations, r
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
 from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
 from torchrl_her_recipes.components.first_look import resolved
-from torchrl_her_recipes.components.goal_space import goal_space
+from torchrl_her_recipes.components.goal_space import GoalSpace, goal_space
 from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -46,7 +46,7 @@ def build(recipe: Recipe) -> Components:
     recipe = resolved(recipe)
     processes = recipe.collection.processes > 0  # then those here only tell what the others are like
     task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
-    curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task)
+    curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task, recipe.weights)
     state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
     rewards, bounds = reward_range(goal_env(task)), reward_bounds(goal_env(task))
     shown = load_demonstrations(recipe, task, state)
@@ -56,7 +56,7 @@ def build(recipe: Recipe) -> Components:
     generators = make_generators(recipe.seeds, devices.replay)
     own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
     agent = make_agent(recipe, eval_env, own, rewards=bounds, curriculum=curriculum, device=devices.learner)
-    behavior = make_behavior(recipe, task, agent, rewards=rewards, space=space, state=state)
+    behavior = make_behavior(recipe, task, agent, rewards=rewards, state=state)
     env = _shown(recipe, task, state, behavior, None if shown is None else shown.starts)
     if processes:
         progress = None if state is None else state.progress
@@ -75,7 +75,7 @@ def build(recipe: Recipe) -> Components:
         eval_env=eval_env,
         collector=collector,
         buffer=replay(devices=devices),
-        goal_target=None if space is None else space.target,
+        goal_target=space.target if isinstance(space, GoalSpace) else None,
         generators=generators if own is generators else [*generators, *own],
         rewards=rewards,
         bounds=bounds,

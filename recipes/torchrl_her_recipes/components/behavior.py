@@ -13,9 +13,10 @@ from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top
 from torchrl_her_recipes.components.envs import evaluation_envs, task_reward
-from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_instructive
+from torchrl_her_recipes.components.goal_space import goal_space
 from torchrl_her_recipes.components.learner import Agent
 from torchrl_her_recipes.components.streams import Stream, generators_of
+from torchrl_her_recipes.components.weights import make_instructive
 from torchrl_her_recipes.config.behavior import IBS, Discover, Mega, Proposed, UniformAchieved
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
@@ -30,7 +31,6 @@ def make_behavior(
     agent: Agent,
     *,
     rewards: tuple[float, float],
-    space: GoalSpace | KernelSpace | None,
     state: CurriculumState | None,
 ) -> BehaviorGoals | None:
     """Returns the transform that proposes goals; None if episodes ask for the task's goals alone."""
@@ -56,7 +56,7 @@ def make_behavior(
     )
     goals = partial(_goals, recipe, env, rewards, **given)
     behavior: BehaviorGoals = load_name(options.maker)(
-        options, goals, recipe=recipe, rewards=rewards, space=space, values=values
+        options, goals, recipe=recipe, rewards=rewards, space=goal_space(recipe, env, options), values=values
     )
     if state is not None:
         for run in range(runs):
@@ -88,7 +88,7 @@ def make_uniform(_options: UniformAchieved, goals: MakeGoals, **_: Any) -> Behav
 
 def make_ibs(options: IBS, goals: MakeGoals, *, recipe: Recipe, space: Any, **_: Any) -> BehaviorGoals:
     """Proposes goals in proportion to q* - q, where q counts proposed goals."""
-    weights = [make_instructive(recipe, space) for _ in recipe.seeds]
+    weights = [make_instructive(options, space=space) for _ in recipe.seeds]
     return goals(weights=weights, update_on="proposed", candidates=options.candidates)
 
 

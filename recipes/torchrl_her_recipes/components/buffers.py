@@ -25,10 +25,10 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
 from torchrl_her_recipes.components.envs import task_reward
-from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace, make_goal_weights
+from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace
 from torchrl_her_recipes.components.memory import check_buffer_size
-from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.values import load_name
 
 # Entries of a collected batch that no loss reads: not stored.
 _NOT_STORED = (
@@ -73,12 +73,13 @@ def make_buffer(
     """
     check_buffer_size(recipe, env, devices.replay, not_stored=_NOT_STORED)
     size = recipe.replay.buffer_size if capacity is None else capacity
-    algorithm, task, runs = get_algorithm(recipe.hindsight.algo), goal_env(env), len(generators)
+    task, runs = goal_env(env), len(generators)
     rule = task_reward(env)
     counted = None
     if norm is not None:
         counted = norm.update if state is None else partial(count_inputs, norm, state.progress)
-    own = [make_goal_weights(each, task, space) for each in recipe.of_runs() if algorithm.hindsight]
+    make = partial(load_name(recipe.weights.maker), recipe.weights, env=task, space=space)
+    weights = [make(seed=seed) for seed in recipe.seeds if recipe.relabels]
     buffer = TensorDictReplayBuffer(
         storage=PackedStorage(runs * size, device=devices.replay),
         writer=HERWriter(
@@ -86,11 +87,11 @@ def make_buffer(
             **_goals(recipe),
             n_steps=recipe.hindsight.n_steps,
             gamma=recipe.learner.gamma,
-            filter_achieved=algorithm.filter_achieved,
+            filter_achieved=recipe.filters,
             redraw=recipe.hindsight.redraw,
-            refill=recipe.hindsight.refill if algorithm.filter_achieved else 1,
+            refill=recipe.hindsight.refill if recipe.filters else 1,
             achieved_reward=rewards[1],
-            weights=[weights for weights in own if weights is not None] or None,
+            weights=[own for own in weights if own is not None] or None,
             exclude=_NOT_STORED,
             runs=runs,
             generators=generators,
@@ -122,7 +123,7 @@ def _rules(state: CurriculumState | None, task: RewardFunction) -> list[LayerRul
 def _goals(recipe: Recipe) -> dict[str, Any]:
     """How many virtual goals are drawn from where, as options of the writer."""
     own = recipe.hindsight
-    if not get_algorithm(own.algo).hindsight:
+    if not recipe.relabels:
         return {"k": 0}
     if own.goal_sources is not None:
         return {"goal_sources": own.goal_sources}

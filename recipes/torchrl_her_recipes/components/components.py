@@ -16,6 +16,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from torchrl_her.behavior import BehaviorGoals
+from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.native.library import CannotCompile
 from torchrl_her.trainers.fused import FusedLearner, Products
 from torchrl_her.trainers.fusing import is_plain_adam, why_not_fused
@@ -27,7 +28,6 @@ from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.demonstrations import RunDemonstrations
 from torchrl_her_recipes.components.devices import CPU, place_of
-from torchrl_her_recipes.components.goal_space import goal_weights, scheduled
 from torchrl_her_recipes.components.learner import Agent
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -141,13 +141,14 @@ class Components(Agent):
         """The training loop over these components."""
         recipe, replay, shown = self.recipe, self.recipe.replay, self.demonstrations
         proposals = [] if self.behavior is None else self.behavior.weights
+        weights = [*self.buffer.writer.goal_weights, *proposals]
         return Trainer(
             collector=self.collector,
             buffer=self.buffer if shown is None else shown.mixed_with(self.buffer, recipe),
             learner=self.learner(),
             schedules=[
                 self.exploration,
-                *scheduled([*goal_weights(self.buffer), *proposals]),
+                *(own for own in weights if isinstance(own, InstructiveWeights)),
                 *rising_beta(self.buffer.sampler, recipe),
             ],
             runs=recipe.run.num_runs,

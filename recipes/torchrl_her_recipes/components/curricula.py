@@ -16,8 +16,8 @@ from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
 from torchrl_her_recipes.components.envs import evaluation_envs, judging, make_task_envs
 from torchrl_her_recipes.components.streams import Stream, generators_of
-from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.weights import Equal
 
 _STATE = ["observation", "desired_goal"]  # what the state is made of, in this order
 
@@ -46,7 +46,7 @@ class CurriculumState:
 
 def make_curriculum(recipe: Recipe, env: EnvBase) -> Curriculum | None:
     """The curriculum that the recipe asks for: its own layers, or those of its task."""
-    if not get_algorithm(recipe.hindsight.algo).curriculum:
+    if not recipe.in_layers:
         return None
     task = goal_env(env)
     return read_curriculum(
@@ -121,11 +121,10 @@ def _make_progress(recipe: Recipe, curriculum: Curriculum) -> CurriculumProgress
             success_threshold=options.success_threshold,
             patience=options.layer_epochs or None,
         )
-    algorithm = get_algorithm(recipe.hindsight.algo)
-    if algorithm.weights:
+    if not isinstance(recipe.weights, Equal):
         raise ValueError(
-            f"{algorithm.name} must not be used with order={options.order}: its weights would take the goals "
-            "of all layers for one kind; choose order=threshold"
+            f"weights={recipe.weights.name} must not be used with order={options.order}: they would take the "
+            "goals of all layers for one kind; choose order=threshold"
         )
     if recipe.collection.processes > 0:
         raise ValueError(

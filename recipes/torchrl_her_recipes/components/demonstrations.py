@@ -19,7 +19,6 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.envs import action_bounds, task_reward
 from torchrl_her_recipes.components.streams import Stream, generators_of
-from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
 
@@ -171,6 +170,5 @@ def _scaled(own: Demonstrations, env: EnvBase) -> Demonstrations:
 
 def rows_needed(recipe: Recipe, own: RunDemonstrations) -> int:
     """How many rows of a run the demonstrations have at most, virtual ones among them."""
-    hindsight = get_algorithm(recipe.hindsight.algo).hindsight
-    copies = sum(recipe.hindsight.sources.values()) * recipe.hindsight.refill if hindsight else 0
+    copies = sum(recipe.hindsight.sources.values()) * recipe.hindsight.refill if recipe.relabels else 0
     return len(own.recorded.rows) * (1 + copies)

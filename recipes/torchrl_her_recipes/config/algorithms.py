@@ -5,15 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
 
 from torchrl_her_recipes.config.options import AUTO, REGISTERED, what_there_is
 
 STRATEGIES = ("future", "final", "episode")  # goal strategies that come with the library
 RECENT = ("actual", "achieved")  # sources of goals besides strategies: those of recent episodes
 _STRATEGY_REGISTRY = "torchrl_her.goals.strategies"
-
-Instructive = Literal["simultaneous", "sequential"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,114 +19,89 @@ class Algorithm:
 
     Args:
         name: the name that recipes take.
-        hindsight: whether virtual rows are written at all.
-        filter_achieved: whether virtual goals that were already achieved are left out.
-        instructive: how virtual goals are weighted by their instructiveness (IBS): "simultaneous" by
-            q* - q, so that a goal counts less the more often it was written; "sequential" by q* alone;
-            None for equal weights.
+        virtual: whether virtual rows are written at all.
+        filter: whether virtual goals that were already achieved are left out.
         curriculum: whether runs learn the layers of a curriculum (CHER).
-        weights: a function that makes other weights, as ``module:function``. It is called once for each run,
-            gets the recipe of that run alone (``recipe.run.seed`` is its seed) and the environment, and
-            returns new :class:`~torchrl_her.GoalWeights`.
-        reads: the options of the groups ``ibs`` and ``novelty`` that this function reads, as in
-            ``"novelty.memory"``; the others are refused. None if it may read all of them.
+        weights: the weights of virtual goals; None if recipes choose them.
         summary: one line for people.
     """
 
     name: str
-    hindsight: bool = True
-    filter_achieved: bool = False
-    instructive: Instructive | None = None
+    virtual: bool = True
+    filter: bool = False
+    weights: str | None = None
     curriculum: bool = False
-    weights: str = ""
-    reads: tuple[str, ...] | None = None
     summary: str = ""
 
-
-# Weights by novelty.
-_RARE: dict[str, Any] = {
-    "weights": "torchrl_her_recipes.components.novelty:rare_goals",
-    "reads": ("novelty.sharpness", "novelty.memory"),
-}
-_RND: dict[str, Any] = {
-    "weights": "torchrl_her_recipes.components.novelty:network_novelty",
-    "reads": ("novelty.sharpness",),
-}
 
 ALGORITHMS: dict[str, Algorithm] = {
     algorithm.name: algorithm
     for algorithm in (
-        Algorithm(name="no_hindsight", hindsight=False, summary="the learner alone"),
+        Algorithm(name="no_hindsight", virtual=False, weights="none", summary="the learner alone"),
         Algorithm(name="her", summary="hindsight experience replay"),
         Algorithm(
-            name="filtered_her",
-            filter_achieved=True,
-            summary="HER without virtual goals that were achieved already",
+            name="filtered_her", filter=True, summary="HER without virtual goals that were achieved already"
         ),
         Algorithm(
-            name="her_ibs",
-            instructive="simultaneous",
-            summary="HER that prefers instructive goals: weights q* - q",
+            name="her_ibs", weights="ibs", summary="HER that prefers instructive goals: weights q* - q"
         ),
         Algorithm(
             name="filtered_her_ibs",
-            filter_achieved=True,
-            instructive="simultaneous",
+            filter=True,
+            weights="ibs",
             summary="Filtered-HER that prefers instructive goals",
         ),
         Algorithm(
             name="her_ibs_sequential",
-            instructive="sequential",
+            weights="ibs_sequential",
             summary="HER with weights q* alone; prioritized replay does the rest",
         ),
         Algorithm(
             name="filtered_her_rare",
-            filter_achieved=True,
+            filter=True,
+            weights="rare",
             summary="Filtered-HER that prefers goals with few others around them",
-            **_RARE,
         ),
         Algorithm(
             name="filtered_her_rnd",
-            filter_achieved=True,
+            filter=True,
+            weights="rnd",
             summary="Filtered-HER that prefers goals new to a network (RND)",
-            **_RND,
         ),
-        Algorithm(
-            name="cher", curriculum=True, filter_achieved=True, summary="Filtered-HER with a curriculum: CHER"
-        ),
+        Algorithm(name="cher", curriculum=True, filter=True, summary="Filtered-HER with a curriculum: CHER"),
         Algorithm(
             name="cher_ibs",
             curriculum=True,
-            filter_achieved=True,
-            instructive="simultaneous",
+            filter=True,
+            weights="ibs",
             summary="CHER that prefers instructive goals in the layers that say so",
         ),
         Algorithm(
             name="cher_rare",
             curriculum=True,
-            filter_achieved=True,
+            filter=True,
+            weights="rare",
             summary="CHER that prefers goals with few others around them",
-            **_RARE,
         ),
         Algorithm(
             name="cher_rnd",
             curriculum=True,
-            filter_achieved=True,
+            filter=True,
+            weights="rnd",
             summary="CHER that prefers goals new to a network (RND)",
-            **_RND,
         ),
         Algorithm(name="unfiltered_cher", curriculum=True, summary="CHER without the filter"),
         Algorithm(
             name="unfiltered_cher_ibs",
             curriculum=True,
-            instructive="simultaneous",
+            weights="ibs",
             summary="CHER that prefers instructive goals, without the filter",
         ),
     )
 }
 
 
-_UNRESOLVED = Algorithm(name=AUTO, filter_achieved=True)  # until the environment tells which one it is
+_UNRESOLVED = Algorithm(name=AUTO, filter=True)  # until the environment tells which one it is
 
 
 def register_algorithm(algorithm: Algorithm) -> None:
@@ -150,7 +122,7 @@ def get_algorithm(name: str) -> Algorithm:
         ValueError: there is none; the message lists those that there are.
 
     Example:
-        >>> get_algorithm("her").filter_achieved
+        >>> get_algorithm("her").filter
         False
     """
     if name == AUTO:

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from torchrl_her_recipes.config.choices import Choice, Kind
 from torchrl_her_recipes.config.options import option
+from torchrl_her_recipes.config.weights import IBS as IBSWeights
 
 _MAKERS = "torchrl_her_recipes.components.behavior"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Behavior(Choice):
-    """Which goals the episodes of training ask for (behavior goals).
-
-    Attributes:
-        instructive: whether goals are weighted by IBS, with the options of the group ``ibs``.
-    """
-
-    instructive: ClassVar[bool] = False
+    """Which goals the episodes of training ask for (behavior goals)."""
 
 
 BEHAVIOR = Kind("behavior", Behavior, default="real")
@@ -39,7 +33,7 @@ class Proposed(Behavior):
 
     The maker takes the options and ``goals``, which makes :class:`~torchrl_her.behavior.BehaviorGoals` from
     ``weights``, ``factors`` and the like, and returns its result. By keyword it also takes ``recipe``,
-    ``rewards`` (of a missed and of an achieved goal), ``space`` (of the task's goals, or None) and
+    ``rewards`` (of a missed and of an achieved goal), ``space`` (of the task's goals, for options of IBS) and
     ``values``, which makes the :class:`~torchrl_her.behavior.GoalValues` of the agent.
     """
 
@@ -65,12 +59,11 @@ class _OneOfSome(Proposed):
 
 @BEHAVIOR.register
 @dataclass(frozen=True, kw_only=True)
-class IBS(_OneOfSome):
+class IBS(IBSWeights, _OneOfSome):
     """Instructive goals: weights q* - q."""
 
     name = "ibs"
     maker = f"{_MAKERS}:make_ibs"
-    instructive = True
 
 
 @BEHAVIOR.register

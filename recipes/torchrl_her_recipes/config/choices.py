@@ -68,6 +68,6 @@ class Kind(dict[str, type[C]]):
 
     def stored(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Returns values of a file without options of other choices that are at their defaults."""
-        choice = self.find(values.get("name") or self.default)
+        choice = self.find(values["name"])
         defaults = {option: [getattr(other, option, self) for other in self.values()] for option in values}
         return {k: v for k, v in values.items() if hasattr(choice, k) or v not in defaults[k]}

@@ -206,47 +206,6 @@ class HindsightConfig(Group):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IBSConfig(Group):
-    """Goals weighted by how instructive they are (IBS)."""
-
-    needs: ClassVar[Needs] = (("estimator", "kernel".__ne__, "floor_is_relative cells recent"),)
-
-    sigma: float | None = option(
-        None, "width of the kernel around the real goals, as a share of the range of goals", above=0
-    )
-    start_factor: float = option(3.0, "sigma begins at this multiple of its final value", at_least=1)
-    decay: float = option(0.9, "the kernel's covariance is multiplied by this each epoch", above=0, at_most=1)
-    floor: float = option(0.002, "lowest weight of a goal, as a share of the largest q*", at_least=0)
-    floor_is_relative: bool = option(
-        True, "whether floor is such a share; if false, it is compared with q* - q as it is (the thesis)"
-    )
-    estimator: str = option(
-        "auto",
-        "what q* and q are: grid (histograms, for goals of up to three numbers), kernel (densities, for any "
-        "goals), or auto (kernel for more than three numbers)",
-        choices=("auto", "grid", "kernel"),
-    )
-    cells: int = option(20, "cells along each dimension of the grid that goals are counted in", at_least=1)
-    recent: int | None = option(
-        None,
-        "how many of the newest virtual goals q counts; all since the buffer was emptied, if not given",
-        at_least=1,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoveltyConfig(Group):
-    """Goals weighted by how rare or new they are."""
-
-    sharpness: float | None = option(
-        None,
-        "exponent of the weights; the default is 1, and 3 / g for rare goals of g numbers, if g is above 3",
-        above=0,
-    )
-    memory: int = option(10_000, "virtual goals among which others are rare, the newest ones", at_least=1)
-
-
-@dataclass(frozen=True, kw_only=True)
 class CurriculumConfig(Group):
     """The layers that runs learn, one after the other or at once (Curriculum-HER)."""
 

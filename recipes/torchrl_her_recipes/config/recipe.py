@@ -9,11 +9,13 @@ from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config import groups
+from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.behavior import BEHAVIOR, Behavior
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, LearnerConfig
 from torchrl_her_recipes.config.options import AUTO
-from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, LONG_ONLY, Nested, over, place
+from torchrl_her_recipes.config.shortcuts import FORMER, GROUPS, KINDS, LONG_ONLY, Nested, chosen, over, place
+from torchrl_her_recipes.config.weights import WEIGHTS, Weights
 from torchrl_her_recipes.config.without_effect import without_effect
 
 # What a run that goes on may set anew, since it leaves what was trained as it is.
@@ -43,8 +45,7 @@ class Recipe:
     learner: LearnerConfig = field(default_factory=LEARNERS)
     collection: groups.CollectionConfig = field(default_factory=groups.CollectionConfig)
     replay: groups.ReplayConfig = field(default_factory=groups.ReplayConfig)
-    ibs: groups.IBSConfig = field(default_factory=groups.IBSConfig)
-    novelty: groups.NoveltyConfig = field(default_factory=groups.NoveltyConfig)
+    weights: Weights = field(default_factory=WEIGHTS)
     curriculum: groups.CurriculumConfig = field(default_factory=groups.CurriculumConfig)
     behavior: Behavior = field(default_factory=BEHAVIOR)
     demonstrations: groups.DemonstrationsConfig = field(default_factory=groups.DemonstrationsConfig)
@@ -57,12 +58,30 @@ class Recipe:
         if self.run.frames is not None and self.collection.epoch_frames != AUTO:
             epochs = -(-self.run.frames // self.collection.epoch_frames)
             object.__setattr__(self, "run", replace(self.run, frames=None, epochs=epochs))
+        if (given := get_algorithm(self.hindsight.algo).weights) not in (None, self.weights.name):
+            problem = f"weights must be {given} with algo={self.hindsight.algo}, got {self.weights.name}"
+            raise ValueError(f"{problem}; choose another algo, as in algo=her weights=rare")
         for (group, name), why in without_effect(self).items():
             section = getattr(self, group)
             value = getattr(section, name)
             if value not in (None, getattr(type(section), name)):
                 shown = f"{group}.{name}" if group in LONG_ONLY else name
                 raise ValueError(f"{shown}={value} has no effect {why}: leave it out")
+
+    @property
+    def relabels(self) -> bool:
+        """Whether virtual transitions are written."""
+        return get_algorithm(self.hindsight.algo).virtual
+
+    @property
+    def filters(self) -> bool:
+        """Whether virtual goals that were achieved already are left out."""
+        return get_algorithm(self.hindsight.algo).filter
+
+    @property
+    def in_layers(self) -> bool:
+        """Whether runs learn the layers of a curriculum."""
+        return get_algorithm(self.hindsight.algo).curriculum
 
     @property
     def total_frames(self) -> int:
@@ -73,15 +92,6 @@ class Recipe:
     def seeds(self) -> list[int]:
         """The seed of each run."""
         return [self.run.seed + run for run in range(self.run.num_runs)]
-
-    def of_runs(self) -> list[Recipe]:
-        """For each run the recipe of that run alone, with its seed.
-
-        Example:
-            >>> [own.seeds for own in Recipe(run=groups.RunConfig(seed=3, num_runs=2)).of_runs()]
-            [[3], [4]]
-        """
-        return [replace(self, run=replace(self.run, seed=seed, num_runs=1)) for seed in self.seeds]
 
     def replace(self, **values: Any) -> Recipe:
         """The same recipe with some other values, by their short names; see :func:`make_recipe`.
@@ -107,8 +117,10 @@ class Recipe:
         return self.replace(**values)
 
     def to_dict(self) -> Nested:
-        """All values, by group and name."""
+        """All values, by group and name, without the name of weights that the algorithm has."""
         named = {group: {"name": getattr(self, group).name} for group in KINDS}
+        if get_algorithm(self.hindsight.algo).weights is not None:
+            del named["weights"]
         return {group: named.get(group, {}) | asdict(own) for group, own in vars(self).items()}
 
     def changed(self) -> Nested:
@@ -132,10 +144,14 @@ class Recipe:
         Raises:
             ValueError: a group or an option that does not exist, or a value that cannot work.
         """
-        placed = place(values)
-        return _assemble(
-            placed | {group: kind.stored(placed.get(group, {})) for group, kind in KINDS.items()}
-        )
+        former = {group: own for group, own in values.items() if group in FORMER and isinstance(own, Mapping)}
+        placed = place({group: own for group, own in values.items() if group not in former})
+        for group, kind in KINDS.items():
+            name = chosen(group, placed)
+            known = [own.name for own in fields(kind.find(name)) if group in ("weights", "behavior")]
+            kept = {key: own[key] for own in former.values() for key in known if key in own}
+            placed[group] = kind.stored({**kept, **placed.get(group, {}), "name": name})
+        return Recipe(**_groups(placed))
 
 
 def check_extending(values: Mapping[str, Any]) -> None:
@@ -178,15 +194,17 @@ def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Reci
         5
     """
     recipe = compose(base, values)
-    if "name" in place(values).get("task", {}):
+    if "name" in place(values, place(base or {})).get("task", {}):
         permit_task(recipe.task.name)
     return recipe
 
 
 def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe:
     """The same recipe as :func:`make_recipe`, where no value was named by the user."""
-    given = place(values)
     below = place(base or {})
+    given = place(values, below)
+    if get_algorithm(chosen("hindsight", given, below)).weights is not None:
+        below.get("weights", {}).pop("name", None)
     _drop_options_of_other_choices(below, given)
     _drop_options_of_another_task(below, given)
     _drop_another_curriculum(below, given)
@@ -203,18 +221,12 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     for group, own in without_effect(SimpleNamespace(**_groups(over(below, given)))):
         if own not in given.get(group, {}) and own in below.get(group, {}):
             del below[group][own]
-    return _assemble(over(below, given))
-
-
-def _chosen(group: str, *values: Nested) -> str:
-    """Returns the name that the first of some values has for a group."""
-    names = (own.get(group, {}).get("name") for own in values)
-    return next(filter(None, names), KINDS[group].default if group in KINDS else groups.TaskConfig.name)
+    return Recipe(**_groups(over(below, given)))
 
 
 def _meant(group: str, *values: Nested) -> str:
     """Returns a group's choice, and for ``auto`` the one that it stands for on the task."""
-    name, task = _chosen(group, *values), _chosen("task", *values)
+    name, task = chosen(group, *values), chosen("task", *values)
     actions = get_task_spec(task).actions if isinstance(task, str) and name == AUTO else None
     return name if actions is None else BY_ACTIONS[actions]
 
@@ -228,7 +240,7 @@ def _drop_options_of_other_choices(below: Nested, given: Nested) -> None:
         ValueError: an option is asked for that ``auto`` does not have on this task.
     """
     for group, kind in KINDS.items():
-        asked = kind.find(_chosen(group, given, below))
+        asked = kind.find(chosen(group, given, below))
         choice, former = kind.find(_meant(group, given, below)), kind.get(_meant(group, below))
         for key, value in given.get(group, {}).items():
             if hasattr(asked, key) and not hasattr(choice, key):
@@ -277,10 +289,7 @@ def drop_other_goal_sources(given: Nested) -> None:
     asked["goal_sources"] = None
 
 
-def _assemble(values: Nested) -> Recipe:
-    return Recipe(**_groups(values))
-
-
 def _groups(values: Nested) -> dict[str, Any]:
     """Returns the groups of a recipe, before they are checked against each other."""
-    return {group: kind(**values.get(group, {})) for group, kind in GROUPS.items()}
+    named = {group: {"name": chosen(group, values)} for group in KINDS}
+    return {group: kind(**values.get(group, {}) | named.get(group, {})) for group, kind in GROUPS.items()}

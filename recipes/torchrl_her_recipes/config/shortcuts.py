@@ -7,10 +7,12 @@ from dataclasses import fields
 from typing import Any
 
 from torchrl_her_recipes.config import groups
+from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.behavior import BEHAVIOR
 from torchrl_her_recipes.config.choices import Kind
 from torchrl_her_recipes.config.learners import LEARNERS
 from torchrl_her_recipes.config.options import nearest, what_there_is
+from torchrl_her_recipes.config.weights import WEIGHTS
 
 Nested = dict[str, dict[str, Any]]
 
@@ -20,8 +22,7 @@ GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
     "learner": LEARNERS,
     "collection": groups.CollectionConfig,
     "replay": groups.ReplayConfig,
-    "ibs": groups.IBSConfig,
-    "novelty": groups.NoveltyConfig,
+    "weights": WEIGHTS,
     "curriculum": groups.CurriculumConfig,
     "behavior": BEHAVIOR,
     "demonstrations": groups.DemonstrationsConfig,
@@ -29,7 +30,7 @@ GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
     "run": groups.RunConfig,
 }
 KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)}
-
+FORMER = ("ibs", "novelty")  # groups whose options are those of weights now
 
 LONG_ONLY = ("demonstrations",)  # its options are always named with it: of what would ``file`` be?
 
@@ -56,25 +57,38 @@ def option_names() -> dict[str, list[str]]:
     return names
 
 
-def locate(name: str) -> tuple[str, str]:
+def chosen(group: str, *values: Nested) -> str:
+    """Returns the name that the first of some values have for a group, or its default."""
+    key = "algo" if group == "hindsight" else "name"
+    if name := next(filter(None, (own.get(group, {}).get(key) for own in values)), None):
+        return name
+    if group == "weights" and (weights := get_algorithm(chosen("hindsight", *values)).weights):
+        return weights
+    return KINDS[group].default if group in KINDS else getattr(GROUPS[group], key)
+
+
+def locate(name: str, *values: Nested) -> tuple[str, str]:
     """The group and the name of an option.
 
     Args:
         name: short (``seed``), with its group (``run.seed``), or a group that has a name (``task``). Those of
             some groups (``demonstrations.file``) are never short.
+        values: Choices by which a short name of several groups is found, the first ones first.
 
     Raises:
         ValueError: it does not exist, or is not unique; the message names the nearest one.
 
     Example:
-        >>> locate("seed"), locate("learner"), locate("ibs.floor")
-        (('run', 'seed'), ('learner', 'name'), ('ibs', 'floor'))
+        >>> locate("seed"), locate("learner"), locate("weights.floor")
+        (('run', 'seed'), ('learner', 'name'), ('weights', 'floor'))
     """
     names = option_names()
     group, _, own = name.partition(".")
     if group == "task_options" or (group == "options" and own):
         meant = ".".join(["task.options", *([own] if own else [])])
         raise ValueError(f"options of the task are written task.options.NAME=VALUE: {meant}, not {name}")
+    if group in FORMER:
+        raise ValueError(f"{name} is called {name.replace(group, 'weights', 1)} now")
     if own:
         if group not in names:
             home = next((each for each, known in names.items() if group in known and group != "name"), None)
@@ -89,12 +103,14 @@ def locate(name: str) -> tuple[str, str]:
     if name in names:
         raise ValueError(f"{name} is a group of options: write {name}.{names[name][0]}=..., for instance")
     found = [group for group, known in names.items() if name in known and group not in LONG_ONLY]
-    if len(found) == 1:
-        return found[0], name
+    if len(found) > 1:
+        having = [g for g in found if g not in KINDS or hasattr(KINDS[g].find(chosen(g, *values)), name)]
+        if len(having) > 1:
+            shown = " or ".join(f"{group}.{name}" for group in having)
+            raise ValueError(f"several groups have an option {name!r}: write {shown}")
+        found = having or found
     if found:
-        raise ValueError(
-            f"several groups have an option {name!r}: write {' or '.join(f'{g}.{name}' for g in found)}"
-        )
+        return found[0], name
     named = [each for each, known in names.items() if "name" in known]
     if long := [f"{group}.{name}" for group in LONG_ONLY if name in names[group]]:
         raise ValueError(f"no option {name!r}; did you mean {long[0]}?")
@@ -105,8 +121,10 @@ def locate(name: str) -> tuple[str, str]:
     raise ValueError(f"no option {name!r}{nearest(name, every)}; `torchrl-her train -h` lists them")
 
 
-def place(values: Mapping[str, Any]) -> Nested:
+def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
     """Values by short or long names, or whole groups as mappings, sorted into their groups.
+
+    Short names that several groups have are looked up among the choices of the values and of ``base``.
 
     Example:
         >>> place({"task": "hand_v0", "seed": 3, "run": {"epochs": 2}, "task.options.bits": 8})
@@ -114,7 +132,7 @@ def place(values: Mapping[str, Any]) -> Nested:
     """
     placed: Nested = {}
     names = option_names()
-    for name, value in values.items():
+    for name, value in sorted(values.items(), key=lambda item: sum(item[0] in own for own in names.values())):
         if not isinstance(name, str):
             raise ValueError(f"options must be names, got {name!r}")
         if name in GROUPS and isinstance(value, Mapping):
@@ -128,11 +146,13 @@ def place(values: Mapping[str, Any]) -> Nested:
             placed.setdefault("curriculum", {})["layers"] = list(value)
             continue
         head, *deeper = name.split(".", 2)[:2] + name.split(".")[2:]
-        group, own = locate(".".join([head, *deeper[:1]]))
+        group, own = locate(".".join([head, *deeper[:1]]), placed, base or {})
         if len(deeper) > 1:
             before = placed.get(group, {}).get(own)
             entry = {".".join(deeper[1:]): value}
             value = Entries(entry) if not isinstance(before, Mapping) else _join(before, entry)
+        elif own in placed.get(group, {}):
+            raise ValueError(f"{name} and {group}.{own} set the same option: give one of them")
         placed.setdefault(group, {})[own] = value
     return placed
 

@@ -110,14 +110,14 @@ class Space:
         Raises:
             ValueError: values that cannot go together.
         """
-        given = place(values)
+        given = place(values, base.to_dict())
         drop_other_goal_sources(given)
         return compose(merge(base.to_dict(), given), {})
 
     def values_of(self, recipe: Recipe) -> dict[str, Any]:
         """A recipe's values of the options that have an effect, in the space or outside."""
         idle = _idle(recipe)
-        places = {name: locate(name) for name in self.ranges}
+        places = {name: locate(name, recipe.to_dict()) for name in self.ranges}
         return {
             name: getattr(getattr(recipe, group), option)
             for name, (group, option) in places.items()

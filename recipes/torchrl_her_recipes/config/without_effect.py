@@ -35,25 +35,14 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     yield "termination" not in takes, with_task, ["task.failure"]  # such tasks end at their goals alone
     yield "dtype" not in takes, with_task, ["run.dtype"]
 
-    given = algorithm.hindsight and groups.hindsight.goal_sources not in (None, AUTO)
+    given = algorithm.virtual and groups.hindsight.goal_sources not in (None, AUTO)
     yield given, "with goal_sources", ["hindsight.k", "hindsight.strategy"]
     with_algo = f"with algo={algorithm.name}"
     of_filter = ["hindsight.redraw", "hindsight.refill"]
-    yield not algorithm.filter_achieved, with_algo, of_filter
-    unread = set(_options(groups, "novelty", "ibs"))  # of weights of goals
-    if algorithm.hindsight and sources and algorithm.weights:
-        unread = set() if algorithm.reads is None else unread - set(algorithm.reads)
-    elif algorithm.hindsight and sources and algorithm.instructive is not None:
-        floor = {"ibs.floor", "ibs.floor_is_relative"} if algorithm.instructive == "sequential" else set()
-        unread = floor | set(_options(groups, "novelty"))
-    elif algorithm.hindsight and sources:
-        unread -= {"ibs.cells", "ibs.recent"}  # virtual goals are counted without weights, too
-    if groups.behavior.instructive:  # whatever the weights of virtual goals are
-        unread -= set(_options(groups, "ibs"))
-    yield True, with_algo, unread
-    relabeling = ["hindsight.strategy", *of_filter, "evaluation.virtual_goals"]
-    yield not sources, "with k=0", [*relabeling, *(unread if algorithm.hindsight else ())]
-    yield not algorithm.hindsight, with_algo, [*relabeling, "hindsight.k", "hindsight.goal_sources"]
+    yield not algorithm.filter, with_algo, of_filter
+    relabeling = ["hindsight.strategy", *of_filter, "evaluation.virtual_goals", *_options(groups, "weights")]
+    yield not sources, "with k=0", relabeling
+    yield not algorithm.virtual, with_algo, [*relabeling, "hindsight.k", "hindsight.goal_sources"]
 
     yield not learner.has_epsilon, f"with learner={learner.name}", ["curriculum.layer_epsilon"]
     yield not algorithm.curriculum, with_algo, _options(groups, "curriculum")
@@ -73,5 +62,5 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     yield groups.run.dtype == "float64", "with dtype=float64", ["learner.products"]
 
 
-def _options(groups: Any, *names: str) -> list[str]:
-    return [f"{group}.{own.name}" for group in names for own in fields(getattr(groups, group))]
+def _options(groups: Any, group: str) -> list[str]:
+    return [f"{group}.{own.name}" for own in fields(getattr(groups, group))]

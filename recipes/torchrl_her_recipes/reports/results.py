@@ -120,7 +120,9 @@ def read_single(label: str, batches: Batches) -> Combination:
 def _differences(made: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
     """The options of a recipe that are not those of another one, and their values in both."""
     ours, theirs = dict(_flat(made.to_dict())), dict(_flat(usual.to_dict()))
-    return [(name, value, theirs.get(name)) for name, value in ours.items() if value != theirs.get(name)]
+    changed = {*dict(_flat(made.changed())), *dict(_flat(usual.changed()))}
+    differ = [name for name, value in ours.items() if name in changed and value != theirs.get(name)]
+    return [(name, ours[name], theirs.get(name)) for name in differ]
 
 
 def _combination(

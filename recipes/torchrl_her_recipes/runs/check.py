@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from torchrl_her_recipes.components.first_look import Facts, resolved
-from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
 _SELDOM = 0.5  # of the episodes
@@ -69,8 +68,8 @@ def _percent(share: float) -> str:
 
 
 def _remedy(facts: Facts, recipe: Recipe, layers_file: str) -> str:
-    algorithm, shown = get_algorithm(recipe.hindsight.algo), "demonstrations (demonstrations.file=FILE)"
-    if algorithm.curriculum and algorithm.filter_achieved:
+    shown = "demonstrations (demonstrations.file=FILE)"
+    if recipe.in_layers and recipe.filters:
         layers = recipe.curriculum.layers
         first = (
             f", whose first goals are for entries {layers[0]['achieved_goal']} of the observation"

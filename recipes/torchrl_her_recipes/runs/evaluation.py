@@ -12,7 +12,6 @@ from torch import Tensor
 from torchrl_her.goals.ibs import GoalHistogram
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.objectives.critics import critic_value
-from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.metrics import discounted_return, final_distance, q_bias, reached, success
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
@@ -54,8 +53,6 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
 def written(components: Components, run: int) -> dict[str, float]:
     """What the writer of one run has counted."""
     writer = components.buffer.writer
-    if not isinstance(writer, HERWriter):
-        return {}
     counts = {f"rows_{name}": value for name, value in asdict(writer.totals_of(run)).items()}
     weights = writer.goal_weights[run] if writer.goal_weights else None
     divergence = None

@@ -10,7 +10,7 @@ import torch
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_her.files.writing import written
-from torchrl_her_recipes.components.goal_space import histograms
+from torchrl_her.goals.ibs import GoalHistogram
 from torchrl_her_recipes.runs.arrays import read_arrays
 
 
@@ -67,7 +67,7 @@ class GoalMap:
 
 def goal_map(buffer: TensorDictReplayBuffer, target: torch.Tensor | None) -> GoalMap | None:
     """The map of the runs' virtual goals and their q* [cells]; None where nothing counts virtual goals."""
-    counted = histograms(buffer)
+    counted = [own for own in buffer.writer.goal_weights if isinstance(own, GoalHistogram)]
     if not counted or target is None:
         return None
     shape = counted[0].grid.shape

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
-from torchrl_her_recipes.config.algorithms import get_algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
 Row = dict[str, float]  # of the table of metrics: one epoch of one run
@@ -89,10 +88,7 @@ def _nothing_achieved(rows: Sequence[Row], recipe: Recipe) -> str | None:
 
 def _nothing_to_relabel(rows: Sequence[Row], recipe: Recipe) -> str | None:
     row = rows[-1]
-    if len(rows) < _STREAK or _success(row) >= _LITTLE or "rows_virtual" not in row:
-        return None
-    algorithm = get_algorithm(recipe.hindsight.algo)
-    if not algorithm.hindsight:
+    if len(rows) < _STREAK or _success(row) >= _LITTLE or "rows_virtual" not in row or not recipe.relabels:
         return None
     if row["rows_virtual_positive"] > _NEARLY_ALL * row["rows_virtual"] > 0:
         return (
@@ -100,7 +96,7 @@ def _nothing_to_relabel(rows: Sequence[Row], recipe: Recipe) -> str | None:
             "before the action: nothing can be learned from them. What helps: the filter "
             "(algo=filtered_her), a curriculum (algo=cher) or demonstrations"
         )
-    if algorithm.filter_achieved and row["rows_relabeled"] <= _FEW * row["rows_real"]:
+    if recipe.filters and row["rows_relabeled"] <= _FEW * row["rows_real"]:
         return (
             f"the filter has left {row['rows_relabeled']:,.0f} of {row['rows_real']:,.0f} transitions with "
             "goals of their own episode: the achieved goal hardly changes. What helps: a curriculum "

@@ -25,6 +25,7 @@ def test_completion_of_names_and_values() -> None:
     assert completed("learner=d") == ["learner=ddpg", "learner=dqn"]
     assert completed("sampler=") == ["sampler=prioritized", "sampler=uniform"]
     assert completed("strategy=f") == ["strategy=future", "strategy=final"]
+    assert completed("estimator=k") == ["estimator=kernel"]
     assert completed("seed=") == []
     assert completed("demonstrations.f") == ["demonstrations.file="]
     assert completed("starts") == []

@@ -15,7 +15,8 @@ from torchrl_her.goals import GoalHistogram
 from torchrl_her_envs import TASKS, make_env
 from torchrl_her_recipes import build, run
 from torchrl_her_recipes.cli import main
-from torchrl_her_recipes.components.goal_space import goal_space, make_goal_weights
+from torchrl_her_recipes.components.goal_space import GoalSpace, goal_space
+from torchrl_her_recipes.config.weights import Equal
 from torchrl_her_recipes.runs.goal_map import GoalMap
 
 from ..small import small
@@ -30,7 +31,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_has_a_target(task: str) -> None:
-    target = goal_space(small(task=task), make_env(task)).target
+    space = goal_space(small(task=task), make_env(task), Equal())
+    assert isinstance(space, GoalSpace)
+    target = space.target
     assert target.shape == (400,)
     assert float(target.sum()) == pytest.approx(1.0)
     greatest = int(target.argmax())
@@ -49,8 +52,7 @@ def test_every_task_has_a_target(task: str) -> None:
     ],
 )
 def test_each_algorithm_has_its_weights(algo: str, kind: type, subtract: bool | None) -> None:
-    recipe, env = small(algo=algo), make_env("hand_v0")
-    weights = make_goal_weights(recipe, env, goal_space(recipe, env))
+    weights = build(small(algo=algo)).buffer.writer.weights
     assert type(weights) is kind
     assert getattr(weights, "subtract", None) is subtract
 
@@ -61,8 +63,7 @@ def test_sigma_is_a_share_of_the_screen_and_smaller_beside_the_wall() -> None:
         ("hand_wall_v0", {}, 0.2),
         ("hand_wall_v0", {"sigma": 0.3}, 0.6),
     ):
-        recipe, env = small(task=task, algo="her_ibs", **options), make_env(task)
-        weights = make_goal_weights(recipe, env, goal_space(recipe, env))
+        weights = build(small(task=task, algo="her_ibs", **options)).buffer.writer.weights
         assert isinstance(weights, Instructiveness)
         assert weights.final_sigma == pytest.approx(sigma)
         assert weights.sigma == pytest.approx(3 * sigma)
@@ -70,7 +71,7 @@ def test_sigma_is_a_share_of_the_screen_and_smaller_beside_the_wall() -> None:
 
 @pytest.mark.parametrize("task", ["hand_reach", "robot_reach"])
 def test_goals_around_the_start_states_are_refused_by_name(task: str) -> None:
-    with pytest.raises(ValueError, match=f"her_ibs must not be used on {task}"):
+    with pytest.raises(ValueError, match=f"IBS must not be used on {task}"):
         build(small(task=task, algo="her_ibs"))
     build(small(task=task, algo="her"))  # counting them is fine
 

@@ -16,9 +16,11 @@ from torchrl_her_recipes.config.study import load_study, study_names
 def test_every_preset_makes_a_recipe_and_says_what_it_is_for(name: str) -> None:
     values = load_preset(name)
     recipe = make_recipe(values).to_dict()
-    with_ibs = make_recipe(values, algo="filtered_her_ibs").to_dict()  # options of IBS are dropped without it
+    with_ibs = make_recipe(values, algo="filtered_her_ibs", behavior="ibs").to_dict()
     for group, own in values.items():
-        made = with_ibs if group == "ibs" else recipe
+        made = (
+            with_ibs if group in ("weights", "behavior") else recipe
+        )  # options of IBS are dropped without it
         assert own == {key: made[group][key] for key in own}
     assert 10 < len(preset_summary(name)) < 90
 

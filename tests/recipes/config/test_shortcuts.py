@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import pytest
 
 from torchrl_her_recipes import make_recipe
 from torchrl_her_recipes.config.shortcuts import LONG_ONLY, locate, merge, option_names, place
+from torchrl_her_recipes.config.weights import IBS
 
 
 def test_every_option_is_found_by_its_long_name() -> None:
@@ -17,8 +20,9 @@ def test_every_option_is_found_by_its_long_name() -> None:
 def test_short_names_are_unique_except_for_the_names_of_groups() -> None:
     short = {group: names for group, names in option_names().items() if group not in LONG_ONLY}
     every = [name for names in short.values() for name in names if name != "name"]
-    unique = [name for name in every if name != "device"]  # which has to be said: of what?
-    assert sorted(unique) == sorted(set(every) - {"device"})
+    several = {"device", *(own.name for own in fields(IBS))}  # which has to be said: of what?
+    unique = [name for name in every if name not in several]
+    assert sorted(unique) == sorted(set(every) - several)
     assert [locate(name)[1] for name in unique] == unique
     with pytest.raises(ValueError, match=r"write learner\.device or replay\.device"):
         locate("device")
@@ -39,7 +43,7 @@ def test_short_names_are_unique_except_for_the_names_of_groups() -> None:
         ),
         ("task_options", "are written task.options.NAME=VALUE: task.options, not task_options$"),
         ("options.bits", "are written task.options.NAME=VALUE: task.options.bits, not options.bits$"),
-        ("name", "several groups have an option 'name': write task.name or learner.name or curriculum.name"),
+        ("name", "several groups have an option 'name': write task.name or learner.name or weights.name"),
     ],
 )
 def test_unknown_names_get_a_hint(name: str, message: str) -> None:

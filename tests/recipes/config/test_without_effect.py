@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from torchrl_her_recipes import ALGORITHMS, Algorithm, Recipe, make_recipe
+from torchrl_her_recipes import Recipe, make_recipe
 
 SHOWN = {"demonstrations.file": "demos.pt", "demonstrations.episodes": 10}
 STARTS = {"demonstrations.starts_share": 0.5}
@@ -18,18 +18,7 @@ IDLE: list[tuple[dict[str, Any], dict[str, Any]]] = [
     ({"k": 0, "algo": "her_ibs"}, {"sigma": 0.3}),
     ({"algo": "her"}, {"redraw": False}),
     ({"k": 0}, {"redraw": False}),
-    ({"algo": "her"}, {"sigma": 0.3}),
-    ({"algo": "her"}, {"floor": 0.3}),
-    ({"algo": "her_ibs_sequential"}, {"floor": 0.3}),
-    ({"algo": "her"}, {"estimator": "kernel"}),
     ({"algo": "her_ibs", "estimator": "kernel"}, {"cells": 8}),
-    ({"algo": "her"}, {"sharpness": 2.0}),
-    ({"algo": "her_ibs"}, {"memory": 50}),
-    ({"algo": "no_hindsight"}, {"memory": 50}),
-    ({"algo": "filtered_her_rnd"}, {"memory": 50}),
-    ({"algo": "cher_rnd"}, {"estimator": "kernel"}),
-    ({"algo": "filtered_her_rare"}, {"sigma": 0.3}),
-    ({"algo": "cher_rare"}, {"cells": 8}),
     ({"algo": "filtered_her_rare", "k": 0}, {"sharpness": 2.0}),
     ({"algo": "her"}, {"window": 5}),
     ({"algo": "cher", "learner": "sac"}, {"layer_epsilon": 0.5}),
@@ -109,18 +98,7 @@ def test_goal_sources_take_the_place_of_k_and_strategy_and_the_other_way_round()
     values = {"hindsight": {"k": 8, "goal_sources": mixed}}
     with pytest.raises(ValueError, match="k=8 has no effect with goal_sources: leave it out"):
         Recipe.from_dict(values)
-    assert make_recipe(algo="her_ibs", goal_sources=mixed, sigma=0.3).ibs.sigma == 0.3
-
-
-def test_weights_of_ones_own_may_read_every_option_of_weights(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(ALGORITHMS, "own", Algorithm(name="own", weights="nowhere:make"))
-    recipe = make_recipe(algo="own", sigma=0.3, memory=50)
-    assert (recipe.ibs.sigma, recipe.novelty.memory) == (0.3, 50)
-    own = Algorithm(name="own", weights="nowhere:make", reads=("ibs.sigma",))
-    monkeypatch.setitem(ALGORITHMS, "own", own)
-    assert make_recipe(algo="own", sigma=0.3).ibs.sigma == 0.3
-    with pytest.raises(ValueError, match="memory=50 has no effect with algo=own"):
-        make_recipe(algo="own", memory=50)
+    assert make_recipe(algo="her_ibs", goal_sources=mixed, sigma=0.3).changed()["weights"] == {"sigma": 0.3}
 
 
 def test_options_of_another_task_do_not_come_along() -> None:

@@ -345,7 +345,7 @@ def test_options_that_a_file_does_not_know_have_their_defaults(tmp_path: Path) -
     own, path = tiny_policy(gamma=0.9), tmp_path / "mine.safetensors"
     own.save(path)
     description, weights = read_policy(path)
-    del description["recipe"]["learner"]["tau"], description["recipe"]["novelty"]
+    del description["recipe"]["learner"]["tau"], description["recipe"]["weights"]
     write_policy(path, weights, description)
     assert load_policy(path).recipe == own.recipe
 

@@ -228,7 +228,10 @@ def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
             {"algo": "cher", "order": "all_at_once", "window": 5},
             "window=5 has no effect with order=all_at_once",
         ),
-        ({"algo": "her", "sigma": 0.3}, "sigma=0.3 has no effect"),
+        (
+            {"algo": "her", "sigma": 0.3},
+            "weights=none has no option sigma; weights=ibs or ibs_sequential has",
+        ),
         (
             {"algo": "cher", "learner": "sac", "order": "all_at_once", "success_threshold": 0.5},
             "success_threshold=0.5 has no effect with order=all_at_once",
@@ -239,7 +242,7 @@ def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
         ),
         ({"behavior": "mega", "real_share": 1.0, "candidates": 7}, "candidates=7 has no effect with real_sh"),
         ({"algo": "no_hindsight", "virtual_goals": True}, "virtual_goals=True has no effect with algo=no_h"),
-        ({"behavior": "ibs", "estimator": "kernel", "cells": 5}, "cells=5 has no effect with estimator=kern"),
+        ({"behavior": "ibs", "estimator": "kernel", "behavior.cells": 5}, "cells=5 has no effect with esti"),
     ],
 )
 def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
@@ -247,9 +250,15 @@ def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
         make_recipe({"algo": "her"}, **options)
 
 
-def test_options_of_ibs_have_an_effect_on_proposals() -> None:
-    own = make_recipe(algo="her", behavior="ibs", **{"ibs.sigma": 0.3, "ibs.floor": 0.01})
-    assert (own.ibs.sigma, own.ibs.floor) == (0.3, 0.01)
+def test_the_options_of_ibs_arrive_at_proposals_alone() -> None:
+    options = {"sigma": 0.1, "behavior.cells": 8, "behavior.recent": 77, "floor": 0.01}
+    components = build(recipe("ibs", **options))
+    assert components.behavior is not None
+    (weights,) = components.behavior.weights
+    assert isinstance(weights, Instructiveness)
+    assert weights.final_sigma == pytest.approx(0.1 * 2.0)  # the screen is 2 wide
+    assert (weights.grid.shape, weights.recent, weights.floor) == ((8, 8), 77, 0.01)
+    assert components.buffer.writer.weights.grid.shape == (20, 20)
 
 
 @pytest.mark.parametrize("options", [{"behavior": "mega"}, {"algo": "cher", "order": "all_at_once"}])
@@ -264,10 +273,10 @@ def test_a_memory_below_what_comes_at_once_is_refused() -> None:
 
 
 def test_weights_that_cannot_tell_layers_apart_are_refused() -> None:
-    with pytest.raises(ValueError, match="cher_rare must not be used with order=all_at_once"):
+    with pytest.raises(ValueError, match="weights=rare must not be used with order=all_at_once"):
         build(small(task="hand_v1", algo="cher_rare", order="all_at_once"))
 
 
 def test_instructive_goals_around_the_start_are_refused() -> None:
-    with pytest.raises(ValueError, match="behavior=ibs must not be used on hand_reach"):
+    with pytest.raises(ValueError, match="IBS must not be used on hand_reach"):
         build(small(task="hand_reach", algo="her", behavior="ibs"))

@@ -1,4 +1,4 @@
-"""Algorithms that prefer rare or new goals, and IBS without a grid: each trains, resumes and stands alone."""
+"""Weights of rare or new goals, and IBS without a grid: each trains, resumes and stands alone."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from torchrl_her_envs import make_env
 from torchrl_her_recipes import build, resume, run
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.goal_space import KernelSpace, goal_space
+from torchrl_her_recipes.config.weights import IBS
 
 from ..small import assert_same, small, stop_after
 
@@ -93,18 +94,18 @@ def test_the_options_arrive() -> None:
 
 
 def test_the_kernel_s_sigma_is_the_grid_s_and_grows_with_the_root_of_the_numbers() -> None:
-    space = goal_space(small(algo="her_ibs", estimator="kernel"), make_env("hand_v0"))
+    space = goal_space(small(), make_env("hand_v0"), IBS(estimator="kernel"))
     assert isinstance(space, KernelSpace)
-    grid = goal_space(small(algo="her_ibs"), make_env("hand_v0"))
+    grid = goal_space(small(), make_env("hand_v0"), IBS())
     assert grid is not None
     assert space.sigma == pytest.approx(grid.sigma) == pytest.approx(0.4)
     assert space.goals.shape[1] == 2
     env = make_env("bit_flip", bits=12)
-    recipe = small(**{"algo": "her_ibs", "task": "bit_flip", "task.options.bits": 12})
-    many = goal_space(recipe, env)
+    recipe = small(**{"task": "bit_flip", "task.options.bits": 12})
+    many = goal_space(recipe, env, IBS())
     assert isinstance(many, KernelSpace)
     assert many.sigma == pytest.approx(0.2 * math.sqrt(12 / 3))
-    given = goal_space(recipe.replace(sigma=0.3), env)
+    given = goal_space(recipe, env, IBS(sigma=0.3))
     assert given is not None
     assert given.sigma == pytest.approx(0.3)
 

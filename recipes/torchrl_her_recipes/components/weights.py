@@ -1,0 +1,45 @@
+"""Makers of the weights of virtual goals, which the choices in :mod:`..config.weights` name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchrl_her.goals.ibs import GoalHistogram, Instructiveness
+from torchrl_her.goals.instructive import InstructiveWeights
+from torchrl_her.goals.kernel_ibs import KernelInstructiveness
+from torchrl_her.goals.rare import RareGoals
+from torchrl_her.goals.rnd import NetworkNovelty
+from torchrl_her_recipes.components.goal_space import MOST_DIMENSIONS, GoalSpace, KernelSpace, goal_width
+from torchrl_her_recipes.config.weights import IBS, RND, Equal, Rare, SequentialIBS
+
+
+def make_counts(options: Equal, *, space: Any, **_: Any) -> GoalHistogram | None:
+    """Counts goals and gives all of them the same weight."""
+    return GoalHistogram(space.grid, recent=options.recent) if space is not None else None
+
+
+def make_instructive(
+    options: SequentialIBS, *, space: GoalSpace | KernelSpace, **_: Any
+) -> InstructiveWeights:
+    """Prefers goals near the real ones (IBS)."""
+    shared = ("start_factor", "decay", "floor")
+    names = shared if isinstance(space, KernelSpace) else (*shared, "floor_is_relative", "recent")
+    given: dict[str, Any] = {name: value for name, value in vars(options).items() if name in names}
+    given |= {"sigma": space.sigma, "subtract": isinstance(options, IBS)}
+    if isinstance(space, KernelSpace):
+        return KernelInstructiveness(space.goals, **given)
+    return Instructiveness(space.grid, space.target_at, **given)
+
+
+def make_rare(options: Rare, *, env: Any, **_: Any) -> RareGoals:
+    """Prefers goals with few others around them: by a kernel in few dimensions, by neighbors in many."""
+    return RareGoals(
+        estimator="kernel" if goal_width(env) <= MOST_DIMENSIONS else "neighbors",
+        sharpness=options.sharpness,
+        memory=options.memory,
+    )
+
+
+def make_network_novelty(options: RND, *, seed: int, **_: Any) -> NetworkNovelty:
+    """Prefers goals that are new to a network, whose first weights come from the run's seed."""
+    return NetworkNovelty(seed=seed, sharpness=1.0 if options.sharpness is None else options.sharpness)
