@@ -45,6 +45,7 @@ def test_a_folder_without_the_study_s_runs_is_refused(tmp_path: Path) -> None:
         read_combinations(STUDY, tmp_path / "none")
 
 
-def test_another_learner_is_a_difference() -> None:
-    differences = _differences(make_recipe(learner="sac"), Recipe())
-    assert ("learner.name", "sac", "auto") in differences
+def test_another_choice_is_a_difference_without_its_own_defaults() -> None:
+    assert _differences(make_recipe(learner="sac"), Recipe()) == [("learner.name", "sac", "auto")]
+    ibs = _differences(make_recipe(algo="her_ibs", sigma=0.3), make_recipe(algo="her"))
+    assert ibs == [("hindsight.algo", "her_ibs", "her"), ("weights.sigma", 0.3, None)]
