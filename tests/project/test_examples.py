@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,14 +25,28 @@ DOCS = Path(__file__).parents[2] / "docs"
 GUIDE = (DOCS / "curriculum.md").read_text()
 
 
-@pytest.fixture(scope="module")
-def example() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("own_curriculum", DOCS / "examples" / "own_curriculum.py")
+def load(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)  # dataclasses look there
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def example() -> ModuleType:
+    return load(DOCS / "examples" / "own_curriculum.py")
+
+
+def test_the_one_file_moves_from_reaching_to_throwing() -> None:
+    path = DOCS.parent / "recipes" / "one_file_cher.py"
+    assert len(path.read_text().splitlines()) <= 250
+    cher = load(path)
+    results = list(cher.train(cher.Options(epochs=4, episodes=20)))
+    assert [result.frames for result in results] == [10_240, 20_480, 30_720, 40_960]
+    assert (results[0].stage, results[-1].stage) == ("reach", "throw")
+    assert max(result.success for result in results if result.stage == "reach") >= 0.9
 
 
 def test_the_guide_s_python_runs_from_top_to_bottom() -> None:
