@@ -1,6 +1,6 @@
 """Filtered-HER with a curriculum (CHER) in one file: a hand picks a ball up and throws it into a hole.
 
-    python recipes/one_file_cher.py --seed 0
+    python recipes/one_file_cher.py --seed 0    # about a minute; 96 to 100 % at the end
 
 Everything that a run needs is here, from the library's parts alone: the environment as its stage shows it,
 the writer that relabels, the networks, the loop of collection and gradient steps, and the change of stage.
@@ -44,7 +44,7 @@ from torchrl_her import (
     success,
 )
 from torchrl_her.curriculum import zero_unused_inputs
-from torchrl_her.modules import StackedLinear
+from torchrl_her.modules import PolicyAverage, StackedLinear
 from torchrl_her_envs import make_env
 
 
@@ -53,7 +53,7 @@ class Options:
     """Settings of a run; frames are environment steps."""
 
     seed: int = 0
-    epochs: int = 20
+    epochs: int = 30
     epoch_frames: int = 10_240
     num_envs: int = 64
     steps_per_batch: int = 10  # of each environment
@@ -76,6 +76,7 @@ class Options:
     tau: float = 0.02
     action_penalty: float = 0.3  # keeps tanh from its ends, where its gradient vanishes
     max_grad_norm: float = 3.0
+    average_decay: float = 0.9995  # of the weights that are evaluated
     # Exploration: a share epsilon of the actions has noise, a fifth of it is uniform
     epsilon_decay: float = 0.9  # each epoch
     epsilon_end: float = 0.05
@@ -112,7 +113,7 @@ def make_network(
     make: Callable[..., TensorDictModule], curriculum: Curriculum, hidden: int
 ) -> TensorDictModule:
     """Returns an actor or a critic whose weights of inputs that the first stage does not use are 0."""
-    network = make([curriculum.input_width], 3, hidden=hidden, in_keys=["input"])
+    network = make([curriculum.input_width], 3, hidden=hidden, norm="layer", in_keys=["input"])
     first = next(module for module in network.modules() if isinstance(module, StackedLinear))
     first.weight.data = zero_unused_inputs(first.weight.data, curriculum.first_inputs, alpha=0.0)
     return network
@@ -158,6 +159,7 @@ def train(options: Options) -> Iterator[Evaluation]:
     optimizer = torch.optim.Adam(loss.parameters(), lr=options.learning_rate)
     target = make_target_updater(loss, tau=options.tau, hard_interval=0)
     learner = FusedLearner(loss, optimizer, target, max_grad_norm=options.max_grad_norm)
+    average = PolicyAverage(actor, decay=options.average_decay)  # steadier than the actor itself
     buffer = make_buffer(options, progress)
     buffer.set_rng(torch.Generator().manual_seed(options.seed))
     collector = Collector(
@@ -183,10 +185,11 @@ def train(options: Options) -> Iterator[Evaluation]:
             if len(buffer) > 0 and steps > 0:
                 rows = buffer.sample(steps * options.batch_size)
                 learner.update(rows, steps)  # gradient steps, each with its own ``batch_size`` rows
+                average.follow(steps)
                 buffer.update_tensordict_priority(rows)
             updates += steps
         exploration.step()
-        achieved = success(evaluate(test_env, policy, max_steps=max_steps)).float()
+        achieved = success(evaluate(test_env, average.module, max_steps=max_steps)).float()
         yield Evaluation(frames, progress.layer_of(0).name, float(achieved.mean()))
         if progress.record(achieved.view(1, -1))[
             0
