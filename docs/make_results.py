@@ -31,7 +31,11 @@ RESULTS = HERE.parent / "results"
 STUDIES = {  # where they are described: in the package, or in a file beside this script
     "v0": str(HERE / "studies" / "v0.yaml"),
     "ibs": "ibs",
+    "ibs_before": "ibs",
     "bias": "bias",
+    "bias_before": "bias",
+    "floor": str(HERE / "studies" / "floor.yaml"),
+    "thesis_v1": str(HERE / "studies" / "thesis_v1.yaml"),
     "curriculum": "curriculum",
     "climb": str(HERE / "studies" / "climb.yaml"),
     "cher": str(HERE / "studies" / "cher.yaml"),
@@ -65,6 +69,7 @@ POSITIVE = ("rows_real_positive", "rows_virtual_positive", "rows_useful_virtual_
 THESIS = {  # metrics of the thesis's figures beside success
     "ibs": ("distance",),
     "bias": ("distance", "q", "q_bias"),
+    "bias_before": ("q_bias",),
     "filter_bias": ("distance", "q"),
     "curriculum": ("distance", *POSITIVE),
 }

@@ -141,19 +141,6 @@ def _points(one: Interval) -> str:
     return _bold(show_gap(row), one.low > 0 or one.high < 0)
 
 
-def pooled(study: str, *, task: str, first: str, second: str, beside: str) -> Finding:
-    """Success of two algorithms in two studies of the same protocol, apart and together."""
-    pairs = {
-        beside: [values_of(cell(beside, task, name), "success") for name in (first, second)],
-        study: [values_of(cell(study, task, f"{name}_all"), "success") for name in (first, second)],
-    }
-    shown = [f"{_points(gap(*pair))} in the {len(pair[0])} runs of `{name}`" for name, pair in pairs.items()]
-    both = [one + other for one, other in zip(*pairs.values(), strict=True)]
-    found = gap(*both)
-    text = f"`{first}` minus `{second}`, `{task}`: {', '.join(shown)}, {_points(found)} in all {len(both[0])}"
-    return text, rule([(found.low > 0, found.high < 0)])
-
-
 def over_training(study: str, *, tasks: Sequence[str], first: str, second: str) -> Finding:
     """Mean success of all evaluations, one algorithm minus another."""
     gaps = []
@@ -185,20 +172,25 @@ def _width(runs: np.ndarray) -> np.ndarray:
 
 
 def higher_without_filter(
-    study: str, *, measure: str, tasks: Sequence[str], cases: Sequence[str], more: str = ""
+    study: str, *, measure: str, tasks: Sequence[str], cases: Sequence[str], algorithms: Sequence[str] = ("",)
 ) -> Finding:
-    """Number of evaluations in which the median of runs is higher without the filter."""
+    """Number of evaluations in which the median of runs is higher without the filter.
+
+    The two sides are called ``her`` and ``filtered_her``, with the end of an algorithm and of a case.
+    """
     shown, higher, of = [], 0, 0
     for case in cases:
+        ends = [f"her{algorithm}{case and '_'}{case}" for algorithm in algorithms]
         pairs = [
-            [_medians(study, task, f"{name}_{case}", measure) for name in ("her", "filtered_her")]
+            [_medians(study, task, name, measure) for name in (end, f"filtered_{end}")]
             for task in tasks
+            for end in ends
         ]
         above = np.concatenate([without > filtered for without, filtered in pairs])
-        shown.append(f"{above.sum()} of {above.size} (`{case}`)")
+        shown.append(f"{above.sum()} of {above.size}" + (f" (`{case}`)" if case else ""))
         higher, of = higher + int(above.sum()), of + above.size
     verdict = "reproduced" if higher > 0.9 * of else "contradicted" if higher < 0.5 * of else "not"
-    return f"median higher without the filter in {', '.join(shown)} evaluations{more}", verdict
+    return f"median higher without the filter in {', '.join(shown)} evaluations", verdict
 
 
 def _medians(study: str, task: str, algorithm: str, measure: str) -> np.ndarray:
@@ -208,11 +200,14 @@ def _medians(study: str, task: str, algorithm: str, measure: str) -> np.ndarray:
     return np.array([np.median(one) for one in values.values()])
 
 
-def distances(study: str, *, task: str, algorithm: str) -> Finding:
+def distances(study: str, *, tasks: Sequence[str], algorithm: str) -> Finding:
     """Median distance to the goal at the first evaluation and at the last."""
-    medians = _medians(study, task, algorithm, "distance")
-    verdict = "contradicted" if medians[-1] < 0.8 * medians[0] else "reproduced"
-    return f"`{task}` `{algorithm}`: median {medians[0]:.2f} at first, {medians[-1]:.2f} at the end", verdict
+    shown, ends = [], []
+    for task in tasks:
+        medians = _medians(study, task, algorithm, "distance")
+        shown.append(f"`{task}` {medians[0]:.2f} at first, {medians[-1]:.2f} at the end")
+        ends.append((bool(medians[-1] >= 0.8 * medians[0]), bool(medians[-1] < 0.8 * medians[0])))
+    return f"median of `{algorithm}`: {', '.join(shown)}", rule(ends)
 
 
 def on_the_floor(study: str, *, task: str, cases: Sequence[str]) -> Finding:
@@ -236,7 +231,6 @@ FINDINGS: dict[str, Callable[..., Finding]] = {
     for find in (
         orders,
         levels,
-        pooled,
         over_training,
         widths,
         higher_without_filter,
@@ -266,8 +260,15 @@ def line(*, section: str, claim: str, study: str = "", **finding: dict[str, Any]
 
 
 def claims() -> list[dict[str, Any]]:
-    """Claims of the thesis, in its order."""
-    return list(yaml.safe_load(CLAIMS.read_text()))
+    """Claims of the thesis, in its order; behind each of them the same claim by other agents (``also``)."""
+    found = []
+    for claim in yaml.safe_load(CLAIMS.read_text()):
+        others = claim.pop("also", {})
+        found += [
+            claim,
+            *({**claim, "claim": f"… {agent}", "study": study} for study, agent in others.items()),
+        ]
+    return found
 
 
 def page(text: str) -> str:
