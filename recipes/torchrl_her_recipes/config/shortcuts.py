@@ -124,7 +124,8 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
 def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
     """Values by short or long names, or whole groups as mappings, sorted into their groups.
 
-    Short names that several groups have are looked up among the choices of the values and of ``base``.
+    Short names that several groups have are looked up among the choices of the values and of ``base``, so
+    they come last. Of values for the same option the last one counts.
 
     Example:
         >>> place({"task": "hand_v0", "seed": 3, "run": {"epochs": 2}, "task.options.bits": 8})
@@ -132,7 +133,8 @@ def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
     """
     placed: Nested = {}
     names = option_names()
-    for name, value in sorted(values.items(), key=lambda item: sum(item[0] in own for own in names.values())):
+    shared = [name for name in values if sum(name in own for own in names.values()) > 1]
+    for name, value in sorted(values.items(), key=lambda item: item[0] in shared):
         if not isinstance(name, str):
             raise ValueError(f"options must be names, got {name!r}")
         if name in GROUPS and isinstance(value, Mapping):
@@ -151,7 +153,7 @@ def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
             before = placed.get(group, {}).get(own)
             entry = {".".join(deeper[1:]): value}
             value = Entries(entry) if not isinstance(before, Mapping) else _join(before, entry)
-        elif own in placed.get(group, {}):
+        elif name in shared and own in placed.get(group, {}):
             raise ValueError(f"{name} and {group}.{own} set the same option: give one of them")
         placed.setdefault(group, {})[own] = value
     return placed
