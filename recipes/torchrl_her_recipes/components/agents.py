@@ -47,10 +47,9 @@ def make_agent(
         curriculum: whose layers the networks see, or None.
         device: where it learns.
     """
-    own = recipe.demonstrations
-    cloning = (
-        Cloning(weight=own.bc_weight, q_filter=own.q_filter) if own.in_batches and own.bc_weight else None
-    )
+    cloning, shown = None, recipe.demonstrations
+    if shown.in_batches and shown.bc_weight > 0:
+        cloning = Cloning(weight=shown.bc_weight, q_filter=shown.q_filter)
     shape = shape_of(recipe, env, curriculum, rewards=rewards)
     builder = find_builder(recipe.learner, shape, generators=generators, cloning=cloning)
     actor, critics = _networks(builder, recipe, curriculum)  # the same on all devices
