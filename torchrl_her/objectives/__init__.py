@@ -1,24 +1,19 @@
 """TorchRL's losses of DDPG, TD3, SAC, TQC and DQN, with clamped targets and costs of actions."""
 
 from torchrl_her.objectives.action_cost import action_cost
-from torchrl_her.objectives.cloning import DEMONSTRATION, ClonesDemonstrations, Cloning, cloning_terms
+from torchrl_her.objectives.cloning import DEMONSTRATION, Cloning, cloning_terms
 from torchrl_her.objectives.critics import critic_value, critic_values
-from torchrl_her.objectives.ddpg import CloningDDPGLoss, PenalizedDDPGLoss, make_ddpg_loss
+from torchrl_her.objectives.ddpg import PenalizedDDPGLoss, make_ddpg_loss
 from torchrl_her.objectives.dqn import make_dqn_loss
-from torchrl_her.objectives.sac import CloningSACLoss, PenalizedSACLoss, make_sac_loss
+from torchrl_her.objectives.sac import PenalizedSACLoss, make_sac_loss
 from torchrl_her.objectives.targets import ClampedTD0, RunsHardUpdate, clamped_td0, make_target_updater
-from torchrl_her.objectives.td3 import CloningTD3Loss, PenalizedTD3Loss, make_td3_loss
-from torchrl_her.objectives.tqc import CloningTQCLoss, PenalizedTQCLoss, make_tqc_loss
+from torchrl_her.objectives.td3 import PenalizedTD3Loss, make_td3_loss
+from torchrl_her.objectives.tqc import PenalizedTQCLoss, make_tqc_loss
 
 __all__ = [
     "DEMONSTRATION",
     "ClampedTD0",
-    "ClonesDemonstrations",
     "Cloning",
-    "CloningDDPGLoss",
-    "CloningSACLoss",
-    "CloningTD3Loss",
-    "CloningTQCLoss",
     "PenalizedDDPGLoss",
     "PenalizedSACLoss",
     "PenalizedTD3Loss",

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives import LossModule
 
 from torchrl_her.objectives.critics import critic_value
 
@@ -73,80 +72,52 @@ def cloning_terms(
     return torch.where(counted, squares, 0.0) / flagged.sum(-1, keepdim=True).clamp(min=1)
 
 
-class ClonesDemonstrations:
-    """Adds behavior cloning to the actor's loss; a base class in front of one of TorchRL's losses.
+def with_cloning(loss: Any, value: Tensor, transitions: TensorDictBase) -> Tensor:
+    """Adds the cloning loss of a loss with ``cloning`` to its actor's loss.
 
-    The subclass calls :meth:`with_cloning` where the actor's loss is computed. For stochastic policies the
-    action is the greedy one.
+    For stochastic policies the cloned action is the greedy one.
 
     Args:
-        *args: of the loss.
-        cloning: its weight and filter.
-        **kwargs: of the loss.
+        loss: TorchRL loss with an actor and the attribute ``cloning``; nothing is added if that is None.
+        value: its actor's loss: the mean over all rows, or one number for each.
+        transitions: rows [..., B]; each block of B is averaged by itself.
+
+    Raises:
+        KeyError: rows have no flag.
+        ValueError: the loss has no critics for the Q filter.
     """
-
-    actor_network: Any
-    actor_network_params: Any
-    tensor_keys: Any
-
-    def __init__(self, *args: Any, cloning: Cloning, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.cloning = cloning
-
-    def with_cloning(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """The actor's loss and the cloning loss.
-
-        Args:
-            loss: of the actor: the mean over all rows, or one number for each.
-            tensordict: rows [..., B]; each block of B is averaged by itself.
-
-        Raises:
-            KeyError: rows have no flag.
-            ValueError: the loss has no critics for the Q filter.
-        """
-        flag = tensordict.get(self.cloning.key, None)
-        if flag is None:
-            raise KeyError(
-                f"behavior cloning needs the flag {self.cloning.key!r} in each row, as MixedReplay gives it, "
-                f"got {list(tensordict.keys())}"
-            )
-        flagged = flag.reshape(tensordict.shape)
-        batch = flagged.shape[-1]
-        at = flagged.reshape(-1, batch).any(0).nonzero().squeeze(-1)  # no other rows count
-        if len(at) == 0:
-            return loss
-        key = self._action_key
-        rows = tensordict.select(*self.actor_network.in_keys, key)[..., at]
-        shown = rows.get(key)
-        with (
-            set_exploration_type(ExplorationType.DETERMINISTIC),
-            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
-        ):
-            action = self.actor_network(rows.copy()).get(key)
-        better = None
-        if self.cloning.q_filter:
-            better = self._prefers(rows, shown, action.detach())
-        terms = self.cloning.weight * cloning_terms(action, shown, flagged[..., at], better=better)
-        if loss.ndim == 0:
-            return loss + terms.sum(-1).mean()
-        return loss + torch.zeros_like(loss).index_copy(-1, at, batch * terms)
-
-    @property
-    def _action_key(self) -> Any:
-        """DDPG's loss has no name for it, but its actor has."""
-        return getattr(self.tensor_keys, "action", self.actor_network.out_keys[0])
-
-    def _prefers(self, rows: TensorDictBase, one: Tensor, other: Tensor) -> Tensor:
-        """Whether the loss's critics value one action [..., b, a] higher than another: [..., b] of bool."""
-        key = self._action_key
-        both = torch.cat([rows.copy().set(key, action) for action in (one, other)], -1)  # one call is faster
-        value = critic_value(cast(LossModule, self), both)
-        if value is None:
-            raise ValueError(f"a {type(self).__name__} has no critics for the Q filter: q_filter=False")
-        first, second = value.squeeze(-1).chunk(2, -1)
-        return first > second
-
-
-def cloning_or(plain: type, clones: type, cloning: Cloning | None) -> tuple[Any, dict[str, Any]]:
-    """Which of two losses to make, and its further options."""
-    return (plain, {}) if cloning is None else (clones, {"cloning": cloning})
+    cloning: Cloning | None = loss.cloning
+    if cloning is None:
+        return value
+    flag = transitions.get(cloning.key, None)
+    if flag is None:
+        raise KeyError(
+            f"behavior cloning needs the flag {cloning.key!r} in each row, as MixedReplay gives it, "
+            f"got {list(transitions.keys())}"
+        )
+    flagged = flag.reshape(transitions.shape)
+    batch = flagged.shape[-1]
+    at = flagged.reshape(-1, batch).any(0).nonzero().squeeze(-1)  # no other rows count
+    if len(at) == 0:
+        return value
+    # DDPG's loss has no name for the action, but its actor has.
+    key = getattr(loss.tensor_keys, "action", loss.actor_network.out_keys[0])
+    rows = transitions.select(*loss.actor_network.in_keys, key)[..., at]
+    shown = rows.get(key)
+    with (
+        set_exploration_type(ExplorationType.DETERMINISTIC),
+        loss.actor_network_params.to_module(loss.actor_network, preserve_module_state=False),
+    ):
+        action = loss.actor_network(rows.copy()).get(key)
+    better = None
+    if cloning.q_filter:
+        both = [rows.copy().set(key, each) for each in (shown, action.detach())]
+        q_values = critic_value(loss, torch.cat(both, -1))  # one call is faster
+        if q_values is None:
+            raise ValueError(f"a {type(loss).__name__} has no critics for the Q filter: q_filter=False")
+        of_shown, of_policy = q_values.squeeze(-1).chunk(2, -1)
+        better = of_shown > of_policy
+    terms = cloning.weight * cloning_terms(action, shown, flagged[..., at], better=better)
+    if value.ndim == 0:
+        return value + terms.sum(-1).mean()
+    return value + torch.zeros_like(value).index_copy(-1, at, batch * terms)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss
 
 from torchrl_her.objectives.action_cost import action_cost
-from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
+from torchrl_her.objectives.cloning import Cloning, with_cloning
 from torchrl_her.objectives.targets import clamped_td0
 
 
@@ -24,33 +24,27 @@ class PenalizedDDPGLoss(DDPGLoss):
         **kwargs: of the same.
         action_penalty: weight of the action L2 penalty, at least 0.
         saturation_penalty: weight of the saturation penalty, at least 0.
+        cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
     """
 
     def __init__(
-        self, *args: Any, action_penalty: float = 0.0, saturation_penalty: float = 0.0, **kwargs: Any
+        self,
+        *args: Any,
+        action_penalty: float = 0.0,
+        saturation_penalty: float = 0.0,
+        cloning: Cloning | None = None,
+        **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
         self.action_penalty, self.saturation_penalty = action_penalty, saturation_penalty
+        self.cloning = cloning
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         with actions_of(self.actor_network) as actions:
             loss, metadata = super().loss_actor(tensordict)
         cost = action_cost(actions[0], l2=self.action_penalty, saturation=self.saturation_penalty)
-        return loss + (cost if loss.ndim else cost.mean()), metadata
-
-
-class CloningDDPGLoss(ClonesDemonstrations, PenalizedDDPGLoss):
-    """The loss with behavior cloning.
-
-    Args:
-        *args: of :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
-        **kwargs: of the same.
-        cloning: its weight and filter.
-    """
-
-    def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        loss, metadata = super().loss_actor(tensordict)
-        return self.with_cloning(loss, tensordict), metadata
+        loss = loss + (cost if loss.ndim else cost.mean())
+        return with_cloning(self, loss, tensordict), metadata
 
 
 @contextmanager
@@ -114,8 +108,7 @@ def make_ddpg_loss(
         >>> round(loss.value_estimator.low), round(loss.value_estimator.high)
         (-50, 0)
     """
-    kind, own = cloning_or(PenalizedDDPGLoss, CloningDDPGLoss, cloning)
-    loss = kind(
+    loss = PenalizedDDPGLoss(
         actor,
         critic,
         delay_actor=True,
@@ -123,7 +116,7 @@ def make_ddpg_loss(
         action_penalty=action_penalty,
         saturation_penalty=saturation_penalty,
         reduction=reduction,
-        **own,
+        cloning=cloning,
     )
     estimator = clamped_td0(gamma, reward_range, loss.actor_critic)
     loss.set_keys(state_action_value=critic.out_keys[0])

@@ -15,7 +15,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SACLoss
 
 from torchrl_her.modules.noise import RunNoise
-from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
+from torchrl_her.objectives.cloning import Cloning, with_cloning
 from torchrl_her.objectives.critics import as_critics, checked_subset, keep_weights, least_of_some
 from torchrl_her.objectives.targets import clamped_td0
 
@@ -36,6 +36,7 @@ class PenalizedSACLoss(SACLoss):
         **kwargs: of the same.
         action_penalty: the weight of the penalty on drawn actions, see
             :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        cloning: see there.
         target_critics: how many critics are drawn for targets; 0 for all.
         runs: R.
         noise: where its random numbers come from.
@@ -48,13 +49,14 @@ class PenalizedSACLoss(SACLoss):
         self,
         *args: Any,
         action_penalty: float = 0.0,
+        cloning: Cloning | None = None,
         target_critics: int = 0,
         runs: int = 1,
         noise: RunNoise | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        self.action_penalty, self.runs = action_penalty, runs
+        self.action_penalty, self.cloning, self.runs = action_penalty, cloning, runs
         self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
         self.noise = noise or RunNoise()
         if runs > 1:
@@ -72,7 +74,8 @@ class PenalizedSACLoss(SACLoss):
             self._by_run(self._alpha, log_prob) * log_prob - value, tensordict=tensordict, weights=weights
         )
         penalty = self.action_penalty * action.square().mean(-1)
-        return loss + (penalty if loss.ndim else penalty.mean()), {"log_prob": log_prob.detach()}
+        loss = loss + (penalty if loss.ndim else penalty.mean())
+        return with_cloning(self, loss, tensordict), {"log_prob": log_prob.detach()}
 
     def _value_for_actor(self, values: Tensor) -> Tensor:
         """Returns the value [...] that the actor maximizes, from the outputs [N, ..., 1] of N critics."""
@@ -109,20 +112,6 @@ class PenalizedSACLoss(SACLoss):
 
     def _alpha_loss(self, log_prob: Tensor) -> Tensor:
         return -self._by_run(self.log_alpha, log_prob) * (log_prob + self.target_entropy)
-
-
-class CloningSACLoss(ClonesDemonstrations, PenalizedSACLoss):
-    """The loss with behavior cloning.
-
-    Args:
-        *args: of :class:`~torchrl_her.objectives.PenalizedSACLoss`.
-        **kwargs: of the same.
-        cloning: its weight and filter.
-    """
-
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        loss, metadata = super().actor_loss(tensordict)
-        return self.with_cloning(loss, tensordict), metadata
 
 
 def make_sac_loss(
@@ -183,8 +172,7 @@ def make_sac_loss(
         2
     """
     own = as_critics(critic, critics)
-    kind, options = cloning_or(PenalizedSACLoss, CloningSACLoss, cloning)
-    loss = kind(
+    loss = PenalizedSACLoss(
         actor,
         own,
         action_spec=action_spec,
@@ -197,7 +185,7 @@ def make_sac_loss(
         noise=RunNoise(generators),
         reduction=reduction,
         scalar_output_mode="exclude" if reduction == "none" else None,
-        **options,
+        cloning=cloning,
     )
     keep_weights(loss, critic)
     loss.set_keys(state_action_value=(own[0] if isinstance(own, list) else own).out_keys[0])

@@ -15,7 +15,7 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_her.modules.noise import RunNoise
 from torchrl_her.objectives.action_cost import action_cost
-from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
+from torchrl_her.objectives.cloning import Cloning, with_cloning
 from torchrl_her.objectives.critics import as_critics, checked_subset, keep_weights, least_of_some
 from torchrl_her.objectives.targets import clamped_td0
 
@@ -30,7 +30,7 @@ class PenalizedTD3Loss(TD3Loss):
     Args:
         *args: of :class:`torchrl.objectives.TD3Loss`.
         **kwargs: of the same, without ``policy_noise`` and ``noise_clip``.
-        action_penalty, saturation_penalty: see :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        action_penalty, saturation_penalty, cloning: see :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
         target_critics: how many critics are drawn for targets; 0 for all.
         target_noise: standard deviation of the noise on the target's actions.
         target_noise_clip: the greatest noise.
@@ -45,6 +45,7 @@ class PenalizedTD3Loss(TD3Loss):
         *args: Any,
         action_penalty: float = 0.0,
         saturation_penalty: float = 0.0,
+        cloning: Cloning | None = None,
         target_critics: int = 0,
         target_noise: float = 0.2,
         target_noise_clip: float = 0.5,
@@ -53,6 +54,7 @@ class PenalizedTD3Loss(TD3Loss):
     ) -> None:
         super().__init__(*args, policy_noise=0.0, noise_clip=0.0, **kwargs)
         self.action_penalty, self.saturation_penalty = action_penalty, saturation_penalty
+        self.cloning = cloning
         self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
         self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
         self.noise = noise or RunNoise()
@@ -66,7 +68,8 @@ class PenalizedTD3Loss(TD3Loss):
         action = acted.get(self.tensor_keys.action)
         cost = action_cost(action, l2=self.action_penalty, saturation=self.saturation_penalty)
         metadata = {"state_action_value_actor": values.detach()}
-        return loss + (cost if loss.ndim else cost.mean()), metadata
+        loss = loss + (cost if loss.ndim else cost.mean())
+        return with_cloning(self, loss, tensordict), metadata
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         weights = self._maybe_get_priority_weight(tensordict)
@@ -106,20 +109,6 @@ class PenalizedTD3Loss(TD3Loss):
         seen = tensordict.select(*self.qvalue_network.in_keys, strict=False)
         valued = self._vmap_qvalue_network00(seen.expand(self.num_qvalue_nets, *seen.batch_size), params)
         return valued.get(self.tensor_keys.state_action_value).squeeze(-1)
-
-
-class CloningTD3Loss(ClonesDemonstrations, PenalizedTD3Loss):
-    """The loss with behavior cloning.
-
-    Args:
-        *args: of :class:`~torchrl_her.objectives.PenalizedTD3Loss`.
-        **kwargs: of the same.
-        cloning: its weight and filter.
-    """
-
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        loss, metadata = super().actor_loss(tensordict)
-        return self.with_cloning(loss, tensordict), metadata
 
 
 def make_td3_loss(
@@ -172,8 +161,7 @@ def make_td3_loss(
         2
     """
     own = as_critics(critic, critics)
-    kind, options = cloning_or(PenalizedTD3Loss, CloningTD3Loss, cloning)
-    loss = kind(
+    loss = PenalizedTD3Loss(
         actor,
         own,
         action_spec=action_spec,
@@ -184,7 +172,7 @@ def make_td3_loss(
         target_critics=target_critics,
         noise=RunNoise(generators),
         reduction=reduction,
-        **options,
+        cloning=cloning,
     )
     keep_weights(loss, critic)
     key = (own[0] if isinstance(own, list) else own).out_keys[0]

@@ -14,7 +14,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import TQCLoss
 
 from torchrl_her.modules.noise import RunNoise
-from torchrl_her.objectives.cloning import ClonesDemonstrations, Cloning, cloning_or
+from torchrl_her.objectives.cloning import Cloning
 from torchrl_her.objectives.critics import as_critics, keep_weights
 from torchrl_her.objectives.sac import PenalizedSACLoss, positive_temperature, set_soft_targets
 
@@ -64,20 +64,6 @@ class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
         rows = tensordict.select(*entries, steps_key, strict=False)
         rows = rows.apply(lambda entry: entry.expand_as(value))  # TorchRL's targets want one shape
         return self.value_estimator.value_estimate(rows, next_value=value)
-
-
-class CloningTQCLoss(ClonesDemonstrations, PenalizedTQCLoss):
-    """The loss with behavior cloning.
-
-    Args:
-        *args: of :class:`~torchrl_her.objectives.PenalizedTQCLoss`.
-        **kwargs: of the same.
-        cloning: its weight and filter.
-    """
-
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        loss, metadata = super().actor_loss(tensordict)
-        return self.with_cloning(loss, tensordict), metadata
 
 
 def make_tqc_loss(
@@ -145,9 +131,7 @@ def make_tqc_loss(
             f"dropped_quantiles must be from 0 to {quantiles - 1}, since critics have {quantiles} "
             f"quantile{'s' * (quantiles != 1)}, got {dropped_quantiles}{hint}"
         )
-    options: dict[str, Any] = {"scalar_output_mode": "exclude" if reduction == "none" else None}
-    kind, cloned = cloning_or(PenalizedTQCLoss, CloningTQCLoss, cloning)
-    loss = kind(
+    loss = PenalizedTQCLoss(
         actor,
         own,
         action_spec=action_spec,
@@ -158,8 +142,8 @@ def make_tqc_loss(
         runs=runs,
         noise=RunNoise(generators),
         reduction=reduction,
-        **options,
-        **cloned,
+        scalar_output_mode="exclude" if reduction == "none" else None,
+        cloning=cloning,
     )
     keep_weights(loss, critic)
     loss.set_keys(state_action_value=first.out_keys[0])

@@ -18,7 +18,6 @@ from torchrl_her.modules.networks import ActorNet, CriticNet, StackedBatchNorm
 from torchrl_her.modules.q_actor import QNet
 from torchrl_her.modules.stochastic_actor import StochasticActorNet
 from torchrl_her.native.job import STOCHASTIC, Algorithm, Norm
-from torchrl_her.objectives.cloning import ClonesDemonstrations
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss
 from torchrl_her.objectives.sac import PenalizedSACLoss
 from torchrl_her.objectives.targets import BuffersSoftUpdate, ClampedTD0, RunsHardUpdate
@@ -118,7 +117,7 @@ def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | Non
         >>> why_not_fused(loss, SoftUpdate(loss, tau=0.01))
         "reduction='sum'"
     """
-    if isinstance(loss, ClonesDemonstrations):
+    if getattr(loss, "cloning", None) is not None:
         return "behavior cloning of demonstrations, which the C++ steps do not have"
     if type(loss) not in FUSED:
         return f"a {type(loss).__name__}, which is not a loss that this library makes"

@@ -13,7 +13,6 @@ from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
-from torchrl_her.objectives.cloning import ClonesDemonstrations
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY
 from torchrl_her.trainers.learner import WEIGHT, LossLearner, check_rows
 
@@ -203,7 +202,7 @@ def why_not_recorded(loss: LossModule, target: TargetNetUpdater | None = None) -
         loss: any of TorchRL's.
         target: moves its target networks.
     """
-    if isinstance(loss, ClonesDemonstrations):
+    if getattr(loss, "cloning", None) is not None:
         return "behavior cloning of demonstrations, whose places in a batch are read from the GPU"
     devices = {parameter.device for parameter in loss.parameters()}
     if any(device.type != "cuda" for device in devices) or len(devices) != 1:

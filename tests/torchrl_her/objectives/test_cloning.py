@@ -23,7 +23,7 @@ from torchrl_her import (
     make_tqc_loss,
 )
 from torchrl_her.modules import stack_runs
-from torchrl_her.objectives import Cloning, CloningDDPGLoss, cloning_terms
+from torchrl_her.objectives import Cloning, PenalizedDDPGLoss, cloning_terms
 from torchrl_her.trainers import LossLearner, why_not_fused, why_not_recorded
 
 from ..ddpg_data import batch
@@ -84,10 +84,10 @@ class Constant(nn.Module):
         return self.action.expand(*observation.shape[:-1], 1)
 
 
-def linear_loss(slope: float, **options: Any) -> CloningDDPGLoss:
+def linear_loss(slope: float, **options: Any) -> PenalizedDDPGLoss:
     actor = TensorDictModule(Constant(0.5), ["observation"], ["action"])
     critic = TensorDictModule(Slope(slope), ["observation", "action"], ["state_action_value"])
-    return CloningDDPGLoss(
+    return PenalizedDDPGLoss(
         actor, critic, delay_actor=True, delay_value=True, action_penalty=0.0, cloning=Cloning(**options)
     )
 
