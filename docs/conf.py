@@ -22,7 +22,7 @@ author = "the authors of torchrl-her"
 version = release = version_of("torchrl-her")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-exclude_patterns = ["examples"]  # a program
+exclude_patterns = ["examples", "upstream"]  # a program; reports for TorchRL
 source_suffix = {".rst": "restructuredtext", ".md": "markdown", ".ipynb": "markdown"}
 
 # Pages in Markdown. They are read in the repository, too, so links in them are those of the repository.
