@@ -16,6 +16,8 @@ from .config.loggers import LOGGERS as LOGGERS
 from .config.loggers import LoggerSpec as LoggerSpec
 from .config.loggers import register_logger as register_logger
 from .config.options import option as option
+from .config.order import ORDER as ORDER
+from .config.order import Order as Order
 from .config.recipe import Recipe as Recipe
 from .config.recipe import make_recipe as make_recipe
 from .config.search import Search as Search

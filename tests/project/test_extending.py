@@ -1,4 +1,4 @@
-"""The page on extending: each of its six examples runs as it is written, from its files to its last line."""
+"""The page on extending: each of its seven examples runs as it is written, from files to last line."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from torchrl_her_recipes.config import imports
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.behavior import BEHAVIOR
 from torchrl_her_recipes.config.learners import LEARNERS
+from torchrl_her_recipes.config.order import ORDER
 from torchrl_her_recipes.config.weights import WEIGHTS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "extending.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL))
-REGISTRIES: tuple[dict, ...] = (STRATEGIES, registry._SPECS, ALGORITHMS, LEARNERS, BEHAVIOR, WEIGHTS)
+REGISTRIES: tuple[dict, ...] = (STRATEGIES, registry._SPECS, ALGORITHMS, LEARNERS, BEHAVIOR, WEIGHTS, ORDER)
 
 
 def blocks(section: str) -> tuple[dict[str, str], list[str]]:
@@ -54,13 +55,14 @@ def registered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None
             del sys.modules[name]
 
 
-def test_the_page_has_six_examples_and_names_them_all() -> None:
+def test_the_page_has_seven_examples_and_names_them_all() -> None:
     assert list(SECTIONS) == [
         "A goal strategy",
         "Weights",
         "A task",
         "A learner",
         "Behavior goals",
+        "An order",
         "A study",
     ]
     for section in SECTIONS:

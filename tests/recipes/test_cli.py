@@ -151,6 +151,7 @@ def test_every_preset_runs(preset: Path) -> None:
         (["train", "hand_v0"], "got 'hand_v0'; did you mean task=hand_v0?"),
         (["train", "weights.flor=3"], "no option 'weights.flor'; did you mean floor?"),
         (["train", "ibs.sigma=3"], "ibs.sigma is called weights.sigma now"),
+        (["train", "curriculum.order=all_at_once"], "curriculum.order is called order now"),
         (["train", "seed=1,2"], "several are a sweep: torchrl-her train -m"),
         (["train", "learner=ddpg", "critics=5"], "learner=ddpg has no option critics"),
         (

@@ -6,18 +6,14 @@ import click
 
 from torchrl_her_envs.registry import GYM, get_task_spec, task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
-from torchrl_her_recipes.config.behavior import BEHAVIOR
-from torchrl_her_recipes.config.learners import LEARNERS
 from torchrl_her_recipes.config.policy_header import read_header
 from torchrl_her_recipes.config.shipped import policy_names, policy_path, preset_names, preset_summary
+from torchrl_her_recipes.config.shortcuts import KINDS
 from torchrl_her_recipes.config.spaces import space_names, space_summary
 from torchrl_her_recipes.config.study import load_study, study_names
-from torchrl_her_recipes.config.weights import WEIGHTS
 
 
-@click.command(
-    "list", short_help="tasks, algorithms, learners, behavior goals, studies, policies, spaces, presets"
-)
+@click.command("list", short_help="tasks, algorithms, choices of options, studies, policies, spaces, presets")
 def listing() -> int:
     """List what there is."""
     sections = {
@@ -25,9 +21,7 @@ def listing() -> int:
         | {f"{GYM}ID": "any gymnasium environment with goals, by its id (gym:my_module:MyEnv-v0)"}
         | {"my_module:make_env": "a TorchRL environment of your own, by its function or class"},
         "algorithms": {name: algorithm.summary for name, algorithm in ALGORITHMS.items()},
-        "learners": LEARNERS.summaries(),
-        "weights of virtual goals": WEIGHTS.summaries(),
-        "behavior goals": BEHAVIOR.summaries(),
+        **{f"choices of {group}": kind.summaries() for group, kind in KINDS.items()},
         "studies": {name: load_study(name).summary for name in study_names()},
         "trained policies": {
             name: f"{read_header(policy_path(name))['info']['success']:.0%} success"

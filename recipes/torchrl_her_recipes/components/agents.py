@@ -18,7 +18,7 @@ from torchrl_her.modules.networks import StackedLinear, stack_runs
 from torchrl_her.objectives.cloning import Cloning
 from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her.trainers.adam import RunsAdam
-from torchrl_her_recipes.components.curricula import is_guided
+from torchrl_her_recipes.components.curricula import CurriculumState, is_guided
 from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.learner import Agent, AgentShape, LearnerBuilder, Networks
 from torchrl_her_recipes.components.normalization import acting, make_norm
@@ -34,7 +34,7 @@ def make_agent(
     generators: Sequence[torch.Generator],
     *,
     rewards: tuple[float, float] = (-1.0, 0.0),
-    curriculum: Curriculum | None = None,
+    state: CurriculumState | None = None,
     device: torch.device = CPU,
 ) -> Agent:
     """The agent that a recipe asks for.
@@ -44,9 +44,10 @@ def make_agent(
         env: tells the widths of observations and actions.
         generators: of the exploration of each run, on the device.
         rewards: the least and the greatest that there can be.
-        curriculum: whose layers the networks see, or None.
+        state: Curriculum whose layers the networks see, or None.
         device: where it learns.
     """
+    curriculum = None if state is None else state.curriculum
     cloning, shown = None, recipe.demonstrations
     if shown.in_batches and shown.bc_weight > 0:
         cloning = Cloning(weight=shown.bc_weight, q_filter=shown.q_filter)
@@ -60,7 +61,7 @@ def make_agent(
     norm = make_norm(options, shape.widths, runs=runs)
     norm = None if norm is None else norm.to(device)
     player = acting(actor, norm)
-    guide = _guide_of(player, recipe, curriculum, generators)
+    guide = _guide_of(player, recipe, state, generators)
     return Agent(
         actor=player,
         critic=critics[0],
@@ -144,17 +145,17 @@ def make_player(
 def _guide_of(
     policy: TensorDictModuleBase,
     recipe: Recipe,
-    curriculum: Curriculum | None,
+    state: CurriculumState | None,
     generators: Sequence[torch.Generator],
 ) -> GuidedExploration | None:
-    if curriculum is None or not is_guided(recipe, curriculum):
+    if state is None or not is_guided(recipe, state.curriculum):
         return None
     guide = GuidedExploration(
         policy,
-        curriculum,
+        state.curriculum,
         share=recipe.curriculum.guided_share,
         per=cast(Literal["episode", "step"], recipe.curriculum.guided_per),
-        layer_key=None if recipe.curriculum.order == "threshold" else "layer",
+        layer_key="layer" if state.progress.by_episode else None,
         runs=recipe.run.num_runs,
         generators=generators,
     )

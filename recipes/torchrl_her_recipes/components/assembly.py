@@ -20,7 +20,6 @@ from torchrl_her_recipes.components.curricula import (
     CurriculumState,
     in_layers,
     is_guided,
-    make_curriculum,
     make_curriculum_state,
     make_played_env,
 )
@@ -46,8 +45,10 @@ def build(recipe: Recipe) -> Components:
     recipe = resolved(recipe)
     processes = recipe.collection.processes > 0  # then those here only tell what the others are like
     task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
-    curriculum, space = make_curriculum(recipe, task), goal_space(recipe, task, recipe.weights)
-    state = None if curriculum is None else make_curriculum_state(recipe, curriculum, eval_seeds(recipe, 0))
+    state, space = (
+        make_curriculum_state(recipe, task, eval_seeds(recipe, 0)),
+        goal_space(recipe, task, recipe.weights),
+    )
     rewards, bounds = reward_range(goal_env(task)), reward_bounds(goal_env(task))
     shown = load_demonstrations(recipe, task, state)
     played = partial(make_played_env, recipe, evaluation_envs(recipe), eval_seeds(recipe, 0))
@@ -55,7 +56,7 @@ def build(recipe: Recipe) -> Components:
     devices = devices_of(recipe)
     generators = make_generators(recipe.seeds, devices.replay)
     own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
-    agent = make_agent(recipe, eval_env, own, rewards=bounds, curriculum=curriculum, device=devices.learner)
+    agent = make_agent(recipe, eval_env, own, rewards=bounds, state=state, device=devices.learner)
     behavior = make_behavior(recipe, task, agent, rewards=rewards, state=state)
     env = _shown(recipe, task, state, behavior, None if shown is None else shown.starts)
     if processes:

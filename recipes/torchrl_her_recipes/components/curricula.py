@@ -16,7 +16,9 @@ from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
 from torchrl_her_recipes.components.envs import evaluation_envs, judging, make_task_envs
 from torchrl_her_recipes.components.streams import Stream, generators_of
+from torchrl_her_recipes.config.order import AllAtOnce, Teacher, Threshold
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.values import load_name
 from torchrl_her_recipes.config.weights import Equal
 
 _STATE = ["observation", "desired_goal"]  # what the state is made of, in this order
@@ -96,43 +98,59 @@ def _read_layer(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumLayer
         raise ValueError(f"{options!r} is no layer of a curriculum: {error}") from error
 
 
-def make_curriculum_state(recipe: Recipe, curriculum: Curriculum, seeds: Sequence[int]) -> CurriculumState:
-    """The recipe's runs in a curriculum, all in its first layer."""
-    progress = _make_progress(recipe, curriculum)
-    layer_env = None
-    if not progress.by_episode:
-        layer_env = in_layers(make_task_envs(recipe, evaluation_envs(recipe), seeds), progress)
-    return CurriculumState(progress, layer_env)
-
-
-def _make_progress(recipe: Recipe, curriculum: Curriculum) -> CurriculumProgress:
-    """What decides in which layer episodes are played.
+def make_curriculum_state(recipe: Recipe, env: EnvBase, seeds: Sequence[int]) -> CurriculumState | None:
+    """Returns the curriculum of the recipe's runs at its beginning; None if it has no curriculum.
 
     Raises:
-        ValueError: processes collect, and would each have to know how the episodes of the others ended; or
-            the algorithm has weights that cannot tell layers apart.
+        ValueError: Episodes have layers, and processes collect, each of which would have to know how the
+            episodes of the others ended; or the weights cannot tell layers apart.
     """
-    options, runs = recipe.curriculum, recipe.run.num_runs
-    if options.order == "threshold":
-        return CurriculumProgress(
-            curriculum,
-            runs=runs,
-            window=options.window,
-            success_threshold=options.success_threshold,
-            patience=options.layer_epochs or None,
-        )
+    curriculum, order = make_curriculum(recipe, env), recipe.order
+    if curriculum is None:
+        return None
+    generators = generators_of(recipe, Stream.LAYERS)
+    progress = load_name(order.maker)(order, curriculum, runs=recipe.run.num_runs, generators=generators)
+    if not progress.by_episode:
+        layer_env = in_layers(make_task_envs(recipe, evaluation_envs(recipe), seeds), progress)
+        return CurriculumState(progress, layer_env)
     if not isinstance(recipe.weights, Equal):
         raise ValueError(
-            f"weights={recipe.weights.name} must not be used with order={options.order}: they would take the "
+            f"weights={recipe.weights.name} must not be used with order={order.name}: they would take the "
             "goals of all layers for one kind; choose order=threshold"
         )
     if recipe.collection.processes > 0:
         raise ValueError(
-            f"order={options.order} draws layers where the environments are: it needs processes=0, "
+            f"order={order.name} draws layers where the environments are: it needs processes=0, "
             f"got processes={recipe.collection.processes}"
         )
-    kind = TeacherStudent if options.order == "teacher_student" else EpisodeLayers
-    return kind(curriculum, runs=runs, generators=generators_of(recipe, Stream.LAYERS))
+    return CurriculumState(progress, None)
+
+
+def make_threshold(options: Threshold, curriculum: Curriculum, *, runs: int, **_: Any) -> CurriculumProgress:
+    """Runs learn one layer after the other."""
+    return CurriculumProgress(
+        curriculum,
+        runs=runs,
+        window=options.window,
+        success_threshold=options.success_threshold,
+        patience=options.layer_epochs or None,
+    )
+
+
+def make_all_at_once(_options: AllAtOnce, curriculum: Curriculum, **runs: Any) -> EpisodeLayers:
+    """Draws each episode's layer, all layers alike."""
+    return EpisodeLayers(curriculum, **runs)
+
+
+def make_teacher(options: Teacher, curriculum: Curriculum, **runs: Any) -> TeacherStudent:
+    """Draws each episode's layer, and rather the layers whose success changes."""
+    return TeacherStudent(
+        curriculum,
+        **runs,
+        memory=options.progress_memory,
+        uniform_share=options.even_share,
+        still=options.least_progress,
+    )
 
 
 def make_played_env(

@@ -101,7 +101,7 @@ def load_demonstrations(
         return None
     if state is not None and state.progress.by_episode:
         raise ValueError(
-            f"demonstrations are shown in a run's layer, and with order={recipe.curriculum.order} "
+            f"demonstrations are shown in a run's layer, and with order={recipe.order.name} "
             "it has none: choose order=threshold"
         )
     try:

@@ -209,10 +209,7 @@ class HindsightConfig(Group):
 class CurriculumConfig(Group):
     """The layers that runs learn, one after the other or at once (Curriculum-HER)."""
 
-    needs: ClassVar[Needs] = (
-        ("guided_share", bool, "guided_per"),
-        ("order", "threshold".__eq__, "window success_threshold layer_epsilon"),
-    )
+    needs: ClassVar[Needs] = (("guided_share", bool, "guided_per"),)
 
     name: str = option(
         "task",
@@ -220,16 +217,6 @@ class CurriculumConfig(Group):
         shown_as="curriculum",
     )
     layers: Any = option(None, "the layers themselves, as a list of their options")
-    order: str = option(
-        "threshold",
-        "threshold: one layer after the other; all_at_once: each episode is played in any of them; "
-        "teacher_student: rather in those whose success changes",
-        choices=("threshold", "all_at_once", "teacher_student"),
-    )
-    window: int = option(20, "a layer ends by the mean success of this many greedy episodes", at_least=1)
-    success_threshold: float = option(0.9, "mean success at which a layer ends", above=0, at_most=1)
-    layer_epochs: int = option(0, "epochs after which a layer ends, learned or not; 0 for never", at_least=0)
-    layer_epsilon: float = option(1.0, "epsilon of exploration when a layer begins", at_least=0, at_most=1)
     guided_share: float = option(
         0.0,
         "share of the episodes that the policy of the layer below begins, until its goal is achieved",

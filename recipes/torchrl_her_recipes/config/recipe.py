@@ -14,7 +14,8 @@ from torchrl_her_recipes.config.behavior import BEHAVIOR, Behavior
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, LearnerConfig
 from torchrl_her_recipes.config.options import AUTO
-from torchrl_her_recipes.config.shortcuts import FORMER, GROUPS, KINDS, LONG_ONLY, Nested, chosen, over, place
+from torchrl_her_recipes.config.order import ORDER, Order
+from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, Nested, chosen, over, place, renewed
 from torchrl_her_recipes.config.weights import WEIGHTS, Weights
 from torchrl_her_recipes.config.without_effect import without_effect
 
@@ -47,6 +48,7 @@ class Recipe:
     replay: groups.ReplayConfig = field(default_factory=groups.ReplayConfig)
     weights: Weights = field(default_factory=WEIGHTS)
     curriculum: groups.CurriculumConfig = field(default_factory=groups.CurriculumConfig)
+    order: Order = field(default_factory=ORDER)
     behavior: Behavior = field(default_factory=BEHAVIOR)
     demonstrations: groups.DemonstrationsConfig = field(default_factory=groups.DemonstrationsConfig)
     evaluation: groups.EvaluationConfig = field(default_factory=groups.EvaluationConfig)
@@ -61,11 +63,10 @@ class Recipe:
         if (given := get_algorithm(self.hindsight.algo).weights) not in (None, self.weights.name):
             problem = f"weights must be {given} with algo={self.hindsight.algo}, got {self.weights.name}"
             raise ValueError(f"{problem}; choose another algo, as in algo=her weights=rare")
+        changed = self.changed()
         for (group, name), why in without_effect(self).items():
-            section = getattr(self, group)
-            value = getattr(section, name)
-            if value not in (None, getattr(type(section), name)):
-                shown = f"{group}.{name}" if group in LONG_ONLY else name
+            if (value := changed.get(group, {}).get(name)) is not None:
+                shown = group if name == "name" else getattr(self, group).prefix + name
                 raise ValueError(f"{shown}={value} has no effect {why}: leave it out")
 
     @property
@@ -144,12 +145,11 @@ class Recipe:
         Raises:
             ValueError: a group or an option that does not exist, or a value that cannot work.
         """
-        former = {group: own for group, own in values.items() if group in FORMER and isinstance(own, Mapping)}
-        placed = place({group: own for group, own in values.items() if group not in former})
+        placed, former = renewed(values)
         for group, kind in KINDS.items():
-            name = chosen(group, placed)
-            known = [own.name for own in fields(kind.find(name)) if group in ("weights", "behavior")]
-            kept = {key: own[key] for own in former.values() for key in known if key in own}
+            name = chosen(group, placed, former)
+            known = {own.name for own in fields(kind.find(name))}
+            kept = {key: value for key, value in former.get(group, {}).items() if key in known}
             placed[group] = kind.stored({**kept, **placed.get(group, {}), "name": name})
         return Recipe(**_groups(placed))
 
@@ -190,8 +190,8 @@ def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Reci
     named in ``base`` needs a permission, see :func:`~torchrl_her_recipes.build`.
 
     Example:
-        >>> make_recipe(task="hand_v1", algo="cher", window=5).curriculum.window
-        5
+        >>> make_recipe(task="hand_v1", algo="cher", window=5, seed=3).run.seed
+        3
     """
     recipe = compose(base, values)
     if "name" in place(values, place(base or {})).get("task", {}):

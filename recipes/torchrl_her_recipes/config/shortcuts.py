@@ -12,6 +12,7 @@ from torchrl_her_recipes.config.behavior import BEHAVIOR
 from torchrl_her_recipes.config.choices import Kind
 from torchrl_her_recipes.config.learners import LEARNERS
 from torchrl_her_recipes.config.options import nearest, what_there_is
+from torchrl_her_recipes.config.order import ORDER
 from torchrl_her_recipes.config.weights import WEIGHTS
 
 Nested = dict[str, dict[str, Any]]
@@ -24,13 +25,15 @@ GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
     "replay": groups.ReplayConfig,
     "weights": WEIGHTS,
     "curriculum": groups.CurriculumConfig,
+    "order": ORDER,
     "behavior": BEHAVIOR,
     "demonstrations": groups.DemonstrationsConfig,
     "evaluation": groups.EvaluationConfig,
     "run": groups.RunConfig,
 }
 KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)}
-FORMER = ("ibs", "novelty")  # groups whose options are those of weights now
+# groups that had options before, and the groups that have them now
+FORMER = {"ibs": ("weights", "behavior"), "novelty": ("weights",), "curriculum": ("order",)}
 
 LONG_ONLY = ("demonstrations",)  # its options are always named with it: of what would ``file`` be?
 
@@ -67,6 +70,27 @@ def chosen(group: str, *values: Nested) -> str:
     return KINDS[group].default if group in KINDS else getattr(GROUPS[group], key)
 
 
+def renamed(name: str) -> list[str]:
+    """Returns the names that an option has now, if its group had it before.
+
+    Example:
+        >>> renamed("curriculum.window"), renamed("curriculum.order"), renamed("curriculum.layers")
+        (['order.window'], ['order'], [])
+    """
+    names, (group, _, own) = option_names(), str(name).partition(".")
+    homes = [] if own in names.get(group, ()) else FORMER.get(group, ())
+    return [home if own == home else f"{home}.{own}" for home in homes if own in (home, *names[home])]
+
+
+def renewed(values: Mapping[str, Any]) -> tuple[Nested, Nested]:
+    """Places values of a file, and apart from them those whose names were other ones before."""
+    groups = [name for name in FORMER if isinstance(values.get(name), Mapping)]
+    every = {name: value for name, value in values.items() if name not in groups}
+    every |= {f"{group}.{own}": value for group in groups for own, value in values[group].items()}
+    former = {now: value for name, value in every.items() for now in renamed(name)}
+    return place({name: value for name, value in every.items() if not renamed(name)}), place(former)
+
+
 def locate(name: str, *values: Nested) -> tuple[str, str]:
     """The group and the name of an option.
 
@@ -87,8 +111,8 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
     if group == "task_options" or (group == "options" and own):
         meant = ".".join(["task.options", *([own] if own else [])])
         raise ValueError(f"options of the task are written task.options.NAME=VALUE: {meant}, not {name}")
-    if group in FORMER:
-        raise ValueError(f"{name} is called {name.replace(group, 'weights', 1)} now")
+    if now := renamed(name):
+        raise ValueError(f"{name} is called {now[0]} now")
     if own:
         if group not in names:
             home = next((each for each, known in names.items() if group in known and group != "name"), None)
@@ -137,7 +161,7 @@ def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
     for name, value in sorted(values.items(), key=lambda item: item[0] in shared):
         if not isinstance(name, str):
             raise ValueError(f"options must be names, got {name!r}")
-        if name in GROUPS and isinstance(value, Mapping):
+        if name in (*GROUPS, *FORMER) and isinstance(value, Mapping):
             for own, each in value.items():
                 group, key = locate(f"{name}.{own}")
                 placed.setdefault(group, {})[key] = each

@@ -21,8 +21,8 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         (group, name): why for group, own in vars(groups).items() for name, why in idle_options(own).items()
     }
     for holds, why, options in _rules(groups):
-        if holds:
-            idle |= {(group, name): why for group, _, name in (own.partition(".") for own in options)}
+        for group, _, name in (own.partition(".") for own in options if holds):
+            idle |= {(group, name): why} if hasattr(getattr(groups, group), name) else {}
     return idle
 
 
@@ -44,13 +44,11 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     yield not sources, "with k=0", relabeling
     yield not algorithm.virtual, with_algo, [*relabeling, "hindsight.k", "hindsight.goal_sources"]
 
-    yield not learner.has_epsilon, f"with learner={learner.name}", ["curriculum.layer_epsilon"]
-    yield not algorithm.curriculum, with_algo, _options(groups, "curriculum")
+    yield not learner.has_epsilon, f"with learner={learner.name}", ["order.layer_epsilon"]
+    layers = [*_options(groups, "curriculum"), "order.name", *_options(groups, "order")]
+    yield not algorithm.curriculum, with_algo, layers
     greedy = getattr(learner, "epsilon_start", None) == 0.0 and not algorithm.curriculum
-    noise = [
-        own for own in _options(groups, "learner") if own in ("learner.action_noise", "learner.uniform_share")
-    ]
-    yield greedy, "with epsilon_start=0", noise
+    yield greedy, "with epsilon_start=0", ["learner.action_noise", "learner.uniform_share"]
     cloning = ["demonstrations.bc_weight", "demonstrations.q_filter"]
     yield not learner.clones, f"with learner={learner.name}", cloning
     others = set(_options(groups, "behavior")) - {"behavior.real_share"}

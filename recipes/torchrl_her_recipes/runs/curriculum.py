@@ -65,7 +65,7 @@ def move_on(components: Components, state: CurriculumState, samples: Tensor, fra
             components.buffer,
             new,
             exploration if learner.has_epsilon else None,
-            epsilon=components.recipe.curriculum.layer_epsilon,
+            epsilon=getattr(components.recipe.order, "layer_epsilon", 1.0),
             run=run,
         )
         if components.behavior is not None:

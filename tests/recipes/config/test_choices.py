@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import pytest
 
-from torchrl_her_recipes import BEHAVIOR, LEARNERS, Proposed, Recipe, build, load_policy, make_recipe, option
+from torchrl_her_recipes import BEHAVIOR, Proposed, Recipe, build, load_policy, make_recipe, option
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config.behavior import Behavior, Mega, Real
 from torchrl_her_recipes.config.choices import Kind
 from torchrl_her_recipes.config.shipped import policy_path
+from torchrl_her_recipes.config.shortcuts import KINDS
 
 from ..small import small
 
@@ -54,7 +55,7 @@ def test_a_name_that_resembles_no_other_may_be_one_of_a_module() -> None:
         make_recipe(behavior="xyz")
 
 
-@pytest.mark.parametrize("kind", [LEARNERS, BEHAVIOR])
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 def test_every_choice_has_a_summary(kind: Kind, capsys: pytest.CaptureFixture[str]) -> None:
     main(["list"])
     listed = capsys.readouterr().out

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from torchrl_her_recipes import build, load_preset, make_recipe, run
+from torchrl_her_recipes.config.order import Threshold
 from torchrl_her_recipes.config.resolve import EnvFacts, auto_options, resolve
 from torchrl_her_recipes.config.shipped import preset_names
 
@@ -35,8 +36,8 @@ def test_a_curriculum_comes_with_its_options() -> None:
     layers = [{"name": "near"}, {"name": "all"}]
     recipe = resolve(make_recipe(), EnvFacts(max_steps=50, layers=layers))
     assert (recipe.hindsight.algo, recipe.curriculum.layers) == ("cher", layers)
-    curriculum = recipe.curriculum
-    assert (curriculum.layer_epochs, curriculum.guided_share, curriculum.guided_per) == (10, 0.5, "step")
+    assert (recipe.curriculum.guided_share, recipe.curriculum.guided_per) == (0.5, "step")
+    assert recipe.order == Threshold(layer_epochs=10, layer_epsilon=0.5)
     assert resolve(make_recipe(), EnvFacts(max_steps=50)).hindsight.algo == "filtered_her"
     assert make_recipe(curriculum=layers).hindsight.algo == "cher"
 

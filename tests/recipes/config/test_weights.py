@@ -49,7 +49,7 @@ def test_without_weights_of_the_algorithm_a_recipe_chooses() -> None:
         ({"algo": "cher_rnd", "estimator": "kernel"}, "weights=rnd has no option estimator"),
         ({"algo": "filtered_her_rare", "cells": 8}, "weights=rare has no option cells"),
         ({"novelty.memory": 50}, "novelty.memory is called weights.memory now"),
-        ({"ibs": {"sigma": 0.3}}, "ibs is called weights now"),
+        ({"ibs": {"sigma": 0.3}}, "ibs.sigma is called weights.sigma now"),
         ({"algo": "her_ibs", "behavior": "ibs", "sigma": 0.3}, "write weights.sigma or behavior.sigma"),
         (
             {"behavior": "ibs", "recent": 50},

@@ -114,7 +114,7 @@ def test_in_a_curriculum_goals_are_proposed_in_the_last_layer() -> None:
     components = build(small(task="hand_v1", algo="cher", behavior="uniform_achieved", num_runs=2))
     assert components.behavior is not None
     assert components.curriculum is not None
-    samples = torch.zeros(2, components.recipe.curriculum.window)
+    samples = torch.zeros(2, components.recipe.order.window)
     samples[1] = 1.0
     move_on(components, components.curriculum, samples, 0)
     components.collector.next()
@@ -131,7 +131,7 @@ def test_ibs_proposals_begin_with_the_last_layer() -> None:
     first = weights.sigma
     components.trainer().epoch()
     assert weights.sigma < first
-    move_on(components, components.curriculum, torch.ones(1, components.recipe.curriculum.window), 0)
+    move_on(components, components.curriculum, torch.ones(1, components.recipe.order.window), 0)
     assert weights.sigma == first
 
 
@@ -226,7 +226,7 @@ def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
         ({"order": "all_at_once"}, "order=all_at_once has no effect with algo=her"),
         (
             {"algo": "cher", "order": "all_at_once", "window": 5},
-            "window=5 has no effect with order=all_at_once",
+            "order=all_at_once has no option window; order=threshold has it",
         ),
         (
             {"algo": "her", "sigma": 0.3},
@@ -234,7 +234,7 @@ def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
         ),
         (
             {"algo": "cher", "learner": "sac", "order": "all_at_once", "success_threshold": 0.5},
-            "success_threshold=0.5 has no effect with order=all_at_once",
+            "order=all_at_once has no option success_threshold; order=threshold has it",
         ),
         (
             {"behavior": "uniform_achieved", "candidates": 7},

@@ -31,7 +31,7 @@ def climbing(**options: object) -> Recipe:
 
 def move(components: Components, *, run: int) -> list[str]:
     """Lets one run learn its layer."""
-    samples = torch.zeros(components.recipe.run.num_runs, components.recipe.curriculum.window)
+    samples = torch.zeros(components.recipe.run.num_runs, components.recipe.order.window)
     samples[run] = 1.0
     assert components.curriculum is not None
     return move_on(components, components.curriculum, samples, 1_600)
