@@ -104,12 +104,8 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
     for group, name in auto_options(recipe):
         values = {f"{group}.{name}": _VALUES[name](recipe, facts)}
         if name == "algo" and facts.layers:
-            values |= {
-                "layers": facts.layers,
-                "layer_epochs": _LAYER_EPOCHS,
-                "layer_epsilon": 0.5,
-                "guided_share": 0.5,
-                "guided_per": "step",
-            }
+            values |= {"layers": facts.layers, "layer_epochs": _LAYER_EPOCHS}
+            values |= {"guided_share": 0.5, "guided_per": "step"}
+            values |= {"layer_epsilon": 0.5} if recipe.learner.has_epsilon else {}
         recipe = recipe.replace(**values)
     return recipe

@@ -38,6 +38,8 @@ def test_a_curriculum_comes_with_its_options() -> None:
     assert (recipe.hindsight.algo, recipe.curriculum.layers) == ("cher", layers)
     assert (recipe.curriculum.guided_share, recipe.curriculum.guided_per) == (0.5, "step")
     assert recipe.order == Threshold(layer_epochs=10, layer_epsilon=0.5)
+    without_epsilon = resolve(make_recipe(learner="sac"), EnvFacts(max_steps=50, layers=layers))
+    assert without_epsilon.order == Threshold(layer_epochs=10)
     assert resolve(make_recipe(), EnvFacts(max_steps=50)).hindsight.algo == "filtered_her"
     assert make_recipe(curriculum=layers).hindsight.algo == "cher"
 
