@@ -20,8 +20,13 @@ def measure(width: int, rounds: int) -> dict[str, tuple[float, float]]:
     """Least seconds of weighing goals, and of telling that some were written, for goals of some numbers."""
     import torch  # noqa: PLC0415  # after the process was put on one core
 
-    from torchrl_her import GoalGrid, GoalWeights, Instructiveness, sampled_target  # noqa: PLC0415
-    from torchrl_her.goals import KernelInstructiveness, NetworkNovelty, RareGoals  # noqa: PLC0415
+    from torchrl_her import GoalGrid, GoalWeights, Instructiveness  # noqa: PLC0415
+    from torchrl_her.goals import (  # noqa: PLC0415
+        KernelInstructiveness,
+        NetworkNovelty,
+        RareGoals,
+        sampled_target,
+    )
 
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(0)

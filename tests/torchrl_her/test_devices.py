@@ -20,7 +20,6 @@ from torchrl_her import (
     CurriculumLayer,
     CurriculumProgress,
     DecayingEpsilon,
-    DecayingEpsilonGreedy,
     GoalGrid,
     GoalReward,
     GoalWeights,
@@ -36,14 +35,7 @@ from torchrl_her import (
     make_actor,
     make_critic,
     make_ddpg_loss,
-    make_dqn_loss,
-    make_q_actor,
-    make_sac_loss,
-    make_stochastic_actor,
     make_target_updater,
-    make_td3_loss,
-    make_tqc_loss,
-    sampled_target,
     save_checkpoint,
     success,
 )
@@ -53,10 +45,19 @@ from torchrl_her.goals import (
     RareGoals,
     log_kernel_density,
     log_neighbor_density,
+    sampled_target,
 )
 from torchrl_her.goals.grid import kl_divergence
-from torchrl_her.modules import NormalizeBatch, NormalizedPolicy, PolicyAverage, RunningNorm
-from torchrl_her.objectives import critic_value
+from torchrl_her.modules import (
+    DecayingEpsilonGreedy,
+    NormalizeBatch,
+    NormalizedPolicy,
+    PolicyAverage,
+    RunningNorm,
+    make_q_actor,
+    make_stochastic_actor,
+)
+from torchrl_her.objectives import critic_value, make_dqn_loss, make_sac_loss, make_td3_loss, make_tqc_loss
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler, empty_run
 from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
 from torchrl_her.trainers.metrics import discounted_return, final_distance

@@ -26,7 +26,7 @@ def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None
     best action.
 
     Args:
-        loss: of TorchRL, for example from :func:`~torchrl_her.make_td3_loss`.
+        loss: of TorchRL, for example from :func:`~torchrl_her.objectives.make_td3_loss`.
         transitions: [...], with all that the critics read; for all but DQN that includes the action. They are
             normalized if the loss is trained on normalized ones (:class:`~torchrl_her.modules.RunningNorm`).
 
@@ -36,7 +36,8 @@ def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None
     Example:
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
-        >>> from torchrl_her import make_actor, make_critic, make_td3_loss
+        >>> from torchrl_her import make_actor, make_critic
+        >>> from torchrl_her.objectives import make_td3_loss
         >>> actor, critic = make_actor((9, 2), 3), make_critic((9, 2), 3)
         >>> loss = make_td3_loss(actor, critic, action_spec=Bounded(-1.0, 1.0, (3,)))
         >>> start = TensorDict({"observation": torch.zeros(4, 9), "desired_goal": torch.zeros(4, 2)}, [4])

@@ -21,7 +21,7 @@ def make_dqn_loss(
     """TorchRL's (double) DQN loss with a target network and clamped targets.
 
     Args:
-        actor: from :func:`~torchrl_her.make_q_actor`.
+        actor: from :func:`~torchrl_her.modules.make_q_actor`.
         gamma: discount, in [0, 1).
         reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
             leave them as they are.
@@ -32,7 +32,7 @@ def make_dqn_loss(
         ValueError: ``gamma`` is outside of [0, 1).
 
     Example:
-        >>> from torchrl_her import make_q_actor
+        >>> from torchrl_her.modules import make_q_actor
         >>> loss = make_dqn_loss(make_q_actor((3, 3), 4)[0])
         >>> round(loss.value_estimator.low), round(loss.value_estimator.high)
         (-50, 0)

@@ -140,7 +140,7 @@ def make_sac_loss(
     Haarnoja et al., Soft actor-critic algorithms and applications, 2018.
 
     Args:
-        actor: from :func:`~torchrl_her.make_stochastic_actor`.
+        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`.
         critic: from :func:`~torchrl_her.make_critic`, the others are made like it; or all critics in a list.
         action_spec: least and greatest actions, of one environment.
         critics: how many there are; targets and policy have the least of their values.
@@ -164,7 +164,8 @@ def make_sac_loss(
             not their number, or ``target_critics`` is not from 0 to ``critics``.
 
     Example:
-        >>> from torchrl_her import make_critic, make_stochastic_actor
+        >>> from torchrl_her import make_critic
+        >>> from torchrl_her.modules import make_stochastic_actor
         >>> spec = Bounded(-1.0, 1.0, (3,))
         >>> actor, critic = make_stochastic_actor((9, 2), spec), make_critic((9, 2), 3)
         >>> loss = make_sac_loss(actor, critic, action_spec=spec)

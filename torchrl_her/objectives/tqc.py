@@ -88,7 +88,7 @@ def make_tqc_loss(
     quantile critics, 2020.
 
     Args:
-        actor: from :func:`~torchrl_her.make_stochastic_actor`.
+        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`.
         critic: from ``make_critic(..., outputs=M)`` with M quantiles, the others are made like it; or all
             critics in a list.
         action_spec: least and greatest actions, of one environment.
@@ -96,7 +96,8 @@ def make_tqc_loss(
         dropped_quantiles: D; targets leave out the D * N greatest of all N * M quantiles.
         gamma: discount, in [0, 1).
         reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
-            leave them as they are, since they contain entropy: see :func:`~torchrl_her.make_sac_loss`.
+            leave them as they are, since they contain entropy: see
+            :func:`~torchrl_her.objectives.make_sac_loss`.
         temperature: what it begins with.
         action_penalty: weight of the action L2 penalty, see
             :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
@@ -111,7 +112,8 @@ def make_tqc_loss(
             do, or ``dropped_quantiles`` is negative or leaves none.
 
     Example:
-        >>> from torchrl_her import make_critic, make_stochastic_actor
+        >>> from torchrl_her import make_critic
+        >>> from torchrl_her.modules import make_stochastic_actor
         >>> spec = Bounded(-1.0, 1.0, (3,))
         >>> actor, critic = make_stochastic_actor((9, 2), spec), make_critic((9, 2), 3, outputs=25)
         >>> make_tqc_loss(actor, critic, action_spec=spec).top_quantiles_to_drop_per_net

@@ -39,10 +39,10 @@ class FusedLearner:
     among as many threads as torch may use (``torch.set_num_threads``).
 
     Args:
-        loss: as :func:`~torchrl_her.make_ddpg_loss`, :func:`~torchrl_her.make_td3_loss`,
-            :func:`~torchrl_her.make_sac_loss`, :func:`~torchrl_her.make_tqc_loss` or
-            :func:`~torchrl_her.make_dqn_loss` makes it, with networks of this library in float32 or
-            float64, on the CPU.
+        loss: as :func:`~torchrl_her.make_ddpg_loss`, :func:`~torchrl_her.objectives.make_td3_loss`,
+            :func:`~torchrl_her.objectives.make_sac_loss`, :func:`~torchrl_her.objectives.make_tqc_loss` or
+            :func:`~torchrl_her.objectives.make_dqn_loss` makes it, with networks of this library in float32
+            or float64, on the CPU.
         optimizer: a plain ``torch.optim.Adam`` over the loss module's parameters.
         target: of the loss.
         max_grad_norm: to which the gradients of each network of each run are clipped separately; all

@@ -10,8 +10,8 @@ import torch
 import yaml
 from torchrl.objectives import DQNLoss, SACLoss, TD3Loss, TQCLoss
 
-from torchrl_her import DecayingEpsilonGreedy
 from torchrl_her.goals import GoalHistogram
+from torchrl_her.modules import DecayingEpsilonGreedy
 from torchrl_her_envs import BitFlip, Chain, TreasureHunt, goal_env
 from torchrl_her_recipes import build, resume, run
 from torchrl_her_recipes.cli import main

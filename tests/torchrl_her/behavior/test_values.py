@@ -9,9 +9,9 @@ from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.objectives import LossModule
 
-from torchrl_her import make_actor, make_critic, make_ddpg_loss, make_td3_loss
+from torchrl_her import make_actor, make_critic, make_ddpg_loss
 from torchrl_her.behavior import GoalValues
-from torchrl_her.objectives import critic_value, critic_values
+from torchrl_her.objectives import critic_value, critic_values, make_td3_loss
 
 WIDTHS = (3, 2)
 

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchrl_her import GoalGrid, box_target, sampled_target
-from torchrl_her.goals import kl_divergence
+from torchrl_her import GoalGrid, box_target
+from torchrl_her.goals import kl_divergence, sampled_target
 
 from ..goal_grids import LINE, RIGHT, SCREEN
 

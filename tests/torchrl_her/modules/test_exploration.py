@@ -14,8 +14,8 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_her import DecayingEpsilon, DecayingEpsilonGreedy, make_actor
-from torchrl_her.modules import explore, explore_actions
+from torchrl_her import DecayingEpsilon, make_actor
+from torchrl_her.modules import DecayingEpsilonGreedy, explore, explore_actions
 from torchrl_her_envs import make_env
 
 ROWS = 100_000  # a share has a standard deviation of at most 0.0016: all bounds below are six of them

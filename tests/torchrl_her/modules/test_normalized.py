@@ -14,16 +14,14 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import SliceSampler
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_her import (
-    DecayingEpsilon,
-    GoalReward,
-    HERSampleUnit,
-    HERWriter,
-    make_actor,
+from torchrl_her import DecayingEpsilon, GoalReward, HERSampleUnit, HERWriter, make_actor
+from torchrl_her.modules import (
+    NormalizeBatch,
+    NormalizedPolicy,
+    RunningNorm,
     make_q_actor,
     make_stochastic_actor,
 )
-from torchrl_her.modules import NormalizeBatch, NormalizedPolicy, RunningNorm
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, rows_of_run
 from torchrl_her_envs import make_env
 

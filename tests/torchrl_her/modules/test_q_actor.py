@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_her import make_q_actor
-from torchrl_her.modules import QNet
+from torchrl_her.modules import QNet, make_q_actor
 
 from ..lost_game import rows
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_her import make_stochastic_actor
-from torchrl_her.modules import StochasticActorNet
+from torchrl_her.modules import StochasticActorNet, make_stochastic_actor
 
 from ..lost_game import SPEC, rows
 

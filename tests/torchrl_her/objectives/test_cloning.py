@@ -12,18 +12,16 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.objectives import LossModule
 
-from torchrl_her import (
-    make_actor,
-    make_critic,
-    make_ddpg_loss,
+from torchrl_her import make_actor, make_critic, make_ddpg_loss, make_target_updater
+from torchrl_her.modules import make_stochastic_actor, stack_runs
+from torchrl_her.objectives import (
+    Cloning,
+    PenalizedDDPGLoss,
+    cloning_terms,
     make_sac_loss,
-    make_stochastic_actor,
-    make_target_updater,
     make_td3_loss,
     make_tqc_loss,
 )
-from torchrl_her.modules import stack_runs
-from torchrl_her.objectives import Cloning, PenalizedDDPGLoss, cloning_terms
 from torchrl_her.trainers import LossLearner, why_not_fused, why_not_recorded
 
 from ..ddpg_data import batch

@@ -7,18 +7,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import ClipPPOLoss, LossModule, SoftUpdate
 
-from torchrl_her import (
-    make_actor,
-    make_critic,
-    make_ddpg_loss,
-    make_dqn_loss,
-    make_q_actor,
-    make_sac_loss,
-    make_stochastic_actor,
-    make_td3_loss,
-)
-from torchrl_her.modules import RunNoise
-from torchrl_her.objectives import critic_value
+from torchrl_her import make_actor, make_critic, make_ddpg_loss
+from torchrl_her.modules import RunNoise, make_q_actor, make_stochastic_actor
+from torchrl_her.objectives import critic_value, make_dqn_loss, make_sac_loss, make_td3_loss
 from torchrl_her.objectives.critics import least_of_some
 
 from ..lost_game import SPEC, rows, say

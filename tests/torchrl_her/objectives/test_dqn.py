@@ -6,7 +6,9 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from torchrl_her import LossLearner, make_dqn_loss, make_q_actor
+from torchrl_her import LossLearner
+from torchrl_her.modules import make_q_actor
+from torchrl_her.objectives import make_dqn_loss
 
 from ..lost_game import rows
 

@@ -8,7 +8,9 @@ import pytest
 import torch
 from torchrl.objectives import LossModule, SACLoss, SoftUpdate
 
-from torchrl_her import LossLearner, make_critic, make_sac_loss, make_stochastic_actor
+from torchrl_her import LossLearner, make_critic
+from torchrl_her.modules import make_stochastic_actor
+from torchrl_her.objectives import make_sac_loss
 from torchrl_her.trainers import RunsAdam
 
 from ..lost_game import SPEC, rows, say

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torchrl.objectives import LossModule, SoftUpdate, TD3Loss
 
-from torchrl_her import LossLearner, make_actor, make_critic, make_td3_loss
-from torchrl_her.objectives import clamped_td0
+from torchrl_her import LossLearner, make_actor, make_critic
+from torchrl_her.objectives import clamped_td0, make_td3_loss
 
 from ..lost_game import SPEC, rows, say
 

@@ -10,8 +10,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate, TQCLoss
 
-from torchrl_her import LossLearner, make_critic, make_stochastic_actor, make_tqc_loss
-from torchrl_her.objectives import critic_value
+from torchrl_her import LossLearner, make_critic
+from torchrl_her.modules import make_stochastic_actor
+from torchrl_her.objectives import critic_value, make_tqc_loss
 from torchrl_her.objectives.tqc import PenalizedTQCLoss
 
 from ..lost_game import SPEC, rows, say

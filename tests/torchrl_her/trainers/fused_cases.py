@@ -11,18 +11,9 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.objectives import LossModule
 
-from torchrl_her import (
-    make_actor,
-    make_critic,
-    make_ddpg_loss,
-    make_dqn_loss,
-    make_q_actor,
-    make_sac_loss,
-    make_stochastic_actor,
-    make_td3_loss,
-    make_tqc_loss,
-)
-from torchrl_her.modules import RunNoise
+from torchrl_her import make_actor, make_critic, make_ddpg_loss
+from torchrl_her.modules import RunNoise, make_q_actor, make_stochastic_actor
+from torchrl_her.objectives import make_dqn_loss, make_sac_loss, make_td3_loss, make_tqc_loss
 
 WIDTHS, ACTIONS = (4, 2), 3
 ALGORITHMS = ("ddpg", "normalized", "td3", "sac", "redq", "tqc", "dqn")

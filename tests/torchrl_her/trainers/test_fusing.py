@@ -12,16 +12,9 @@ from torchrl.data import Bounded
 from torchrl.objectives import DDPGLoss, LossModule, SoftUpdate, ValueEstimators
 
 from tests.torchrl_her.trainers.fused_cases import ALGORITHMS, make_loss
-from torchrl_her import (
-    FusedLearner,
-    make_actor,
-    make_critic,
-    make_sac_loss,
-    make_stochastic_actor,
-    make_target_updater,
-    make_tqc_loss,
-)
-from torchrl_her.objectives import PenalizedDDPGLoss, clamped_td0
+from torchrl_her import FusedLearner, make_actor, make_critic, make_target_updater
+from torchrl_her.modules import make_stochastic_actor
+from torchrl_her.objectives import PenalizedDDPGLoss, clamped_td0, make_sac_loss, make_tqc_loss
 from torchrl_her.trainers import is_plain_adam, why_not_fused
 
 

@@ -12,16 +12,9 @@ from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.objectives import LossModule
 
-from torchrl_her import (
-    make_actor,
-    make_critic,
-    make_ddpg_loss,
-    make_sac_loss,
-    make_stochastic_actor,
-    make_target_updater,
-    make_td3_loss,
-    make_tqc_loss,
-)
+from torchrl_her import make_actor, make_critic, make_ddpg_loss, make_target_updater
+from torchrl_her.modules import make_stochastic_actor
+from torchrl_her.objectives import make_sac_loss, make_td3_loss, make_tqc_loss
 from torchrl_her.trainers import GraphLearner, LossLearner, RunsAdam, why_not_recorded
 
 from ...emulated import DEVICE, emulated_device

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_her import GoalReward, reached, success
-from torchrl_her.trainers import discounted_return, final_distance, first_episode, q_bias
+from torchrl_her import GoalReward, success
+from torchrl_her.trainers import discounted_return, final_distance, first_episode, q_bias, reached
 
 # How a step ends: "-" goes on, "T" terminates, "U" truncates, "B" does both.
 ENDS = "-TUB"

@@ -21,7 +21,7 @@ from torchrl_her_recipes.components.learners.ddpg import DDPGBuilder
 
 
 class SACBuilder(DDPGBuilder):
-    """See :func:`~torchrl_her.make_sac_loss`; the critics are those of DDPG."""
+    """See :func:`~torchrl_her.objectives.make_sac_loss`; the critics are those of DDPG."""
 
     def actor(self, runs: int) -> TensorDictModule:
         return make_stochastic_actor(

@@ -13,7 +13,7 @@ from torchrl_her_recipes.components.learners.ddpg import DDPGBuilder
 
 
 class TD3Builder(DDPGBuilder):
-    """See :func:`~torchrl_her.make_td3_loss`; the networks are those of DDPG."""
+    """See :func:`~torchrl_her.objectives.make_td3_loss`; the networks are those of DDPG."""
 
     def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_td3_loss(

@@ -12,7 +12,7 @@ from torchrl_her_recipes.components.learners.sac import SACBuilder
 
 
 class TQCBuilder(SACBuilder):
-    """See :func:`~torchrl_her.make_tqc_loss`; the actor is that of SAC."""
+    """See :func:`~torchrl_her.objectives.make_tqc_loss`; the actor is that of SAC."""
 
     @property
     def outputs(self) -> int:
