@@ -77,6 +77,13 @@ struct Product {
     bool relu;
 };
 
+// Clang unrolls these loops only if it is told to, and then keeps sums in registers as g++ does by itself.
+#if defined(__clang__)
+#define UNROLLED _Pragma("clang loop unroll(full)")
+#else
+#define UNROLLED
+#endif
+
 // M rows and P vectors of columns of the result.
 template <int M, int P, class Number>
 inline __attribute__((always_inline)) void tile(const Product<Number>& p, long row, long column) {
@@ -84,21 +91,21 @@ inline __attribute__((always_inline)) void tile(const Product<Number>& p, long r
     const Number* b = p.b + column;
     using Right = typename VectorOf<Number>::Type;
     Vector sum[M][P];
-    for (int j = 0; j < P; ++j) {
+    UNROLLED for (int j = 0; j < P; ++j) {
         const Vector start = p.bias ? reinterpret_cast<const Vector*>(p.bias + column)[j] : Vector{};
-        for (int i = 0; i < M; ++i) sum[i][j] = start;
+        UNROLLED for (int i = 0; i < M; ++i) sum[i][j] = start;
     }
     for (int k = 0; k < p.k; ++k) {
         Right right[P];
-        for (int j = 0; j < P; ++j) right[j] = reinterpret_cast<const Right*>(b + k * p.b_row)[j];
-        for (int i = 0; i < M; ++i) {
+        UNROLLED for (int j = 0; j < P; ++j) right[j] = reinterpret_cast<const Right*>(b + k * p.b_row)[j];
+        UNROLLED for (int i = 0; i < M; ++i) {
             const Number left = a[i * p.a_row + k * p.a_column];
-            for (int j = 0; j < P; ++j) sum[i][j] = add_product(sum[i][j], left, right[j]);
+            UNROLLED for (int j = 0; j < P; ++j) sum[i][j] = add_product(sum[i][j], left, right[j]);
         }
     }
-    for (int i = 0; i < M; ++i) {
+    UNROLLED for (int i = 0; i < M; ++i) {
         Vector* out = reinterpret_cast<Vector*>(p.c + (row + i) * p.c_row + column);
-        for (int j = 0; j < P; ++j) out[j] = p.relu ? (sum[i][j] < 0 ? Vector{} : sum[i][j]) : sum[i][j];
+        UNROLLED for (int j = 0; j < P; ++j) out[j] = p.relu ? (sum[i][j] < 0 ? Vector{} : sum[i][j]) : sum[i][j];
     }
 }
 
