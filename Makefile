@@ -7,10 +7,13 @@ BIN := $(VENV)/bin
 # to have it, each process that a test starts would compile all of torch, which takes six seconds.
 PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal --durations=15
 
-.PHONY: demo shell test test-full test-versions lint bench bench-gpu docs clean
+.PHONY: demo shell test test-full test-versions lint bench bench-gpu wheel docs clean
 .SILENT:
 
 demo: $(VENV)/.ready  ## learn to pick up a ball and throw it, in a minute; ends with a curve and a GIF
+	test -n "$$CXX$$(command -v g++; command -v clang++; command -v c++)" || { \
+		echo "There is no C++ compiler: installing ziglang, which has one"; \
+		$(BIN)/python -m pip install --quiet ziglang || true; }
 	$(BIN)/torchrl-her train preset=demo
 
 shell: $(VENV)/.ready  ## a shell in which torchrl-her can be called
@@ -37,6 +40,9 @@ bench: $(VENV)/.ready-bench  ## all benchmarks, beside peers, in one report: run
 bench-gpu: $(VENV)/.ready  ## what a GPU gives, in less than ten minutes: runs/bench_gpu.md
 	mkdir -p runs
 	$(BIN)/python benchmarks/gpu.py --out runs/bench_gpu.md
+
+wheel: $(VENV)/.ready  ## source distribution and, for Linux on x86-64, a wheel with compiled C++ code: dist/
+	HATCH_BUILD_HOOK_ENABLE_CUSTOM=1 $(BIN)/uv build
 
 docs: $(VENV)/.ready-docs  ## the documentation as a site, with the studies' pages: build/docs/index.html
 	$(BIN)/python -m sphinx -W --keep-going docs build/docs

@@ -1,16 +1,22 @@
-"""Compiling C++ for this machine, once, and loading it."""
+"""Compiling C++ for this machine, once, and loading it; or loading what a wheel carries.
+
+The build of a wheel runs this file where torch is not installed (``hatch_build.py``).
+"""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
+import importlib.util
 import logging
 import os
 import platform
 import shutil
 import subprocess
+import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 _FLAGS = (
@@ -22,15 +28,23 @@ _FLAGS = (
     "-shared",
     "-fPIC",
 )
-# Tried in this order, since not every compiler knows them.
+# Tried in this order, since not every compiler knows them, and some (zig) have no library for OpenMP.
 _EXTRAS = (
     ("-march=native", "-mprefer-vector-width=512", "-fopenmp"),
+    ("-march=native", "-mprefer-vector-width=512", "-fopenmp-simd"),
     ("-march=native", "-fopenmp"),
     ("-mcpu=native", "-fopenmp"),
     ("-march=native",),
     ("-mcpu=native",),
     (),
 )
+_V3 = frozenset(("abm", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"))
+# Levels of x86-64 that wheels carry libraries for, the fastest first, and what /proc/cpuinfo lists for each.
+LEVELS = {
+    "x86-64-v4": _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
+    "x86-64-v3": _V3,
+}
+_SHIPPED = Path(__file__).parent  # in a wheel it has a folder for each level
 _LOGGER = logging.getLogger("torchrl_her")
 
 
@@ -43,7 +57,8 @@ def load_library(source: str, *, headers: Sequence[str] = (), real: str = "float
 
     It is compiled for this processor the first time, which takes some seconds, and kept in the user's cache:
     the folder that ``TORCHRL_HER_CACHE`` names, or ``torchrl_her`` in that of ``XDG_CACHE_HOME``. The
-    compiler is ``CXX`` from the environment, or else g++, clang++ or c++.
+    compiler is ``CXX`` from the environment, or else g++, clang++, c++ or the package ``ziglang``. Without
+    one, the library is the one that the wheel carries for such processors.
 
     Args:
         source: the file's name.
@@ -52,49 +67,107 @@ def load_library(source: str, *, headers: Sequence[str] = (), real: str = "float
 
     Raises:
         CannotCompile: there is no compiler, or it failed, or the library cannot be loaded; the message says
-            which.
+            which. No wheel's library can be loaded instead.
     """
     try:
-        compiler, folder = _compiler(), Path(__file__).parent
-        text = "".join((folder / name).read_text(encoding="utf-8") for name in (source, *headers))
-        made_of = (text, real, *compiler, _version(compiler), str(_FLAGS), str(_EXTRAS), _processor())
-        name = hashlib.sha256("\n".join(made_of).encode()).hexdigest()[:20]
-        library = _cache() / f"{Path(source).stem}-{real}-{name}.so"
-        if not library.exists():
-            _LOGGER.info("compiling %s (%s), once for this machine", source, real)
-            _compile(compiler, folder / source, real, library)
-        return ctypes.CDLL(str(library))
-    # A compiler that cannot run, no home, a full disk, a folder that must not be written, a damaged file.
+        return _load_compiled(source, headers, real)
+    # A compiler that cannot run, no home, a full disk, a folder that must not be written.
     except (OSError, RuntimeError) as error:
+        if library := _load_shipped(source, real):
+            return library
         if isinstance(error, CannotCompile):
             raise
         raise CannotCompile(f"{source} cannot be compiled or loaded: {error}") from error
 
 
-def _compile(compiler: Sequence[str], source: Path, real: str, library: Path) -> None:
+def compile_library(
+    compiler: Sequence[str], source: Path, library: Path, *, real: str, extras: Sequence[str]
+) -> None:
+    """Compiles a C++ source with one set of further options.
+
+    Raises:
+        CannotCompile: the compiler failed; the message has the first line that it wrote.
+    """
+    command = [*compiler, *_FLAGS, *extras, f"-DREAL={real}", str(source), "-o", str(library)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        error = result.stderr.strip().partition("\n")[0] or "?"
+        raise CannotCompile(f"{' '.join(compiler)} cannot compile {source.name}: {error}")
+
+
+def shipped_name(source: str, real: str) -> str:
+    """Name of the library that a wheel carries, in the folder of a level.
+
+    Example:
+        >>> shipped_name("steps.cpp", "float")
+        'steps-float.so'
+    """
+    return f"{Path(source).stem}-{real}.so"
+
+
+def levels(flags: Collection[str]) -> list[str]:
+    """Returns the levels of x86-64 whose libraries a processor can run, the fastest first.
+
+    Args:
+        flags: names of its instruction sets, as in ``/proc/cpuinfo``.
+
+    Example:
+        >>> levels("fma avx2 bmi1 bmi2 f16c movbe abm avx512f".split())
+        ['x86-64-v3']
+    """
+    return [level for level, needed in LEVELS.items() if needed.issubset(flags)]
+
+
+def _load_shipped(source: str, real: str) -> ctypes.CDLL | None:
+    for level in levels(_processor_flags().split()):
+        with contextlib.suppress(OSError):  # no wheel of this kind, or the system's libraries are older
+            return ctypes.CDLL(str(_SHIPPED / level / shipped_name(source, real)))
+    return None
+
+
+def _load_compiled(source: str, headers: Sequence[str], real: str) -> ctypes.CDLL:
+    compiler, folder = find_compiler(), Path(__file__).parent
+    text = "".join((folder / name).read_text(encoding="utf-8") for name in (source, *headers))
+    made_of = (text, real, *compiler, _version(compiler), str(_FLAGS), str(_EXTRAS), _processor())
+    name = hashlib.sha256("\n".join(made_of).encode()).hexdigest()[:20]
+    library = _cache() / f"{Path(source).stem}-{real}-{name}.so"
+    with contextlib.suppress(OSError):  # it is not there yet, or damaged
+        return ctypes.CDLL(str(library))
+    _LOGGER.info("compiling %s (%s), once for this machine", source, real)
+    return _compile(compiler, folder / source, real, library)
+
+
+def _compile(compiler: Sequence[str], source: Path, real: str, library: Path) -> ctypes.CDLL:
+    """Compiles with the first options whose library also loads, and loads it."""
     library.parent.mkdir(parents=True, exist_ok=True)
-    error = ""
+    errors: list[Exception] = []
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         made = Path(folder) / library.name
         for extras in _EXTRAS:
-            command = [*compiler, *_FLAGS, *extras, f"-DREAL={real}", str(source), "-o", str(made)]
-            result = subprocess.run(command, capture_output=True, text=True, check=False)
-            if result.returncode == 0:
+            try:
+                compile_library(compiler, source, made, real=real, extras=extras)
+                loaded = ctypes.CDLL(str(made))
+            except (CannotCompile, OSError) as error:
+                errors.append(error)
+            else:
                 os.replace(made, library)  # at once: other processes may be compiling the same
-                return
-            error = error or result.stderr.strip()
-    raise CannotCompile(
-        f"{compiler[0]} cannot compile {source.name}: {error.splitlines()[0] if error else '?'}"
-    )
+                return loaded
+    raise errors[0]
 
 
-def _compiler() -> list[str]:
-    """The compiler and options of its own: ``CXX`` may say ``ccache g++``."""
+def find_compiler() -> list[str]:
+    """The compiler and options of its own: ``CXX`` may say ``ccache g++``.
+
+    Raises:
+        CannotCompile: there is none.
+    """
     wanted = os.environ.get("CXX", "").split()
     for name, *options in [wanted] if wanted else [["g++"], ["clang++"], ["c++"]]:
         if path := shutil.which(name):
             return [path, *options]
-    named = f" {wanted[0]}" if wanted else " (g++ or clang++)"
+    if not wanted and importlib.util.find_spec("ziglang"):
+        return [sys.executable, "-m", "ziglang", "c++"]
+    named = f" {wanted[0]}" if wanted else " (g++ or clang++; `pip install ziglang` brings one)"
     raise CannotCompile(f"there is no C++ compiler{named}")
 
 
@@ -104,12 +177,14 @@ def _version(compiler: Sequence[str]) -> str:
 
 def _processor() -> str:
     """Describes the processor: a cache may be shared by machines that need other instructions."""
-    flags = ""
+    return "\n".join((platform.machine(), platform.processor(), _processor_flags()))
+
+
+def _processor_flags() -> str:
+    """Names of the processor's instruction sets, as Linux lists them; nothing on other systems."""
     info = Path("/proc/cpuinfo")
-    if info.exists():
-        lines = info.read_text(encoding="utf-8").splitlines()
-        flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    return "\n".join((platform.machine(), platform.processor(), flags))
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+    return next((line for line in lines if line.startswith(("flags", "Features"))), "")
 
 
 def _cache() -> Path:

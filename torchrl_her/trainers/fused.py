@@ -63,7 +63,7 @@ class FusedLearner:
         ValueError: the loss, its targets or the optimizer are set to what the fused steps do not do, see
             :func:`~torchrl_her.trainers.why_not_fused`: use :class:`~torchrl_her.LossLearner`. Or there are
             no such products for these weights.
-        CannotCompile: there is no C++ compiler.
+        CannotCompile: there is no C++ compiler, and no library in a wheel.
 
     Example:
         >>> from torchrl.objectives import SoftUpdate

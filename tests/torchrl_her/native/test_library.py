@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from torchrl_her.native import CannotCompile, load_steps
-from torchrl_her.native.library import _EXTRAS
+from torchrl_her.native import CannotCompile, library, load_library, load_steps
+from torchrl_her.native.library import _EXTRAS, compile_library, find_compiler, levels, shipped_name
+
+V3 = "sse2 avx avx2 bmi1 bmi2 f16c fma movbe abm"
+V4 = f"{V3} avx512f avx512bw avx512cd avx512dq avx512vl"
+# With OpenMP it needs a function that is nowhere, so that it compiles but does not load.
+TINY = """
+#if defined(_OPENMP)
+extern "C" int nowhere();
+int needed = nowhere();
+#endif
+extern "C" int answer() { return ANSWER; }
+"""
+needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler")
 
 
 @pytest.fixture(autouse=True)
@@ -17,6 +31,21 @@ def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """An empty cache, and no library that is loaded already."""
     load_steps.cache_clear()
     monkeypatch.setenv("TORCHRL_HER_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(library, "_SHIPPED", tmp_path / "shipped")
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    """A source whose function gives 1, and its libraries in a wheel: 3 for x86-64-v3, damaged for v4."""
+    source = tmp_path / "tiny.cpp"
+    source.write_text(TINY.replace("ANSWER", "3"), encoding="utf-8")
+    for level in library.LEVELS:
+        (tmp_path / "shipped" / level).mkdir(parents=True)
+    name = shipped_name("tiny.cpp", "float")
+    compile_library(["g++"], source, tmp_path / "shipped" / "x86-64-v3" / name, real="float", extras=())
+    (tmp_path / "shipped" / "x86-64-v4" / name).write_text("damaged", encoding="utf-8")
+    source.write_text(TINY.replace("ANSWER", "1"), encoding="utf-8")
+    return source
 
 
 def fake_compiler(folder: Path, text: str) -> Path:
@@ -35,8 +64,70 @@ def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_without_any_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(CannotCompile, match=r"there is no C\+\+ compiler \(g\+\+ or clang\+\+\)"):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(CannotCompile, match=r"there is no C\+\+ compiler \(g\+\+ or clang\+\+"):
         load_steps(torch.float32)
+
+
+def test_a_compiler_from_pip_is_found_where_there_is_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr(importlib.util, "find_spec", {"ziglang": object()}.get)
+    assert find_compiler() == [sys.executable, "-m", "ziglang", "c++"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ("sse2 avx", []),
+        (V3.replace("fma", "fma4"), []),
+        (V3, ["x86-64-v3"]),
+        (f"{V3} avx512f avx512cd avx512er avx512pf", ["x86-64-v3"]),  # a Xeon Phi
+        (V4, ["x86-64-v4", "x86-64-v3"]),
+        (f"{V4} avx512_bf16 amx_tile", ["x86-64-v4", "x86-64-v3"]),
+    ],
+)
+def test_a_processor_runs_the_levels_all_of_whose_instructions_it_has(
+    flags: str, expected: list[str]
+) -> None:
+    assert levels(flags.split()) == expected
+
+
+@needs_compiler
+def test_what_compiles_but_does_not_load_is_compiled_with_other_options(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, tiny: Path
+) -> None:
+    log = tmp_path / "calls"
+    monkeypatch.setenv("CXX", str(fake_compiler(tmp_path, f'echo "$*" >> {log}; exec g++ "$@"')))
+    assert load_library(str(tiny)).answer() == 1
+    calls = [line.split() for line in log.read_text(encoding="utf-8").splitlines() if " -o " in line]
+    assert "-fopenmp" in calls[0]
+    assert len(calls) > 1
+    assert "-fopenmp" not in calls[-1]
+    (kept,) = (tmp_path / "cache").iterdir()
+    kept.unlink()  # the library is mapped into memory: do not write into its file
+    kept.write_text("damaged", encoding="utf-8")
+    assert load_library(str(tiny)).answer() == 1
+
+
+@needs_compiler
+@pytest.mark.parametrize("flags", [V3, V4])  # of the latter, the library is damaged
+def test_without_a_compiler_the_wheels_library_is_loaded(
+    monkeypatch: pytest.MonkeyPatch, tiny: Path, flags: str
+) -> None:
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setattr(library, "_processor_flags", lambda: f"flags : {flags}")
+    assert load_library(str(tiny)).answer() == 3
+
+
+@needs_compiler
+def test_a_wheels_library_is_not_loaded_on_a_processor_that_cannot_run_it(
+    monkeypatch: pytest.MonkeyPatch, tiny: Path
+) -> None:
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setattr(library, "_processor_flags", lambda: "flags : sse2 avx")
+    with pytest.raises(CannotCompile, match="there is no C\\+\\+ compiler no-such-compiler"):
+        load_library(str(tiny))
 
 
 def test_what_the_compiler_says_is_passed_on_and_nothing_is_kept(
@@ -75,7 +166,7 @@ def test_a_cache_that_cannot_be_written_is_said(monkeypatch: pytest.MonkeyPatch,
         load_steps(torch.float32)
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler")
+@needs_compiler
 def test_it_is_compiled_once_and_then_found_in_the_cache(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
