@@ -1,12 +1,11 @@
 from .common.batched_env import BatchedEnv as BatchedEnv
 from .common.goal_env import GoalEnv as GoalEnv
-from .common.goal_env import TaskTraits as TaskTraits
 from .common.goal_env import goal_env as goal_env
 from .common.goal_env import reward_bounds as reward_bounds
 from .common.goal_env import reward_range as reward_range
 from .common.own_env import OwnGoalEnv as OwnGoalEnv
 from .common.own_env import make_own_env as make_own_env
-from .common.rendering.recording import record_episodes as record_episodes
+from .common.recording import record_episodes as record_episodes
 from .common.rendering.video import write_video as write_video
 from .gym.from_gym import GymGoalEnv as GymGoalEnv
 from .gym.from_gym import make_gym_env as make_gym_env

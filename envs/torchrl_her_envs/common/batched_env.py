@@ -12,16 +12,15 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase
 
-from torchrl_her_envs.common.goal_env import TaskTraits
+from torchrl_her_envs.common.goal_env import GoalEnv
 from torchrl_her_envs.common.seeding import block_keys
 
 _ENDS = ("done", "terminated", "truncated")
 _COUNTERS = ("step", "episode")  # of the state: what is counted and not physical
 
 
-class BatchedEnv(TaskTraits, EnvBase):
+class BatchedEnv(GoalEnv):
     """N environments whose state is a dataclass of tensors with N rows, and a random key for each of them.
 
     Subclasses say how episodes start (:meth:`_start_episodes`), what an action does (:meth:`_advance`),

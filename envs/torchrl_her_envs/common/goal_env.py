@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol, cast
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase
+
+from torchrl_her_envs.common.rendering.pictures import captioned
 
 Box = tuple[list[float], list[float]]  # the least and the greatest coordinates
 Names = str | Sequence[str]  # of an entry that an environment shows, or of several
@@ -18,74 +21,34 @@ INFO = "info"  # the entry of transitions that holds what rewards read besides g
 _HAIR = 1e-6  # width of the bounds of a fixed action, relative to its value
 
 
-class GoalEnv(Protocol):
-    """N environments with goals in one batch, besides all that TorchRL's ``EnvBase`` has.
+class GoalEnv(EnvBase):
+    """Base class of environments with goals: N of them in one batch, besides all that TorchRL's has.
 
-    ``max_steps`` is the length of the longest episode. ``compute_reward`` and ``compute_terminated``
-    map achieved and desired goals [..., g] to [..., 1]. ``set_seeds`` takes R seeds for R equal blocks
-    of environments, and each block then does the same as if it were alone. The other members are those
-    of :class:`TaskTraits`, which gives all of them a default.
+    Subclasses set ``max_steps`` and the specs, and say how goals are rewarded and how environments are
+    seeded. All other members have defaults to override.
+
+    Attributes:
+        max_steps: length of the longest episode.
+        missed_reward, achieved_reward: rewards of a missed and of an achieved goal.
+        dense_reward: whether there are many rewards besides these two.
     """
 
-    @property
-    def max_steps(self) -> int: ...
+    max_steps: int
+    missed_reward: float = -1.0
+    achieved_reward: float = 0.0
+    dense_reward: bool = False
 
-    @property
-    def observation_spec(self) -> Composite: ...
+    @abstractmethod
+    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """The reward of goals: [..., g] to [..., 1]."""
 
-    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor: ...
+    @abstractmethod
+    def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """Whether an episode ends there: goals [..., g] to [..., 1] of bool."""
 
-    def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor: ...
-
-    def set_seeds(self, seeds: Sequence[int]) -> None: ...
-
-    @property
-    def task_name(self) -> str: ...
-
-    @property
-    def info_keys(self) -> Sequence[NestedKey]: ...
-
-    @property
-    def goal_sigma(self) -> float: ...
-
-    @property
-    def starts_near_goals(self) -> bool: ...
-
-    @property
-    def can_render(self) -> bool: ...
-
-    @property
-    def continues_after_termination(self) -> bool: ...
-
-    @property
-    def batched(self) -> bool: ...
-
-    def layers(self) -> list[dict[str, Any]]: ...
-
-    def state_names(self) -> dict[str, list[int]]: ...
-
-    def action_limits(self) -> tuple[Tensor, Tensor]: ...
-
-    def goal_box(self) -> Box | None: ...
-
-    def picture_box(self) -> Box | None: ...
-
-    def regions(self) -> dict[str, Box]: ...
-
-    def trail_points(self) -> Tensor | None: ...
-
-    def render(
-        self,
-        worlds: int | Sequence[int] | None = None,
-        *,
-        size: int | None = None,
-        trail: Sequence[Tensor] = (),
-        caption: str = "",
-    ) -> Tensor: ...
-
-
-class TaskTraits:
-    """Base class with traits of an environment's task; its members are defaults to override."""
+    @abstractmethod
+    def set_seeds(self, seeds: Sequence[int]) -> None:
+        """Seeds R equal blocks of environments, each of which then does the same as if it were alone."""
 
     @property
     def task_name(self) -> str:
@@ -165,8 +128,7 @@ class TaskTraits:
             >>> make_env("hand_v1").state_names()["hole"], make_env("bit_flip", bits=2).state_names()
             ([9, 10], {'observation': [0, 1], 'desired_goal': [2, 3]})
         """
-        spec = cast(Any, self).observation_spec
-        seen, goal = (spec[key].shape[-1] for key in ("observation", "desired_goal"))
+        seen, goal = (self.observation_spec[key].shape[-1] for key in ("observation", "desired_goal"))
         return {"observation": list(range(seen)), "desired_goal": list(range(seen, seen + goal))}
 
     def action_limits(self) -> tuple[Tensor, Tensor]:
@@ -179,7 +141,7 @@ class TaskTraits:
             >>> make_env("hand_v1").action_limits()
             (tensor([-1., -1., -1.]), tensor([1., 1., 1.]))
         """
-        space = cast(Any, self).action_spec_unbatched.space
+        space = self.action_spec_unbatched.space
         return space.low, space.high
 
     def goal_box(self) -> Box | None:
@@ -239,8 +201,15 @@ class TaskTraits:
             Pictures [len(worlds), height, width, 3] of uint8; without the first dimension for one index.
 
         Raises:
-            ValueError: the environment gives no pictures.
+            ValueError: the environment gives no pictures, an index is out of range, or the machine lacks what
+                drawing needs.
         """
+        pictures = self._draw_worlds(choose_indices(self.batch_size[0], worlds), size)
+        pictures = [captioned(picture, caption) for picture in pictures]
+        return pictures[0] if isinstance(worlds, int) else torch.stack(pictures)
+
+    def _draw_worlds(self, worlds: Sequence[int], size: int | None) -> list[Tensor]:
+        """Pictures [height, width, 3] of some environments, without a caption; for :meth:`render`."""
         raise ValueError(f"{self.task_name} gives no pictures")
 
 
@@ -256,25 +225,11 @@ def goal_env(env: EnvBase) -> GoalEnv:
         >>> goal_env(TransformedEnv(make_env("hand_v1"), StepCounter())).max_steps
         50
     """
-    inner = first_below(env, is_goal_env)
-    if inner is None:
-        raise TypeError(f"expected an environment with goals, got {type(env).__name__}")
-    return cast(GoalEnv, inner)
-
-
-def first_below(env: EnvBase, fits: Callable[[object], bool]) -> object | None:
-    """The environment, or the first one below its transforms, for which ``fits`` is true; or None.
-
-    Example:
-        >>> from torchrl.envs import StepCounter, TransformedEnv
-        >>> from torchrl_her_envs import BitFlip, make_env
-        >>> env = make_env("bit_flip")
-        >>> first_below(TransformedEnv(env, StepCounter()), lambda env: isinstance(env, BitFlip)) is env
-        True
-    """
-    inner: object | None = env
-    while inner is not None and not fits(inner):
+    inner: object = env
+    while not isinstance(inner, GoalEnv):
         inner = getattr(inner, "base_env", None)
+        if inner is None:
+            raise TypeError(f"expected an environment with goals, got {type(env).__name__}")
     return inner
 
 
@@ -327,7 +282,7 @@ def info_rows(transitions: TensorDictBase, names: Iterable[str], shape: torch.Si
     return {name: own.expand(*shape, *own.shape[transitions.ndim :]) for name, own in entries.items()}
 
 
-def needs_info(env: TaskTraits) -> str:
+def needs_info(env: GoalEnv) -> str:
     """The message about an environment whose rewards read more than the goals, where only goals are given."""
     return (
         f"compute_reward of {env.task_name} reads {env.info_keys} of transitions: pass them, as in "
@@ -343,7 +298,7 @@ def reward_range(env: GoalEnv) -> tuple[float, float]:
         >>> reward_range(make_env("hand_v1"))
         (-1.0, 0.0)
     """
-    return getattr(env, "missed_reward", -1.0), getattr(env, "achieved_reward", 0.0)
+    return env.missed_reward, env.achieved_reward
 
 
 def reward_bounds(env: GoalEnv) -> tuple[float, float]:
@@ -354,9 +309,4 @@ def reward_bounds(env: GoalEnv) -> tuple[float, float]:
         >>> reward_bounds(make_env("hand_v1"))
         (-1.0, 0.0)
     """
-    return (-math.inf, math.inf) if getattr(env, "dense_reward", False) else reward_range(env)
-
-
-def is_goal_env(env: object) -> bool:
-    """Whether the class itself has what makes a GoalEnv: TransformedEnv passes on attributes it lacks."""
-    return all(hasattr(type(env), name) for name in ("compute_reward", "compute_terminated", "set_seeds"))
+    return (-math.inf, math.inf) if env.dense_reward else reward_range(env)

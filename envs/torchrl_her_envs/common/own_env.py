@@ -17,12 +17,10 @@ from torchrl.envs import EnvBase
 
 from torchrl_her_envs.common.goal_env import (
     INFO,
+    GoalEnv,
     Names,
-    TaskTraits,
     bounded_actions,
-    choose_indices,
     info_rows,
-    is_goal_env,
     needs_info,
 )
 from torchrl_her_envs.common.goal_rules import (
@@ -36,7 +34,7 @@ from torchrl_her_envs.common.goal_rules import (
     equal_with_info,
     warn_once,
 )
-from torchrl_her_envs.common.rendering.pictures import as_picture, captioned, resized
+from torchrl_her_envs.common.rendering.pictures import as_picture
 from torchrl_her_envs.common.seeding import as_seeds, block_keys
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -81,8 +79,8 @@ def make_own_env(
         options: for the function.
 
     Returns:
-        The environments themselves if they offer all of :class:`~torchrl_her_envs.TaskTraits` and what
-        :class:`~torchrl_her_envs.GoalEnv` asks for; otherwise an :class:`OwnGoalEnv` around them.
+        The environments themselves if they are :class:`~torchrl_her_envs.GoalEnv`; otherwise an
+        :class:`OwnGoalEnv` around them.
 
     Raises:
         ValueError: there is no such module or name, it gives something else, or lacks what is needed.
@@ -117,16 +115,14 @@ def make_own_env(
         block_keys(seed, count)  # whether they can be shared out
         share = count // len(seed)
         first = make_one(share, seed[0])
-        if (isinstance(first, TaskTraits) and is_goal_env(first)) or callable(
-            getattr(first, "set_seeds", None)
-        ):  # it takes several seeds
+        if callable(getattr(first, "set_seeds", None)):  # it takes several seeds
             first.close()
             return [make_one(count, seed)]
         return [first, *(make_one(share, own) for own in seed[1:])]
 
     envs = make_many(num_envs, seed)
     names = dict(zip(KEYS, (observation_key, achieved_goal_key, desired_goal_key), strict=True))
-    if isinstance(envs[0], TaskTraits) and is_goal_env(envs[0]):
+    if isinstance(envs[0], GoalEnv):
         plain = len(info_keys) == 0 and all(key == name for key, name in names.items())
         if termination not in ("auto", "watch") or achieved_reward is not None or not plain:
             raise ValueError(f"{path} says itself how it ends and rewards: leave out {', '.join(_OURS[1:])}")
@@ -211,7 +207,7 @@ class GoalRules:
     dense: bool
 
 
-class OwnGoalEnv(TaskTraits, EnvBase):
+class OwnGoalEnv(GoalEnv):
     """Environments of a user's own as one batch, with seeds, a time limit and ends at goals.
 
     They show ``observation``, ``achieved_goal`` and ``desired_goal``, vectors each, take a bounded or
@@ -225,7 +221,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
       argument, a dictionary of these entries [..., w] of the same step; for a virtual goal, too. Transitions
       have them as ``("info", KEY)``.
     - ``max_steps``, the length of an episode; the option of that name is needed if it is missing.
-    - ``layers()``, see :class:`~torchrl_her_envs.TaskTraits`.
+    - ``layers()``, see :class:`~torchrl_her_envs.GoalEnv`.
     - ``render()``, a picture [height, width, 3] of uint8, or [N, height, width, 3] of a batch.
     - ``set_seeds(seeds)`` of a batch, for R equal blocks; a batch without it has one seed.
 
@@ -242,6 +238,7 @@ class OwnGoalEnv(TaskTraits, EnvBase):
 
     Attributes:
         rules: how it rewards and ends.
+        goal_ends: what ends an episode at its goal, and what the environment was seen to do there.
 
     Raises:
         ValueError: something is missing or cannot be used; the message names it.
@@ -277,10 +274,11 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         self._make_specs(first)
         self._latest: list[TensorDictBase] = []
         self._steps = torch.zeros(count, 1, dtype=torch.int64)
-        untried = GoalEnds(name, own=None, tells_success=True)
-        self.rules = rules or GoalRules(ends=untried, missed_reward=-1.0, achieved_reward=0.0, dense=False)
         if rules is None:
-            self.rules = self._try_out(check_termination(termination), achieved_reward)
+            self.goal_ends = GoalEnds(name, own=None, tells_success=True)  # while it is tried
+            rules = self._try_out(check_termination(termination), achieved_reward)
+        self.rules, self.goal_ends, self.dense_reward = rules, rules.ends, rules.dense
+        self.missed_reward, self.achieved_reward = rules.missed_reward, rules.achieved_reward
         self.set_seeds(as_seeds(seed))
 
     # What goal environments offer
@@ -300,29 +298,9 @@ class OwnGoalEnv(TaskTraits, EnvBase):
         return callable(getattr(self._envs[0], "render", None))
 
     @property
-    def goal_ends(self) -> GoalEnds:
-        """Rule for the ends of episodes at goals, and what the environment was seen to do there."""
-        return self.rules.ends
-
-    @property
     def ends(self) -> Ends:
         """Rule for the ends of episodes, see :class:`~torchrl_her_envs.common.goal_rules.GoalEnds`."""
-        return self.rules.ends.rule
-
-    @property
-    def missed_reward(self) -> float:
-        """The least reward that was seen when the environment was tried."""
-        return self.rules.missed_reward
-
-    @property
-    def achieved_reward(self) -> float:
-        """The least reward of an achieved goal."""
-        return self.rules.achieved_reward
-
-    @property
-    def dense_reward(self) -> bool:
-        """Whether there are many rewards besides these two."""
-        return self.rules.dense
+        return self.goal_ends.rule
 
     def layers(self) -> list[dict[str, Any]]:
         own = getattr(self._envs[0], "layers", None)
@@ -363,28 +341,15 @@ class OwnGoalEnv(TaskTraits, EnvBase):
                 for env, key in zip(self._envs, keys[:: len(keys) // len(self._envs)], strict=True):
                     env.set_seed(key)
 
-    def render(
-        self,
-        worlds: int | Sequence[int] | None = None,
-        *,
-        size: int | None = None,
-        trail: Sequence[Tensor] = (),
-        caption: str = "",
-    ) -> Tensor:
-        """Pictures of the environments; see :meth:`torchrl_her_envs.TaskTraits.render`."""
+    def _draw_worlds(self, worlds: Sequence[int], size: int | None) -> list[Tensor]:
         if not self.can_render:
-            return super().render(worlds)
-        chosen = choose_indices(self.batch_size[0], worlds)
+            return super()._draw_worlds(worlds, size)
         if self._whole:
             everything = [picture for env in self._envs for picture in env.render()]
-            drawn = [everything[index] for index in chosen]
+            drawn = [everything[index] for index in worlds]
         else:
-            drawn = [self._envs[index].render() for index in chosen]
-        pictures = [as_picture(picture, self._name) for picture in drawn]
-        if size is not None:
-            pictures = [resized(picture, size) for picture in pictures]
-        pictures = [captioned(picture, caption) for picture in pictures]
-        return pictures[0] if isinstance(worlds, int) else torch.stack(pictures)
+            drawn = [self._envs[index].render() for index in worlds]
+        return [as_picture(picture, self._name, size=size) for picture in drawn]
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Closes all environments."""

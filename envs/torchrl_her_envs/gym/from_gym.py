@@ -19,10 +19,9 @@ from torchrl.envs import GymWrapper
 
 from torchrl_her_envs.common.goal_env import (
     INFO,
+    GoalEnv,
     Names,
-    TaskTraits,
     bounded_actions,
-    choose_indices,
     needs_info,
 )
 from torchrl_her_envs.common.goal_rules import (
@@ -38,7 +37,7 @@ from torchrl_her_envs.common.goal_rules import (
     say_once,
     warn_once,
 )
-from torchrl_her_envs.common.rendering.pictures import as_picture, captioned, resized
+from torchrl_her_envs.common.rendering.pictures import as_picture
 from torchrl_her_envs.common.seeding import as_seeds, block_keys
 from torchrl_her_envs.gym.check import (
     EPISODES,
@@ -152,7 +151,7 @@ def make_gym_env(
     return env
 
 
-class GymGoalEnv(TaskTraits, GymWrapper):
+class GymGoalEnv(GoalEnv, GymWrapper):
     """N environments of gymnasium's with goals, stepped by gymnasium and wrapped by TorchRL.
 
     Keys: ``observation``, ``achieved_goal``, ``desired_goal`` and ``reward`` in float32, ``action``
@@ -224,7 +223,7 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         self._layouts = {key: Layout(shown[key], f"{id}: {key}") for key in KEYS}
         super().__init__(envs, device="cpu", **kwargs)  # TorchRL's metaclass adds some
         self._reference_env = reference_env
-        self._limit = spec_of(reference_env).max_episode_steps or 0
+        self.max_steps = spec_of(reference_env).max_episode_steps or 0
         self._try_out(check_termination(termination), achieved_reward, info_keys)
         self.set_seeds(as_seeds(seed))
 
@@ -329,11 +328,6 @@ class GymGoalEnv(TaskTraits, GymWrapper):
             names, first = names | inner, first + layout.width
         return names
 
-    @property
-    def max_steps(self) -> int:
-        """Steps after which an episode is truncated."""
-        return self._limit
-
     def compute_reward(
         self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
     ) -> Tensor:
@@ -373,42 +367,15 @@ class GymGoalEnv(TaskTraits, GymWrapper):
         # Some environments hand their seed to generators that take 32 bits.
         self._next_seeds: list[int | None] = (block_keys(seeds, self.batch_size[0]) >> np.uint64(33)).tolist()
 
-    def render(
-        self,
-        worlds: int | Sequence[int] | None = None,
-        *,
-        size: int | None = None,
-        trail: Sequence[Tensor] = (),
-        caption: str = "",
-    ) -> Tensor:
-        """Pictures of the environments as they are now; they must be made with ``render_mode="rgb_array"``.
-
-        Args:
-            worlds: an index, several, or None for all environments of the batch.
-            size: of the longer side of each picture in pixels; as the environment draws it if None.
-            trail: not used.
-            caption: a line of text in each picture.
-
-        Returns:
-            Pictures [len(worlds), height, width, 3] of uint8; without the first dimension for one index.
-
-        Raises:
-            ValueError: they were made without pictures, an index is out of range, or the machine lacks what
-                drawing needs.
-        """
+    def _draw_worlds(self, worlds: Sequence[int], size: int | None) -> list[Tensor]:
         if not self.can_render:
             mode = self._reference_env.render_mode
             raise ValueError(f'pictures need render_mode="rgb_array", got {mode!r}')
-        chosen = choose_indices(self.batch_size[0], worlds)
         try:
-            drawn = self._drawn(chosen)
+            drawn = self._drawn(worlds)
         except Exception as error:  # whatever a renderer raises
             raise ValueError(cannot_draw(self.task_name, error)) from error
-        pictures = [as_picture(picture, self.task_name) for picture in drawn]
-        if size is not None:
-            pictures = [resized(picture, size) for picture in pictures]
-        pictures = [captioned(picture, caption) for picture in pictures]
-        return pictures[0] if isinstance(worlds, int) else torch.stack(pictures)
+        return [as_picture(picture, self.task_name, size=size) for picture in drawn]
 
     def _drawn(self, chosen: Sequence[int]) -> Sequence[Any]:
         if isinstance(self._env, SyncVectorEnv):

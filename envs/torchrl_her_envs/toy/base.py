@@ -14,8 +14,6 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical
 
 from torchrl_her_envs.common.batched_env import BatchedEnv
-from torchrl_her_envs.common.goal_env import choose_indices
-from torchrl_her_envs.common.rendering.pictures import captioned
 from torchrl_her_envs.common.seeding import as_seeds, uniform
 from torchrl_her_envs.toy.goals import LatticeGoals
 from torchrl_her_envs.toy.pictures import WIDTH, Sheet, draw
@@ -136,22 +134,9 @@ class ToyEnv(BatchedEnv):
     def can_render(self) -> bool:
         return True
 
-    def render(
-        self,
-        worlds: int | Sequence[int] | None = None,
-        *,
-        size: int | None = None,
-        trail: Sequence[Tensor] = (),
-        caption: str = "",
-    ) -> Tensor:
-        """Draws environments as they are now; see :meth:`torchrl_her_envs.TaskTraits.render`.
-
-        Pictures are three fifths as high as they are wide.
-        """
-        chosen = choose_indices(self.batch_size[0], worlds)
-        width = WIDTH if size is None else size
-        pictures = [captioned(draw(width, partial(self._draw, world=world)), caption) for world in chosen]
-        return pictures[0] if isinstance(worlds, int) else torch.stack(pictures)
+    def _draw_worlds(self, worlds: Sequence[int], size: int | None) -> list[Tensor]:
+        """Pictures three fifths as high as they are wide."""
+        return [draw(WIDTH if size is None else size, partial(self._draw, world=world)) for world in worlds]
 
     # What each toy environment says
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -90,7 +90,7 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
 
     Those of the task itself are returned, below a transform that scales them.
     """
-    actions = cast(EnvBase, goal_env(env)).action_spec_unbatched
+    actions = goal_env(env).action_spec_unbatched
     if isinstance(actions, Bounded) and bool((actions.low.isfinite() & actions.high.isfinite()).all()):
         return actions.low, actions.high
     one = torch.ones(actions.shape, device=actions.device)

@@ -177,7 +177,7 @@ def _facts(
     played: list[TensorDictBase], task: GoalEnv, seconds: float, actions: list[tuple[float, float]] | None
 ) -> Facts:
     rows = cast(TensorDictBase, torch.cat(cast(list[Tensor], played)))
-    achieved_reward = float(getattr(task, "achieved_reward", 0.0))
+    achieved_reward = task.achieved_reward
     rule = task_reward(cast(EnvBase, task))
 
     def meets(achieved: Outcome, desired: Tensor) -> Tensor:

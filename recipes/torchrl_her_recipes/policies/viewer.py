@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Self
 from torch import Tensor
 
 from torchrl_her_envs.common.goal_env import goal_env
-from torchrl_her_envs.common.rendering.live import LiveEpisodes
+from torchrl_her_envs.common.live import LiveEpisodes
 from torchrl_her_envs.common.rendering.pictures import beside, underlined
 from torchrl_her_envs.common.rendering.video import write_video
 from torchrl_her_envs.registry import get_task_spec

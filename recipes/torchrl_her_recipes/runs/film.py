@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_her_envs.common.goal_env import goal_env
-from torchrl_her_envs.common.rendering.recording import record_episodes
+from torchrl_her_envs.common.recording import record_episodes
 from torchrl_her_envs.common.rendering.video import write_video
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.components.assembly import eval_seeds

@@ -11,12 +11,12 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_her_envs import make_env
-from torchrl_her_envs.common.goal_env import TaskTraits, goal_env
+from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 
 _LENGTHS = ("observation", "achieved_goal", "desired_goal")
 
 
-class InUnits(TaskTraits, EnvBase):
+class InUnits(GoalEnv):
     """Environments with goals whose observations and goals are multiplied by a factor; actions are not.
 
     Args:
@@ -35,8 +35,7 @@ class InUnits(TaskTraits, EnvBase):
         self.reward_spec = env.reward_spec.clone()
         self.done_spec = env.full_done_spec.clone()
         for name in ("missed_reward", "achieved_reward", "dense_reward"):
-            if hasattr(task, name):
-                setattr(self, name, getattr(task, name))
+            setattr(self, name, getattr(task, name))
 
     @property
     def task_name(self) -> str:

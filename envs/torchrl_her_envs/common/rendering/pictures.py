@@ -17,8 +17,13 @@ _TEXT = 0.045  # of a picture's height: height of a caption
 _LINE, _LEAST_LINE, _MOST_LINE = 0.055, 11, 18  # of a line below a picture, of its width, and in pixels
 
 
-def as_picture(drawn: Any, name: str) -> Tensor:
+def as_picture(drawn: Any, name: str, *, size: int | None = None) -> Tensor:
     """A copy of what the method ``render`` of an environment gave, [height, width, 3] of uint8.
+
+    Args:
+        drawn: what it gave.
+        name: of the environment, for the message.
+        size: of the longer side in pixels; as it was drawn if None.
 
     Raises:
         ValueError: it is something else.
@@ -32,7 +37,7 @@ def as_picture(drawn: Any, name: str) -> Tensor:
     if picture.ndim != 3 or picture.shape[-1] != 3 or picture.dtype != np.uint8:
         got = f"{list(picture.shape)} of {picture.dtype}" if picture.ndim else drawn
         raise ValueError(f"render() of {name} must give a picture [height, width, 3] of uint8, got {got}")
-    return torch.from_numpy(picture)
+    return torch.from_numpy(picture) if size is None else resized(torch.from_numpy(picture), size)
 
 
 def resized(picture: Tensor, size: int) -> Tensor:

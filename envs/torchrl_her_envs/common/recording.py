@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_her_envs.common.rendering.live import LiveEpisodes, Policy
+from torchrl_her_envs.common.live import LiveEpisodes, Policy
 
 
 def record_episodes(

@@ -13,7 +13,7 @@ from torchrl_her_envs import ThrowingEnv, WorldConfig, make_env, record_episodes
 from torchrl_her_envs.common.rendering import colors
 from torchrl_her_envs.common.rendering.pictures import tile
 
-from ...gym.walk import LAST, walk
+from ..gym.walk import LAST, walk
 
 SIZE = 48
 SHORT = WorldConfig(max_steps=5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from torchrl_her_envs import make_env
-from torchrl_her_envs.common.rendering.live import LiveEpisodes
+from torchrl_her_envs.common.live import LiveEpisodes
 
 
 def test_each_step_is_one_of_all_environments_and_the_end_of_an_episode_is_its_own() -> None:
