@@ -22,6 +22,7 @@ from torchrl_her_recipes.components.curricula import CurriculumState, is_guided
 from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.learner import Agent, AgentShape, LearnerBuilder, Networks
 from torchrl_her_recipes.components.normalization import acting, make_norm
+from torchrl_her_recipes.config.groups import CurriculumConfig, RunConfig
 from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, Actions, LearnerConfig
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
@@ -51,9 +52,10 @@ def make_agent(
     cloning, shown = None, recipe.demonstrations
     if shown.in_batches and shown.bc_weight > 0:
         cloning = Cloning(weight=shown.bc_weight, q_filter=shown.q_filter)
-    shape = shape_of(recipe, env, curriculum, rewards=rewards)
+    shape = shape_of(recipe.task.name, recipe.run, env, curriculum, rewards=rewards)
     builder = find_builder(recipe.learner, shape, generators=generators, cloning=cloning)
-    actor, critics = _networks(builder, recipe, curriculum)  # the same on all devices
+    # The same on all devices.
+    actor, critics = _networks(builder, recipe.seeds, recipe.curriculum, curriculum)
     actor, critics = actor.to(device), [critic.to(device) for critic in critics]
     exploration = builder.exploration().to(device)
     options, runs = recipe.learner, shape.runs
@@ -61,7 +63,7 @@ def make_agent(
     norm = make_norm(options, shape.widths, runs=runs)
     norm = None if norm is None else norm.to(device)
     player = acting(actor, norm)
-    guide = _guide_of(player, recipe, state, generators)
+    guide = _guide_of(player, recipe.curriculum, state, generators)
     return Agent(
         actor=player,
         critic=critics[0],
@@ -87,17 +89,22 @@ def make_agent(
 
 
 def shape_of(
-    recipe: Recipe, env: EnvBase, curriculum: Curriculum | None, *, rewards: tuple[float, float] = (-1.0, 0.0)
+    task: str,
+    run: RunConfig,
+    env: EnvBase,
+    curriculum: Curriculum | None = None,
+    *,
+    rewards: tuple[float, float] = (-1.0, 0.0),
 ) -> AgentShape:
-    """Returns the inputs and outputs of a recipe's networks, as the environment has them."""
+    """Returns the inputs and outputs of the networks of some runs, as the task's environment has them."""
     in_keys = ("observation", "desired_goal") if curriculum is None else ("input",)
     return AgentShape(
-        task=recipe.task.name,
+        task=task,
         widths={key: env.observation_spec[key].shape[-1] for key in in_keys},
         action_spec=env.action_spec_unbatched,
         rewards=rewards,
-        runs=recipe.run.num_runs,
-        dtype=getattr(torch, recipe.run.dtype),
+        runs=run.num_runs,
+        dtype=getattr(torch, run.dtype),
     )
 
 
@@ -137,45 +144,47 @@ def make_player(
     recipe: Recipe, env: EnvBase, *, curriculum: Curriculum | None = None
 ) -> TensorDictModuleBase:
     """The greedy policy with its normalization, whose weights and statistics can be loaded."""
-    shape = shape_of(recipe, env, curriculum)
-    actor, _ = _networks(find_builder(recipe.learner, shape), recipe, curriculum)
+    shape = shape_of(recipe.task.name, recipe.run, env, curriculum)
+    actor, _ = _networks(find_builder(recipe.learner, shape), recipe.seeds, recipe.curriculum, curriculum)
     return acting(actor, make_norm(recipe.learner, shape.widths, runs=shape.runs))
 
 
 def _guide_of(
     policy: TensorDictModuleBase,
-    recipe: Recipe,
+    options: CurriculumConfig,
     state: CurriculumState | None,
     generators: Sequence[torch.Generator],
 ) -> GuidedExploration | None:
-    if state is None or not is_guided(recipe, state.curriculum):
+    if state is None or not is_guided(options, state.curriculum):
         return None
     guide = GuidedExploration(
         policy,
         state.curriculum,
-        share=recipe.curriculum.guided_share,
-        per=cast(Literal["episode", "step"], recipe.curriculum.guided_per),
+        share=options.guided_share,
+        per=cast(Literal["episode", "step"], options.guided_per),
         layer_key="layer" if state.progress.by_episode else None,
-        runs=recipe.run.num_runs,
+        runs=len(generators),
         generators=generators,
     )
     return guide.to(place_of(policy))
 
 
-def _networks(builder: LearnerBuilder, recipe: Recipe, curriculum: Curriculum | None) -> Networks:
+def _networks(
+    builder: LearnerBuilder, seeds: Sequence[int], options: CurriculumConfig, curriculum: Curriculum | None
+) -> Networks:
     """The actor and the critics; the weights of each run depend on its own seed alone."""
     with torch.random.fork_rng(devices=[]):
         alone = []
-        for seed in recipe.seeds:
+        for seed in seeds:
             torch.manual_seed(seed)
             single, others = builder.networks(1)
             alone.append([single, *others])
-        actor, critics = builder.networks(recipe.run.num_runs)
+        actor, critics = builder.networks(len(seeds))
     networks = [actor, *critics]
     for network, own in zip(networks, zip(*alone, strict=True), strict=True):
         network.load_state_dict(stack_runs([single.state_dict() for single in own]))
     if curriculum is not None:
-        alphas = [recipe.curriculum.alpha_actor, *[recipe.curriculum.alpha_critic] * len(critics)]
+        alphas = [options.alpha_actor, *[options.alpha_critic] * len(critics)]
         for network, alpha in zip(networks, alphas, strict=True):
             first = next(own for own in network.modules() if isinstance(own, StackedLinear))
             weight = first.weight.data

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 from tensordict.nn import TensorDictModuleBase
@@ -45,15 +46,13 @@ def build(recipe: Recipe) -> Components:
     recipe = resolved(recipe)
     processes = recipe.collection.processes > 0  # then those here only tell what the others are like
     task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
-    state, space = (
-        make_curriculum_state(recipe, task, eval_seeds(recipe, 0)),
-        goal_space(recipe, task, recipe.weights),
-    )
+    seeds = eval_seeds(recipe.seeds, 0)
+    state, space = make_curriculum_state(recipe, task, seeds), goal_space(recipe, task, recipe.weights)
     rewards, bounds = reward_range(goal_env(task)), reward_bounds(goal_env(task))
     shown = load_demonstrations(recipe, task, state)
-    played = partial(make_played_env, recipe, evaluation_envs(recipe), eval_seeds(recipe, 0))
+    played = partial(make_played_env, recipe, evaluation_envs(recipe), seeds)
     eval_env = played()
-    devices = devices_of(recipe)
+    devices = devices_of(recipe.learner, recipe.replay, recipe.run.num_runs)
     generators = make_generators(recipe.seeds, devices.replay)
     own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
     agent = make_agent(recipe, eval_env, own, rewards=bounds, state=state, device=devices.learner)
@@ -63,7 +62,7 @@ def build(recipe: Recipe) -> Components:
         progress = None if state is None else state.progress
         collector = ProcessCollector(recipe, agent.policy, progress, storing_device=devices.replay)
     else:
-        collector = make_collector(recipe, env, agent.policy, devices)
+        collector = make_collector(env, agent.policy, recipe.collection.steps_per_batch, devices)
     replay = partial(
         make_buffer, recipe, task, generators, rewards=rewards, space=space, state=state, norm=agent.norm
     )
@@ -97,14 +96,14 @@ def _shown(
 ) -> EnvBase:
     """The task's environments as the runs see them in training."""
     if state is not None:
-        begins = is_guided(recipe, state.curriculum)
+        begins = is_guided(recipe.curriculum, state.curriculum)
         return in_layers(task, state.progress, begins=begins, behavior=behavior, starts=starts)
     own = behavior if starts is None else starts  # a recipe has one of them at most
     return task if own is None else TransformedEnv(task, own, auto_unwrap=True)
 
 
 def make_collector(
-    recipe: Recipe, env: EnvBase, policy: TensorDictModuleBase, devices: Devices = ON_THE_CPU
+    env: EnvBase, policy: TensorDictModuleBase, steps_per_batch: int, devices: Devices = ON_THE_CPU
 ) -> Collector:
     """Runs a policy in the training environments, a few steps of each at a time."""
     if devices == ON_THE_CPU:
@@ -116,13 +115,13 @@ def make_collector(
     return Collector(
         env,
         policy,
-        frames_per_batch=env.batch_size.numel() * recipe.collection.steps_per_batch,
+        frames_per_batch=env.batch_size.numel() * steps_per_batch,
         total_frames=-1,
         **places,
         auto_register_policy_transforms=False,
     )
 
 
-def eval_seeds(recipe: Recipe, epoch: int) -> list[int]:
+def eval_seeds(seeds: Sequence[int], epoch: int) -> list[int]:
     """The seeds of an evaluation: for each run and epoch its own, and never one of training."""
-    return [Stream.EVALUATION + (seed << 20) + epoch for seed in recipe.seeds]
+    return [Stream.EVALUATION + (seed << 20) + epoch for seed in seeds]

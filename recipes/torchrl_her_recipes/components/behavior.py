@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,6 +18,7 @@ from torchrl_her_recipes.components.learner import Agent
 from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.components.weights import make_instructive
 from torchrl_her_recipes.config.behavior import IBS, Discover, Mega, Proposed, UniformAchieved
+from torchrl_her_recipes.config.learners import LearnerConfig
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
 
@@ -54,9 +55,15 @@ def make_behavior(
     values = partial(
         GoalValues, agent.loss, agent.actor, runs=runs, before_actor=pad, before_critic=agent.norm
     )
-    goals = partial(_goals, recipe, env, rewards, **given)
+    goals = partial(_goals, recipe.seeds, env, rewards, **given)
     behavior: BehaviorGoals = load_name(options.maker)(
-        options, goals, recipe=recipe, rewards=rewards, space=goal_space(recipe, env, options), values=values
+        options,
+        goals,
+        learner=recipe.learner,
+        runs=runs,
+        rewards=rewards,
+        space=goal_space(recipe, env, options),
+        values=values,
     )
     if state is not None:
         for run in range(runs):
@@ -67,14 +74,14 @@ def make_behavior(
 def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = (-1.0, 0.0)) -> BehaviorGoals:
     """The transform that lets episodes ask for any goals that are put into its memory, for evaluation."""
     memory = evaluation_envs(recipe)
-    return _goals(recipe, env, rewards, remember=False, real_share=0.0, candidates=1, memory=memory)
+    return _goals(recipe.seeds, env, rewards, remember=False, real_share=0.0, candidates=1, memory=memory)
 
 
-def _goals(recipe: Recipe, env: EnvBase, rewards: tuple[float, float], **options: Any) -> BehaviorGoals:
+def _goals(seeds: Sequence[int], env: EnvBase, rewards: tuple[float, float], **options: Any) -> BehaviorGoals:
     return BehaviorGoals(
         task_reward(env),
-        runs=recipe.run.num_runs,
-        generators=generators_of(recipe, Stream.PROPOSED_GOALS),
+        runs=len(seeds),
+        generators=generators_of(seeds, Stream.PROPOSED_GOALS),
         achieved_reward=rewards[1],
         continues_after_termination=goal_env(env).continues_after_termination,
         **options,
@@ -86,18 +93,25 @@ def make_uniform(_options: UniformAchieved, goals: MakeGoals, **_: Any) -> Behav
     return goals()
 
 
-def make_ibs(options: IBS, goals: MakeGoals, *, recipe: Recipe, space: Any, **_: Any) -> BehaviorGoals:
+def make_ibs(options: IBS, goals: MakeGoals, *, runs: int, space: Any, **_: Any) -> BehaviorGoals:
     """Proposes goals in proportion to q* - q, where q counts proposed goals."""
-    weights = [make_instructive(options, space=space) for _ in recipe.seeds]
+    weights = [make_instructive(options, space=space) for _ in range(runs)]
     return goals(weights=weights, update_on="proposed", candidates=options.candidates)
 
 
 def make_mega(
-    options: Mega, goals: MakeGoals, *, recipe: Recipe, rewards: Any, values: MakeValues, **_: Any
+    options: Mega,
+    goals: MakeGoals,
+    *,
+    learner: LearnerConfig,
+    runs: int,
+    rewards: Any,
+    values: MakeValues,
+    **_: Any,
 ) -> BehaviorGoals:
     """Proposes the rarest achieved goal that the critic believes in."""
-    cutoffs = scaled_cutoffs(options.cutoff, recipe.learner.gamma, rewards)
-    factors = [InverseDensity(), ValueCutoff(values(), runs=recipe.run.num_runs, **cutoffs)]
+    cutoffs = scaled_cutoffs(options.cutoff, learner.gamma, rewards)
+    factors = [InverseDensity(), ValueCutoff(values(), runs=runs, **cutoffs)]
     return goals(factors=factors, greedy=True, candidates=options.candidates)
 
 
@@ -114,10 +128,10 @@ def scaled_cutoffs(cutoff: float, gamma: float, rewards: tuple[float, float]) ->
 
 
 def make_discover(
-    options: Discover, goals: MakeGoals, *, recipe: Recipe, values: MakeValues, **_: Any
+    options: Discover, goals: MakeGoals, *, learner: LearnerConfig, runs: int, values: MakeValues, **_: Any
 ) -> BehaviorGoals:
     """Proposes the achievable and new goal that leads farthest towards the task's goal."""
-    several = getattr(recipe.learner, "critics", 1) > 1  # their disagreement shows what is new
-    score = DiscoverScore(values(), runs=recipe.run.num_runs)
+    several = getattr(learner, "critics", 1) > 1  # their disagreement shows what is new
+    score = DiscoverScore(values(), runs=runs)
     factors = [score] if several else [InverseDensity(), score]
     return goals(factors=factors, greedy=True, candidates=options.candidates)

@@ -27,6 +27,7 @@ from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
 from torchrl_her_recipes.components.envs import task_reward
 from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace
 from torchrl_her_recipes.components.memory import check_buffer_size
+from torchrl_her_recipes.config.groups import HindsightConfig, ReplayConfig
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
 
@@ -71,9 +72,9 @@ def make_buffer(
         devices: where the buffer is, and the learner that samples from it.
         capacity: in transitions of each run; the recipe's if None.
     """
-    check_buffer_size(recipe, env, devices.replay, not_stored=_NOT_STORED)
-    size = recipe.replay.buffer_size if capacity is None else capacity
-    task, runs = goal_env(env), len(generators)
+    size, task, runs = recipe.replay.buffer_size, goal_env(env), len(generators)
+    check_buffer_size(size, runs, env, devices.replay, not_stored=_NOT_STORED)
+    size = size if capacity is None else capacity
     rule = task_reward(env)
     counted = None
     if norm is not None:
@@ -84,7 +85,7 @@ def make_buffer(
         storage=PackedStorage(runs * size, device=devices.replay),
         writer=HERWriter(
             rule,
-            **_goals(recipe),
+            **(_goals(recipe.hindsight) if recipe.relabels else {"k": 0}),
             n_steps=recipe.hindsight.n_steps,
             gamma=recipe.learner.gamma,
             filter_achieved=recipe.filters,
@@ -98,7 +99,7 @@ def make_buffer(
             layers=_rules(state, rule),
             on_write=counted,
         ),
-        sampler=_make_sampler(recipe, generators, size, devices.replay),
+        sampler=_make_sampler(recipe.replay, recipe.learner.priority_power, generators, size, devices.replay),
         priority_key="td_error",
     )
     if devices.learner != devices.replay:
@@ -120,34 +121,33 @@ def _rules(state: CurriculumState | None, task: RewardFunction) -> list[LayerRul
     return [LayerRule(layer.reward_fn or task, layer.instructive) for layer in state.curriculum.layers]
 
 
-def _goals(recipe: Recipe) -> dict[str, Any]:
+def _goals(options: HindsightConfig) -> dict[str, Any]:
     """How many virtual goals are drawn from where, as options of the writer."""
-    own = recipe.hindsight
-    if not recipe.relabels:
-        return {"k": 0}
-    if own.goal_sources is not None:
-        return {"goal_sources": own.goal_sources}
-    return {"k": own.k, "strategy": own.strategy}
+    if options.goal_sources is not None:
+        return {"goal_sources": options.goal_sources}
+    return {"k": options.k, "strategy": options.strategy}
 
 
-def rising_beta(sampler: Sampler, recipe: Recipe) -> list[LinearScheduler]:
+def rising_beta(sampler: Sampler, end: float | None, epochs: int) -> list[LinearScheduler]:
     """Returns the schedule of ``priority_beta``, a step an epoch; none if it stays."""
-    end = recipe.replay.priority_beta_end
     if end is None or not isinstance(sampler, PrioritizedSampler):
         return []
-    return [LinearScheduler(sampler, "beta", end, max(1, recipe.run.epochs - 1))]
+    return [LinearScheduler(sampler, "beta", end, max(1, epochs - 1))]
 
 
 def _make_sampler(
-    recipe: Recipe, generators: Sequence[torch.Generator], capacity: int, device: torch.device
+    options: ReplayConfig,
+    power: float,
+    generators: Sequence[torch.Generator],
+    capacity: int,
+    device: torch.device,
 ) -> Sampler:
-    options = recipe.replay
     if options.sampler == "uniform":
         return RunsSampler(capacity, runs=len(generators), generators=generators, device=device)
-    # Alpha is Schaul's, for absolute TD errors; most of TorchRL's losses give their squares.
+    # Alpha is Schaul's, for absolute TD errors; most of TorchRL's losses give a power of them, the square.
     return RunsPrioritizedSampler(
         capacity,
-        alpha=options.priority_alpha / recipe.learner.priority_power,
+        alpha=options.priority_alpha / power,
         beta=options.priority_beta,
         runs=len(generators),
         generators=generators,

@@ -39,6 +39,7 @@ from torchrl_her_recipes.components.collection_worker import (
     share_of_envs,
 )
 from torchrl_her_recipes.components.devices import CPU
+from torchrl_her_recipes.config.groups import CollectionConfig
 from torchrl_her_recipes.config.imports import imported_modules
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -216,9 +217,9 @@ class ProcessCollector(BaseCollector):
         """Starts the processes, which takes seconds: each of them imports torch."""
         recipe, config = self.recipe, self.recipe.collection
         make = partial(make_worker_env, recipe, imported_modules())
-        frames = len(recipe.seeds) * share_of_envs(recipe) * config.steps_per_batch
+        frames = len(recipe.seeds) * share_of_envs(config) * config.steps_per_batch
         if config.ray is not None:
-            return _start_on_cluster(recipe, make, _to_send(self.policy), frames)
+            return _start_on_cluster(config, make, _to_send(self.policy), frames)
         _check_main_script(f"processes={config.processes}")
         kind = SyncWorkers if config.sync else AsyncWorkers
         with _interrupts_later():  # processes that were interrupted while they start would say so at length
@@ -284,10 +285,9 @@ def _check_main_script(asked: str) -> None:
 
 
 def _start_on_cluster(
-    recipe: Recipe, make: Callable[[], EnvBase], policy: TensorDictModuleBase, frames: int
+    config: CollectionConfig, make: Callable[[], EnvBase], policy: TensorDictModuleBase, frames: int
 ) -> Workers:
     """Starts the processes on the nodes of a Ray cluster."""
-    config = recipe.collection
     try:
         module = import_module("torchrl_her_recipes.components.collection_ray")  # needs an extra
     except ModuleNotFoundError as error:

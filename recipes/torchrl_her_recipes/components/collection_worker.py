@@ -24,13 +24,14 @@ from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import in_layers, is_guided, make_curriculum
 from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.config.groups import CollectionConfig
 from torchrl_her_recipes.config.imports import import_modules, permit_task
 from torchrl_her_recipes.config.recipe import Recipe
 
 
-def share_of_envs(recipe: Recipe) -> int:
+def share_of_envs(options: CollectionConfig) -> int:
     """How many environments of each run one process steps."""
-    return recipe.collection.num_envs // recipe.collection.processes
+    return options.num_envs // options.processes
 
 
 def make_worker_env(recipe: Recipe, modules: Sequence[str] = ()) -> EnvBase:
@@ -42,13 +43,13 @@ def make_worker_env(recipe: Recipe, modules: Sequence[str] = ()) -> EnvBase:
     """
     permit_task(recipe.task.name)
     import_modules(modules)
-    env = make_task_envs(recipe, share_of_envs(recipe), recipe.seeds)
+    env = make_task_envs(recipe, share_of_envs(recipe.collection), recipe.seeds)
     curriculum = make_curriculum(recipe, env)
     if curriculum is not None:
         env = in_layers(
             env,
             CurriculumProgress(curriculum, runs=recipe.run.num_runs),
-            begins=is_guided(recipe, curriculum),
+            begins=is_guided(recipe.curriculum, curriculum),
         )
     # Only ids tell there which environment a row belongs to: batches come one by one, or a node is replaced.
     if not recipe.collection.sync or recipe.collection.ray is not None:

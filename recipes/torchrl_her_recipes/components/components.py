@@ -144,18 +144,20 @@ class Components(Agent):
         weights = [*self.buffer.writer.goal_weights, *proposals]
         return Trainer(
             collector=self.collector,
-            buffer=self.buffer if shown is None else shown.mixed_with(self.buffer, recipe),
+            buffer=self.buffer
+            if shown is None
+            else shown.mixed_with(self.buffer, recipe.demonstrations.share, replay.batch_size),
             learner=self.learner(),
             schedules=[
                 self.exploration,
                 *(own for own in weights if isinstance(own, InstructiveWeights)),
-                *rising_beta(self.buffer.sampler, recipe),
+                *rising_beta(self.buffer.sampler, replay.priority_beta_end, recipe.run.epochs),
             ],
             runs=recipe.run.num_runs,
             epoch_frames=recipe.collection.epoch_frames,
             frames_per_update=recipe.collection.frames_per_update,
             warmup_frames=recipe.collection.warmup_frames,
-            batch_size=recipe.replay.batch_size,
+            batch_size=replay.batch_size,
             batches_per_sample=min(replay.batches_per_sample, replay.buffer_size // replay.batch_size),
             average=self.average,
         )

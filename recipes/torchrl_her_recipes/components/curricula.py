@@ -16,6 +16,7 @@ from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
 from torchrl_her_recipes.components.envs import evaluation_envs, judging, make_task_envs
 from torchrl_her_recipes.components.streams import Stream, generators_of
+from torchrl_her_recipes.config.groups import CurriculumConfig
 from torchrl_her_recipes.config.order import AllAtOnce, Teacher, Threshold
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
@@ -108,7 +109,7 @@ def make_curriculum_state(recipe: Recipe, env: EnvBase, seeds: Sequence[int]) ->
     curriculum, order = make_curriculum(recipe, env), recipe.order
     if curriculum is None:
         return None
-    generators = generators_of(recipe, Stream.LAYERS)
+    generators = generators_of(recipe.seeds, Stream.LAYERS)
     progress = load_name(order.maker)(order, curriculum, runs=recipe.run.num_runs, generators=generators)
     if not progress.by_episode:
         layer_env = in_layers(make_task_envs(recipe, evaluation_envs(recipe), seeds), progress)
@@ -169,9 +170,9 @@ def make_played_env(
     return env if behavior is None else TransformedEnv(env, behavior, auto_unwrap=True)
 
 
-def is_guided(recipe: Recipe, curriculum: Curriculum) -> bool:
+def is_guided(options: CurriculumConfig, curriculum: Curriculum) -> bool:
     """Whether some episodes are begun by what was learned in the layer below."""
-    return recipe.curriculum.guided_share > 0 and len(curriculum) > 1
+    return options.guided_share > 0 and len(curriculum) > 1
 
 
 def in_layers(

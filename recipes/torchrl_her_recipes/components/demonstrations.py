@@ -62,12 +62,11 @@ class RunDemonstrations:
         if self.starts is not None:
             self.starts.show(self.shown(run), run=run)
 
-    def mixed_with(self, buffer: TensorDictReplayBuffer, recipe: Recipe) -> Any:
-        """A buffer that gives their rows besides a run's own."""
+    def mixed_with(self, buffer: TensorDictReplayBuffer, share: float, batch_size: int) -> Any:
+        """A buffer in whose batches a share of the rows are theirs."""
         if self.buffer is None:
             return buffer
-        share = recipe.demonstrations.share
-        return MixedReplay(buffer, self.buffer, share=share, batch_size=recipe.replay.batch_size)
+        return MixedReplay(buffer, self.buffer, share=share, batch_size=batch_size)
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain data; that of the starts is a part of the collector's."""
@@ -111,7 +110,7 @@ def load_demonstrations(
             f"demonstrations.file={options.file} cannot be read ({str(error.strerror).lower()}): "
             f"`torchrl-her record {recipe.task.name} --out {options.file}` writes it"
         ) from error
-    _check(every, recipe, env)
+    _check(every, str(options.file), recipe.task.name, env)
     recorded = _scaled(every.first(options.episodes), env).to(getattr(torch, recipe.run.dtype))
     own = RunDemonstrations(recorded, env, state)
     if options.as_starts:
@@ -130,7 +129,7 @@ def load_demonstrations(
             [own.shown(run) for run in range(runs)],
             share=options.starts_share,
             runs=runs,
-            generators=generators_of(recipe, Stream.DEMONSTRATED_STARTS),
+            generators=generators_of(recipe.seeds, Stream.DEMONSTRATED_STARTS),
             width=options.starts_width,
             stride=options.starts_stride,
             threshold=options.starts_threshold,
@@ -139,11 +138,10 @@ def load_demonstrations(
     return own
 
 
-def _check(every: Demonstrations, recipe: Recipe, env: EnvBase) -> None:
+def _check(every: Demonstrations, file: str, task: str, env: EnvBase) -> None:
     """Refuses demonstrations of something else."""
-    options, task = recipe.demonstrations, recipe.task.name
     if every.task != task:
-        raise ValueError(f"{options.file} holds demonstrations of {every.task}, not of {task}")
+        raise ValueError(f"{file} holds demonstrations of {every.task}, not of {task}")
     base: Any = goal_env(env)
     if base.info_keys:
         raise ValueError(
@@ -154,7 +152,7 @@ def _check(every: Demonstrations, recipe: Recipe, env: EnvBase) -> None:
         width, own = base.observation_spec[key].shape[-1], every.rows[key].shape[-1]
         if width != own:
             raise ValueError(
-                f"{options.file} holds demonstrations of {task} with other options: {key!r} of width {own}, "
+                f"{file} holds demonstrations of {task} with other options: {key!r} of width {own}, "
                 f"not {width}"
             )
 

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.groups import ReplayConfig
+from torchrl_her_recipes.config.learners import LearnerConfig
 
 CPU = torch.device("cpu")
 _WORTH_IT = 1e9  # multiplications of a gradient step of all runs, from which on a GPU is worth its calls
@@ -29,13 +30,15 @@ class Devices(NamedTuple):
 ON_THE_CPU = Devices(CPU, CPU)
 
 
-def devices_of(recipe: Recipe) -> Devices:
-    """The devices that a recipe asks for."""
-    learner = _choose(recipe) if recipe.learner.device == "auto" else recipe.learner.device
-    replay = recipe.replay.device
+def devices_of(learner: LearnerConfig, replay: ReplayConfig, runs: int) -> Devices:
+    """The devices that options ask for; "auto" is a GPU if the gradient steps of all runs are worth it."""
+    device = learner.device
+    if device == "auto":
+        work = 6 * learner.hidden_weights * replay.batch_size * runs
+        device = "cuda" if torch.cuda.is_available() and work >= _WORTH_IT else "cpu"
     return Devices(
-        _find(learner, "learner.device", "auto"),
-        _find(learner if replay == "learner" else replay, "replay.device", "learner"),
+        _find(device, "learner.device", "auto"),
+        _find(device if replay.device == "learner" else replay.device, "replay.device", "learner"),
     )
 
 
@@ -47,12 +50,6 @@ def place_of(module: nn.Module) -> torch.device:
 def make_generators(seeds: Sequence[int], device: torch.device) -> list[torch.Generator]:
     """Sources of random numbers on a device, one for each run."""
     return [torch.Generator(device).manual_seed(seed) for seed in seeds]
-
-
-def _choose(recipe: Recipe) -> str:
-    """A GPU if there is one and the gradient steps are large enough for it."""
-    work = 6 * recipe.learner.hidden_weights * recipe.replay.batch_size * recipe.run.num_runs
-    return "cuda" if torch.cuda.is_available() and work >= _WORTH_IT else "cpu"
 
 
 def _find(name: str, option: str, word: str) -> torch.device:

@@ -79,8 +79,10 @@ def goal_space(recipe: Recipe, env: EnvBase, options: Group) -> GoalSpace | Kern
             "the goals that it would prefer are achieved without doing anything; choose a throwing task"
         )
     if _without_grid(recipe.task.name, options.estimator, goal_width(task)):
-        return _kernel(recipe, task, options, box)
-    return _sampled(recipe, task, options) if box is None else _given(recipe.task.name, task, options, *box)
+        return _kernel(recipe.task.name, task, options, box, _desired_goals(recipe, task))
+    if box is None:
+        return _sampled(task, options, _desired_goals(recipe, task))
+    return _given(recipe.task.name, task, options, *box)
 
 
 def goal_width(env: Any) -> int:
@@ -98,14 +100,12 @@ def _without_grid(task: str, choice: str, width: int) -> bool:
     return choice == "kernel" or (choice == "auto" and width > MOST_DIMENSIONS)
 
 
-def _kernel(recipe: Recipe, env: Any, options: SequentialIBS, box: Box | None) -> KernelSpace:
+def _kernel(task: str, env: Any, options: SequentialIBS, box: Box | None, goals: Tensor) -> KernelSpace:
     """Goals of the task. Its own share for sigma grows with the root of their width, as distances do."""
     if options.recent is not None:
         raise ValueError(
-            f"recent={options.recent} has no effect on {recipe.task.name}, where q is a kernel density: "
-            "leave it out"
+            f"recent={options.recent} has no effect on {task}, where q is a kernel density: leave it out"
         )
-    goals = _desired_goals(recipe, env).double()
     low, high = (goals.amin(0), goals.amax(0)) if box is None else map(goals.new_tensor, box)
     width = float((high - low).max()) or 1.0
     wider = math.sqrt(max(1.0, goals.shape[-1] / MOST_DIMENSIONS)) if options.sigma is None else 1.0
@@ -125,9 +125,8 @@ def _given(task: str, env: Any, options: Equal, low: Sequence[float], high: Sequ
     return GoalSpace(grid, target, _share(options, env) * max(b - a for a, b in zip(low, high, strict=True)))
 
 
-def _sampled(recipe: Recipe, env: Any, options: SequentialIBS) -> GoalSpace:
+def _sampled(env: Any, options: SequentialIBS, goals: Tensor) -> GoalSpace:
     """A box around goals of the task, half as wide again on each side."""
-    goals = _desired_goals(recipe, env).double()
     low, high = goals.amin(0), goals.amax(0)
     width = float((high - low).max()) or 1.0
     margin = torch.where(high > low, (high - low) / 2, width / 2)
@@ -137,15 +136,15 @@ def _sampled(recipe: Recipe, env: Any, options: SequentialIBS) -> GoalSpace:
 
 
 def _desired_goals(recipe: Recipe, env: Any) -> Tensor:
-    """Goals [n, g] as episodes have them."""
+    """Goals [n, g] of float64, as episodes have them."""
     distribution = getattr(env, "goal_distribution", None)
     if distribution is not None:
-        return distribution.sample(_SAMPLES, generator=torch.Generator().manual_seed(0))
+        return distribution.sample(_SAMPLES, generator=torch.Generator().manual_seed(0)).double()
     envs = make_task_envs(recipe, recipe.collection.num_envs, [Stream.GOAL_SPACE])
     resets = -(-_RESETS // recipe.collection.num_envs)
     goals = torch.cat([envs.reset()["desired_goal"] for _ in range(resets)])
     envs.close()
-    return goals
+    return goals.double()
 
 
 def _share(options: Equal, env: Any) -> float:

@@ -9,16 +9,15 @@ import torch
 from torchrl.envs import EnvBase
 
 from torchrl_her.replay_buffers.keys import in_root_and_next
-from torchrl_her_recipes.config.recipe import Recipe
 
 
 def check_buffer_size(
-    recipe: Recipe, env: EnvBase, device: torch.device, *, not_stored: Sequence[str] = ()
+    size: int, runs: int, env: EnvBase, device: torch.device, *, not_stored: Sequence[str] = ()
 ) -> None:
     """Refuses a replay buffer that is larger than the memory of its device."""
     step = env.fake_tensordict().exclude(*in_root_and_next(not_stored))
     row = sum(entry.numel() * entry.element_size() for entry in step.values(True, True)) // env.numel()
-    size, runs, there = recipe.replay.buffer_size, recipe.run.num_runs, memory_of(device)
+    there = memory_of(device)
     if size * runs * row > there:
         raise ValueError(
             f"buffer_size={size} needs {size * runs * row / 1e9:.0f} GB for num_runs={runs}, {row} bytes for "

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 
 import torch
 
 from torchrl_her_recipes.components.devices import CPU, make_generators
-from torchrl_her_recipes.config.recipe import Recipe
 
 
 class Stream(IntEnum):
@@ -20,6 +20,6 @@ class Stream(IntEnum):
     DEMONSTRATED_STARTS = (1 << 40) + (1 << 32)
 
 
-def generators_of(recipe: Recipe, stream: Stream) -> list[torch.Generator]:
-    """The sources of random numbers of a part, one for each run."""
-    return make_generators([stream + seed for seed in recipe.seeds], CPU)
+def generators_of(seeds: Sequence[int], stream: Stream) -> list[torch.Generator]:
+    """The sources of random numbers of a part, one for each run's seed."""
+    return make_generators([stream + seed for seed in seeds], CPU)

@@ -32,9 +32,10 @@ class Proposed(Behavior):
     """Base class: goals that were achieved before, in some of the episodes.
 
     The maker takes the options and ``goals``, which makes :class:`~torchrl_her.behavior.BehaviorGoals` from
-    ``weights``, ``factors`` and the like, and returns its result. By keyword it also takes ``recipe``,
-    ``rewards`` (of a missed and of an achieved goal), ``space`` (of the task's goals, for options of IBS) and
-    ``values``, which makes the :class:`~torchrl_her.behavior.GoalValues` of the agent.
+    ``weights``, ``factors`` and the like, and returns its result. By keyword it also takes ``learner`` (its
+    options), ``runs`` (their number), ``rewards`` (of a missed and of an achieved goal), ``space`` (of the
+    task's goals, for options of IBS) and ``values``, which makes the
+    :class:`~torchrl_her.behavior.GoalValues` of the agent.
     """
 
     real_share: float = option(

@@ -138,7 +138,7 @@ class Policy(TensorDictModuleBase):
             dtype=recipe.run.dtype,
             normalize_clip=recipe.learner.normalize_clip if recipe.learner.normalize else None,
             algorithm=recipe.hindsight.algo,
-            learner=find_learner(recipe.learner, shape_of(recipe, env, None)).name,
+            learner=find_learner(recipe.learner, shape_of(recipe.task.name, recipe.run, env)).name,
             seed=recipe.run.seed + chosen,
             frames=int(rows[-1]["frames"]),
             versions=present_versions(),

@@ -24,7 +24,7 @@ def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDic
     """Greedy episodes of each run, run after run, with starts and goals of their own in each epoch."""
     task, recipe = goal_env(env), components.recipe
     runs, episodes = recipe.run.num_runs, recipe.evaluation.episodes
-    task.set_seeds(eval_seeds(recipe, epoch))
+    task.set_seeds(eval_seeds(recipe.seeds, epoch))
     worlds = env.batch_size[0] // runs
     rounds = math.ceil(episodes / worlds)
     player = components.player

@@ -36,7 +36,7 @@ def film_policy(
         _film(player, env, out, run * worlds, shown)
     elif get_task_spec(recipe.task.name).for_pictures:
         try:
-            drawn = make_played_env(recipe, shown, eval_seeds(recipe, epoch), pictures=True)
+            drawn = make_played_env(recipe, shown, eval_seeds(recipe.seeds, epoch), pictures=True)
             with closing(drawn):
                 if goal_env(drawn).can_render:
                     _film(player, drawn, out, run * shown, shown)

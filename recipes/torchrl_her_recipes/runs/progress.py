@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from tqdm import tqdm
 
 from torchrl_her.trainers.trainer import Trainer
-from torchrl_her_recipes.config.recipe import Recipe
 
 
 class Progress:
@@ -18,11 +17,11 @@ class Progress:
     On a terminal it is a bar; where that goes into a file or to another program, a line for each epoch.
     """
 
-    def __init__(self, recipe: Recipe, trainer: Trainer, *, show: bool) -> None:
-        self.trainer, self.epochs = trainer, recipe.run.epochs
+    def __init__(self, trainer: Trainer, *, epochs: int, frames: int, show: bool) -> None:
+        self.trainer, self.epochs = trainer, epochs
         self.show, self.lines = show, show and not sys.stderr.isatty()
         self.bar = tqdm(
-            total=recipe.total_frames,
+            total=frames,
             initial=trainer.frames,
             unit="frames",
             disable=not show or self.lines,

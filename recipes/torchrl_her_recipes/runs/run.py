@@ -229,7 +229,7 @@ class _Run:
         threads = torch.get_num_threads()
         torch.set_num_threads(recipe.run.threads)
         torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
-        shown = Progress(recipe, trainer, show=progress)
+        shown = Progress(trainer, epochs=recipe.run.epochs, frames=recipe.total_frames, show=progress)
         interrupted = stopped = saved = False
         with soft_interrupt() as check, ExitStack() as opened:  # also while things are saved at the end
             for logger in loggers:

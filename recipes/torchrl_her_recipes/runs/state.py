@@ -44,7 +44,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
     """All parts of a run that have a state, by name, in the order in which they are loaded."""
     buffer, collector, state = components.buffer, components.collector, components.curriculum
     guide, generators, device = components.guide, components.generators, place_of(components.loss)
-    worlds = _worlds(components.env, components.recipe)
+    worlds = _worlds(components.env, components.recipe.collection.processes)
 
     def check_made_of(made_of: dict[str, str]) -> None:
         for name, value in _made_of(components).items():
@@ -127,15 +127,15 @@ def load_run_state(parts: dict[str, Any], state: dict[str, Any]) -> None:
 
 def seed_epoch(env: EnvBase, recipe: Recipe, trainer: Trainer) -> None:
     """Seeds environments whose state no checkpoint holds, so that a resumed run plays the same epoch."""
-    begins = trainer.epochs > 0 and not trainer.in_epoch
-    if begins and recipe.collection.processes == 0 and _worlds(env, recipe) is None:
+    begins, processes = trainer.epochs > 0 and not trainer.in_epoch, recipe.collection.processes
+    if begins and processes == 0 and _worlds(env, processes) is None:
         goal_env(env).set_seeds([derive_seed(seed, trainer.epochs) for seed in recipe.seeds])
 
 
-def _worlds(env: EnvBase, recipe: Recipe) -> BatchedEnv | None:
+def _worlds(env: EnvBase, processes: int) -> BatchedEnv | None:
     """The environment below all transforms, if it is one of ours and collects here."""
     worlds = goal_env(env)
-    return worlds if recipe.collection.processes == 0 and isinstance(worlds, BatchedEnv) else None
+    return worlds if processes == 0 and isinstance(worlds, BatchedEnv) else None
 
 
 def _made_of(components: Components) -> dict[str, str]:

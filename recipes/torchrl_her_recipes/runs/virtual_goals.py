@@ -47,7 +47,7 @@ def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> l
     widths = (env.observation_spec[key].shape[-1] for key in ("desired_goal", "observation"))
     number, (width, seen) = asking.memory.capacity, widths
     every = torch.zeros(components.recipe.run.num_runs, number, width)
-    for run, seed in enumerate(eval_seeds(components.recipe, epoch)):
+    for run, seed in enumerate(eval_seeds(components.recipe.seeds, epoch)):
         goals = _virtual_goals(components.buffer, components.curriculum, run, number, seed)
         found.append(len(goals) > 0)
         if found[-1]:

@@ -19,7 +19,7 @@ from ..small import SMALL, small
 
 
 def learner_of(recipe: Recipe, env: EnvBase) -> type[LearnerConfig]:
-    return find_learner(recipe.learner, shape_of(recipe, env, None))
+    return find_learner(recipe.learner, shape_of(recipe.task.name, recipe.run, env))
 
 
 @pytest.mark.parametrize(

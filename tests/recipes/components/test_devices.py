@@ -15,8 +15,8 @@ from torch.overrides import TorchFunctionMode
 
 from torchrl_her import FusedLearner, LossLearner, load_checkpoint
 from torchrl_her.trainers import GraphLearner
-from torchrl_her_recipes import Components, build, cli, load_policy, resume, run
-from torchrl_her_recipes.components.devices import devices_of
+from torchrl_her_recipes import Components, Recipe, build, cli, load_policy, resume, run
+from torchrl_her_recipes.components.devices import Devices, devices_of
 
 from ...emulated import emulated_device
 from ...emulated_graphs import emulated_graphs
@@ -162,14 +162,18 @@ def test_gradient_steps_do_not_wait_for_the_device() -> None:
         assert len(waits[2]) == len(waits[16]) == 9
 
 
+def devices_asked_for(recipe: Recipe) -> Devices:
+    return devices_of(recipe.learner, recipe.replay, recipe.run.num_runs)
+
+
 def test_the_replay_is_where_the_learner_is_if_nothing_else_is_asked_for(name: str) -> None:
-    assert {own.type for own in devices_of(small(**{"learner.device": name}))} == {name}
+    assert {own.type for own in devices_asked_for(small(**{"learner.device": name}))} == {name}
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_auto_is_the_cpu_where_there_is_no_gpu() -> None:
     large = small(num_runs=50, hidden=256, **{"learner.device": "auto"})
-    assert {own.type for own in devices_of(large)} == {"cpu"}
+    assert {own.type for own in devices_asked_for(large)} == {"cpu"}
 
 
 def test_what_auto_took_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

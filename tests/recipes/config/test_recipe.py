@@ -211,7 +211,7 @@ def test_sac_may_take_the_place_of_ddpg() -> None:
     components.actor = components.policy = actor
     components.critic, components.loss, components.target = None, loss, SoftUpdate(loss, tau=0.01)
     components.optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
-    components.collector = make_collector(components.recipe, components.env, actor)
+    components.collector = make_collector(components.env, actor, components.recipe.collection.steps_per_batch)
     rows = run(components, progress=False).rows
     assert rows[-1]["loss_qvalue"] > 0
     assert rows[-1]["loss_alpha"] != rows[0]["loss_alpha"]

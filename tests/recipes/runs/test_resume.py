@@ -163,7 +163,7 @@ def test_ctrl_c_saves_what_there_is(tmp_path: Path) -> None:
 def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_state, "_worlds", lambda _env, _recipe: None)
+    monkeypatch.setattr(run_state, "_worlds", lambda _env, _processes: None)
     recipe = small(epochs=2)
     run(press_ctrl_c(build(recipe), 25), tmp_path / "run", progress=False)
     held = load_checkpoint(tmp_path / "run" / "checkpoint.pt")["buffer"]["writer"]["held"]
