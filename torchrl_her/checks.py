@@ -1,4 +1,4 @@
-"""Checks of what users hand over: options that are whole numbers, and tensors that must be finite."""
+"""Checks of arguments: options that must be whole numbers, and tensors that must be finite."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from torch import Tensor
 
 
 def check_whole(*, least: int = 1, **options: object) -> None:
-    """Refuses options that are not whole numbers, or too small.
+    """Raises an error for options that are not whole numbers, or too small.
 
     Keyword Args:
         least: the smallest number that is allowed.
         **options: numbers by name.
 
     Raises:
-        ValueError: one of them cannot be; the message names it.
+        ValueError: an option is not a whole number or too small; the message names it.
 
     Example:
         >>> check_whole(runs=2, least=1)
@@ -32,13 +32,13 @@ def check_whole(*, least: int = 1, **options: object) -> None:
 
 
 def check_finite(tensors: Mapping[str, Tensor]) -> None:
-    """Refuses tensors that hold NaN or infinity.
+    """Raises an error for tensors that hold NaN or infinity.
 
     Their sums tell, in a twentieth of the time of ``isfinite`` over all. Sums of finite numbers may overflow:
     where one is not finite, each number is looked at.
 
     Args:
-        tensors: of any shapes and types, on one device, by what messages call them.
+        tensors: tensors of any shapes and types, on one device, by their names in messages.
 
     Raises:
         ValueError: one of them is not finite; the message names it.

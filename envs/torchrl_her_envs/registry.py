@@ -1,4 +1,4 @@
-"""All tasks by name. Importing this module loads no torch: only :func:`make_env` does, when it makes one."""
+"""All tasks by name. Importing this module does not import torch; :func:`make_env` does."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class TaskSpec:
     """Facts about a task that are known before its environment is made.
 
     Args:
-        name: what :func:`make_env` calls it; without a colon.
-        summary: one line for people.
+        name: name for :func:`make_env`, without a colon.
+        summary: one-line description for users.
         family: the tasks that it belongs to, such as ``"throwing"`` or ``"toy"``.
         make: the function or class that makes the environment, as ``"module:name"``; it is imported when
             it is first used. It takes ``num_envs``, ``seed``, the arguments and the options.
-        arguments: what it is always given, beyond the options.
+        arguments: arguments that it is always given, besides the options.
         options: all options that the task takes, with their defaults.
-        actions: which kind it has; None if only its environment tells.
+        actions: kind of its actions; None if only its environment can tell.
         takes_others: whether it may take further options, which are only known when it is made.
         for_pictures: options that let its environments give pictures, if they do not always.
 
@@ -56,7 +56,7 @@ _SPECS: dict[str, TaskSpec] = {}
 
 
 def register_task(spec: TaskSpec) -> None:
-    """Adds a task, which :func:`make_env` makes from then on.
+    """Registers a task for :func:`make_env`.
 
     Args:
         spec: its name, and how to make it.
@@ -80,7 +80,7 @@ def register_task(spec: TaskSpec) -> None:
 
 
 def task_names() -> list[str]:
-    """The names of all tasks, in the order in which they were registered.
+    """Returns the names of all tasks, in the order in which they were registered.
 
     Example:
         >>> task_names()[:2], task_names()[-1]
@@ -110,10 +110,10 @@ def get_task_spec(name: str) -> TaskSpec:
 
 
 def module_of(name: str) -> str:
-    """Returns the module, other than this package's, that the name of a task imports.
+    """Returns the user's module that making a task imports, from the task's name.
 
     Returns:
-        Its name, or nothing for tasks of this package and for what gymnasium itself knows.
+        Its name; empty for tasks of this package and for those that gymnasium has registered.
 
     Example:
         >>> module_of("my_module:make_env"), module_of("gym:my_module:MyEnv-v0"), module_of("hand_v0")
@@ -124,7 +124,7 @@ def module_of(name: str) -> str:
 
 
 def check_task(name: str) -> None:
-    """Raises a ValueError for a name that is no task's; it lists the tasks and suggests the nearest name.
+    """Raises a ValueError for an unknown task, which lists all tasks and suggests the nearest name.
 
     Whether gymnasium knows the ID of ``gym:ID``, or a module its function, is only found out when the
     environment is made.
@@ -151,8 +151,8 @@ def make_env(name: str, *, num_envs: int = 1, seed: int | Sequence[int] = 0, **o
         name: one of :func:`task_names`, ``gym:ID`` for an environment of gymnasium's, or
             ``module:function`` for a TorchRL environment of one's own; the module is imported.
         num_envs: number of environments.
-        seed: of all that is random; R seeds for R equal blocks of environments, each as if alone.
-        options: of the task (see :class:`TaskSpec`), for ``gym:ID`` those of
+        seed: seed of all that is random; R seeds for R equal blocks of environments, each as if alone.
+        options: options of the task (see :class:`TaskSpec`), for ``gym:ID`` those of
             :func:`~torchrl_her_envs.make_gym_env`, for ``module:function`` those of
             :func:`~torchrl_her_envs.make_own_env`.
 
@@ -174,7 +174,7 @@ def make_env(name: str, *, num_envs: int = 1, seed: int | Sequence[int] = 0, **o
 
 
 def check_options(spec: TaskSpec, options: Mapping[str, Any]) -> None:
-    """Raises a ValueError that names an option which a task does not take, and those that it takes.
+    """Raises a ValueError for an option that a task does not take, and lists its options.
 
     Example:
         >>> check_options(get_task_spec("treasure_hunt"), {"bits": 4})

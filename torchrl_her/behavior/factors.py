@@ -1,4 +1,4 @@
-"""Factors of how likely an achieved goal is to be proposed."""
+"""Factors of the probability that an achieved goal is proposed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Values = Callable[[Tensor, Tensor, Sequence[int]], Tensor]
 
 
 class GoalCandidates(NamedTuple):
-    """Goals of which one is proposed for each of m episodes that begin, run after run.
+    """Achieved goals from which one is proposed for each of m episodes that begin, run after run.
 
     Attributes:
         goals: [m, c, g], achieved goals.
@@ -39,13 +39,13 @@ class GoalCandidates(NamedTuple):
 
     @property
     def run(self) -> Tensor:
-        """[m] int64, the run of each episode."""
+        """The run of each episode, [m] of int64."""
         counts = torch.tensor(list(self.counts), device=self.goals.device)
         return torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
 
 
 class GoalFactor:
-    """Factor of how likely a goal is to be proposed. Subclass it for a measure of your own.
+    """Factor of the probability that a goal is proposed. Subclass it for a measure of your own.
 
     The base class finds all goals alike.
 
@@ -61,11 +61,11 @@ class GoalFactor:
     samples: int = 0
 
     def __call__(self, offers: GoalCandidates) -> Tensor:
-        """[m, c] of at least 0, or of bool."""
+        """Returns a factor for each candidate of m episodes: [m, c] of at least 0, or of bool."""
         return offers.goals.new_ones(offers.goals.shape[:-1])
 
     def record(self, ended: Tensor, achieved: Tensor) -> None:
-        """Told how many episodes with proposed goals have ended, and in how many the goal was achieved.
+        """Records how many episodes with proposed goals have ended, and in how many the goal was achieved.
 
         Args:
             ended: [R] int64, of each run.
@@ -77,7 +77,7 @@ class GoalFactor:
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave."""
+        """Restores the state that :meth:`state_dict` returned."""
 
 
 class Successes:
@@ -158,7 +158,7 @@ class InverseDensity(GoalFactor):
 
 
 class ValueCutoff(GoalFactor):
-    """Leaves out goals that the critics do not yet believe in: those of a value below a cut-off.
+    """Leaves out goals that the critics consider out of reach: those with a value below a cut-off.
 
     The cut-off is each run's own and moves with the success of its proposed goals: down, by a step for as
     many episodes as ``memory``, as long as more than ``high`` of them are achieved, and up, to its first
@@ -167,11 +167,11 @@ class ValueCutoff(GoalFactor):
     RL, 2020 (arXiv 2007.02832), section 3.3.
 
     Args:
-        values: of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
+        values: values of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
 
     Keyword Args:
         runs: R.
-        cutoff: where it begins; its greatest value.
+        cutoff: first value of the cut-off, which is also its greatest.
         floor: its least value.
         step: how far it moves in ``memory`` episodes.
         low, high: between which success it stays where it is.
@@ -247,7 +247,7 @@ class DiscoverScore(GoalFactor):
     With a single critic S is 0. :class:`InverseDensity` then takes its place.
 
     Args:
-        values: of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
+        values: values of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
 
     Keyword Args:
         runs: R.
@@ -313,5 +313,5 @@ class DiscoverScore(GoalFactor):
         self.alpha, self.successes.rate = state["alpha"].clone(), state["rate"].clone()
 
     def _bound(self, values: Tensor) -> Tensor:
-        """The optimistic value [m, c] of those of critics [m, c, E]."""
+        """Returns an optimistic value [m, c] of each goal, from the values [m, c, E] of E critics."""
         return values.mean(-1) + self.beta * values.std(-1, correction=0)

@@ -1,4 +1,4 @@
-"""The goals that were achieved lately, as a memory from which goals of new episodes are taken."""
+"""Memory of the goals that were achieved most recently, from which goals of new episodes are taken."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class AchievedGoals:
 
     @property
     def sizes(self) -> list[int]:
-        """How many goals each run has."""
+        """Number of goals that each run has stored."""
         return self._written.clamp(max=self.capacity).tolist()
 
     def add(self, goals: Tensor, observations: Tensor, *, which: Tensor | None = None) -> None:
-        """Adds goals of all runs; the oldest ones make room for them. Those that are not finite are left out.
+        """Adds goals of all runs; a full memory drops the oldest ones. Goals that are not finite are skipped.
 
         Args:
             goals: [N, g], R equal blocks in the order of the runs.
@@ -80,7 +80,7 @@ class AchievedGoals:
             own[flat[which]] = new[which].to(own)
 
     def draw(self, counts: Sequence[int], width: int, generators: Generators) -> Tensor:
-        """Draws goals, all alike, for episodes of several runs.
+        """Draws goals for episodes of several runs, all goals of a run being equally likely.
 
         Args:
             counts: R numbers of episodes; 0 where a run has no goals.
@@ -96,11 +96,11 @@ class AchievedGoals:
         return run.unsqueeze(1) * self.capacity + (numbers * size).long()
 
     def goals(self, index: Tensor) -> Tensor:
-        """The goals [..., g] at some places [...]."""
+        """Returns the goals [..., g] at the given positions [...] of the memory."""
         return self._at(0, index)
 
     def observations(self, index: Tensor) -> Tensor:
-        """The observations [..., o] in which the goals at some places [...] were achieved."""
+        """Returns the observations [..., o] in which the goals at the given positions [...] were achieved."""
         return self._at(1, index)
 
     def clear(self, run: int) -> None:
@@ -116,7 +116,7 @@ class AchievedGoals:
         return {"written": self._written.clone(), "capacity": self.capacity, "rows": rows}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave.
+        """Restores the state that :meth:`state_dict` returned.
 
         Raises:
             ValueError: it is of another number of runs, or of another capacity.

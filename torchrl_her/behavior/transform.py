@@ -24,7 +24,7 @@ UpdateOn = Literal["achieved", "proposed"]
 
 
 class BehaviorGoals(Transform):
-    """Asks for goals that were achieved before, in place of the task's own, in a share of the episodes.
+    """Replaces the task's own goal by one that was achieved before, in a fraction of the episodes.
 
     At a reset, some goals that the run has achieved are drawn, and one of them is proposed, in proportion to
 
@@ -55,7 +55,7 @@ class BehaviorGoals(Transform):
         reward_fn: maps (achieved, desired) goals to (reward, terminated), as the environment's own does.
 
     Keyword Args:
-        weights: of goals; for several runs a list, one of each. None for all alike.
+        weights: weights of goals; for several runs a list, one of each. None for all alike.
         factors: others by which the weights are multiplied.
         update_on: goals that the weights are updated on: ``achieved`` or ``proposed`` ones.
         remember: whether achieved goals are remembered; if not, ``memory.add`` says which goals there are.
@@ -64,16 +64,17 @@ class BehaviorGoals(Transform):
         candidates: goals of which one is proposed.
         memory: goals that each run remembers.
         runs: R.
-        generators: sources of random numbers, one of each run; None for torch's own, with one run only.
+        generators: generators, one for each run; None for torch's own, with one run only.
         achieved_reward: the reward of an achieved goal.
         continues_after_termination: whether the environment can be stepped further after it terminated an
             episode; if not, the episode is truncated there.
         observation_key, achieved_goal_key, desired_goal_key, reward_key, terminated_key, truncated_key,
             done_key: read, and all but the first two written.
-        real_goal_key: where the task's own goal is written.
-        proposed_key: where it is written whether the goal is a proposed one, bool [..., 1].
-        reached_key: where it is written whether a proposed goal was achieved in the episode, bool [..., 1].
-        layer_key: of the layer [..., 1] that an episode is played in, if it has one.
+        real_goal_key: key under which the task's own goal is written.
+        proposed_key: key under which a bool [..., 1] is written: whether the goal is a proposed one.
+        reached_key: key under which a bool [..., 1] is written: whether
+            a proposed goal was achieved in the episode.
+        layer_key: key of the layer [..., 1] that an episode is played in, if it has one.
         layer: the one in which goals are proposed.
 
     Attributes:
@@ -165,7 +166,7 @@ class BehaviorGoals(Transform):
         self._active = [True] * runs
 
     def set_active(self, active: bool, *, run: int = 0) -> None:
-        """Lets a run remember goals and propose them, or neither. IBS begins anew when it begins."""
+        """Switches the memory of goals and the proposals of a run on or off. Switching on restarts IBS."""
         if active and not self._active[run] and self.weights:
             self.weights[run].clear()
             if isinstance(own := self.weights[run], InstructiveWeights):
@@ -173,13 +174,13 @@ class BehaviorGoals(Transform):
         self._active[run] = active
 
     def success(self) -> Tensor:
-        """The success [R] of the proposed goals since the last call; NaN without any."""
+        """Returns the success rate [R] of the goals proposed since the last call; NaN if there were none."""
         rate = self.achieved.double() / self.ended.double()
         self.achieved, self.ended = torch.zeros_like(self.achieved), torch.zeros_like(self.ended)
         return rate
 
     def get_extra_state(self) -> dict[str, Any]:
-        """All that it knows, as tensors and plain data: a part of ``state_dict()``."""
+        """Returns the transform's whole state as tensors and plain data; it is a part of ``state_dict()``."""
         return {
             "memory": self.memory.state_dict(),
             "weights": [own.state_dict() for own in self.weights],
@@ -191,7 +192,7 @@ class BehaviorGoals(Transform):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Puts back what :meth:`get_extra_state` gave.
+        """Restores the state that :meth:`get_extra_state` returned.
 
         Raises:
             ValueError: it is that of another number of runs, or of other weights and factors.
@@ -249,10 +250,10 @@ class BehaviorGoals(Transform):
         before = self._get(next_tensordict, self.reward_key)
         ended = self._get(next_tensordict, self.terminated_key)
         fell = ended & (before < self.achieved_reward)
-        if bool(fell.any()):  # it ends so for any goal, unless the task's own goal has ended it
+        if bool(fell.any()):  # such an end holds for any goal, unless the task's own goal has caused it
             own_reward, own_end = call_reward(self.reward_fn, outcome, real)
             fell = fell & ~own_end
-            reward = reward + (before - own_reward).clamp(max=0.0) * fell  # and costs so much for any goal
+            reward = reward + (before - own_reward).clamp(max=0.0) * fell  # and its cost does, too
         reached = self._get(tensordict, reached_key) | (proposed & (reward >= self.achieved_reward))
         terminated = torch.where(proposed, terminated | fell, ended)
         done = terminated
@@ -286,7 +287,7 @@ class BehaviorGoals(Transform):
     # The work
 
     def _takes_part(self, tensordict: TensorDictBase, goals: Tensor) -> Tensor | None:
-        """The environments [N] in which goals are remembered and proposed; None for all."""
+        """Returns which environments [N] store and propose goals; None if all do."""
         part = None
         if not all(self._active):
             active = torch.tensor(self._active, device=goals.device)
@@ -307,7 +308,7 @@ class BehaviorGoals(Transform):
             self._weights_of_runs().update(goals, range(self.runs), self._counts(part, len(achieved)))
 
     def _propose(self, tensordict: TensorDictBase, begins: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Which of the environments [N] get a proposed goal, and these goals [m, g]."""
+        """Returns which of the environments [N] get a proposed goal, and these goals [m, g]."""
         part = self._takes_part(tensordict, begins)
         chosen = begins if part is None else begins & part
         known = torch.tensor([size > 0 for size in self.memory.sizes], device=begins.device)
@@ -339,7 +340,7 @@ class BehaviorGoals(Transform):
                 ),
             )
         goals = offers.goals.take_along_dim(place.unsqueeze(-1), 1).squeeze(1)
-        if not bool(valid.all()):  # then the task's own goal stays
+        if not bool(valid.all()):  # the others keep the task's own goal
             chosen, goals = chosen.index_put((chosen.clone(),), valid), goals[valid]
             counts = self._counts(chosen, len(begins))
         if self.weights and self.update_on == "proposed":
@@ -347,7 +348,7 @@ class BehaviorGoals(Transform):
         return chosen, goals
 
     def _sample(self, counts: Sequence[int]) -> Sequence[Tensor]:
-        """Some of the goals of each run that has episodes, as many as a factor asks for."""
+        """Draws goals of each run that has episodes, as many as the most demanding factor needs."""
         number = max((factor.samples for factor in self.factors), default=0)
         own = [min(1, count) for count in counts]
         if number == 0:
@@ -356,7 +357,7 @@ class BehaviorGoals(Transform):
         return [part.flatten(0, 1) for part in goals.split(own)]
 
     def _likelihood(self, offers: GoalCandidates) -> Tensor:
-        """How likely each goal is to be proposed, [m, c]."""
+        """Returns the likelihood [m, c] that each goal is proposed."""
         likelihood = offers.goals.new_ones(offers.goals.shape[:-1])
         if self.weights and not self.weights[0].alike:
             own = self._weights_of_runs()(offers.goals, range(self.runs), offers.counts)
@@ -366,7 +367,7 @@ class BehaviorGoals(Transform):
         return likelihood
 
     def _count(self, ended: Tensor, achieved: Tensor) -> None:
-        """Notes which episodes with proposed goals have ended, and how."""
+        """Counts the episodes with proposed goals that have ended, and those that achieved their goal."""
         if not bool(ended.any()):
             return
         counts = [own.reshape(self.runs, -1).sum(1) for own in (ended, ended & achieved)]
@@ -380,7 +381,7 @@ class BehaviorGoals(Transform):
         return type(self.weights[0]).of_runs(self.weights)
 
     def _counts(self, which: Tensor | None, rows: int) -> list[int]:
-        """How many of the environments are of each run."""
+        """Returns the number of the given environments that belong to each run."""
         if which is None:
             return [rows // self.runs] * self.runs
         return which.view(self.runs, -1).sum(1).tolist()
@@ -393,5 +394,5 @@ class BehaviorGoals(Transform):
 
 
 def _rows(entry: Tensor) -> Tensor:
-    """An entry [..., n] as [N, n], also that of a single environment."""
+    """Returns an entry [..., n] in the shape [N, n], also if there is a single environment."""
     return entry.reshape(-1, entry.shape[-1])

@@ -1,4 +1,4 @@
-"""Values of goals by a loss's own networks: how well each can be achieved from where an episode begins."""
+"""Values of goals from the networks of a loss: how well each goal can be achieved from an episode's start."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ Prepare = Callable[[TensorDictBase], TensorDictBase]
 
 
 class GoalValues:
-    """Values of goals, [m, c, E] of E critics, for what is observed and goals that could be asked for.
+    """Computes the values [m, c, E] that E critics give to candidate goals, from the first observations.
 
     The value is that of the greedy action. With rewards of -1 until the goal is achieved, a goal that takes d
     steps has the value -(1 - gamma^d) / (1 - gamma).
 
     Args:
-        loss: of TorchRL, whose critics are asked; see :func:`~torchrl_her.objectives.critic_values`.
+        loss: loss of TorchRL, whose critics are asked; see :func:`~torchrl_her.objectives.critic_values`.
         actor: the greedy policy.
 
     Keyword Args:
@@ -32,7 +32,7 @@ class GoalValues:
             for example :class:`~torchrl_her.ZeroPad`.
         before_critic: called with them before the critics; for example
             :class:`~torchrl_her.modules.RunningNorm`.
-        observation_key, desired_goal_key: of what the networks see.
+        observation_key, desired_goal_key: keys of what the networks see.
 
     Raises:
         ValueError: the loss has no critics that are known.
@@ -96,7 +96,7 @@ class GoalValues:
 
 
 def _blocks(counts: Sequence[int], device: torch.device) -> Tensor:
-    """Positions of rows [R * n], as R equal blocks; shorter ones are padded with the first row of all.
+    """Returns positions of rows as R equal blocks [R * n]; shorter blocks are padded with row 0.
 
     Example:
         >>> _blocks([1, 2], torch.device("cpu")).tolist()
@@ -110,6 +110,6 @@ def _blocks(counts: Sequence[int], device: torch.device) -> Tensor:
 
 
 def _inside(counts: Sequence[int], device: torch.device) -> Tensor:
-    """Which of the padded positions are rows: [R * n] of bool."""
+    """Returns which of the padded positions are rows, [R * n] of bool."""
     step = torch.arange(max(counts), device=device)
     return (step < torch.tensor(list(counts), device=device).unsqueeze(1)).flatten()

@@ -1,4 +1,4 @@
-"""Exploring by what was learned before: episodes that begin as the layer below has learned it."""
+"""Exploration guided by the policy of the layer below, which plays the beginning of some episodes."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ class GuidedExploration(TensorDictModuleBase):
         curriculum: the layers.
 
     Keyword Args:
-        share: of the episodes that are begun so; of those above the first layer, if episodes have layers.
+        share: fraction of episodes that are guided; of those above the first layer, if episodes have layers.
         per: whether guidance is drawn for each ``"episode"`` or for each ``"step"``.
         runs: R; the weights of R runs are stacked, along the first dimension of each parameter.
-        generators: sources of the random numbers, one for each run, or None for torch's own.
-        layer_key: of the layer [..., 1] that each episode is played in; None if runs have layers.
-        state_key, input_key, action_key, init_key: of the state vector, which is read, of what the policy
-            reads and writes, and of the flag at the beginning of an episode.
+        generators: generators, one for each run, or None for torch's own.
+        layer_key: key of the layer [..., 1] that each episode is played in; None if runs have layers.
+        state_key, input_key, action_key, init_key: keys of the state vector, which is read, of what the
+            policy reads and writes, and of the flag at the beginning of an episode.
 
     Attributes:
         layer: [R], which layer's policy begins a run's episodes; -1 as long as there is none. It does not
@@ -107,7 +107,7 @@ class GuidedExploration(TensorDictModuleBase):
             self.module = deepcopy(policy).requires_grad_(False)
         else:
             self.in_keys.append(layer_key)
-            self._policy = (policy,)  # not a module of this one: its weights are those of the policy before
+            self._policy = (policy,)  # not a submodule: its weights are copies of the policy's earlier ones
         self.curriculum, self.share, self.per = curriculum, share, per
         self.generators = [None] * runs if generators is None else list(generators)
         self.register_buffer("layer", torch.full((runs,), -1))
@@ -124,14 +124,14 @@ class GuidedExploration(TensorDictModuleBase):
 
     @torch.no_grad()
     def follow(self, policy: TensorDictModuleBase, layer: int, *, run: int = 0) -> None:
-        """Takes over the weights of a run that has learned a layer.
+        """Copies the current weights of a run that has learned a layer into the guiding policy.
 
         Args:
             policy: like the one that this was made with.
-            layer: which one.
+            layer: index of the layer.
 
         Keyword Args:
-            run: which one.
+            run: index of the run.
         """
         runs = len(self.generators)
         learned = policy.state_dict()
@@ -141,7 +141,7 @@ class GuidedExploration(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Replaces the actions of those environments that are guided.
+        """Replaces the actions of the environments that are guided.
 
         Raises:
             KeyError: an entry is missing.
@@ -171,17 +171,17 @@ class GuidedExploration(TensorDictModuleBase):
         rows = TensorDict({self.input_key: seen}, tensordict.batch_size)
         own = tensordict.get(action_key)
         acts = guided >= 0 if own.ndim == guided.ndim else (guided >= 0).squeeze(-1)
-        # Greedy: whether it is asked at all depends on the other runs, so it must not draw for this one.
+        # Greedy: whether it is called depends on other runs, so it must not draw numbers for this one.
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             action = self.guide(rows).get(action_key)
         return tensordict.set(action_key, torch.where(acts, action, own))
 
     def _begin(self, begun: Tensor, top: Tensor | None) -> Tensor:
-        """Draws which of the episodes that begin are guided; the others are as they were."""
-        known = self.guided is not None and self.guided.dtype == torch.int64  # once these were flags
+        """Draws which of the episodes that begin are guided; episodes under way stay as they are."""
+        known = self.guided is not None and self.guided.dtype == torch.int64  # older states have flags here
         if self.guided is None or not known or self.guided.shape != begun.shape:
             self.guided = torch.full(begun.shape, -1, device=begun.device)
-        self.guided = self.guided.to(begun.device)  # it may have come with a checkpoint
+        self.guided = self.guided.to(begun.device)  # the tensor may have been loaded from a checkpoint
         runs = len(self.generators)
         tops = [None] * runs if top is None else list(top.chunk(runs))
         blocks = zip(self.guided.chunk(runs), begun.chunk(runs), tops, strict=True)
@@ -189,7 +189,7 @@ class GuidedExploration(TensorDictModuleBase):
             blocks, self.layer.tolist(), self.generators, strict=True
         ):
             first = layer if own is None else 0
-            if first >= 0 and bool(new.any()):  # the others draw nothing, as when they are alone
+            if first >= 0 and bool(new.any()):  # without a start, a run draws nothing
                 drawn = torch.rand(new.shape, generator=generator, device=new.device) < self.share
                 drawn = drawn if own is None else drawn & (own > 0)
                 guided.copy_(torch.where(new, torch.where(drawn, first, -1), guided))

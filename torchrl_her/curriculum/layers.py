@@ -1,4 +1,4 @@
-"""CHER: what each layer of a curriculum sees and wants, and which layer each run is in.
+"""CHER: the observation and the goal of each layer of a curriculum, and the layer that each run is in.
 
 After chapter 6 (Curriculum HER) of the thesis that the method is from. The transforms that apply
 this to environments and to replay buffers are :class:`~torchrl_her.StateToObs` and
@@ -33,12 +33,12 @@ class CurriculumLayer:
         name: for messages and reports.
         observation, achieved_goal, desired_goal: indices into the state vector, or names for them that
             :class:`~torchrl_her.Curriculum` is given.
-        constant_goal: in place of ``desired_goal`` the same goal for all episodes, as a gap in a wall; in the
+        constant_goal: one goal for all episodes, as a gap in a wall, in place of ``desired_goal``; in the
             unit of the achieved goal.
         threshold: the goal is achieved at distances below this, in the unit of the state. The last layer,
             which is the environment's own task, needs none: relabeled goals then have the reward function
             that the writer was made with.
-        rewards: of a missed and of an achieved goal, in layers below the last.
+        rewards: rewards of a missed and of an achieved goal, in layers below the last.
         instructive: whether IBS weights apply in this layer.
 
     Raises:
@@ -81,7 +81,7 @@ class CurriculumLayer:
 
     @cached_property  # the same function for all runs in a layer, so that a writer can relabel them at once
     def reward_fn(self) -> RewardFunction | None:
-        """Reward of the layer's goals; None without a threshold."""
+        """Reward function of the layer's goals; None without a threshold."""
         if self.threshold is None:
             return None
         missed, achieved = self.rewards
@@ -95,14 +95,14 @@ class CurriculumLayer:
             raise ValueError(f"layer {self.name!r}: give desired_goal or constant_goal, got both")
 
     def _check_indices(self) -> None:
-        """The checks that need no width of the state, once all names are resolved."""
+        """Checks the indices of a layer whose names are resolved, except against the width of the state."""
         for key in _LISTS:
             entries = getattr(self, key)
             if min(entries, default=0) < 0:
                 raise ValueError(f"layer {self.name!r}: {key} must have indices of at least 0, got {entries}")
             if len(set(entries)) < len(entries):
                 raise ValueError(f"layer {self.name!r}: {key} must have each index once, got {entries}")
-        for key in ("observation", "achieved_goal"):  # these two usually share entries
+        for key in ("observation", "achieved_goal"):  # observation and achieved goal usually share entries
             shared = sorted(set(self.desired_goal) & set(getattr(self, key)))
             if shared:
                 raise ValueError(
@@ -126,8 +126,8 @@ class Curriculum:
     hole].
 
     Args:
-        layers: one or more.
-        state_width: of the state vector, the real observation with the real goal behind it.
+        layers: layers in the order of training, one or more.
+        state_width: width of the state vector, the real observation with the real goal behind it.
 
     Keyword Args:
         names: the indices into the state that names in the layers' lists stand for.
@@ -201,7 +201,7 @@ class Curriculum:
         return len(self.layers)
 
     def extend(self, state: Tensor) -> Tensor:
-        """States [..., state_width] with the zero and the constant goals behind them, which layers refer to.
+        """Appends a zero and the constant goals, to which layers refer, to states [..., state_width].
 
         Example:
             >>> gap = CurriculumLayer(
@@ -250,7 +250,7 @@ class Curriculum:
 
 
 def _resolve(layer: CurriculumLayer, names: Mapping[str, Sequence[int]]) -> CurriculumLayer:
-    """The layer with indices in place of names, and all checks made."""
+    """Returns a layer with indices in place of names, checked on its own."""
 
     def indices(key: str) -> list[int]:
         found: list[int] = []
@@ -267,7 +267,7 @@ def _resolve(layer: CurriculumLayer, names: Mapping[str, Sequence[int]]) -> Curr
 
 
 class CurriculumProgress:
-    """Which layer each of R independent runs is in, and its recent successes there.
+    """Progress of R independent runs: the layer that each is in, and its recent successes there.
 
     A run moves to the next layer when the mean of its last ``window`` samples of success reaches the
     threshold. The window is then cleared, so that samples of earlier layers never count. The last layer has
@@ -324,16 +324,16 @@ class CurriculumProgress:
         self.layers = (0,) * runs
         self._successes: list[list[float]] = [[] for _ in range(runs)]
         self._expert = [False] * runs
-        self._evaluations = [0] * runs  # in the present layer
+        self._evaluations = [0] * runs  # evaluations in the present layer
 
     @property
     def layer(self) -> Tensor:
-        """[R] of int64, a copy: :meth:`set_layer` changes it."""
+        """The layer of each run, [R] of int64. It is a copy; :meth:`set_layer` moves a run."""
         return torch.tensor(self.layers)
 
     @property
     def expert(self) -> Tensor:
-        """[R] of bool: whether the run has ever reached the threshold in the last layer."""
+        """Whether each run has ever reached the threshold in the last layer, [R] of bool."""
         return torch.tensor(self._expert)
 
     @property
@@ -343,11 +343,11 @@ class CurriculumProgress:
 
     @property
     def evaluations(self) -> list[int]:
-        """How often each run was evaluated in its present layer."""
+        """Number of evaluations of each run in its present layer."""
         return list(self._evaluations)
 
     def mean_layer(self, run: int) -> float:
-        """The layer that a run's episodes are played in, on average."""
+        """Mean index of the layers in which a run's episodes are played."""
         return float(self.layers[self._check_run(run)])
 
     def layer_of(self, run: int) -> CurriculumLayer:
@@ -355,7 +355,7 @@ class CurriculumProgress:
         return self.curriculum.layers[self.layers[self._check_run(run)]]
 
     def set_layer(self, run: int, layer: int) -> None:
-        """Moves a run by hand, and clears its window.
+        """Moves a run to a layer, and clears its window of successes.
 
         Raises:
             ValueError: there is no such run or layer.
@@ -367,7 +367,7 @@ class CurriculumProgress:
         self._successes[run], self._expert[run], self._evaluations[run] = [], False, 0
 
     def record(self, successes: Tensor) -> Tensor:
-        """Adds samples of all runs; see :meth:`record_run`.
+        """Adds samples of success of all runs; see :meth:`record_run`.
 
         Args:
             successes: [R, n], each in [0, 1] (or of bool), the earliest first.
@@ -377,11 +377,11 @@ class CurriculumProgress:
         """
         if successes.ndim != 2 or len(successes) != self.runs:
             raise ValueError(f"successes must be [{self.runs}, n], got {list(successes.shape)}")
-        samples = [_samples(own) for own in successes]  # all are checked before any counts
+        samples = [_samples(own) for own in successes]  # all runs are checked before any sample is counted
         return torch.tensor([self._record(run, own) for run, own in enumerate(samples)])
 
     def record_run(self, run: int, successes: Tensor) -> bool:
-        """Adds samples of one run, one after the other.
+        """Adds samples of success of one run, one after the other.
 
         A layer ends at the first sample that completes it. The samples after that one were made in the
         old layer and are dropped, so a call ends at most one layer.
@@ -408,7 +408,7 @@ class CurriculumProgress:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave.
+        """Restores the state that :meth:`state_dict` returned.
 
         Raises:
             ValueError: it has another number of runs, or a layer that does not exist.
@@ -456,7 +456,7 @@ def _samples(successes: Tensor) -> list[float]:
 
 
 def zero_unused_inputs(weight: Tensor, used: int, *, alpha: float = 0.0) -> Tensor:
-    """The weights of a network's first layer, with those of inputs that are not used yet scaled down.
+    """Scales down the weights that the first layer of a network gives to inputs that are not used yet.
 
     Unused inputs are 0, so these weights have gradients of 0 and stay as they are until their layer begins
     (under an optimizer without weight decay). With ``alpha = 0``, the outputs at that moment do not depend
@@ -465,7 +465,7 @@ def zero_unused_inputs(weight: Tensor, used: int, *, alpha: float = 0.0) -> Tens
     Args:
         weight: [..., inputs, outputs], as :class:`~torchrl_her.modules.StackedLinear` has it
             (``nn.Linear`` has it transposed).
-        used: how many of the leading inputs are used; see ``Curriculum.first_inputs``.
+        used: number of leading inputs that are used; see ``Curriculum.first_inputs``.
         alpha: factor for the weights of all other inputs.
 
     Returns:

@@ -32,16 +32,16 @@ def count_inputs(
     behind ``ZeroPad``.
 
     Args:
-        norm: of the input.
+        norm: normalization of the input.
         progress: tells the layer of each run.
         rows: [n], run after run, as the layers show them.
-        runs: which runs these are.
-        counts: how many rows each of them has.
+        runs: indices of the runs that the rows belong to.
+        counts: number of rows of each of these runs.
 
     Keyword Args:
         observation_key, desired_goal_key: read.
-        input_key: of the input, in ``norm``.
-        layer_key: of the layer that each row carries, if episodes have layers of their own.
+        input_key: key of the input, in ``norm``.
+        layer_key: key of the layer that each row carries, if episodes have layers of their own.
 
     Returns:
         What undoes it.
@@ -72,18 +72,18 @@ def restart_inputs(
     run: int = 0,
     input_key: NestedKey = "input",
 ) -> None:
-    """Forgets the statistics of those inputs of a run that mean something else in its new layer.
+    """Resets the statistics of the inputs that mean something else in the new layer of a run.
 
     The others go on, so that at first the networks do in the new layer what they did in the old one.
 
     Args:
-        norm: of the input.
+        norm: normalization of the input.
         before: the layer that the run was in.
         after: the one that it enters.
 
     Keyword Args:
-        run: which one.
-        input_key: of the input, in ``norm``.
+        run: index of the run.
+        input_key: key of the input, in ``norm``.
 
     Example:
         >>> near = CurriculumLayer(

@@ -13,7 +13,7 @@ from torchrl_her.replay_buffers.runs.streams import Generators, check_generators
 
 
 class EpisodeLayers(CurriculumProgress):
-    """Draws the layer of each episode when it begins, all layers alike: all of them are trained at once.
+    """Draws the layer of each episode when it begins, all with equal probabilities: they are trained at once.
 
     Runs are always in the last layer, which is the full task; it is their episodes that are in layers.
     :class:`~torchrl_her.StateToObs` draws them, and writes each row's layer, so that one buffer holds rows
@@ -26,7 +26,7 @@ class EpisodeLayers(CurriculumProgress):
 
     Keyword Args:
         runs: R.
-        generators: sources of random numbers, one of each run; None for torch's own, with one run only.
+        generators: generators, one for each run; None for torch's own, with one run only.
 
     Raises:
         ValueError: ``runs`` is below 1, or several runs have no generators.
@@ -61,7 +61,7 @@ class EpisodeLayers(CurriculumProgress):
 
     @property
     def shares(self) -> Tensor:
-        """How likely each layer is for the next episode of each run, [R, L] of float64."""
+        """Returns the probability of each layer for the next episode of each run, [R, L] of float64."""
         return torch.full((self.runs, len(self.curriculum)), 1 / len(self.curriculum), dtype=torch.float64)
 
     def mean_layer(self, run: int) -> float:
@@ -81,7 +81,7 @@ class EpisodeLayers(CurriculumProgress):
         return (numbers >= below[:, :-1]).sum(1)
 
     def record_episodes(self, ended: Tensor, achieved: Tensor) -> None:
-        """Told how many episodes of each run and layer have ended, and in how many the goal was achieved.
+        """Records how many episodes of each run and layer have ended, and in how many the goal was achieved.
 
         Args:
             ended: [R, L] int64.
@@ -104,7 +104,7 @@ class EpisodeLayers(CurriculumProgress):
 
 
 class TeacherStudent(EpisodeLayers):
-    """Prefers layers whose success changes: in proportion to its absolute progress, up or down.
+    """Prefers layers whose success rate changes, in proportion to the absolute change.
 
     Each layer's success is averaged over its recent episodes, and over the half as many newest ones; the
     distance between the two is its progress. A share of the episodes is drawn from all layers alike, so that
@@ -116,7 +116,7 @@ class TeacherStudent(EpisodeLayers):
 
     Keyword Args:
         runs: R.
-        generators: sources of random numbers, one of each run; None for torch's own, with one run only.
+        generators: generators, one for each run; None for torch's own, with one run only.
         memory: episodes of a layer after which an episode counts 1 / e of what it counted first.
         uniform_share: share of the episodes that are drawn from all layers alike.
         still: progress that counts as standing still: it is added to that of all layers, so that chance alone

@@ -1,4 +1,4 @@
-"""The beginning of a layer: buffer, weights of goals and exploration of a run start anew."""
+"""Start of a layer: resets the buffer, the weights of goals and the exploration of a run."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ def set_layer_goals(writer: Writer, layer: CurriculumLayer, *, run: int = 0) -> 
     """Lets a writer relabel a run with a layer's reward, and use its IBS weights only if the layer says so.
 
     Args:
-        writer: of one run or several.
+        writer: writer of one run or several.
         layer: the layer that the run is in.
 
     Keyword Args:
-        run: which of the writer's runs.
+        run: index of the run in the writer.
 
     Raises:
         TypeError: the writer does not relabel.
@@ -40,19 +40,19 @@ def enter_layer(
     epsilon: float | None = None,
     run: int = 0,
 ) -> None:
-    """Begins a run's layer: its rows, priorities and q are emptied, its exploration and sigma start anew.
+    """Begins a run's layer: empties its rows, priorities and q, and resets its exploration and sigma.
 
     Networks and optimizer are not touched, since the next layer builds on what was learned.
 
     Args:
-        buffer: of the run, or of all runs, with a :class:`~torchrl_her.HERWriter`. It must not prefetch,
-            since it would then still return old transitions.
+        buffer: buffer of the run, or of all runs, with a :class:`~torchrl_her.HERWriter`. It must not
+            prefetch, since it would then still return old transitions.
         layer: the layer that begins.
-        exploration: of all runs; None to leave exploration as it is.
+        exploration: exploration of all runs; None to leave exploration as it is.
 
     Keyword Args:
-        epsilon: where exploration starts again; None for where it started first.
-        run: which run begins the layer, for exploration and in a buffer of several runs.
+        epsilon: epsilon with which exploration starts again; None for its first value.
+        run: index of the run that begins the layer, in the exploration and in a buffer of several runs.
     """
     place = run if runs_of(buffer) > 1 else 0
     empty_run(buffer, place)

@@ -39,7 +39,7 @@ def take_columns(rows: Tensor, index: Tensor) -> Tensor:
 
 
 class _LayerTransform(Transform):
-    """A transform that depends on the layers that the runs are in at the moment."""
+    """Transform that depends on the layers that the runs are in at present."""
 
     def __init__(
         self,
@@ -61,14 +61,14 @@ class _LayerTransform(Transform):
         self._shown_in: tuple[int, ...] | None = None  # the layers that the last states were shown in
 
     def _layers(self) -> tuple[int, ...]:
-        """The layer of each block of rows; a single one if all runs are in the same layer."""
+        """Returns the layer of each block of rows; a single one if all runs are in the same layer."""
         layers = self.progress.layers
         if self.run is not None:
             return layers[self.run : self.run + 1]
         return layers[:1] if layers.count(layers[0]) == len(layers) else layers
 
     def _rows_layers(self, tensordict: TensorDictBase) -> Tensor | None:
-        """The layer [...] that each row carries; None where it is the run that has one."""
+        """Returns the layer [...] that each row carries; None if layers are those of runs."""
         if not self.progress.by_episode:
             return None
         return self._get(tensordict, self.layer_key, 1).squeeze(-1)
@@ -83,12 +83,12 @@ class _LayerTransform(Transform):
             )
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._shown_in is None:  # later on, some environments may be left as they are
+        if self._shown_in is None:  # later resets may be partial: the other rows stay as they were shown
             self._shown_in = self.progress.layers
         return self._call(tensordict_reset)
 
     def _show_again(self, root: TensorDictBase) -> Tensor | None:
-        """If layers have changed, shows the state before a step in the present ones.
+        """Recomputes the observations before a step if layers have changed since the last one.
 
         Returns:
             [...] of bool, which rows were shown in another layer; None if layers are as they were.
@@ -102,11 +102,11 @@ class _LayerTransform(Transform):
         for key in self.out_keys:
             shown, new = root.get(key), again.get(key)
             differs |= (shown != new).any(-1)
-            shown.copy_(new)  # in place: the collector keeps this tensor, and not this TensorDict
+            shown.copy_(new)  # in place, as the collector keeps this tensor but not this TensorDict
         return differs
 
     def _get(self, tensordict: TensorDictBase, key: NestedKey, width: int) -> Tensor:
-        """An entry, which must have that width."""
+        """Returns an entry; raises if it is missing or has another width."""
         entry = tensordict.get(key, None)
         if entry is None:
             raise KeyError(f"{type(self).__name__} needs the entry {key!r}, got {list(tensordict.keys())}")
@@ -115,7 +115,7 @@ class _LayerTransform(Transform):
         return entry
 
     def _seen(self, spec: Composite, key: NestedKey, width: int) -> TensorSpec:
-        """The spec of an entry, which must have that width."""
+        """Returns the spec of an entry; raises if it is missing or has another width."""
         if key not in spec.keys(True, True):
             raise KeyError(
                 f"{type(self).__name__} needs the observation {key!r}, got {list(spec.keys(True, True))}"
@@ -157,14 +157,14 @@ class StateToObs(_LayerTransform):
 
     Args:
         curriculum: the layers.
-        progress: which layer each run is in; looked up in every call.
+        progress: the layer of each run; looked up in every call.
 
     Keyword Args:
         state_key: the state vector, which is read.
         observation_key, achieved_goal_key, desired_goal_key, reward_key, terminated_key, done_key: what is
             written.
-        layer_key: where the layer of each row is written, [..., 1] of int64, if episodes have layers of their
-            own (:class:`~torchrl_her.curriculum.EpisodeLayers`).
+        layer_key: key under which the layer of each row is written, [..., 1] of int64, if episodes have
+            layers of their own (:class:`~torchrl_her.curriculum.EpisodeLayers`).
         truncated_key: read; None if the environment below has no time limit (a StepCounter after this
             transform may add one).
         continues_after_termination: whether the environment can be stepped further after it terminated an
@@ -247,7 +247,7 @@ class StateToObs(_LayerTransform):
         return next_tensordict
 
     def _judge(self, tensordict: TensorDictBase) -> None:
-        """Sets reward and ends of rows in layers below the last, by the rules of their layers."""
+        """Sets the rewards and ends of rows in layers below the last, by the rules of their layers."""
         *below, last = range(len(self.curriculum))
         present, achieved = self._layers(), tensordict.get(self.out_keys[1])
         rows = self._rows_layers(tensordict)
@@ -310,7 +310,7 @@ class StateToObs(_LayerTransform):
         return done_spec
 
     def _draw(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
-        """The layers [..., 1] of rows whose episode begins; TorchRL leaves the others as they are."""
+        """Draws the layers [..., 1] of rows whose episode begins; TorchRL keeps the other rows."""
         assert isinstance(self.progress, EpisodeLayers)
         state, mask = tensordict_reset.get(self.in_keys[0]), tensordict.get("_reset", None)
         self._check_blocks(state.shape)
@@ -323,7 +323,7 @@ class StateToObs(_LayerTransform):
         return layers.masked_scatter(begins, drawn.to(state.device))
 
     def _observe(self, tensordict: TensorDictBase) -> None:
-        """Sets what the layers see."""
+        """Sets the observations and goals of each row's layer."""
         state = self._get(tensordict, self.in_keys[0], self.curriculum.state_width)
         index = self._lookup(state, self._rows_layers(tensordict))
         entries = take_columns(self.curriculum.extend(state), index).split(self._widths, -1)
@@ -331,7 +331,7 @@ class StateToObs(_LayerTransform):
             tensordict.set(key, entry)
 
     def _lookup(self, state: Tensor, rows: Tensor | None) -> Tensor:
-        """Columns [B, n] of the present layers, of blocks or of rows."""
+        """Returns the columns [B, n] of the state for the layers of blocks or rows."""
         layers = self._layers() if rows is None else tuple(range(len(self.curriculum)))
         made_for = layers, state.device
         if self._tables[0] != made_for:
@@ -340,7 +340,7 @@ class StateToObs(_LayerTransform):
 
 
 class LayerOutcomes(Transform):
-    """Tells :class:`~torchrl_her.curriculum.EpisodeLayers` how the episodes of each layer have ended.
+    """Counts successes by layer for :class:`~torchrl_her.curriculum.EpisodeLayers`, as episodes end.
 
     Put it behind all transforms that decide where episodes end. Episodes whose goal was proposed
     (:class:`~torchrl_her.behavior.BehaviorGoals`) do not count: they say little of the layer's own goals.
@@ -402,14 +402,14 @@ class ZeroPad(_LayerTransform):
 
     Args:
         curriculum: the layers.
-        progress: which layer each run is in; looked up in every call.
+        progress: the layer of each run; looked up in every call.
 
     Keyword Args:
         run: the run that all transitions belong to, in batches of any shape; None if the first
             dimension is R equal blocks, in the order of the runs.
         observation_key, desired_goal_key: read.
         input_key: written.
-        layer_key: of the layer [..., 1] that each row carries, if episodes have layers of their own
+        layer_key: key of the layer [..., 1] that each row carries, if episodes have layers of their own
             (:class:`~torchrl_her.curriculum.EpisodeLayers`).
 
     Raises:

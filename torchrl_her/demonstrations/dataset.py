@@ -1,4 +1,4 @@
-"""Demonstrations: whole episodes that another policy played, and their file."""
+"""Demonstrations: whole episodes played by another policy, and their file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _KIND = "demonstrations 1"
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """Whole episodes, one after the other, and what is known of them.
+    """Whole episodes, one after the other, with the task and the origin that they were recorded for.
 
     Args:
         rows: [n], all transitions: ``observation``, ``achieved_goal``, ``desired_goal``, ``action``, and
@@ -40,7 +40,7 @@ class Demonstrations:
         states: the physical state of the environment before each transition, n rows each; None if the
             environment has no states that it can be put in.
         task: its name.
-        made_by: what made them, as plain data, for people.
+        made_by: description of the policy or controller that played them, as plain data for users.
         achieved_reward: the reward of an achieved goal.
 
     Raises:
@@ -71,9 +71,7 @@ class Demonstrations:
             raise ValueError(f"demonstrations need lengths [E] of at least 1, got {self.lengths.tolist()}")
         n = int(self.lengths.sum())
         if self.rows.batch_size != (n,):
-            raise ValueError(
-                f"episodes of {n} transitions in all cannot have rows {list(self.rows.batch_size)}"
-            )
+            raise ValueError(f"rows must be [{n}], the sum of all lengths, got {list(self.rows.batch_size)}")
         check_finite({f"{key!r} of demonstrations": own for key, own in self.rows.items(True, True)})
         ends = self.lengths.cumsum(0) - 1
         if self.rows["next", "done"].flatten().nonzero().flatten().tolist() != ends.tolist():
@@ -87,23 +85,23 @@ class Demonstrations:
 
     @property
     def begins(self) -> Tensor:
-        """[E] int64, the row of each episode's first transition."""
+        """Row of each episode's first transition, [E] of int64."""
         return self.lengths.cumsum(0) - self.lengths
 
     @property
     def episode(self) -> Tensor:
-        """[n] int64, the number of each transition's episode."""
+        """Number of the episode that each transition belongs to, [n] of int64."""
         return torch.arange(len(self)).repeat_interleave(self.lengths)
 
     @property
     def achieved(self) -> Tensor:
-        """[E] of bool: whether each episode achieved its goal at some step."""
+        """Whether each episode achieved its goal at some step, [E] of bool."""
         steps = self.rows["next", "reward"].flatten() >= self.achieved_reward
         return torch.zeros(len(self)).index_add(0, self.episode, steps.float()) > 0
 
     @property
     def digest(self) -> str:
-        """A short checksum of all transitions and states, by which files are told apart."""
+        """Short checksum of all transitions and states, which distinguishes files."""
         sha, entries = hashlib.sha256(), dict(self.rows.items(True, True))
         for name, own in {**entries, **(self.states or {}), "lengths": self.lengths}.items():
             sha.update(str(name).encode())
@@ -111,7 +109,7 @@ class Demonstrations:
         return sha.hexdigest()[:16]
 
     def select(self, episodes: Tensor | Sequence[int]) -> Demonstrations:
-        """Some of the episodes, in the given order.
+        """Returns the episodes with the given numbers, in the given order.
 
         Args:
             episodes: [m] int64, their numbers.
@@ -122,7 +120,7 @@ class Demonstrations:
         return self.take(begins.repeat_interleave(lengths) + offset, lengths)
 
     def take(self, index: Tensor, lengths: Tensor, *, rows: TensorDictBase | None = None) -> Demonstrations:
-        """Some of the transitions, which are episodes of these lengths.
+        """Returns the transitions at the given rows, which form episodes of the given lengths.
 
         Args:
             index: [m] int64, which transitions.
@@ -136,7 +134,7 @@ class Demonstrations:
         return replace(self, rows=taken, lengths=lengths, states=states)
 
     def first(self, count: int) -> Demonstrations:
-        """The first episodes.
+        """Returns the first episodes.
 
         Raises:
             ValueError: there are fewer, or ``count`` is below 1.
@@ -158,14 +156,14 @@ class Demonstrations:
         states: Mapping[str, Tensor] | None = None,
         **facts: Any,
     ) -> Demonstrations:
-        """Episodes of a rollout, environment after environment; one that is open at the end is truncated.
+        """Makes demonstrations of a rollout, environment after environment; the last episodes are truncated.
 
         Args:
             rollout: [N, T], time last.
 
         Keyword Args:
             first: whether only the first episode of each environment counts.
-            states: of the environments before each step, [N, T, ...] each.
+            states: states of the environments before each step, [N, T, ...] each.
             **facts: the other arguments of the class.
 
         Raises:
@@ -187,7 +185,7 @@ class Demonstrations:
 
     @classmethod
     def join(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
-        """The episodes of several, in order; what is known of them is that of the first."""
+        """Joins the episodes of several demonstrations, in order; task and origin are those of the first."""
         states = None
         if parts[0].states is not None:
             states = {
@@ -255,7 +253,7 @@ class Demonstrations:
 
 
 def check_free(path: str | Path, *, force: bool = False) -> None:
-    """Refuses to write over a file.
+    """Raises a FileExistsError if a file would be overwritten.
 
     Raises:
         ValueError: it exists, and ``force`` is False.

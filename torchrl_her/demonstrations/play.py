@@ -24,7 +24,7 @@ def demonstrate(
     achieved_reward: float = 0.0,
     **facts: Any,
 ) -> Demonstrations:
-    """The next episode of each environment, as a policy plays it without exploration.
+    """Plays the next episode of each environment with a policy, without exploration.
 
     The physical states are among them if the environment below the transforms has them: a method
     ``world_state_dict``, which gives tensors with a row for each environment.
@@ -34,7 +34,7 @@ def demonstrate(
         policy: chooses actions.
 
     Keyword Args:
-        max_steps: of an episode, T; one that is longer is truncated.
+        max_steps: maximum number of steps of an episode, T; one that is longer is truncated.
         achieved_reward: the reward of an achieved goal.
         **facts: ``task`` and ``made_by`` of :class:`~torchrl_her.demonstrations.Demonstrations`.
 

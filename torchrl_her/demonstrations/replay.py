@@ -26,21 +26,21 @@ def write_demonstrations(
         demonstrations: with the run's reward, see :func:`~torchrl_her.demonstrations.with_reward`.
 
     Keyword Args:
-        run: which one.
+        run: index of the run.
 
     Raises:
         TypeError: the buffer has another writer.
     """
     if not isinstance(buffer.writer, HERWriter):
         kind = type(buffer.writer).__name__
-        raise TypeError(f"demonstrations are written by a HERWriter, the buffer has a {kind}")
+        raise TypeError(f"demonstrations need a buffer with a HERWriter, got a {kind}")
     place = buffer.storage.device
     rows = demonstrations.rows
     buffer.writer.extend_run(rows if place in (None, "auto") else rows.to(place), run)
 
 
 def demonstration_rows(share: float, batch_size: int) -> int:
-    """How many rows of a batch are demonstrations: the share, rounded, but at least one and not all.
+    """Number of rows of a batch that are demonstrations: the share, rounded, but at least one and not all.
 
     Example:
         >>> demonstration_rows(0.125, 256), demonstration_rows(0.001, 256)
@@ -69,12 +69,12 @@ class MixedReplay:
 
     Args:
         own: the buffer that is trained from; for one run or several.
-        demonstrations: of as many runs, with the same transforms.
+        demonstrations: buffer of demonstrations of as many runs, with the same transforms.
 
     Keyword Args:
-        share: of a batch that are demonstrations; each batch has as many.
+        share: fraction of each batch that is demonstrations.
         batch_size: rows of a batch of one run, as the trainer has it.
-        demonstration_key: of the flag, a bool [..., 1].
+        demonstration_key: key of the flag, a bool [..., 1].
 
     Raises:
         ValueError: the share is not between 0 and 1, a batch has no room for both, or the buffers are for
@@ -102,7 +102,7 @@ class MixedReplay:
     ) -> None:
         if runs_of(own) != runs_of(demonstrations):
             raise ValueError(
-                f"the buffers must be for as many runs, got {runs_of(own)} and {runs_of(demonstrations)}"
+                f"buffers must have equally many runs, got {runs_of(own)} and {runs_of(demonstrations)}"
             )
         self.own, self.demonstrations = own, demonstrations
         self.runs, self.batch_size = runs_of(own), batch_size
@@ -116,18 +116,18 @@ class MixedReplay:
 
     @property
     def priority_key(self) -> str:
-        """Under which new priorities are found."""
+        """Key of new priorities."""
         return self.own.priority_key
 
     def __len__(self) -> int:
         return len(self.own)
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Writes a collected batch into the own buffer."""
+        """Writes a collected batch into the buffer of the runs' own transitions."""
         return self.own.extend(data)
 
     def sample(self, batch_size: int) -> TensorDictBase:
-        """Rows [R * S * B] of S batches of each run: R equal blocks of S batches each.
+        """Samples rows [R * S * B]: R equal blocks, one for each run, of S batches of B rows.
 
         Under ``index``, demonstrations count on from the last row of the own storage.
         """
@@ -137,7 +137,7 @@ class MixedReplay:
                 f"{batch_size} rows are no whole number of batches of {self.batch_size} for {self.runs} runs"
             )
         if not all(sizes_of(self.demonstrations)):
-            raise RuntimeError("there are runs without demonstrations: write_demonstrations writes them")
+            raise RuntimeError("some runs have no demonstrations: write them with write_demonstrations")
         parts = []
         for buffer, count in (
             (self.own, self.batch_size - self.shown),
@@ -155,7 +155,7 @@ class MixedReplay:
         return mixed.reshape(batch_size)
 
     def update_tensordict_priority(self, rows: TensorDictBase) -> None:
-        """Gives each row's sampler its new priority.
+        """Passes the new priority of each row to the sampler that it came from.
 
         Args:
             rows: [n], with ``index`` and the new priorities.

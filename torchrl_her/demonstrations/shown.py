@@ -1,4 +1,4 @@
-"""Demonstrations as a run sees them: with its own reward, and as its layer of a curriculum shows them."""
+"""Demonstrations converted for a run: to its reward, and to the view of its layer of a curriculum."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
 
 
 def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> Demonstrations:
-    """Demonstrations with a reward and ends of one's own: each ends where its goal terminates it first.
+    """Recomputes the rewards and ends of demonstrations: each ends where its goal terminates it first.
 
     One that does not terminate any more is truncated at its end. One that had terminated without achieving
     its goal, as by a fall, still does.
@@ -62,7 +62,7 @@ def in_layer(
     layer: int,
     task_reward: RewardFunction | None = None,
 ) -> Demonstrations:
-    """Demonstrations of the full task as a layer shows them, like :class:`~torchrl_her.StateToObs`.
+    """Converts demonstrations of the full task to the view of a layer, like :class:`~torchrl_her.StateToObs`.
 
     In layers below the last, they end where the layer's goal is achieved. What the environment terminated
     says nothing about that goal, so others are truncated at their end.
@@ -70,7 +70,7 @@ def in_layer(
     Args:
         demonstrations: whose observation with the desired goal behind it is the state of the curriculum.
         curriculum: its layers.
-        layer: which one, from 0.
+        layer: index of the layer, from 0.
         task_reward: reward of the last layer, the full task, if the curriculum has none for it; as recorded
             if None.
 
@@ -98,7 +98,7 @@ def in_layer(
 
 
 def _until_first(end: Tensor, demonstrations: Demonstrations) -> tuple[Tensor, Tensor]:
-    """The rows [m] up to the first end [n] of each episode, and how many of each episode, [E]."""
+    """Returns the rows [m] up to the first end [n] of each episode, and the number of these, [E]."""
     of, rows = demonstrations.episode, torch.arange(len(end))
     first = torch.full_like(demonstrations.lengths, len(end))
     first = first.scatter_reduce(0, of[end], rows[end], "amin")

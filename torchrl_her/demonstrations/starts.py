@@ -15,7 +15,7 @@ from torchrl_her.demonstrations.walk import WalkBack
 
 
 class DemonstrationStarts(Transform):
-    """Starts a share of the episodes at states of demonstrations, with the goals of these.
+    """Starts a fraction of the episodes at states of demonstrations, with the goals of the demonstrations.
 
     At first episodes start a few steps before the end of a demonstration, so that the goal is near. When
     enough of them achieve it, starts walk back, see :class:`~torchrl_her.demonstrations.WalkBack`. They have
@@ -34,10 +34,10 @@ class DemonstrationStarts(Transform):
             or R of them.
 
     Keyword Args:
-        share: of the episodes.
+        share: fraction of the episodes.
         runs: R.
-        generators: sources of random numbers, one for each run, or None for torch's own.
-        width, stride, threshold, samples: of :class:`~torchrl_her.demonstrations.WalkBack`.
+        generators: generators, one for each run, or None for torch's own.
+        width, stride, threshold, samples: options of :class:`~torchrl_her.demonstrations.WalkBack`.
 
     Attributes:
         walk: how far starts have walked back.
@@ -92,17 +92,17 @@ class DemonstrationStarts(Transform):
         self._asks_elsewhere = False
 
     def show(self, demonstrations: Demonstrations, *, run: int = 0) -> None:
-        """Gives a run other demonstrations, such as those of its next layer, and begins its walk anew."""
+        """Replaces the demonstrations of a run, as by those of its next layer, and restarts its walk."""
         self._shown[run] = usable(demonstrations)
         self.walk.restart(run, int(self._shown[run].lengths.max()))
 
     def outcomes(self) -> Transform:
-        """A transform that sees how episodes end, in place of this one."""
+        """Returns a transform that counts how episodes end, in place of this one."""
         self._asks_elsewhere = True
         return _Outcomes(self)
 
     def note(self, after: TensorDictBase) -> None:
-        """Counts the episodes that started at a demonstration and are over.
+        """Counts the successes of episodes that started at a demonstration and have ended.
 
         Args:
             after: [N], a step's ``next``.
@@ -140,7 +140,7 @@ class DemonstrationStarts(Transform):
         return tensordict_reset.update(env.start_at(states, which))
 
     def _draw(self, begun: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Which of the environments [N] that begin start at demonstrations, and their states."""
+        """Draws which of the environments [N] start at demonstrations, and their states."""
         assert self._back is not None
         each = len(begun) // self.runs
         chosen: list[Tensor] = []
@@ -148,7 +148,7 @@ class DemonstrationStarts(Transform):
         for run, (own, generator) in enumerate(zip(begun.chunk(self.runs), self._generators, strict=True)):
             new = own.nonzero().flatten()
             if len(new) == 0:
-                continue  # as when the run is alone: it draws nothing
+                continue  # draws nothing, as when the run is trained alone
             u = torch.rand(len(new), 3, generator=generator, dtype=torch.float64)
             started = u[:, 0] < self.share
             shown, (least, most) = self._shown[run], self.walk.window(run)
@@ -167,7 +167,7 @@ class DemonstrationStarts(Transform):
         return torch.cat(chosen), {name: torch.cat([own[name] for own in parts]) for name in parts[0]}
 
     def _environment(self) -> Any:
-        """The environment below, which can be started at a state."""
+        """Finds the environment below that can start at a given state; raises if there is none."""
         env: Any = self.container
         while env is not None and not callable(getattr(type(env), "start_at", None)):
             below = getattr(env, "base_env", None)
@@ -180,7 +180,7 @@ class DemonstrationStarts(Transform):
             env = below
         return env
 
-    # Part of the state_dict, which collectors have among their own
+    # Part of the state_dict, which collectors include in theirs
 
     def get_extra_state(self) -> dict[str, Any]:
         """The walk, the episodes under way, and the sources of random numbers."""
@@ -191,7 +191,7 @@ class DemonstrationStarts(Transform):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Puts back what :meth:`get_extra_state` gave."""
+        """Restores the state that :meth:`get_extra_state` returned."""
         self.walk.load_state_dict(state["walk"])
         self._back = None if state["back"] is None else state["back"].clone()
         for generator, own in zip(self._generators, state["generators"], strict=True):
@@ -200,11 +200,11 @@ class DemonstrationStarts(Transform):
 
 
 class _Outcomes(Transform):
-    """Tells starts how episodes end."""
+    """Passes the ends of episodes to :class:`DemonstrationStarts`."""
 
     def __init__(self, starts: DemonstrationStarts) -> None:
         super().__init__()
-        self.__dict__["starts"] = starts  # which is in the environment already, and not a part of this one
+        self.__dict__["starts"] = starts  # not a submodule: the starts are in the environment already
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self.starts.note(next_tensordict)

@@ -1,4 +1,4 @@
-"""How far from the end of a demonstration episodes start: a walk back from the goal."""
+"""Distance from the end of a demonstration at which episodes start: a walk back from the goal."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torchrl_her.checks import check_whole
 def step_back(
     back: int, outcomes: Sequence[bool], *, stride: int, threshold: float, samples: int, longest: int
 ) -> tuple[int, list[bool]]:
-    """Where starts are after some more episodes that began there.
+    """Moves the starts a step back if the episodes that began there were successful.
 
     Args:
         back: the greatest number of steps before the end at which episodes start.
-        outcomes: of the episodes since the last step back, oldest first: whether they achieved their goal.
+        outcomes: whether each episode since the last step back achieved its goal, oldest first.
 
     Keyword Args:
-        stride: of a step back.
+        stride: length of a step back.
         threshold: share of successes at which there is one.
         samples: number of episodes of which it is the share: the latest ones.
         longest: ``back`` is at most this.
@@ -53,7 +53,7 @@ class WalkBack:
     Keyword Args:
         width: number of steps among which starts are drawn: from ``back - width + 1`` to ``back`` steps
             before the end.
-        stride, threshold, samples: of a step back, see :func:`step_back`.
+        stride, threshold, samples: options of a step back, see :func:`step_back`.
 
     Attributes:
         back: R, the greatest number of steps before the end at which episodes start.
@@ -88,12 +88,12 @@ class WalkBack:
         self._outcomes: list[list[bool]] = [[] for _ in longest]
 
     def window(self, run: int) -> tuple[int, int]:
-        """The least and the greatest number of steps before the end at which a run's episodes start."""
+        """Returns the range of steps before the end at which a run's episodes start, as (least, greatest)."""
         return max(1, self.back[run] - self.width + 1), self.back[run]
 
     def record(self, run: int, outcomes: Sequence[bool]) -> None:
-        """Counts episodes of a run that started there and are over: whether they achieved their goal."""
-        for own in outcomes:  # one by one: several in a call may complete a step back
+        """Records whether episodes of a run that started at demonstrations achieved their goal."""
+        for own in outcomes:  # one by one: any of them may complete a step back
             self.back[run], self._outcomes[run] = step_back(
                 self.back[run],
                 [*self._outcomes[run], own],
@@ -104,7 +104,7 @@ class WalkBack:
             )
 
     def restart(self, run: int, longest: int) -> None:
-        """Begins a run's walk anew, with other demonstrations."""
+        """Restarts a run's walk, for other demonstrations."""
         self._longest[run], self.back[run], self._outcomes[run] = longest, min(self.width, longest), []
 
     def state_dict(self) -> dict[str, Any]:
@@ -113,7 +113,7 @@ class WalkBack:
         return {"back": list(self.back), "outcomes": outcomes, "longest": list(self._longest)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave.
+        """Restores the state that :meth:`state_dict` returned.
 
         Raises:
             ValueError: it is of another number of runs.

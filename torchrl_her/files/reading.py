@@ -19,7 +19,7 @@ from zipfile import ZIP_STORED, ZipFile
 import torch
 from torch import Tensor, nn
 
-_STEPS = 1 << 22  # of a description: they take a few hundred megabytes at most
+_STEPS = 1 << 22  # steps of a description: they take a few hundred megabytes at most
 _DEPTH = 100
 _REPEATED = 1 << 24  # numbers of tensors beyond those that are stored
 # The last bytes of an archive of torch.save. They give the size and the place of the directory, and the place
@@ -40,7 +40,7 @@ _NAMES = {
 }
 _NAME, _STORAGE = -1, 6  # sizes: of a name, and of ("storage", type, key, device, count)
 _SIZES = {"GLOBAL": _NAME, "BINPERSID": _STORAGE}
-_NEEDS = {"REDUCE": _NAME, "NEWOBJ": _NAME, "BINPERSID": _STORAGE}  # what a step is applied to
+_NEEDS = {"REDUCE": _NAME, "NEWOBJ": _NAME, "BINPERSID": _STORAGE}  # operands of each step
 _PLAIN = (bool, int, float, str, type(None), torch.dtype, dict, list, tuple)
 
 
@@ -132,7 +132,7 @@ def _check_archive(file: BinaryIO, begin: int) -> None:
 
 
 def _check_description(description: bytes) -> None:
-    """Refuses a pickle that names or calls anything but makers of tensors, or has tuples in tuples forever.
+    """Refuses a pickle that names or calls anything but makers of tensors, or nests tuples without end.
 
     A tuple that has the same tuple twice, and so on, is small. Its hash takes time for all of its entries.
     Lists have no hash, but torch would print one that is called in its error.
@@ -175,7 +175,7 @@ def _check_description(description: bytes) -> None:
 
 
 def _check_tree(loaded: Any) -> None:
-    """Refuses values that are no data, and tensors that are far larger than what is stored of them."""
+    """Refuses values that are not plain data, and tensors that are far larger than their stored numbers."""
     repeated = 0
     for count, value in enumerate(_values(loaded)):
         if type(value) in (Tensor, nn.Parameter):
@@ -186,7 +186,7 @@ def _check_tree(loaded: Any) -> None:
         if count > _STEPS:
             raise _RefusedError(f"it has more than {_STEPS:,} entries")
         if repeated > _REPEATED:
-            raise _RefusedError(f"a tensor of shape {list(value.shape)} is larger than what is stored of it")
+            raise _RefusedError(f"a tensor of shape {list(value.shape)} is larger than its stored numbers")
 
 
 def _values(value: Any, depth: int = 0) -> Iterator[Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def part_of(path: Path) -> Path:
-    """Where a file is written before it takes its place; its suffix stays, for those who write by it.
+    """Temporary path for a file being written. It keeps the suffix, by which libraries choose the format.
 
     Example:
         >>> part_of(Path("runs/curves.png")).name
@@ -20,7 +20,7 @@ def part_of(path: Path) -> Path:
 
 @contextmanager
 def written(path: str | Path) -> Iterator[Path]:
-    """A file that is always either the new one or the one before, even after a loss of power.
+    """Replaces a file atomically: even after a loss of power it is either the new or the old one.
 
     Gives the path to write to, beside the file. At the end what was written there is synced to the disk and
     takes the file's place; after an error it is removed.
@@ -46,17 +46,17 @@ def written(path: str | Path) -> Iterator[Path]:
         _sync(part)
         os.replace(part, path)
     except OSError as error:
-        if error.errno is None:  # of a library, and not of the system
+        if error.errno is None:  # an error of a library without an error number of the system
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
-        part.unlink(missing_ok=True)  # missing if all went well; otherwise it would waste a full disk
-    if os.name == "posix":  # elsewhere a folder cannot be opened
-        _sync(path.parent)  # or a loss of power may undo the renaming
+        part.unlink(missing_ok=True)  # after an error, the partial file must not fill the disk
+    if os.name == "posix":  # folders can be opened on POSIX systems alone
+        _sync(path.parent)  # without it, a loss of power may undo the renaming
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Writes a text in UTF-8, lines ending as they do in it.
+    """Writes a text in UTF-8 and keeps its line endings.
 
     Raises:
         OSError: the file cannot be written; the one before is untouched.

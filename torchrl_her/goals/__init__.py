@@ -1,4 +1,4 @@
-"""Goals: rewards, which goals to relabel with, and how useful each of them is."""
+"""Goals: their rewards, the strategies that choose virtual goals, and weights for how useful each goal is."""
 
 from torchrl_her.goals.density import log_kernel_density, log_neighbor_density
 from torchrl_her.goals.factors import candidates, combine, draw, draw_alike, draw_weighted

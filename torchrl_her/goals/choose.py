@@ -1,4 +1,4 @@
-"""Choosing goals for transitions from lines of candidates, by candidate times weight times filter.
+"""Draws goals for transitions from lists of candidates, in proportion to candidate times weight times filter.
 
 A line is all that a transition may take its goal from: the goals of its episode, or those of a pool that
 many transitions share. What the strategy allows is a part of it.
@@ -28,14 +28,14 @@ class Draws(Protocol):
     """Uniform numbers in [0, 1) for transitions [n]."""
 
     def __call__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-        """Numbers of a shape [n, k]."""
+        """Returns random numbers of a shape [n, k]."""
 
     def of(self, some: Tensor) -> Self:
         """Returns the random numbers for the transitions at the positions ``some``."""
 
 
 class Candidates(NamedTuple):
-    """The goals that transitions [n] may take, before weights and filter.
+    """Goals that transitions [n] may take, before weights and filter.
 
     Attributes:
         goals: [p, g].
@@ -72,7 +72,7 @@ def choose_goals(
     from the likelihoods of all its candidates. The result follows the product of the three factors.
 
     Args:
-        candidates: of n transitions.
+        candidates: candidates of n transitions.
         k: number of draws.
 
     Keyword Args:
@@ -113,7 +113,7 @@ def choose_goals(
     begin = line * width  # of the lines in the flat table
 
     def test(which: Index, index: Tensor) -> Tensor:
-        """Which goals [m, c] of some transitions may not be taken."""
+        """Returns which of c proposed goals the filter rejects, for m transitions: [m, c] of bool."""
         at = begin[which].unsqueeze(-1) + index
         out = torch.zeros_like(at, dtype=torch.bool)
         if weight is not None and useless:
@@ -147,7 +147,7 @@ def choose_goals(
 
 
 def _propose(candidates: Candidates, k: int, weight: Tensor | None, draws: Draws) -> Tensor:
-    """Places [n, k] in the lines of transitions, by candidates and weights alone."""
+    """Draws k positions in the lines of n transitions, [n, k], without the filter."""
     _, _, line, first, end = candidates
     if weight is None:
         return draw_alike(first, end, k, generator=draws)
@@ -157,13 +157,13 @@ def _propose(candidates: Candidates, k: int, weight: Tensor | None, draws: Draws
     place = None if whole else torch.arange(n, device=line.device) - (counts.cumsum(0) - counts)[line]
 
     def by_line(x: Tensor) -> Tensor:
-        """Entries [n, ...] as [L, longest, ...]."""
+        """Returns entries [n, ...] of transitions in the shape [L, longest, ...], padded by line."""
         if place is None:
             return x.reshape(len(counts), longest, *x.shape[1:])
         return x.new_zeros(len(counts), longest, *x.shape[1:]).index_put_((line, place), x)
 
     def numbers(_: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-        """Numbers for transitions alone: what is drawn must not depend on how far lines are padded."""
+        """Returns random numbers, none for padding: draws must not depend on the length of other lines."""
         return by_line(draws((n, k), dtype, device))
 
     drawn = draw_weighted(weight, by_line(first), by_line(end), k, generator=numbers)
@@ -177,7 +177,7 @@ def _likelihoods(
     weight: Tensor | None,
     keep: Keep | None,
 ) -> Iterator[Tensor]:
-    """For some transitions, the likelihoods [m, W] of all goals of their lines, part by part."""
+    """Yields the likelihoods [m, W] of all goals in the lines of transitions, part by part."""
     for part in parts:
         own = candidates.line[part]
         yield combine(

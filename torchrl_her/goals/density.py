@@ -1,4 +1,4 @@
-"""Densities of goals in any number of dimensions, estimated from samples; all in logarithms.
+"""Logarithms of densities of goals in any number of dimensions, estimated from samples.
 
 In 30 dimensions densities span hundreds of orders of magnitude, which only their logarithms can hold.
 """
@@ -18,7 +18,7 @@ _FARTHEST = 1e140  # coordinates, in sigmas, beyond which squares of float64 wou
 
 
 def goal_scale(samples: Tensor) -> Tensor:
-    """The standard deviations [g] of samples [n, g], by which goals of different units are divided.
+    """Returns the standard deviations [g] of samples [n, g], to scale goals of different units.
 
     One that is less than a hundredth of the greatest counts as that: a number that hardly varies shall not
     make all goals rare. All are 1 if nothing varies.
@@ -33,7 +33,7 @@ def goal_scale(samples: Tensor) -> Tensor:
 
 
 def log_kernel_density(points: Tensor, samples: Tensor, sigma: Numbers) -> Tensor:
-    """The logarithm of a kernel density: the mean of a normal distribution around each sample.
+    """Returns the logarithm of a kernel density: the mean of normal densities around the samples.
 
     Parzen, On estimation of a probability density function and mode, 1962; here with a Gaussian product
     kernel in g dimensions, normalized.
@@ -66,7 +66,7 @@ def log_kernel_density(points: Tensor, samples: Tensor, sigma: Numbers) -> Tenso
 
 
 def log_neighbor_density(points: Tensor, samples: Tensor, k: int, *, least_distance: float = 1e-6) -> Tensor:
-    """The logarithm of a nearest-neighbor density: k / n in the ball that reaches to the k-th nearest sample.
+    """Returns the log of a nearest-neighbor density: k / n in the ball up to the k-th nearest sample.
 
     Loftsgaarden and Quesenberry, A nonparametric estimate of a multivariate density function, 1965. The ball
     grows where samples are few, so this estimate needs no width and remains of use in many dimensions.
@@ -74,7 +74,7 @@ def log_neighbor_density(points: Tensor, samples: Tensor, k: int, *, least_dista
     Args:
         points: [..., g], where the density is wanted. A point that is itself a sample is its own neighbor.
         samples: [n, g] of it.
-        k: which neighbor, from 1 to n.
+        k: number of the neighbor whose distance counts, from 1 to n.
 
     Keyword Args:
         least_distance: distances below this count as this, in the unit of the goals: at k equal samples the
@@ -101,12 +101,12 @@ def log_neighbor_density(points: Tensor, samples: Tensor, k: int, *, least_dista
     flat, known = ((own - center).clamp_(-_FARTHEST, _FARTHEST) for own in (flat, known))
     parts = [_kth_distance(part, known, k) for part in flat.split(max(1, _CHUNK // max(n, k * g)))]
     distance = torch.cat(parts).view(points.shape[:-1]).clamp_min_(least_distance)
-    ball = g * 0.5 * math.log(math.pi) - math.lgamma(g * 0.5 + 1.0)  # volume of the one of radius 1
+    ball = g * 0.5 * math.log(math.pi) - math.lgamma(g * 0.5 + 1.0)  # volume of the unit ball
     return _marked(math.log(k / n) - ball - g * distance.log(), points)
 
 
 def _checked(points: Tensor, samples: Tensor) -> tuple[Tensor, Tensor]:
-    """Points [m, g], NaN and infinity as 0, and samples [n, g], both of float64."""
+    """Returns points [m, g], with 0 for NaN and infinity, and samples [n, g], both in float64."""
     if samples.ndim != 2 or len(samples) == 0 or samples.shape[1] == 0 or not samples.isfinite().all():
         raise ValueError(f"samples must be finite, [n, g] with n > 0, got a shape of {list(samples.shape)}")
     if points.ndim == 0 or points.shape[-1] != samples.shape[1]:
@@ -118,27 +118,27 @@ def _checked(points: Tensor, samples: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _squares(points: Tensor, samples: Tensor) -> Tensor:
-    """Squared distances [m, n]. Differences instead of products would take several times as long."""
+    """Returns squared distances [m, n], by products: differences would take several times as long."""
     products = torch.addmm(samples.square().sum(1), points, samples.T, alpha=-2.0)
     return products.add_(points.square().sum(1, True)).clamp_min_(0.0)
 
 
 def _log_sum(points: Tensor, samples: Tensor) -> Tensor:
-    """The logarithm [m] of the sum of exp(-distance^2 / 2) over samples; faster than logsumexp."""
+    """Returns the logarithm [m] of the sum of exp(-distance^2 / 2) over samples; faster than logsumexp."""
     logs = _squares(points, samples).mul_(-0.5)
     greatest = logs.amax(1, True)
     return logs.sub_(greatest).exp_().sum(1).log_().add_(greatest.squeeze(1))
 
 
 def _kth_distance(points: Tensor, samples: Tensor, k: int) -> Tensor:
-    """The distance [m] to the k-th nearest sample."""
+    """Returns the distance [m] to the k-th nearest sample."""
     nearest = _squares(points, samples).topk(k, 1, largest=False, sorted=False).indices
     # Products lose the digits of small distances, so these few are computed again by differences.
     return (points.unsqueeze(1) - samples[nearest]).norm(dim=-1).amax(1)
 
 
 def _scale(sigma: Numbers, samples: Tensor) -> Tensor:
-    """Sigma [g], where samples are."""
+    """Returns sigma [g] on the device of the samples."""
     scale = torch.as_tensor(sigma, dtype=torch.float64).to(samples.device).reshape(-1)
     g = samples.shape[1]
     if len(scale) not in (1, g) or not bool(((scale > 0) & scale.isfinite()).all()):
@@ -147,5 +147,5 @@ def _scale(sigma: Numbers, samples: Tensor) -> Tensor:
 
 
 def _marked(log_density: Tensor, points: Tensor) -> Tensor:
-    """NaN where a point is not finite."""
+    """Returns values with NaN where a point is not finite."""
     return log_density.masked_fill_(~points.isfinite().all(-1), math.nan)

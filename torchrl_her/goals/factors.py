@@ -22,7 +22,7 @@ Randomness = torch.Generator | Callable[[tuple[int, ...], torch.dtype, torch.dev
 
 
 def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
-    """Which achieved goals each transition may take as its virtual goal, as a table.
+    """Returns a table of the achieved goals that each transition may take as its virtual goal.
 
     Args:
         strategy: a name or a function: see :func:`~torchrl_her.goals.candidate_range`.
@@ -45,13 +45,13 @@ def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
 
 
 def between(first: Tensor, end: Tensor, horizon: int) -> Tensor:
-    """The candidates of :func:`~torchrl_her.goals.candidate_range` as a mask [..., T]; T is the horizon."""
+    """Converts ranges from :func:`~torchrl_her.goals.candidate_range` to a mask [..., T] over a horizon T."""
     time = torch.arange(horizon, device=first.device)
     return (time >= first.unsqueeze(-1)) & (time < end.unsqueeze(-1))
 
 
 def combine(candidate: Tensor, weight: Tensor | None = None, keep: Tensor | None = None) -> Tensor:
-    """The product of the factors: how likely each goal is to be drawn, before normalizing.
+    """Multiplies candidates, weights and filter to the likelihood of each goal, not yet normalized.
 
     Args:
         candidate: [..., T] of bool, from :func:`~torchrl_her.goals.candidates` or ``between``.
@@ -79,7 +79,7 @@ def _uniform(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device, s
 
 
 def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: Randomness = None) -> Tensor:
-    """Draws k goals, with replacement, for each transition; all its candidates are equally likely.
+    """Draws k goals for each transition, with replacement, all of its candidates being equally likely.
 
     The result is that of :func:`~torchrl_her.goals.draw` from a table of candidates. No table is made, as it
     would be as large as the number of transitions times the horizon.
@@ -104,7 +104,7 @@ def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: Randomness = No
 def draw_weighted(
     weight: Tensor, first: Tensor, end: Tensor, k: int, *, generator: Randomness = None
 ) -> Tensor:
-    """Draws k goals, with replacement, for each transition, in proportion to the goals' weights.
+    """Draws k goals for each transition, with replacement, in proportion to the goals' weights.
 
     The result is that of :func:`~torchrl_her.goals.draw` from a table of the candidates' weights. No table is
     made: all transitions of an episode look up their draws in the same running sum.
@@ -138,7 +138,7 @@ def draw_weighted(
 
 
 def draw(likelihood: Tensor, k: int, *, generator: Randomness = None) -> tuple[Tensor, Tensor]:
-    """Draws k goals, with replacement, for each transition.
+    """Draws k goals for each transition, with replacement, in proportion to a table of likelihoods.
 
     Args:
         likelihood: [..., T], at least 0, from :func:`~torchrl_her.goals.combine`.

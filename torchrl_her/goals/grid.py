@@ -28,7 +28,7 @@ def _floats(x: Numbers) -> tuple[float, ...]:
 
 
 class GoalGrid:
-    """A box of goals in any number d of dimensions, cut into equal cells.
+    """Grid of equal cells over a box of goals in any number d of dimensions.
 
     Args:
         low, high: d numbers each, corners of the box, in the unit of the goals.
@@ -79,7 +79,7 @@ class GoalGrid:
         return torch.stack(torch.meshgrid(*self.axes, indexing="ij"), -1).reshape(self.num_cells, -1)
 
     def cell(self, goals: Tensor) -> Tensor:
-        """The cell [...] of int64 of each goal [..., d]; the last dimension varies fastest.
+        """Returns the cell [...] of int64 of each goal [..., d]; the last dimension varies fastest.
 
         Goals outside are counted in the cell at the edge. The first time that a goal is farther outside than
         a cell is wide, a warning names it (unless ``warn`` is False).
@@ -100,7 +100,7 @@ class GoalGrid:
         return index
 
     def _along(self, goals: Tensor) -> Iterator[tuple[Tensor, int]]:
-        """For each dimension, where goals [..., d] lie [...] in cells from the corner, and its cells."""
+        """Yields for each dimension the position [...] of goals in cells, and the number of cells."""
         for i, (low, size, n) in enumerate(zip(self.low, self.cell_size, self.shape, strict=True)):
             yield (goals[..., i] - low) / size, n
 
@@ -116,18 +116,18 @@ class GoalGrid:
 
 
 def box_target(grid: GoalGrid, low: Numbers, high: Numbers, sigma: Numbers, *, name: str = "") -> Tensor:
-    """The target q* for goals that are uniform in a box, in closed form. Equations 4.3 and 4.7.
+    """Computes the target q* for goals that are uniform in a box, in closed form. Equations 4.3 and 4.7.
 
     The integral over a box is a product of differences of the normal distribution function. If
     sigma is so small that every cell's mass underflows, the cells nearest to the box get all of it.
 
     Args:
-        grid: where virtual goals may be.
+        grid: grid of cells over all virtual goals.
         low, high: d numbers each, corners of the box of real goals.
         sigma: standard deviation of the Gaussian kernel, in the unit of the goals; or d of them.
 
     Keyword Args:
-        name: of the task or layer; error messages begin with it.
+        name: name of the task or layer; error messages begin with it.
 
     Returns:
         [cells] of float64, sums to 1.
@@ -152,7 +152,7 @@ def box_target(grid: GoalGrid, low: Numbers, high: Numbers, sigma: Numbers, *, n
 
 
 def _log_mass(x: Tensor, low: float, high: float, sigma: float) -> Tensor:
-    """Log of the normal kernel's integral over [low, high], seen from x [n], up to a constant.
+    """Returns the log of a normal kernel's integral over [low, high], around each x [n], up to a constant.
 
     A factor exp(-near^2 / 2) is kept apart from each mass, near being the distance to the box, since
     it would underflow.
@@ -164,7 +164,7 @@ def _log_mass(x: Tensor, low: float, high: float, sigma: float) -> Tensor:
     outside = torch.special.erfcx(near / root) - torch.special.erfcx(far / root) * torch.exp(
         -width * (near + far) / 2
     )
-    thin = math.sqrt(2 / math.pi) * width * torch.exp(-width * (near + width / 4) / 2)  # by its middle
+    thin = math.sqrt(2 / math.pi) * width * torch.exp(-width * (near + width / 4) / 2)  # at its middle
     outside = torch.where(width * (1 + near) < _THIN, thin, outside)
     mass = torch.where(near > 0, outside, inside).clamp_min(torch.finfo(x.dtype).tiny)
     return mass.log() - near.square() / 2
@@ -180,10 +180,10 @@ def _sigmas(grid: GoalGrid, sigma: Numbers, label: str = "") -> list[float]:
 
 
 def sampled_target(grid: GoalGrid, samples: Tensor, sigma: Numbers) -> Tensor:
-    """The target q* for goals of any distribution, estimated from samples. Equations 4.2 and 4.7.
+    """Estimates the target q* from samples of goals of any distribution. Equations 4.2 and 4.7.
 
     Args:
-        grid: where virtual goals may be.
+        grid: grid of cells over all virtual goals.
         samples: [n, d] real goals.
         sigma: standard deviation of the Gaussian kernel, in the unit of the goals; or d of them.
 
@@ -226,4 +226,4 @@ def kl_divergence(q: Tensor, q_star: Tensor) -> Tensor:
         >>> kl_divergence(torch.tensor([0.5, 0.5, 0.0]), torch.tensor([0.25, 0.25, 0.5]))
         tensor(0.6931)
     """
-    return (torch.xlogy(q, q) - torch.xlogy(q, q_star)).sum(-1).clamp_min(0)  # rounding may go below
+    return (torch.xlogy(q, q) - torch.xlogy(q, q_star)).sum(-1).clamp_min(0)  # it may round to below 0

@@ -19,13 +19,13 @@ from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 
 
 class GoalHistogram(GoalWeights):
-    """Gives all goals the same weight, and counts the virtual goals since the buffer was last emptied.
+    """Counts virtual goals in the cells of a grid, and gives all goals the same weight.
 
     Args:
         grid: cells to count in.
 
     Keyword Args:
-        recent: how many of the newest goals count; None for all of them.
+        recent: number of the newest goals that count; None for all of them.
 
     Raises:
         ValueError: ``recent`` is below 1.
@@ -47,7 +47,7 @@ class GoalHistogram(GoalWeights):
             check_whole(recent=recent)
         self.grid, self.recent = grid, recent
         self.counts = torch.zeros(grid.num_cells, dtype=torch.int64)
-        self._newest = torch.zeros(0, dtype=torch.int32)  # cells of the goals that count, if not all do
+        self._newest = torch.zeros(0, dtype=torch.int32)  # cells of the newest goals, if only these count
 
     @property
     def q(self) -> Tensor:
@@ -104,11 +104,11 @@ class Instructiveness(InstructiveWeights, GoalHistogram):
     Keyword Args:
         sigma: the final standard deviation of the kernel, in the unit of the goals.
         start_factor: the first sigma divided by the final one; at least 1.
-        decay: what a step multiplies the covariance by, in (0, 1]; 1 never shrinks it.
+        decay: factor of the covariance in each step, in (0, 1]; 1 never shrinks it.
         floor: the least weight of a goal. At 0, a goal is no longer drawn once q reaches q* in its cell.
         floor_is_relative: whether ``floor`` is multiplied by the largest q*; the thesis's floor is absolute.
         subtract: False for the weights q* alone, without q and floor (the sequential architecture).
-        recent: how many of the newest virtual goals q counts; None for all since the buffer was emptied.
+        recent: number of the newest virtual goals that q counts; None for all since the buffer was emptied.
 
     Attributes:
         sigma, q_star: their present values.
@@ -182,7 +182,7 @@ class Instructiveness(InstructiveWeights, GoalHistogram):
 
 
 class HistogramsOfRuns(WeightsOfRuns):
-    """The histograms of several runs over one grid, counted and looked up for all runs at once.
+    """Histograms of several runs over one grid, counted and looked up for all runs at once.
 
     Args:
         own: R, of each run: all :class:`GoalHistogram`, or all :class:`Instructiveness`, over the same grid.
@@ -199,7 +199,7 @@ class HistogramsOfRuns(WeightsOfRuns):
 
     @staticmethod
     def fits(own: Sequence[GoalWeights]) -> bool:
-        """Whether these are histograms over one grid. Subclasses may do anything, so they do not count."""
+        """Returns whether all weights are histograms over one grid; False for subclasses."""
         first = own[0]
         return type(first) in (GoalHistogram, Instructiveness) and all(
             type(weights) is type(first) and weights.grid is first.grid  # type: ignore[attr-defined]
@@ -220,7 +220,7 @@ class HistogramsOfRuns(WeightsOfRuns):
             self.own[run]._add(own, part - place * size)
 
     def _cells(self, goals: Tensor, counts: Sequence[int]) -> Tensor:
-        """The cell [n, ...] of each goal in the joined tables of some runs."""
+        """Returns the cell [n, ...] of each goal in the joined tables of the given runs."""
         cells, size = self.own[0].grid.cell(goals), self.own[0].grid.num_cells
         for position, part in enumerate(cells.split(list(counts))):
             part += position * size
@@ -228,6 +228,6 @@ class HistogramsOfRuns(WeightsOfRuns):
 
 
 def _look_up(table: Tensor, cells: Tensor, goals: Tensor) -> Tensor:
-    """Weights [...] of goals [..., g] in cells [...]; of their type, unless that is whole numbers."""
+    """Looks up weights [...] of goals in cells [...], in the type of the goals if it is floating-point."""
     dtype = goals.dtype if goals.is_floating_point() else None
     return table.to(goals.device, dtype).index_select(0, cells.flatten()).view(cells.shape)

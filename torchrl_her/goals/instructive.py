@@ -9,7 +9,7 @@ from torchrl_her.goals.weights import GoalWeights
 
 
 class InstructiveWeights(GoalWeights):
-    """The instructiveness of goals, max(q* - q, floor), with a kernel whose sigma shrinks. A base class.
+    """Base class of IBS weights: instructiveness max(q* - q, floor), with a kernel whose sigma shrinks.
 
     Sigma starts larger and shrinks at each :meth:`step` down to its final value. Emptying the buffer
     (``clear``) forgets q but not sigma; :meth:`restart` sets sigma back to its first value, as at the change
@@ -19,7 +19,7 @@ class InstructiveWeights(GoalWeights):
     Keyword Args:
         sigma: the final standard deviation of the kernel.
         start_factor: the first sigma divided by the final one; at least 1.
-        decay: what a step multiplies the covariance by, in (0, 1]; 1 never shrinks it.
+        decay: factor of the covariance in each step, in (0, 1]; 1 never shrinks it.
         floor: the least weight of a goal.
         subtract: False for the weights q* alone, without q and floor (the sequential architecture).
 
@@ -76,5 +76,5 @@ class InstructiveWeights(GoalWeights):
         self._set_sigma(state["sigma"])
 
     def _set_sigma(self, sigma: float) -> None:
-        """Called whenever sigma changes."""
+        """Hook for subclasses that is called whenever sigma changes."""
         self.sigma = sigma

@@ -35,7 +35,7 @@ class KernelInstructiveness(InstructiveWeights):
     Keyword Args:
         sigma: the final standard deviation of the kernel, in the unit of the goals divided by ``scale``.
         start_factor: the first sigma divided by the final one; at least 1.
-        decay: what a step multiplies the covariance by, in (0, 1]; 1 never shrinks it.
+        decay: factor of the covariance in each step, in (0, 1]; 1 never shrinks it.
         floor: the least weight of a goal, as a share of the largest q* of a real goal.
         subtract: False for the weights q* alone, without q and floor (the sequential architecture).
         scale: what goals are divided by first, a number or g of them, where their numbers have different
@@ -48,7 +48,7 @@ class KernelInstructiveness(InstructiveWeights):
     Attributes:
         sigma: its present value.
         final_sigma: its value at the end of the schedule.
-        written: how many virtual goals there were since the buffer was last emptied.
+        written: number of virtual goals since the buffer was last emptied.
 
     Raises:
         ValueError: an option is out of its range, goals are not finite, or of another width than the real
@@ -104,7 +104,7 @@ class KernelInstructiveness(InstructiveWeights):
         """
         if len(self._virtual) == 0:
             return math.nan
-        generator = torch.Generator().manual_seed(0)  # the same goals at each call, up to where q is
+        generator = torch.Generator().manual_seed(0)  # the same goals at each call, on whatever device q is
         noise = torch.randn(self._virtual.shape, dtype=torch.float64, generator=generator)
         self._move(self._virtual.device)
         goals = self._virtual + self.final_sigma * self._scale * noise.to(self._virtual.device)
@@ -127,7 +127,7 @@ class KernelInstructiveness(InstructiveWeights):
         return weight.clamp_min(least).nan_to_num(0.0).to(dtype)
 
     def update(self, goals: Tensor) -> None:
-        """Counts goals in q.
+        """Adds virtual goals to q.
 
         Each goal has a key, the fraction of its number times the golden ratio, and those with the least keys
         stay. Such keys are spread evenly over any stretch of numbers, so what stays is, too, and at each
@@ -178,7 +178,7 @@ class KernelInstructiveness(InstructiveWeights):
             raise ValueError(f"real goals have {self._real.shape[1]} numbers, got goals of {goals.shape[-1]}")
 
     def _move(self, device: torch.device) -> None:
-        """Everything to where goals are."""
+        """Moves all tensors to the device of the goals."""
         if self._real.device != device or self._virtual.device != device:
             self._real, self._scale = self._real.to(device), self._scale.to(device)
             self._virtual, self._keys = self._virtual.to(device), self._keys.to(device)

@@ -21,7 +21,7 @@ _SHARPEST = 3.0  # dimensions from which on the default of sharpness falls
 
 
 class RareGoals(GoalWeights):
-    """A goal's weight is the inverse of its density among the goals that were lately written.
+    """Weights goals by the inverse of their density among the goals that were written most recently.
 
     Goals at the edge of what has been reached are then drawn more often than those in its middle. MEGA
     (Pitis et al., Maximum entropy gain exploration for long horizon multi-goal reinforcement learning, 2020)
@@ -35,12 +35,12 @@ class RareGoals(GoalWeights):
         estimator: ``"kernel"`` for a Gaussian kernel around each goal, for a few dimensions; ``"neighbors"``
             for the distance to the k-th nearest goal, for many.
         sigma: width of the kernel, in standard deviations of the goals; or one for each of their numbers.
-        k: which neighbor.
+        k: number of the neighbor whose distance counts.
         sharpness: weights are ``density ** -sharpness``; None for 1 up to three dimensions and 3 / g beyond,
             since the same ratio of distances is a far greater ratio of densities there.
         limit: a goal weighs at most so many times as much, or as little, as one of median density.
-        memory: how many goals are remembered, the newest ones.
-        samples: how many of these a density is estimated from; they are spread evenly over the memory.
+        memory: number of the newest goals that are remembered.
+        samples: number of these from which densities are estimated; they are spread evenly over the memory.
 
     Attributes:
         goals: [n, g], those remembered, in no particular order; None if there are none.
@@ -79,7 +79,7 @@ class RareGoals(GoalWeights):
         self.estimator, self.sigma, self.k, self.sharpness, self.limit = estimator, sigma, k, sharpness, limit
         self.memory, self.samples = memory, samples
         self.goals: Tensor | None = None
-        self._next = 0  # where the memory, once full, is written over
+        self._next = 0  # next position to be overwritten once the memory is full
         self._reference: _Reference | None = None
 
     def __call__(self, goals: Tensor) -> Tensor:
@@ -94,7 +94,7 @@ class RareGoals(GoalWeights):
         return normalized_weights(((level - logs) * sharpness).clamp(-bound, bound), goals)
 
     def update(self, goals: Tensor) -> None:
-        """Remembers goals; if there are more than fit, as many as fit, spread evenly."""
+        """Adds goals to the memory; of more than fit, a part that is spread evenly over them."""
         goals = goals.detach().reshape(-1, goals.shape[-1])
         goals = goals[goals.isfinite().all(-1)]
         new = goals[spread_evenly(len(goals), self.memory, goals.device)]
@@ -127,12 +127,12 @@ class RareGoals(GoalWeights):
         )
 
     def _look(self) -> _Reference:
-        """Points that densities are estimated from, until the memory changes."""
+        """Selects the points that densities are estimated from until the memory changes."""
         assert self.goals is not None
         samples = self.goals[spread_evenly(len(self.goals), self.samples, self.goals.device)].double()
         scale = goal_scale(samples)
         samples = samples / scale
-        # Densities of some goals among the others, of which they are no part.
+        # Densities of some goals among the others: a goal must not be its own neighbor.
         asked = torch.arange(len(samples), device=samples.device) % max(2, len(samples) // _LEVEL) == 0
         others = samples if len(samples) == 1 else samples[~asked]
         return _Reference(samples, scale, float(self._log_density(samples[asked], others).median()))

@@ -1,4 +1,4 @@
-"""Goals as points: distance, whether one is achieved, and the sparse reward made of that."""
+"""Goals as points: their distance, whether one is achieved, and the sparse reward."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FORM = (
 )
 # Achieved goals [..., g]; or goals and info, for a reward function that reads further entries.
 Outcome: TypeAlias = Tensor | TensorDictBase
-_LOOKED_AT = 100  # infos, to see whether goals end episodes
+_LOOKED_AT = 100  # number of infos that are tried to see whether goals end episodes
 
 
 class RewardFunction(Protocol):
@@ -36,7 +36,7 @@ class RewardFunction(Protocol):
 
 
 def distance(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """Euclidean distance between goals.
+    """Returns the Euclidean distance between goals.
 
     Args:
         achieved_goal: [..., g].
@@ -53,7 +53,7 @@ def distance(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
 
 
 def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> Tensor:
-    """Whether the achieved goal is nearer to the desired goal than a threshold.
+    """Returns whether the achieved goal is nearer to the desired goal than a threshold.
 
     Args:
         achieved_goal: [..., g].
@@ -71,7 +71,7 @@ def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> T
 
 
 class GoalReward:
-    """The sparse reward: 0 where the goal is achieved, which terminates the episode, and -1 elsewhere.
+    """Sparse reward: 0 where the goal is achieved, which terminates the episode, and -1 elsewhere.
 
     Args:
         threshold: goals nearer than this count as achieved; in the unit of the goals.
@@ -130,7 +130,7 @@ class EnvReward:
         *,
         info_keys: Sequence[NestedKey] = (),
     ) -> None:
-        if isinstance(info_keys, str):  # a sequence of letters
+        if isinstance(info_keys, str):  # a string is a sequence of letters
             raise TypeError(f"info_keys must be a list, got {info_keys!r}: write [{info_keys!r}]")
         self.compute_reward = compute_reward
         self.compute_terminated = compute_terminated
@@ -147,7 +147,7 @@ class EnvReward:
 
 
 def outcomes(reward_fn: RewardFunction | None, achieved_goal: Tensor, *parts: TensorDictBase) -> Outcome:
-    """Achieved goals [..., g] with the info that a reward function reads, if it does.
+    """Returns achieved goals [..., g], with the info that the reward function reads, if it reads any.
 
     Args:
         reward_fn: whose ``info_keys`` name the entries.
@@ -178,7 +178,7 @@ def outcomes(reward_fn: RewardFunction | None, achieved_goal: Tensor, *parts: Te
 
 
 def call_reward(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
-    """The answer of a reward function to goals [..., g], unchecked."""
+    """Calls a reward function for goals [..., g]; the result is not checked."""
     return reward_fn(*_arguments(achieved, desired_goal))
 
 
@@ -212,7 +212,7 @@ def ask_reward(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tenso
 
 
 def _call(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the answer of a reward function; a ValueError names the form that it must have."""
+    """Calls a reward function and raises a ValueError if its result is not of the required form."""
     try:
         answer = call_reward(reward_fn, achieved, desired_goal)
     except TypeError as error:
@@ -231,23 +231,23 @@ def _call(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor) ->
 
 
 def _takes(function: Callable[..., object], arguments: Sequence[object]) -> bool:
-    """Whether a function can be called with some arguments; true if that cannot be told."""
+    """Returns whether a function can be called with some arguments; True if its signature is unknown."""
     try:
         inspect.signature(function).bind(*arguments)
     except TypeError:
         return False
-    except ValueError:  # as of functions in C
+    except ValueError:  # no signature, as with functions in C
         return True
     return True
 
 
 def _pairs(achieved: Outcome, desired_goal: Tensor) -> torch.Size:
-    """The shape [...] of goals [..., g] that are broadcast against each other."""
+    """Returns the shape [...] of goals [..., g] that are broadcast against each other."""
     return torch.broadcast_shapes(*(goals.shape for goals in _arguments(achieved, desired_goal)[:2]))[:-1]
 
 
 def _checked(reward: Tensor, shape: torch.Size) -> Tensor:
-    """Rewards of a reward function in the shape of the pairs of goals that it was given."""
+    """Returns rewards in the shape of the pairs of goals; raises if there is not one for each pair."""
     if reward.numel() != shape.numel():
         raise ValueError(
             f"the reward function must give one reward for each of {shape.numel()} pairs of goals, got a "
@@ -260,7 +260,7 @@ def _checked(reward: Tensor, shape: torch.Size) -> Tensor:
 def missed(
     reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor, achieved_reward: float
 ) -> Tensor:
-    """Where a goal is not achieved, as the reward tells: [...] of bool, for goals [..., g].
+    """Returns where the reward is below that of an achieved goal: [...] of bool, for goals [..., g].
 
     ``terminated`` is half of the work and not needed, so it is not computed where that can be avoided.
 
@@ -281,7 +281,7 @@ def missed(
 
 
 def ends_at_goals(reward_fn: RewardFunction, goals: Outcome) -> bool:
-    """Whether an episode ends where its goal is achieved; with some info at least, if that is read.
+    """Returns whether an achieved goal ends an episode, for at least one info if infos are read.
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
@@ -299,7 +299,7 @@ def ends_at_goals(reward_fn: RewardFunction, goals: Outcome) -> bool:
 def is_achieved(
     after: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
 ) -> Tensor:
-    """Whether steps ended with their goal achieved: by the environment's own word, else by a reward function.
+    """Returns whether steps achieved their goals: by the environment's own flag, else by a reward function.
 
     The environment's word is the entry ``is_success``. The reward of a step is the last resort, because it
     may contain more than the goal, such as a cost of actions.

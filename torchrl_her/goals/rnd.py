@@ -25,7 +25,7 @@ _RANGE = 2.0  # standard deviations within which most goals are
 
 
 class NetworkNovelty(GoalWeights):
-    """A goal's weight is the error with which a network predicts what a random network makes of it.
+    """Weights goals by the error with which a network predicts the output of a random network.
 
     The predictor is trained on the goals that are written, so its error is small where there were many like
     them and large where there were few. Burda et al., Exploration by random network distillation, 2018, with
@@ -38,10 +38,10 @@ class NetworkNovelty(GoalWeights):
     the buffer (``clear``) starts again with the networks of the beginning.
 
     Keyword Args:
-        seed: of both networks.
+        seed: seed of both networks.
         sharpness: weights are ``error ** sharpness``, of the squared error.
         hidden: width of the hidden layers, of which the target has one and the predictor two.
-        features: how many numbers the networks give.
+        features: number of outputs of the networks.
         lr: learning rate of the predictor (Adam).
         steps: gradient steps for the goals of one ``update``, at most.
         batch_size: goals of a gradient step, at most. Of more goals than all steps take, some are left out
@@ -99,7 +99,7 @@ class NetworkNovelty(GoalWeights):
         return error.masked_fill(~goals.isfinite().all(-1), math.nan)
 
     def update(self, goals: Tensor) -> None:
-        """Learns goals."""
+        """Trains the predictor on goals."""
         goals = goals.detach().reshape(-1, goals.shape[-1])
         goals = _bounded(goals[goals.isfinite().all(-1)])
         if len(goals) == 0:
@@ -135,7 +135,7 @@ class NetworkNovelty(GoalWeights):
             self._learned.optimizer.load_state_dict(deepcopy(state["optimizer"]))
 
     def _begin(self, width: int, device: torch.device) -> _Learned:
-        """New networks, always the same ones for a seed and width."""
+        """Makes new networks, always the same ones for a seed and a width of goals."""
         generator = torch.Generator().manual_seed(self.seed)
         target = _network([width, self.hidden, self.features], generator)
         predictor = _network([width, self.hidden, self.hidden, self.features], generator)
@@ -149,7 +149,7 @@ class NetworkNovelty(GoalWeights):
         return _Learned(loss, torch.optim.Adam(loss.predictor_network.parameters(), lr=self.lr))
 
     def _at(self, goals: Tensor) -> _Learned | None:
-        """The networks, moved to where goals are."""
+        """Returns the networks, moved to the device of the goals."""
         learned = self._learned
         if learned is None:
             return None
@@ -163,25 +163,25 @@ class NetworkNovelty(GoalWeights):
 
 
 class _Learned(NamedTuple):
-    """Both networks with the goals' moments, and what trains the predictor."""
+    """Both networks, the moments of the goals, and the predictor's optimizer."""
 
     loss: RNDLoss
     optimizer: torch.optim.Optimizer
 
 
 def _bounded(goals: Tensor) -> Tensor:
-    """Finite goals as the networks take them."""
+    """Returns finite goals, normalized and bounded, as inputs of the networks."""
     return goals.float().clamp(-_FARTHEST, _FARTHEST)
 
 
 def _errors(loss: RNDLoss, goals: Tensor) -> Tensor:
-    """The squared errors [...] of finite goals [..., g]."""
+    """Returns the squared prediction errors [...] of finite goals [..., g]."""
     flat = goals.reshape(-1, goals.shape[-1])
     return loss(TensorDict({_GOAL: flat}, [len(flat)]))["loss_predictor"].view(goals.shape[:-1])
 
 
 def _network(widths: Sequence[int], generator: torch.Generator) -> nn.Sequential:
-    """Linear layers with rectifiers between them, whose weights come from a generator.
+    """Makes linear layers with rectifiers between them, with weights from a generator.
 
     Biases of the first layer are spread over the range of normalized goals. Without them outputs would grow
     in proportion along each ray from the mean, and the predictor would know them from the goals near the

@@ -1,4 +1,4 @@
-"""Goal sources: how many of a transition's virtual goals come from where."""
+"""Goal sources: the number of virtual goals that each transition gets from each source."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ GoalSources = Mapping[Strategy, int]
 
 
 def check_goal_sources(sources: GoalSources) -> dict[Strategy, int]:
-    """Checks how many virtual goals each transition gets from each source.
+    """Checks the number of virtual goals that each transition gets from each source.
 
     A source is a goal strategy, which gives goals of the transition's own episode, or one of two that look
     beyond it: ``"actual"``, the goals that were really wanted in recent episodes, and ``"achieved"``, those

@@ -13,22 +13,22 @@ Strategy = str | StrategyFunction
 
 
 def future(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-    """The goals that this action and all later ones achieved."""
+    """Candidates are the goals that this action and all later ones achieved."""
     return time, lengths
 
 
 def final(_time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-    """The goal that the episode's last action achieved."""
+    """The candidate is the goal that the episode's last action achieved."""
     return lengths - 1, lengths
 
 
 def episode(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-    """All goals that were achieved in the episode, earlier ones too."""
+    """Candidates are all goals that were achieved in the episode, earlier ones too."""
     return torch.zeros_like(time), lengths
 
 
 STRATEGIES: dict[str, StrategyFunction] = {"future": future, "final": final, "episode": episode}
-_SAFE = tuple(STRATEGIES.values())  # these never leave the episode, so that is not checked
+_SAFE = tuple(STRATEGIES.values())  # these never leave the episode, so their candidates are not checked
 
 # Sources of goals that are no strategies, as they look beyond the episode: see ``sources``.
 RECENT = ("actual", "achieved")
@@ -40,7 +40,7 @@ def register_strategy(name: str, function: StrategyFunction) -> None:
     A function can also be used without a name: ``HERWriter(reward_fn, strategy=function)``.
 
     Args:
-        name: not yet taken.
+        name: name of the strategy, not yet taken.
         function: maps the steps of transitions and the lengths of their episodes, both [...] int64, to
             ``(first, end)``, both [...] int64: the candidates are the transitions ``first <= t' < end``.
             There must be at least one, and all must lie within the episode.
@@ -68,7 +68,7 @@ def register_strategy(name: str, function: StrategyFunction) -> None:
 
 
 def get_strategy(strategy: Strategy) -> StrategyFunction:
-    """The function of a goal strategy that is given by its name, or as a function already.
+    """Returns the function of a goal strategy that is given by its name or as a function.
 
     Raises:
         ValueError: there is no strategy of that name.
@@ -102,7 +102,7 @@ def strategy_name(strategy: Strategy) -> str:
 
 
 def candidate_range(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-    """The first candidate of each transition, and the end of its candidates.
+    """Returns the first candidate of each transition, and the end of its candidates.
 
     A candidate is a transition t' of the same episode. Its achieved goal is that of the state it leads
     to, so with ``"future"`` (t' >= t) no goal is achieved before the action. Andrychowicz et al.,
@@ -131,7 +131,7 @@ def candidate_range(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[
     first, end = function(time, lengths)
     if not any(function is safe for safe in _SAFE):
         first, end, _ = torch.broadcast_tensors(first, end, time)
-        wrong = (time < lengths) & ((first < 0) | (first >= end) | (end > lengths))  # padding may be anything
+        wrong = (time < lengths) & ((first < 0) | (first >= end) | (end > lengths))  # padding is ignored
         if bool(wrong.any()):
             t, length, low, high = (int(x[wrong][0]) for x in (time, lengths, first, end))
             raise ValueError(

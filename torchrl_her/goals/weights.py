@@ -12,7 +12,7 @@ _GOLDEN = (5**0.5 - 1) / 2
 
 
 class GoalWeights:
-    """How useful each achieved goal is as a virtual goal. Subclass it for a measure of your own.
+    """Measure of how useful each achieved goal is as a virtual goal. Subclass it for one of your own.
 
     The base class gives all goals the same weight and has no state.
 
@@ -30,7 +30,7 @@ class GoalWeights:
     alike: bool = False
 
     def __call__(self, goals: Tensor) -> Tensor:
-        """Weights [...] of at least 0 for goals [..., g]."""
+        """Returns weights [...] of at least 0 for goals [..., g]."""
         return goals.new_ones(goals.shape[:-1])
 
     def update(self, goals: Tensor) -> None:
@@ -44,16 +44,16 @@ class GoalWeights:
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave."""
+        """Restores the state that :meth:`state_dict` returned."""
 
     @classmethod
     def of_runs(cls, own: Sequence[GoalWeights]) -> WeightsOfRuns:
-        """The weights of several runs, all of this class, to be asked and told about all runs at once."""
+        """Combines the weights of several runs, all of this class, into one object for all runs."""
         return WeightsOfRuns(own)
 
 
 class WeightsOfRuns:
-    """The weights of goals of several runs, each with weights of its own. They are asked one after the other.
+    """Weights of goals of several runs, each with weights of its own, which are called one after the other.
 
     Args:
         own: R, of each run.
@@ -74,7 +74,7 @@ class WeightsOfRuns:
         self.own = own
 
     def __call__(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> Tensor:
-        """The weights [n, ...] of goals of some runs.
+        """Returns the weights [n, ...] of goals of the given runs.
 
         Args:
             goals: [n, ..., g], those of one run after those of the other.
@@ -85,14 +85,14 @@ class WeightsOfRuns:
         return torch.cat([self.own[run](part) for run, part in zip(runs, parts, strict=True)])
 
     def update(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> None:
-        """Tells which goals [n, g] were written; the rest is as for a call."""
+        """Updates the weights of the given runs with the virtual goals [n, g] that were written."""
         for run, part in zip(runs, goals.split(list(counts)), strict=True):
             if len(part):
                 self.own[run].update(part)
 
 
 def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: int) -> list[GoalWeights]:
-    """The weights of R runs as a list; empty if all goals are alike.
+    """Returns the weights of R runs as a list; empty if all goals have the same weight.
 
     Raises:
         ValueError: there are not as many as runs.
@@ -104,7 +104,7 @@ def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: in
 
 
 def checked_weights(weight: Tensor, goals: Tensor) -> Tensor:
-    """Weights [...] of goals [..., g] as floating-point numbers.
+    """Computes weights [...] of goals [..., g] as floating-point numbers, and checks them.
 
     Raises:
         ValueError: there is not one for each goal, or some are negative or not finite.
@@ -123,7 +123,7 @@ def checked_weights(weight: Tensor, goals: Tensor) -> Tensor:
 
 
 def normalized_weights(logs: Tensor, goals: Tensor) -> Tensor:
-    """Weights from their logarithms, the largest of them 1, and none so small that it would be rounded to 0.
+    """Computes weights from their logarithms: the largest is 1, and none is rounded to 0.
 
     Args:
         logs: [...], of the weights; NaN for a goal that must not be drawn.
@@ -144,7 +144,7 @@ def normalized_weights(logs: Tensor, goals: Tensor) -> Tensor:
 
 
 def spread_evenly(count: int, most: int, device: torch.device | None = None) -> Tensor:
-    """Indices of ``count`` things: of all, or of ``most`` of them that are spread evenly.
+    """Returns the indices of ``count`` items, or of ``most`` of them that are spread evenly.
 
     There is one in each of as many equal parts, and where in its part it is changes from part to part. Always
     at its begin, with one part for each episode or step, say, all of them would be of first transitions, or

@@ -1,4 +1,4 @@
-"""Networks, exploration around a greedy policy, and normalization of what they see."""
+"""Networks, exploration around a greedy policy, and normalization of inputs."""
 
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import (

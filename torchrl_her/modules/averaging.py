@@ -1,4 +1,4 @@
-"""A policy whose weights are the average of those that another one had."""
+"""A policy whose weights are an average of the weights that the learning policy had."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PolicyAverage(nn.Module):
         policy: the one that learns.
 
     Keyword Args:
-        decay: what stays of the average in a gradient step: 0.9995 averages over about 2,000 steps.
+        decay: fraction of the average that a gradient step keeps: 0.9995 averages over about 2,000 steps.
         runs: R independent ones, whose weights are stacked: the first dimension of each parameter.
 
     Attributes:
@@ -54,7 +54,7 @@ class PolicyAverage(nn.Module):
             raise ValueError(f"decay must be between 0 and 1, got {decay}")
         super().__init__()
         self.module = deepcopy(policy).requires_grad_(False)
-        self.decay, self._policy = decay, (policy,)  # in a tuple, it is no submodule of this one
+        self.decay, self._policy = decay, (policy,)  # in a tuple, so that it is not a submodule
         self.register_buffer("steps", torch.zeros(runs, dtype=torch.int64))
         self._weights = [list(own.parameters()) for own in (self.module, policy)]
         self._copies = next(self.module.buffers(), None) is not None
@@ -64,15 +64,15 @@ class PolicyAverage(nn.Module):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """The one that learns."""
+        """The policy that learns."""
         return self._policy[0]
 
     @torch.no_grad()
     def follow(self, steps: int = 1, *, idle: Sequence[int] = ()) -> None:
-        """Moves the average towards the policy, which has made some gradient steps since the last call.
+        """Moves the average towards the policy, by the number of gradient steps since the last call.
 
         Args:
-            steps: how many.
+            steps: number of gradient steps since the last call.
             idle: the runs that made none.
         """
         made = [0 if run in idle else steps for run in range(len(self.steps))]
@@ -90,14 +90,14 @@ class PolicyAverage(nn.Module):
 
     @torch.no_grad()
     def restart(self) -> None:
-        """Forgets what the weights were: begins with those that the policy has now."""
+        """Restarts the average from the policy's present weights."""
         self.steps.zero_()
         for own, now in zip(*self._weights, strict=True):
             own.copy_(now)
         self._copy_buffers()
 
     def _kept(self, done: int) -> float:
-        """The decay of one gradient step after so many."""
+        """Returns the decay of the average in one gradient step, after a number of steps."""
         return min(self.decay, (1 + done) / (10 + done))
 
     def _copy_buffers(self) -> None:

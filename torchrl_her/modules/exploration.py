@@ -1,4 +1,4 @@
-"""Exploration: a share epsilon of the actions, which decays, is not greedy."""
+"""Exploration: a fraction epsilon of the actions, which decays, is not greedy."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def explore_actions(
 
     Args:
         greedy: [...] of integers, the actions of the policy.
-        actions: how many there are.
+        actions: number of actions.
         epsilon: share of actions that are drawn uniformly.
         generator: source of the random numbers.
 
@@ -156,7 +156,7 @@ class Exploration(TensorDictModuleBase):
 
     @abstractmethod
     def _explore(self, greedy: Tensor, epsilon: Tensor, generator: torch.Generator | None) -> Tensor:
-        """The actions of one run, some of them exploring."""
+        """Returns the actions of one run, some of them exploring."""
 
 
 class DecayingEpsilon(Exploration):
@@ -168,7 +168,7 @@ class DecayingEpsilon(Exploration):
 
     Keyword Args:
         noise, uniform_share: see :func:`~torchrl_her.modules.explore`.
-        **options: of :class:`~torchrl_her.modules.Exploration`.
+        **options: options of :class:`~torchrl_her.modules.Exploration`.
 
     Raises:
         ValueError: ``noise`` is negative or ``uniform_share`` outside of [0, 1].
@@ -208,10 +208,10 @@ class DecayingEpsilonGreedy(Exploration):
     """Epsilon-greedy exploration of discrete actions, given as integers (``Categorical``).
 
     Args:
-        actions: how many there are.
+        actions: number of actions.
 
     Keyword Args:
-        **options: of :class:`~torchrl_her.modules.Exploration`.
+        **options: options of :class:`~torchrl_her.modules.Exploration`.
 
     Raises:
         ValueError: fewer than one action.

@@ -47,7 +47,7 @@ class StackedLinear(nn.Module):
         self.bias = nn.Parameter(torch.empty(runs, 1, outputs).uniform_(-bound, bound))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[R, rows, inputs] to [R, rows, outputs]."""
+        """Maps [R, rows, inputs] to [R, rows, outputs]."""
         return torch.baddbmm(self.bias, x, self.weight)
 
 
@@ -84,7 +84,7 @@ class StackedBatchNorm(nn.Module):
         self.register_buffer("running_var", torch.ones(runs, 1, width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[R, rows, width] to the same."""
+        """Normalizes [R, rows, width] entry by entry; the shape stays."""
         runs, rows, width = x.shape
         flat = x.transpose(0, 1).reshape(rows, runs * width)
         own = (self.running_mean, self.running_var, self.weight, self.bias)
@@ -100,7 +100,7 @@ class StackedLayerNorm(nn.Module):
     Ba et al., Layer normalization, 2016.
 
     Args:
-        width: of the input.
+        width: width of the input.
         runs: R.
 
     Example:
@@ -114,14 +114,14 @@ class StackedLayerNorm(nn.Module):
         self.bias = nn.Parameter(torch.zeros(runs, 1, width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[R, rows, width] to the same."""
+        """Normalizes [R, rows, width] entry by entry; the shape stays."""
         return torch.nn.functional.layer_norm(x, x.shape[-1:]) * self.weight + self.bias
 
 
 def hidden_layer(
     inputs: int, outputs: int, *, runs: int = 1, norm: Norm = "none", activation: ActivationName = "relu"
 ) -> nn.Sequential:
-    """A stacked linear layer, a normalization if there is one, and an activation."""
+    """Makes a stacked linear layer, a normalization unless ``norm`` is none, and an activation."""
     norms: dict[str, Any] = {"layer": StackedLayerNorm, "batch": StackedBatchNorm}
     between = [norms[norm](outputs, runs=runs)] if norm in norms else []
     return nn.Sequential(StackedLinear(inputs, outputs, runs=runs), *between, ACTIVATIONS[activation]())
@@ -137,12 +137,12 @@ def hidden_layers(
     norm: Norm = "none",
     activation: ActivationName = "relu",
 ) -> list[nn.Module]:
-    """Hidden layers of one width, one after the other.
+    """Makes hidden layers of one width, one after the other.
 
     Args:
         inputs: width of the input.
         hidden: width of each layer.
-        depth: how many there are, at least 2.
+        depth: number of layers, at least 2.
         joined: width of what the second one takes in besides the outputs of the first.
         runs: R.
         norm: normalization of each layer.
@@ -165,13 +165,13 @@ def hidden_layers(
 
 
 class ActorNet(nn.Module):
-    """(observation, goal) to an action in [-1, 1].
+    """Network of the policy: maps (observation, goal) to an action in [-1, 1].
 
     Args:
         inputs: width of all inputs together.
         actions: width of the action.
         hidden: width of the hidden layers.
-        depth: how many hidden layers there are, at least 2.
+        depth: number of hidden layers, at least 2.
         activation: behind each of them: ``"relu"``, ``"tanh"`` or ``"elu"``.
         norm: ``"layer"`` for layer normalization before each activation, ``"none"`` without.
         runs: R, how many independent actors.
@@ -206,24 +206,24 @@ class ActorNet(nn.Module):
         )
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[..., widths] of the inputs to [..., actions]."""
+        """Maps inputs [..., width] to actions [..., actions]."""
         x = torch.cat(inputs, -1)
         return self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
 
 
 class CriticNet(nn.Module):
-    """(observation, goal, action) to the action's value, or to several numbers such as its quantiles.
+    """Network of a critic: maps (observation, goal, action) to a value, or to several such as quantiles.
 
     Args:
         inputs: width of all inputs together, without the action.
         actions: width of the action, the last input.
         hidden: width of the hidden layers.
-        depth: how many hidden layers there are, at least 2.
+        depth: number of hidden layers, at least 2.
         activation: behind each of them: ``"relu"``, ``"tanh"`` or ``"elu"``.
         norm: ``"layer"`` for layer normalization of the hidden layers, ``"batch"`` for batch normalization of
             the input and the hidden layers, ``"none"`` without.
         runs: R, how many independent critics.
-        outputs: how many numbers.
+        outputs: number of outputs.
 
     Raises:
         ValueError: an option cannot be.
@@ -256,7 +256,7 @@ class CriticNet(nn.Module):
         self.rest = nn.Sequential(*rest, StackedLinear(hidden, outputs, runs=runs, bound=_LAST_LAYER))
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[..., widths] of the inputs, the action last, to [..., outputs]."""
+        """Maps inputs [..., width], the action last, to [..., outputs]."""
         *seen, action = inputs
         hidden = self.first(by_run(torch.cat(seen, -1), self.runs))
         return self.rest(torch.cat((hidden, by_run(action, self.runs)), -1)).view(
@@ -265,12 +265,12 @@ class CriticNet(nn.Module):
 
 
 def by_run(x: Tensor, runs: int) -> Tensor:
-    """Separates the R equal blocks of a batch: [..., width] to [R, rows, width]."""
+    """Separates the R equal blocks of a batch: reshapes [..., width] to [R, rows, width]."""
     return x.reshape(runs, -1, x.shape[-1])
 
 
 def stack_runs(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    """The state dict of a stacked network, made of those of single networks.
+    """Stacks the state dicts of single networks to that of a stacked network.
 
     Args:
         states: ``state_dict()`` of R networks of the same shape, each of a single run.
@@ -287,7 +287,7 @@ def stack_runs(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
 
 
 def take_run(state: Mapping[str, Tensor], run: int, runs: int) -> dict[str, Tensor]:
-    """The state dict of one run's network, taken out of that of a stacked network.
+    """Extracts the state dict of one run's network from that of a stacked network.
 
     Args:
         state: ``state_dict()`` of the stacked network.
@@ -309,15 +309,15 @@ def make_actor(
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     action_key: NestedKey = "action",
 ) -> TensorDictModule:
-    """The actor as a TensorDict module.
+    """Makes an actor as a TensorDict module.
 
     Args:
-        widths: of the inputs, one for each of ``in_keys``.
+        widths: widths of the inputs, one for each of ``in_keys``.
         actions: width of the action, which is within [-1, 1].
         hidden, depth, activation, norm: see :class:`ActorNet`.
         runs: R, how many independent actors.
-        in_keys: what it sees; the goal must be among them.
-        action_key: where it writes the action.
+        in_keys: keys of the inputs; the goal must be among them.
+        action_key: key under which the action is written.
 
     Example:
         >>> from tensordict import TensorDict
@@ -346,17 +346,17 @@ def make_critic(
     action_key: NestedKey = "action",
     value_key: NestedKey = "state_action_value",
 ) -> TensorDictModule:
-    """The critic as a TensorDict module.
+    """Makes a critic as a TensorDict module.
 
     Args:
-        widths: of the inputs, one for each of ``in_keys``.
+        widths: widths of the inputs, one for each of ``in_keys``.
         actions: width of the action.
         hidden, depth, activation, norm: see :class:`CriticNet`.
         runs: R, how many independent critics.
-        outputs: how many numbers each gives, for example quantiles of the return.
-        in_keys: what it sees besides the action; the goal must be among them.
-        action_key: where it reads the action.
-        value_key: where it writes the action's value.
+        outputs: number of outputs, for example quantiles of the return.
+        in_keys: keys of the inputs besides the action; the goal must be among them.
+        action_key: key from which the action is read.
+        value_key: key under which the action's value is written.
 
     Example:
         >>> from tensordict import TensorDict

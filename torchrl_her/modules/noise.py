@@ -18,7 +18,7 @@ class RunNoise:
         generators: R of them; None for torch's own generator, which all runs share.
 
     Attributes:
-        generators: as given. Copies of this object share them.
+        generators: generators of the runs. Copies of this object share them.
         idle: runs that draw nothing; their numbers are 0.
 
     Example:
@@ -37,7 +37,7 @@ class RunNoise:
         return RunNoise(self.generators)
 
     def __call__(self, like: Tensor) -> Tensor:
-        """Numbers of the shape, type and device of a tensor whose first dimension is R equal blocks."""
+        """Draws numbers of the shape, type and device of a tensor whose first dimension is R equal blocks."""
         if self.generators is None:
             return torch.randn_like(like)
         out = torch.empty_like(like, memory_format=torch.contiguous_format)
@@ -50,7 +50,7 @@ class RunNoise:
         return out
 
     def subsets(self, count: int, of: int) -> Tensor:
-        """Whole numbers below ``of``, without repetition, drawn for each run: [R, count], in order of size.
+        """Draws distinct whole numbers below ``of`` for each run, [R, count] in ascending order.
 
         From torch's own generator, all runs share one draw: [1, count].
 
@@ -59,7 +59,7 @@ class RunNoise:
             torch.Size([3, 2])
         """
         sources: Sequence[torch.Generator | None] = self.generators or [None]
-        devices = [None if own is None else own.device for own in sources]  # draws elsewhere are refused
+        devices = [None if own is None else own.device for own in sources]
         drawn = [
             torch.arange(count, device=device)
             if run in self.idle

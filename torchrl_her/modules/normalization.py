@@ -1,4 +1,4 @@
-"""Running normalization: what networks see has about mean 0 and standard deviation 1, in each entry.
+"""Running normalization: gives each input of networks about mean 0 and standard deviation 1.
 
 Statistics are those of all transitions that were written, virtual ones included. Andrychowicz et al.,
 Hindsight experience replay, 2017, appendix A.
@@ -22,10 +22,10 @@ _RELATIVE_STD = 1e-4  # of the mean: smaller deviations are hardly more than wha
 
 
 class Moments(NamedTuple):
-    """How many values there were, and their mean and variance; of each entry, [...] of float64 all three.
+    """Number, mean and variance of values, each [...] of float64.
 
     Attributes:
-        n: how many; weights need not be whole numbers.
+        n: number of values; not a whole number if values have weights.
         mean: their mean.
         var: the mean squared deviation from it.
     """
@@ -36,7 +36,7 @@ class Moments(NamedTuple):
 
 
 def moments(values: Tensor) -> Moments:
-    """Number, mean and variance of values [n, width], n at least 1.
+    """Computes number, mean and variance of values [n, width], n at least 1.
 
     Example:
         >>> n, mean, var = moments(torch.tensor([[1.0, 5.0], [3.0, 5.0]]))
@@ -50,7 +50,7 @@ def moments(values: Tensor) -> Moments:
 
 
 def merge(one: Moments, other: Moments) -> Moments:
-    """Number, mean and variance of all values of two sets; either may have none.
+    """Combines the moments of two sets of values, each of which may be empty.
 
     Chan, Golub and LeVeque, Updating formulae and a pairwise algorithm for computing sample variances, 1979.
 
@@ -67,7 +67,7 @@ def merge(one: Moments, other: Moments) -> Moments:
 
 
 def normalize(values: Tensor, mean: Tensor, std: Tensor, limit: Tensor) -> Tensor:
-    """``(values - mean) / std``, clipped to [-limit, limit]; arguments are broadcast against each other.
+    """Computes ``(values - mean) / std``, clipped to [-limit, limit]; arguments are broadcast.
 
     Example:
         >>> normalize(torch.tensor([4.0, 90.0]), torch.tensor(2.0), torch.tensor(4.0), torch.tensor(5.0))
@@ -94,7 +94,7 @@ class RunningNorm(nn.Module):
     normalized by itself, so statistics of a concatenation are those of its parts, side by side.
 
     Args:
-        widths: of the entries that are normalized, by their keys.
+        widths: widths of the entries that are normalized, by their keys.
 
     Keyword Args:
         runs: R.
@@ -153,17 +153,17 @@ class RunningNorm(nn.Module):
 
     @property
     def keys(self) -> list[NestedKey]:
-        """The entries that are normalized."""
+        """Keys of the entries that are normalized."""
         return list(self.widths)
 
     def moments_of(self, key: NestedKey, run: int = 0) -> Moments:
-        """Number, mean and variance of an entry's values so far, [width] each; a view."""
+        """Returns number, mean and variance of an entry's values so far, [width] each, as views."""
         columns = self.columns_of(key)
         return Moments(*(own[run, columns] for own in (self.n, self.mean, self.var)))
 
     @property
     def std(self) -> Tensor:
-        """Standard deviations [R, W] by which values are divided; 1 where nothing was counted."""
+        """Returns the standard deviations [R, W] by which values are divided; 1 where nothing was counted."""
         rounding = self.mean.abs() * _RELATIVE_STD + torch.finfo(torch.float32).tiny
         least = rounding if self.least_std is None else rounding.new_tensor(self.least_std)
         return self.var.sqrt().maximum(least)
@@ -171,14 +171,14 @@ class RunningNorm(nn.Module):
     def restart(
         self, run: int | None = None, *, key: NestedKey | None = None, places: Sequence[int] | None = None
     ) -> None:
-        """Forgets the values of one run, or of all.
+        """Resets the statistics of one run, or of all.
 
         Args:
-            run: which one; None for all.
+            run: index of the run; None for all.
 
         Keyword Args:
             key: the entry; None for all.
-            places: which numbers of the entry; None for all.
+            places: positions of numbers in the entry; None for all.
         """
         columns = torch.arange(self.n.shape[-1], device=self.n.device)
         columns = columns if key is None else columns[self.columns_of(key)]
@@ -190,12 +190,12 @@ class RunningNorm(nn.Module):
     def update(
         self, rows: TensorDictBase, runs: Sequence[int] | None = None, counts: Sequence[int] | None = None
     ) -> Callable[[], None]:
-        """Counts transitions, by what is in their root; nothing of them if an entry cannot be counted.
+        """Adds the root entries of transitions to the statistics; none of them if an entry is invalid.
 
         Args:
-            rows: of any shape; with ``runs`` they are run after run, otherwise R equal blocks.
-            runs: which runs they are of; None for all R of them.
-            counts: how many each of these runs has; None for equally many.
+            rows: transitions of any shape; with ``runs`` they are run after run, otherwise R equal blocks.
+            runs: indices of the runs that they belong to; None for all R runs.
+            counts: number of rows of each of these runs; None if all have the same.
 
         Returns:
             What undoes it, see :meth:`snapshot`.
@@ -225,7 +225,7 @@ class RunningNorm(nn.Module):
         return undo
 
     def snapshot(self) -> Callable[[], None]:
-        """A function that makes the statistics what they are now.
+        """Returns a function that restores the present statistics.
 
         Example:
             >>> norm = RunningNorm({"observation": 1})
@@ -245,14 +245,14 @@ class RunningNorm(nn.Module):
 
     @torch.no_grad()
     def count(self, key: NestedKey, values: Tensor, *, run: int = 0, weight: float = 1.0) -> None:
-        """Counts values of one entry.
+        """Adds values of one entry to the statistics.
 
         Args:
-            key: of the entry.
+            key: key of the entry.
             values: [..., width], or less wide: then they are the first numbers of the entry.
 
         Keyword Args:
-            run: which they are of.
+            run: index of the run that they belong to.
             weight: how often each value counts.
 
         Raises:
@@ -270,10 +270,10 @@ class RunningNorm(nn.Module):
         _add(Moments(*(each[:width] for each in own)), new._replace(n=new.n * weight))
 
     def normalize(self, key: NestedKey, values: Tensor) -> Tensor:
-        """Normalized values of one entry.
+        """Returns normalized values of one entry.
 
         Args:
-            key: of the entry.
+            key: key of the entry.
             values: [..., width], R equal blocks in the order of the runs.
 
         Returns:
@@ -289,12 +289,12 @@ class RunningNorm(nn.Module):
         if not values.is_floating_point():  # means and deviations would be rounded to whole numbers, too
             values = values.to(torch.get_default_dtype())
         n, mean, std = (own[:, columns] for own in (self.n, self.mean, self.std))
-        limit = torch.where(n > 0, self.clip, torch.inf)  # nothing is changed before the first update
+        limit = torch.where(n > 0, self.clip, torch.inf)  # values stay as they are before the first update
         mean, std, limit = (own.to(values).unsqueeze(1) for own in (mean, std, limit))
         return normalize(by_run(values, self.runs), mean, std, limit).view(values.shape)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """A shallow copy with normalized entries, in the root and, as far as they are there, under ``next``.
+        """Returns a shallow copy with normalized entries, in the root and, where present, under ``next``.
 
         Raises:
             KeyError: an entry is missing in the root.
@@ -309,16 +309,16 @@ class RunningNorm(nn.Module):
         return out
 
     def columns_of(self, key: NestedKey) -> slice:
-        """The columns of an entry in ``n``, ``mean``, ``var`` and ``std``."""
+        """Returns the columns of an entry in ``n``, ``mean``, ``var`` and ``std``."""
         columns = self._columns.get(unravel_key(key))
         if columns is None:
             raise KeyError(f"{key!r} is not normalized, only {', '.join(map(repr, self.widths))}")
         return columns
 
     def _finite_moments(self, key: NestedKey, values: Tensor) -> Moments:
-        """Number, mean and variance of values [..., width]; raises if one of them is not finite."""
+        """Computes number, mean and variance of values [..., width]; raises if a value is not finite."""
         new = moments(values.reshape(-1, values.shape[-1]).to(self.mean.device))
-        if not bool(new.var.isfinite().all()):  # one NaN or infinity among the values is enough for that
+        if not bool(new.var.isfinite().all()):  # one NaN or infinity among the values is enough
             raise ValueError(f"{key!r} must be finite to be counted, got NaN or infinity in it")
         return new
 
@@ -346,7 +346,7 @@ def _add(own: Moments, new: Moments) -> None:
 
 
 def entry_to_normalize(rows: TensorDictBase, key: NestedKey, *, who: str = "normalization") -> Tensor:
-    """An entry.
+    """Returns an entry that is to be normalized; raises if it is missing.
 
     Raises:
         KeyError: it is missing.

@@ -1,4 +1,4 @@
-"""Where running normalization is applied: to what is sampled, and to what a policy sees."""
+"""Applies running normalization to sampled transitions and to the inputs of a policy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl_her.modules.normalization import RunningNorm, entry_to_normalize
 
 
 class NormalizeBatch(Transform):
-    """Normalizes what a replay buffer samples: put it there with ``buffer.append_transform``.
+    """Normalizes the transitions that a replay buffer samples: add it with ``buffer.append_transform``.
 
     Relabeling comes before: a :class:`~torchrl_her.HERWriter` stores transitions with their virtual goals,
     and a :class:`~torchrl_her.HERSampleUnit` puts them in before all transforms. So losses see normalized
@@ -75,7 +75,7 @@ class NormalizeBatch(Transform):
         return self.norm(tensordict)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Sees what is written, and leaves it as it is."""
+        """Counts transitions that are written, and leaves them unchanged."""
         if self.counted_k is not None and not self.norm.frozen:
             # Checked first, so that rows which cannot be counted leave the statistics as they were.
             key = unravel_key(("next", self.achieved_goal_key))
@@ -92,7 +92,7 @@ class NormalizeBatch(Transform):
 
 
 class NormalizedPolicy(TensorDictModuleBase):
-    """A policy that sees normalized entries, while everybody else sees them as they were.
+    """Gives a policy normalized inputs, and leaves the entries that others read unchanged.
 
     Only what the actor writes is put into the tensordict, so collectors yield raw observations and goals,
     which is what has to be stored. Exploration belongs behind this module, or within the actor. The
@@ -102,7 +102,7 @@ class NormalizedPolicy(TensorDictModuleBase):
     Args:
         actor: trained on batches of :class:`~torchrl_her.modules.NormalizeBatch`. Losses take the actor
             itself.
-        norm: the same statistics.
+        norm: running statistics, which other modules may share.
 
     Raises:
         ValueError: the actor reads no normalized entry, or writes one.
@@ -132,7 +132,7 @@ class NormalizedPolicy(TensorDictModuleBase):
         self.actor, self.norm = actor, norm
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Runs the actor on normalized entries; writes what it wrote.
+        """Runs the actor on normalized entries, and copies its outputs.
 
         Raises:
             KeyError: an entry that the actor reads normalized is missing.

@@ -1,4 +1,4 @@
-"""The values of discrete actions, and the policy that is greedy in them."""
+"""Networks for the values of discrete actions, and the greedy policy."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from torchrl_her.modules.networks import ActivationName, Norm, StackedLinear, by
 
 
 class QNet(nn.Module):
-    """(observation, goal) to the values of all actions.
+    """Network that maps (observation, goal) to the values of all actions.
 
     Args:
         inputs: width of all inputs together.
-        actions: how many actions there are.
-        hidden, depth, activation, norm: as for :class:`~torchrl_her.modules.ActorNet`.
+        actions: number of actions.
+        hidden, depth, activation, norm: see :class:`~torchrl_her.modules.ActorNet`.
         runs: R, how many independent networks.
 
     Example:
@@ -45,13 +45,13 @@ class QNet(nn.Module):
         self.layers = nn.Sequential(*layers, StackedLinear(hidden, actions, runs=runs))
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[..., widths] of the inputs to [..., actions]."""
+        """Maps inputs [..., width] to values [..., actions]."""
         x = torch.cat(inputs, -1)
         return self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
 
 
 class BestAction(nn.Module):
-    """(observation, goal) to the action of the greatest value.
+    """Greedy policy: maps (observation, goal) to the action of the greatest value.
 
     Args:
         net: gives the values; it may be shared.
@@ -67,11 +67,11 @@ class BestAction(nn.Module):
         self.net = net
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[..., widths] of the inputs to integers [...]."""
+        """Maps inputs [..., width] to integers [...]."""
         return self.net(*inputs).argmax(-1)
 
     def regret(self, action: Tensor, *inputs: Tensor) -> Tensor:
-        """By how much the value of an action [...] is below the greatest one, [...].
+        """Returns by how much the value of an action [...] is below the greatest one, [...].
 
         Example:
             >>> best, seen = BestAction(QNet(6, 4)), (torch.zeros(2, 3), torch.zeros(2, 3))
@@ -83,7 +83,7 @@ class BestAction(nn.Module):
 
 
 class _ChosenValue(nn.Module):
-    """(observation, goal, action) to the action's value [..., 1]."""
+    """Critic that maps (observation, goal, action) to the action's value [..., 1]."""
 
     def __init__(self, net: QNet) -> None:
         super().__init__()
@@ -106,15 +106,15 @@ def make_q_actor(
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     value_key: NestedKey = "state_action_value",
 ) -> tuple[QValueActor, TensorDictModule]:
-    """A policy that is greedy in the values of a :class:`~torchrl_her.modules.QNet`, and the matching critic.
+    """Makes a policy that is greedy in the values of a :class:`~torchrl_her.modules.QNet`, and its critic.
 
     Args:
-        widths: of the inputs, one for each of ``in_keys``.
-        actions: how many actions there are; they are integers (``Categorical``).
-        hidden, depth, activation, norm: as for :class:`~torchrl_her.modules.ActorNet`.
+        widths: widths of the inputs, one for each of ``in_keys``.
+        actions: number of actions; they are integers (``Categorical``).
+        hidden, depth, activation, norm: see :class:`~torchrl_her.modules.ActorNet`.
         runs: R, how many independent networks.
-        in_keys: what it sees; the goal must be among them.
-        value_key: where the value of a given action is written.
+        in_keys: keys of the inputs; the goal must be among them.
+        value_key: key under which the value of a given action is written.
 
     Returns:
         ``(actor, critic)``, which share their weights; the critic gives the value of the action that it is

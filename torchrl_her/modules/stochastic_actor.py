@@ -16,16 +16,16 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl_her.modules.networks import ActivationName, Norm, StackedLinear, by_run, hidden_layers
 from torchrl_her.modules.noise import RunNoise
 
-_LEAST_SCALE, _GREATEST_SCALE = -10.0, 2.0  # of the logarithm: Haarnoja et al., 2018
+_LEAST_SCALE, _GREATEST_SCALE = -10.0, 2.0  # bounds of the scale's logarithm: Haarnoja et al., 2018
 
 
 class StochasticActorNet(nn.Module):
-    """(observation, goal) to the location and the scale of a normal distribution.
+    """Network that maps (observation, goal) to the location and the scale of a normal distribution.
 
     Args:
         inputs: width of all inputs together.
         actions: width of the action.
-        hidden, depth, activation, norm: as for :class:`~torchrl_her.modules.ActorNet`.
+        hidden, depth, activation, norm: see :class:`~torchrl_her.modules.ActorNet`.
         runs: R, how many independent actors.
 
     Example:
@@ -51,7 +51,7 @@ class StochasticActorNet(nn.Module):
         self.layers = nn.Sequential(*layers, StackedLinear(hidden, 2 * actions, runs=runs))
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """[..., widths] of the inputs to two of [..., actions]."""
+        """Maps inputs [..., width] to location and scale, [..., actions] each."""
         x = torch.cat(inputs, -1)
         out = self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
         location, scale = out.chunk(2, -1)
@@ -65,9 +65,9 @@ class StochasticActor(ProbabilisticActor):
     they play for the same runs.
 
     Args:
-        *args: of :class:`torchrl.modules.ProbabilisticActor`.
+        *args: arguments of :class:`torchrl.modules.ProbabilisticActor`.
         generators: R of them; None for torch's own generator, which all runs share.
-        **kwargs: of the same.
+        **kwargs: keyword arguments of the same class.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class StochasticActor(ProbabilisticActor):
 
     @property
     def generators(self) -> list[torch.Generator | None] | None:
-        """Sources of the draws of each run."""
+        """Generators of each run's random numbers."""
         return self.noise.generators
 
     @generators.setter
@@ -100,7 +100,7 @@ class SquashedLocation(nn.Module):
     """The greedy action of a stochastic actor: the location of its normal distribution, squashed and scaled.
 
     Args:
-        net: of the actor; it may be shared.
+        net: network of the actor; it may be shared.
         low: the least actions [width].
         high: the greatest ones.
 
@@ -120,7 +120,7 @@ class SquashedLocation(nn.Module):
         self.register_buffer("high", high.clone(), persistent=False)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[..., widths] of the inputs to [..., actions]."""
+        """Maps inputs [..., width] to actions [..., actions]."""
         location, _ = self.net(*inputs)
         return (self.high + self.low) / 2 + (self.high - self.low) / 2 * location.tanh()
 
@@ -137,15 +137,15 @@ def make_stochastic_actor(
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     generators: Sequence[torch.Generator] | None = None,
 ) -> ProbabilisticActor:
-    """SAC's actor: draws from a squashed normal distribution; its greedy action is the squashed location.
+    """Makes SAC's actor: it draws from a squashed normal distribution, whose squashed location is greedy.
 
     Args:
-        widths: of the inputs, one for each of ``in_keys``.
+        widths: widths of the inputs, one for each of ``in_keys``.
         action_spec: least and greatest actions, of one environment.
-        hidden, depth, activation, norm: as for :class:`~torchrl_her.modules.ActorNet`.
+        hidden, depth, activation, norm: see :class:`~torchrl_her.modules.ActorNet`.
         runs: R, how many independent actors.
-        in_keys: what it sees; the goal must be among them.
-        generators: of the actions that each run draws; None for torch's own.
+        in_keys: keys of the inputs; the goal must be among them.
+        generators: generators of the actions that each run draws; None for torch's own.
 
     Example:
         >>> from tensordict import TensorDict

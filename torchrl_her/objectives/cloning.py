@@ -1,4 +1,4 @@
-"""Behavior cloning: what pulls a policy to the actions of demonstrations."""
+"""Behavior cloning: a loss that pulls a policy to the actions of demonstrations."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ DEMONSTRATION = "demonstration"  # the flag of rows that are demonstrations
 
 @dataclass(frozen=True, kw_only=True)
 class Cloning:
-    """How a loss clones the behavior of demonstrations.
+    """Options for cloning the behavior of demonstrations in a loss.
 
     Args:
-        weight: of the cloning loss, which is added to the actor's, at least 0.
+        weight: weight of the cloning loss, which is added to the actor's, at least 0.
         q_filter: whether only those actions are cloned that the critic prefers to the policy's.
-        key: of the flag [..., 1] of bool that marks rows of demonstrations.
+        key: key of the flag [..., 1] of bool that marks rows of demonstrations.
 
     Raises:
         ValueError: the weight is negative.
@@ -42,7 +42,7 @@ class Cloning:
 def cloning_terms(
     action: Tensor, demonstrated: Tensor, flagged: Tensor, *, better: Tensor | None = None
 ) -> Tensor:
-    """The terms of the cloning loss: their sum over a batch is the mean over the demonstrations in it.
+    """Returns the terms of the cloning loss, whose sum over a batch is the mean over its demonstrations.
 
     A term is ``||action - demonstrated||^2 / D`` for D demonstrations among B rows; 0 for other rows, and for
     demonstrations that the Q filter drops. Nair et al., Overcoming exploration in reinforcement learning with
@@ -97,7 +97,7 @@ def with_cloning(loss: Any, value: Tensor, transitions: TensorDictBase) -> Tenso
         )
     flagged = flag.reshape(transitions.shape)
     batch = flagged.shape[-1]
-    at = flagged.reshape(-1, batch).any(0).nonzero().squeeze(-1)  # no other rows count
+    at = flagged.reshape(-1, batch).any(0).nonzero().squeeze(-1)  # other rows have weight 0
     if len(at) == 0:
         return value
     # DDPG's loss has no name for the action, but its actor has.
@@ -112,7 +112,7 @@ def with_cloning(loss: Any, value: Tensor, transitions: TensorDictBase) -> Tenso
     better = None
     if cloning.q_filter:
         both = [rows.copy().set(key, each) for each in (shown, action.detach())]
-        q_values = critic_value(loss, torch.cat(both, -1))  # one call is faster
+        q_values = critic_value(loss, torch.cat(both, -1))  # one call for both is faster
         if q_values is None:
             raise ValueError(f"a {type(loss).__name__} has no critics for the Q filter: q_filter=False")
         of_shown, of_policy = q_values.squeeze(-1).chunk(2, -1)

@@ -1,4 +1,4 @@
-"""The critics of a loss, of which there may be several: what they are and what they think."""
+"""The critics of a loss: how several are given to it, and the values that they compute."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl_her.modules.noise import RunNoise
 
 @torch.no_grad()
 def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None:
-    """The value of actions, as the loss's own critics see it.
+    """Returns the value of actions, from the critics of a loss.
 
     TD3 and SAC train several critics, which they make anew from the one they are given. Their value is the
     least of these, as in their targets. Where targets take some critics at random, it is the mean of all, and
@@ -26,7 +26,7 @@ def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None
     best action.
 
     Args:
-        loss: of TorchRL, for example from :func:`~torchrl_her.objectives.make_td3_loss`.
+        loss: loss of TorchRL, for example from :func:`~torchrl_her.objectives.make_td3_loss`.
         transitions: [...], with all that the critics read; for all but DQN that includes the action. They are
             normalized if the loss is trained on normalized ones (:class:`~torchrl_her.modules.RunningNorm`).
 
@@ -53,10 +53,10 @@ def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None
 
 @torch.no_grad()
 def critic_values(loss: LossModule, transitions: TensorDictBase) -> Tensor | None:
-    """The values of actions that each of the loss's critics gives; see :func:`critic_value`.
+    """Returns the values of actions from each critic of a loss; see :func:`critic_value`.
 
     Args:
-        loss: of TorchRL.
+        loss: loss of TorchRL.
         transitions: [...], with all that the critics read.
 
     Returns:
@@ -74,7 +74,7 @@ def critic_values(loss: LossModule, transitions: TensorDictBase) -> Tensor | Non
     else:
         return None
     training, values = network.training, []
-    network.eval()  # neither uses nor changes the statistics of this batch
+    network.eval()  # batch normalization neither uses nor changes the statistics of this batch
     try:
         for own in params.data.unbind(0) if params.ndim else [params.data]:
             with own.to_module(network, preserve_module_state=False):
@@ -85,11 +85,11 @@ def critic_values(loss: LossModule, transitions: TensorDictBase) -> Tensor | Non
 
 
 def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
-    """The least value of critics, or of as many of them as are drawn at random for each run.
+    """Returns the least value of all critics, or of some that are drawn at random for each run.
 
     Args:
         values: [N, ...] of N critics; the rest is one equal block for each run.
-        count: how many critics are drawn; 0 for all of them.
+        count: number of critics that are drawn; 0 for all of them.
         noise: draws them, if ``count`` is not 0.
 
     Returns:
@@ -109,10 +109,10 @@ def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
 
 
 def checked_subset(target_critics: int, critics: int) -> int:
-    """How many critics are drawn for targets; 0 if all are.
+    """Returns the number of critics that are drawn for targets, checked; 0 if all are used.
 
     Raises:
-        ValueError: not from 0 to their number.
+        ValueError: the number is not from 0 to the number of critics.
 
     Example:
         >>> checked_subset(2, 10), checked_subset(10, 10)
@@ -153,7 +153,7 @@ def keep_weights(loss: LossModule, critic: TensorDictModule | Sequence[TensorDic
 
     Args:
         loss: made with what :func:`as_critics` gave.
-        critic: what that was given.
+        critic: critic or list of critics that the loss was made with.
     """
     if isinstance(critic, TensorDictModule) or len(critic) > 1:
         return

@@ -20,8 +20,8 @@ class PenalizedDDPGLoss(DDPGLoss):
     """TorchRL's DDPG loss with a cost of actions, see :func:`~torchrl_her.objectives.action_cost`.
 
     Args:
-        *args: of :class:`torchrl.objectives.DDPGLoss`.
-        **kwargs: of the same.
+        *args: arguments of :class:`torchrl.objectives.DDPGLoss`.
+        **kwargs: keyword arguments of the same class.
         action_penalty: weight of the action L2 penalty, at least 0.
         saturation_penalty: weight of the saturation penalty, at least 0.
         cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
@@ -86,7 +86,7 @@ def make_ddpg_loss(
     reduction: Literal["mean", "none"] = "mean",
     cloning: Cloning | None = None,
 ) -> DDPGLoss:
-    """TorchRL's DDPG loss with clamped targets, and target networks for actor and critic.
+    """Makes TorchRL's DDPG loss with clamped targets, and target networks for actor and critic.
 
     Args:
         actor: from :func:`~torchrl_her.make_actor`.

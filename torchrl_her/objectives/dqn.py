@@ -18,7 +18,7 @@ def make_dqn_loss(
     double: bool = True,
     reduction: Literal["mean", "none"] = "mean",
 ) -> DQNLoss:
-    """TorchRL's (double) DQN loss with a target network and clamped targets.
+    """Makes TorchRL's (double) DQN loss with a target network and clamped targets.
 
     Args:
         actor: from :func:`~torchrl_her.modules.make_q_actor`.

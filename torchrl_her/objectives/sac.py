@@ -32,14 +32,14 @@ class PenalizedSACLoss(SACLoss):
     for each critic where stacked runs need one for each transition.
 
     Args:
-        *args: of :class:`torchrl.objectives.SACLoss`.
-        **kwargs: of the same.
+        *args: arguments of :class:`torchrl.objectives.SACLoss`.
+        **kwargs: keyword arguments of the same class.
         action_penalty: the weight of the penalty on drawn actions, see
             :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
-        cloning: see there.
-        target_critics: how many critics are drawn for targets; 0 for all.
+        cloning: options of behavior cloning, see :class:`~torchrl_her.objectives.Cloning`.
+        target_critics: number of critics that are drawn for targets; 0 for all.
         runs: R.
-        noise: where its random numbers come from.
+        noise: source of its random numbers.
 
     Raises:
         ValueError: ``target_critics`` is not from 0 to the number of critics.
@@ -82,7 +82,7 @@ class PenalizedSACLoss(SACLoss):
         return (values.mean(0) if self.target_critics else values.amin(0)).squeeze(-1)
 
     def _draw(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """An action [..., a] for each row, and the logarithm of its likelihood [...]."""
+        """Draws an action [..., a] for each row; returns it with the logarithm of its likelihood [...]."""
         with (
             set_exploration_type(ExplorationType.RANDOM),
             self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
@@ -94,7 +94,7 @@ class PenalizedSACLoss(SACLoss):
         return action, dist.base_dist.log_prob(before) - squash.log_abs_det_jacobian(before, action).sum(-1)
 
     def _by_run(self, number: Tensor, like: Tensor) -> Tensor:
-        """A number [R] of each run in the shape of rows [R, B]; one number as it is."""
+        """Expands a number [R] of each run to the shape of rows [R, B]; returns a single number unchanged."""
         return number.view(-1, *[1] * (like.ndim - 1)) if self.runs > 1 else number
 
     @torch.no_grad()
@@ -130,7 +130,7 @@ def make_sac_loss(
     reduction: Literal["mean", "none"] = "mean",
     cloning: Cloning | None = None,
 ) -> SACLoss:
-    """TorchRL's SAC loss with several critics and a learned temperature.
+    """Makes TorchRL's SAC loss with several critics and a learned temperature.
 
     Targets contain the policy's entropy besides the rewards, so they may rightly be outside of the range of
     possible returns, and are not clamped unless ``reward_range`` is given. Clamping them makes sense where
@@ -143,19 +143,19 @@ def make_sac_loss(
         actor: from :func:`~torchrl_her.modules.make_stochastic_actor`.
         critic: from :func:`~torchrl_her.make_critic`, the others are made like it; or all critics in a list.
         action_spec: least and greatest actions, of one environment.
-        critics: how many there are; targets and policy have the least of their values.
-        target_critics: as many critics are drawn at random in each gradient step, and targets have the least
-            of their values alone, while the policy has the mean of all. 0: both have the least of all. Chen
-            et al., Randomized ensembled double Q-learning, 2021.
+        critics: number of critics; targets and policy use the least of their values.
+        target_critics: number of critics drawn at random in each gradient step: targets use the least of
+            their values alone, while the policy has the mean of all. 0: both have the least of all. Chen et
+            al., Randomized ensembled double Q-learning, 2021.
         gamma: discount, in [0, 1).
         reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
             leave them as they are.
-        temperature: what it begins with. At TorchRL's 1, entropy outweighs rewards of -1 and 0 for so long
-            that some runs never find what is rewarded.
+        temperature: first value of the temperature. At TorchRL's 1, entropy outweighs rewards of -1 and 0 for
+            so long that some runs never find what is rewarded.
         action_penalty: weight of the action L2 penalty, see
             :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
         runs: R, how many runs the networks are stacked for; each has a temperature of its own.
-        generators: of the random numbers of each run; None for torch's own.
+        generators: generators of the random numbers of each run; None for torch's own.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
         cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 
@@ -195,7 +195,7 @@ def make_sac_loss(
 
 
 def positive_temperature(temperature: float) -> float:
-    """The temperature.
+    """Returns a temperature, which must be positive.
 
     Raises:
         ValueError: it is not positive.

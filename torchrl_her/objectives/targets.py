@@ -29,7 +29,7 @@ class ClampedTD0(TD0Estimator):
     Args:
         low: least target.
         high: greatest target.
-        **kwargs: of :class:`torchrl.objectives.value.TD0Estimator`.
+        **kwargs: keyword arguments of :class:`torchrl.objectives.value.TD0Estimator`.
     """
 
     def __init__(self, *, low: float, high: float, **kwargs: Any) -> None:
@@ -37,14 +37,14 @@ class ClampedTD0(TD0Estimator):
         self.low, self.high = low, high
 
     def value_estimate(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Tensor:
-        """The targets, clamped."""
+        """Returns the clamped targets."""
         return super().value_estimate(tensordict, *args, **kwargs).clamp(self.low, self.high)
 
 
 def clamped_td0(
     gamma: float, reward_range: tuple[float, float] | None, value_network: TensorDictModule | None = None
 ) -> ClampedTD0:
-    """Targets for ``loss.make_value_estimator``, clamped to the returns that are possible.
+    """Makes targets for ``loss.make_value_estimator``, clamped to the returns that are possible.
 
     Args:
         gamma: discount, in [0, 1).
@@ -58,7 +58,7 @@ def clamped_td0(
         raise ValueError(f"gamma must be in [0, 1), got {gamma}")
     least, greatest = reward_range or (-math.inf, math.inf)
     return ClampedTD0(
-        low=min(least, least / (1.0 - gamma)),  # paid once, if the episode ends there, or forever
+        low=min(least, least / (1.0 - gamma)),  # least reward: once, if the episode ends there, or forever
         high=max(greatest, greatest / (1.0 - gamma)),
         gamma=gamma,
         value_network=value_network,
@@ -66,11 +66,11 @@ def clamped_td0(
 
 
 class _BuffersToo(TargetNetUpdater):
-    """Moves the buffers of target networks as their weights; TorchRL's updates leave buffers unchanged."""
+    """Updates the buffers of target networks like their weights, which TorchRL's updates do not."""
 
     @cached_property
     def _buffers(self) -> dict[str, list[Any]]:
-        """The keys of buffers, by the names of online networks that have some."""
+        """Returns the keys of buffers, by the names of the online networks that have some."""
         found = {
             name: [
                 key
@@ -100,7 +100,7 @@ class BuffersSoftUpdate(SoftUpdate, _BuffersToo):
 
 
 class RunsHardUpdate(HardUpdate, _BuffersToo):
-    """Copies the online weights of each of R runs to its target networks, by the run's own count of steps.
+    """Copies the online weights of each of R runs to its target networks, every n steps of the run.
 
     Args:
         loss: with stacked networks.
@@ -121,7 +121,7 @@ class RunsHardUpdate(HardUpdate, _BuffersToo):
         self._due: list[int] = []
 
     def step(self) -> None:
-        """Counts a gradient step of each run that is not idle, and copies the weights where it is time."""
+        """Counts a gradient step of each run that is not idle, and copies the weights that are due."""
         learning = [run for run in range(len(self.counts)) if run not in self.idle]
         for run in learning:
             self.counts[run] += 1
@@ -156,7 +156,7 @@ def make_target_updater(
     Keyword Args:
         tau: share of the online weights in a soft update, which follows each step if ``hard_interval`` is 0.
         hard_interval: copies the online weights every so many steps; 0 for soft updates.
-        runs: how many independent runs the loss has; each has its own count of steps.
+        runs: number of independent runs in the loss; each has its own count of steps.
 
     Example:
         >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss

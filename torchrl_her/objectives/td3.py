@@ -21,20 +21,20 @@ from torchrl_her.objectives.targets import clamped_td0
 
 
 class PenalizedTD3Loss(TD3Loss):
-    """TorchRL's TD3 loss with a cost of actions, and with random numbers of each run's own.
+    """TorchRL's TD3 loss with a cost of actions, and with separate random numbers for each run.
 
     Targets have the least value of all critics, or of some that are drawn at random in each gradient step, as
     in REDQ (Chen et al., 2021). In the second case the actor follows the mean of all critics instead of the
     first one.
 
     Args:
-        *args: of :class:`torchrl.objectives.TD3Loss`.
-        **kwargs: of the same, without ``policy_noise`` and ``noise_clip``.
+        *args: arguments of :class:`torchrl.objectives.TD3Loss`.
+        **kwargs: keyword arguments of the same class, without ``policy_noise`` and ``noise_clip``.
         action_penalty, saturation_penalty, cloning: see :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
-        target_critics: how many critics are drawn for targets; 0 for all.
+        target_critics: number of critics that are drawn for targets; 0 for all.
         target_noise: standard deviation of the noise on the target's actions.
         target_noise_clip: the greatest noise.
-        noise: where its random numbers come from.
+        noise: source of its random numbers.
 
     Raises:
         ValueError: ``target_critics`` is not from 0 to the number of critics.
@@ -89,7 +89,7 @@ class PenalizedTD3Loss(TD3Loss):
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
 
     def _next_value(self, tensordict: TensorDictBase) -> Tensor:
-        """The value [...] of the next state, where the target actor acts with noise."""
+        """Returns the value [...] of the next state, where the target actor acts with noise."""
         after = self._act(tensordict.get("next"), self.target_actor_network_params)
         action = after.get(self.tensor_keys.action)
         noise = (self.noise(action) * self.target_noise).clamp(
@@ -105,7 +105,7 @@ class PenalizedTD3Loss(TD3Loss):
             return self.actor_network(tensordict.select(*self.actor_network.in_keys, strict=False))
 
     def _values(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        """The values [N, ...] of actions, as N critics see them."""
+        """Returns the values [N, ...] that N critics give to actions."""
         seen = tensordict.select(*self.qvalue_network.in_keys, strict=False)
         valued = self._vmap_qvalue_network00(seen.expand(self.num_qvalue_nets, *seen.batch_size), params)
         return valued.get(self.tensor_keys.state_action_value).squeeze(-1)
@@ -126,7 +126,7 @@ def make_td3_loss(
     reduction: Literal["mean", "none"] = "mean",
     cloning: Cloning | None = None,
 ) -> TD3Loss:
-    """TorchRL's TD3 loss: several critics, and targets smoothed by noise and clamped.
+    """Makes TorchRL's TD3 loss: several critics, and targets smoothed by noise and clamped.
 
     The actor learns in every step, as in DDPG, and not in every second one.
 
@@ -136,15 +136,15 @@ def make_td3_loss(
         actor: from :func:`~torchrl_her.make_actor`.
         critic: from :func:`~torchrl_her.make_critic`, the others are made like it; or all critics in a list.
         action_spec: least and greatest actions, of one environment.
-        critics: how many there are; targets have the least of their values.
-        target_critics: as many critics are drawn at random in each gradient step, and targets have the least
-            of their values alone; 0 for all. Chen et al., Randomized ensembled double Q-learning, 2021.
+        critics: number of critics; targets use the least of their values.
+        target_critics: number of critics drawn at random in each gradient step: targets use the least of
+            their values alone; 0 for all. Chen et al., Randomized ensembled double Q-learning, 2021.
         gamma: discount, in [0, 1).
         reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
             leave them as they are.
         action_penalty, saturation_penalty: weights of the costs of actions, see
             :func:`~torchrl_her.objectives.action_cost`.
-        generators: of the random numbers of each run; None for torch's own.
+        generators: generators of the random numbers of each run; None for torch's own.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
         cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 

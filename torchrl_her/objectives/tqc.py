@@ -29,9 +29,9 @@ class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
     critic where it is greatest.
 
     Args:
-        *args: of :class:`torchrl.objectives.TQCLoss`.
-        **kwargs: of the same, and of :class:`~torchrl_her.objectives.PenalizedSACLoss`, but for
-            ``target_critics``.
+        *args: arguments of :class:`torchrl.objectives.TQCLoss`.
+        **kwargs: keyword arguments of the same class, and of
+            :class:`~torchrl_her.objectives.PenalizedSACLoss`, but for ``target_critics``.
 
     Raises:
         TypeError: ``target_critics`` is given.
@@ -50,7 +50,7 @@ class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
 
     @torch.no_grad()
     def compute_target(self, tensordict: TensorDictBase) -> Tensor:
-        """The targets [..., K]: the least K quantiles of all critics together."""
+        """Computes the targets [..., K]: the least K quantiles of all critics together."""
         after = tensordict.get("next").copy()
         action, log_prob = self._draw(after)
         after.set(self.tensor_keys.action, action)
@@ -82,7 +82,7 @@ def make_tqc_loss(
     reduction: Literal["mean", "none"] = "mean",
     cloning: Cloning | None = None,
 ) -> TQCLoss:
-    """TorchRL's TQC loss: critics that give quantiles, of which targets leave out the greatest ones.
+    """Makes TorchRL's TQC loss: critics give quantiles, and targets leave out the greatest ones.
 
     Kuznetsov et al., Controlling overestimation bias with truncated mixture of continuous distributional
     quantile critics, 2020.
@@ -98,11 +98,11 @@ def make_tqc_loss(
         reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
             leave them as they are, since they contain entropy: see
             :func:`~torchrl_her.objectives.make_sac_loss`.
-        temperature: what it begins with.
+        temperature: first value of the temperature.
         action_penalty: weight of the action L2 penalty, see
             :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
         runs: R, how many runs the networks are stacked for; each has a temperature of its own.
-        generators: of the random numbers of each run; None for torch's own.
+        generators: generators of the random numbers of each run; None for torch's own.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
         cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 

@@ -83,7 +83,7 @@ def draw_goals(
 
 
 class DrawnGoals(NamedTuple):
-    """Virtual goals of some transitions.
+    """Virtual goals that were drawn, and the transitions that get them.
 
     Attributes:
         source: [V] int64, the transitions to be relabeled, one after the other, each for up to k goals. Those
@@ -114,14 +114,14 @@ def draw_for_runs(
         chunk: Episodes of m runs.
 
     Keyword Args:
-        weights: of all runs; None for all goals alike.
+        weights: weights of all runs; None for all goals alike.
         generators: m of them.
         recent: the goals of recent episodes of all runs, those of these episodes among them.
-        times: how many times as many goals as the options say are drawn in the own episode.
+        times: factor for the number of goals drawn in the own episode, relative to the options.
     """
     rows, piece, reward_fn, options = chunk.rows, chunk.piece, chunk.reward_fn, chunk.options
     episodes = piece.episodes
-    if options.k == 0:  # then the batch may be without goals
+    if options.k == 0:  # without virtual goals, transitions need no goals
         return DrawnGoals(episodes.lengths[:0], episodes.lengths[:0], [0] * len(piece.runs))
     drawn = _Transitions.of(episodes, options.per)
     after = entry_of(rows, chunk.keys.next_achieved)
@@ -169,10 +169,10 @@ def draw_for_runs(
 
 
 class _Transitions(NamedTuple):
-    """The transitions [n] that get goals of their own.
+    """Transitions [n] for which goals are drawn.
 
     Attributes:
-        row: [n] int64, where they are.
+        row: [n] int64, their positions in the batch.
         episode: [n] int64, ascending: the episode of each.
         time: [n] int64, its step there.
     """
@@ -183,23 +183,23 @@ class _Transitions(NamedTuple):
 
     @classmethod
     def of(cls, episodes: Episodes, per: Per) -> _Transitions:
-        """All transitions of some episodes, or the first one of each."""
+        """Selects all transitions of some episodes, or the first one of each."""
         if per == "episode":
             episode = torch.arange(len(episodes.lengths), device=episodes.rows.device)
             return cls(episodes.rows[:, 0], episode, torch.zeros_like(episode))
         return cls(episodes.rows[episodes.inside], *episodes.inside.nonzero(as_tuple=True))
 
     def candidates(self, after: Tensor, episodes: Episodes, strategy: Strategy) -> Candidates:
-        """Goals that were achieved in the own episode."""
+        """Returns as candidates the goals that were achieved in the transition's own episode."""
         first, end = candidate_range(strategy, self.time, episodes.lengths[self.episode])
         return Candidates(after, episodes.rows, self.episode, first, end)
 
     def pool(self, goals: Tensor, lines: Episodes, position: Tensor | None) -> Candidates:
-        """Goals that the own run remembers.
+        """Returns as candidates the goals that the transition's run remembers.
 
         Args:
             goals: [p, g].
-            lines: where those of each run lie in there.
+            lines: positions of each run's goals among these.
             position: [E] int64, the position of each episode's run; None if there is only one.
         """
         line = torch.zeros_like(self.episode) if position is None else position[self.episode]
@@ -208,7 +208,7 @@ class _Transitions(NamedTuple):
     def filter(
         self, before: Outcome, keep: Keep | None, starts: Outcome | None = None
     ) -> Callable[[Index, Tensor], Tensor] | None:
-        """The filter, for goals achieved before [n, g], as :func:`choose_goals` asks it.
+        """Returns the filter in the form that :func:`choose_goals` takes.
 
         Where episodes go on at their goals, it also keeps goals that were not achieved at their ``starts``
         [E, g].
@@ -224,7 +224,7 @@ class _Transitions(NamedTuple):
         )
 
     def draws(self, generators: Generators, position: Tensor | None) -> RunDraws:
-        """Random numbers, from the generator of the run that each transition is of."""
+        """Returns random numbers for transitions, from the generator of each transition's run."""
         return RunDraws(
             generators, None if position is None or len(generators) == 1 else position[self.episode]
         )

@@ -1,4 +1,4 @@
-"""Ids by which the environments of several collectors are told apart."""
+"""Ids that distinguish the environments of several collectors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchrl_her.replay_buffers.keys import device_of
 
 
 class EnvIds(Transform):
-    """Gives each environment an id that no other one has, in this process or another.
+    """Gives each environment an id that no other environment has, in this process or another.
 
     Append it to environments whose collector gives batches in which an environment has no fixed place:
     :class:`~torchrl.collectors.MultiAsyncCollector` over batched environments, or
@@ -28,7 +28,7 @@ class EnvIds(Transform):
     on their values.
 
     Args:
-        key: where the ids are put, in the root and under ``next``.
+        key: key of the ids, in the root and under ``next``.
 
     Example:
         >>> from torchrl.envs import GymEnv, SerialEnv, TransformedEnv
@@ -41,7 +41,7 @@ class EnvIds(Transform):
     def __init__(self, key: NestedKey = "env_ids") -> None:
         super().__init__(in_keys=[], out_keys=[key])
         self._ids: Tensor | None = None
-        self._process = 0  # that drew them: a fork is another environment, too
+        self._process = 0  # process that drew the ids: a fork is another environment, too
 
     def _own_ids(self, tensordict: TensorDictBase) -> Tensor:
         shape = (*tensordict.batch_size, 1)
@@ -49,7 +49,7 @@ class EnvIds(Transform):
             ids = torch.arange(torch.Size(shape).numel(), device=device_of(tensordict)).view(shape)
             # 62 random bits: two processes draw overlapping ranges with a probability of about 1e-15
             self._ids, self._process = ids + secrets.randbits(62), os.getpid()
-        return self._ids.clone()  # a collector writes into what it got, in place, when it is reset
+        return self._ids.clone()  # a copy: collectors write into the entries of a reset in place
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return tensordict_reset.set(self.out_keys[0], self._own_ids(tensordict_reset))
@@ -58,7 +58,7 @@ class EnvIds(Transform):
         return next_tensordict.set(self.out_keys[0], self._own_ids(next_tensordict))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds the ids' entry."""
+        """Adds the spec of the ids."""
         shape = (*observation_spec.shape, 1)
         observation_spec[self.out_keys[0]] = Unbounded(
             shape=shape, dtype=torch.int64, device=observation_spec.device
@@ -66,7 +66,7 @@ class EnvIds(Transform):
         return observation_spec
 
     def clone(self) -> EnvIds:
-        """Another transform, with ids of its own."""
+        """Returns another transform, with ids of its own."""
         out: EnvIds = super().clone()
         out._ids = None
         return out

@@ -12,7 +12,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class EpisodeIndex:
-    """Where the episodes of a ring buffer lie.
+    """Index of the episodes in a ring buffer: converts rows of the storage to places in episodes, and back.
 
     A row is a stored transition, a lane is an environment, and a run is a stretch of rows of one lane that
     belong to the same episode without a break. Each row has a *position*, in the order of lanes and then
@@ -39,30 +39,30 @@ class EpisodeIndex:
     first: Tensor
 
     def place(self, row: Tensor) -> Tensor:
-        """Places [...] of rows [...]."""
+        """Returns the places [...] of rows [...] in the order of episodes."""
         position = row % self.lanes * self.slots + (row // self.lanes - self.oldest) % self.slots
         run = torch.searchsorted(self.begins, position, right=True) - 1
         return self.places[run] + position - self.begins[run]
 
     def row(self, place: Tensor) -> Tensor:
-        """The rows [...] at places [...], the inverse of :meth:`place`."""
+        """Returns the rows [...] at places [...]; the inverse of :meth:`place`."""
         run = torch.searchsorted(self.ordered_places, place, right=True) - 1
         position = self.ordered_begins[run] + place - self.ordered_places[run]
         return (position % self.slots + self.oldest) % self.slots * self.lanes + position // self.slots
 
     def episode(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """For places [...], the places at which their episodes begin, and those after their newest rows."""
+        """Returns where the episodes of places [...] begin, and the places behind their newest rows."""
         episode = torch.searchsorted(self.first, place, right=True) - 1
         return self.first[episode], self.first[episode + 1]
 
     def newest(self, count: int) -> Tensor:
-        """The newest rows, at most so many, oldest first."""
+        """Returns up to ``count`` of the newest rows, oldest first."""
         rows = self.slots * self.lanes
         number = torch.arange(max(0, rows - count), rows, device=self.first.device)
         return (number // self.lanes + self.oldest) % self.slots * self.lanes + number % self.lanes
 
     def newest_episodes(self, count: int) -> Tensor:
-        """The first rows of the episodes that ended last or are open, at most so many, oldest first."""
+        """Returns the first rows of up to ``count`` of the newest episodes, open ones too, oldest first."""
         last = self.row(self.first[1:] - 1)
         time = (last // self.lanes - self.oldest) % self.slots
         return self.row(self.first[:-1][time.argsort(stable=True)[-count:]])
@@ -101,7 +101,7 @@ def index_episodes(
         [[4, 0, 1], [2, 3]]
     """
     slots, rows = len(done), done.numel()
-    new = done.roll(1, 0)  # whether an episode begins: the row before was done
+    new = done.roll(1, 0)  # whether an episode begins: true if the row before was done
     if trajectory is not None:
         new[1:] |= trajectory[1:] != trajectory[:-1]
         new[0] |= trajectory[0] != trajectory[-1]
@@ -113,7 +113,7 @@ def index_episodes(
     # Only these flags are put in the order of time: moving the ids would take eight times as long.
     begins = new.roll(-oldest, 0).t().reshape(-1).nonzero().squeeze(-1)
     lanes, behind = rows // slots, begins.new_tensor([rows])
-    if trajectory is None or done.ndim > 1:  # every run is an episode
+    if trajectory is None or done.ndim > 1:  # without ids, every run of rows is an episode
         first = torch.cat((begins, behind))
         return EpisodeIndex(slots, lanes, oldest, begins, begins, begins, begins, first)
     lengths = begins.diff(append=behind)
@@ -125,13 +125,13 @@ def index_episodes(
     whole = done[last]
     opens = torch.ones_like(whole)
     opens[1:] = (own[1:] != own[:-1]) | whole[:-1]
-    for after, before in seams:  # a run goes on in another one only if that begins where it ends
+    for after, before in seams:  # two runs are one episode only if these agree
         opens[1:] |= _differ(after[last[:-1]], before[(ordered_begins[1:] + oldest) % slots])
     first = torch.cat((ordered_places[opens], behind))
     return EpisodeIndex(slots, lanes, oldest, begins, places, ordered_begins, ordered_places, first)
 
 
 def _differ(one: Tensor, other: Tensor) -> Tensor:
-    """Where vectors [..., g] differ, [...]; coordinate by coordinate, as torch is slow over few of them."""
+    """Returns where vectors [..., g] differ, [...], by coordinate, as torch is slow over few of them."""
     pairs = zip(one.unbind(-1), other.unbind(-1), strict=True)
     return reduce(torch.logical_or, [a != b for a, b in pairs])

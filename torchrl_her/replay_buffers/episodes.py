@@ -22,7 +22,7 @@ class Episodes:
 
     @property
     def inside(self) -> Tensor:
-        """[E, T] of bool: which entries are not padding."""
+        """Mask of the entries that are not padding, [E, T] of bool."""
         return torch.arange(self.rows.shape[1], device=self.rows.device) < self.lengths.unsqueeze(-1)
 
     def split(self, size: int) -> list[Episodes]:
@@ -32,7 +32,7 @@ class Episodes:
 
 
 def time_order(lanes: Tensor) -> Tensor:
-    """Positions [n] that put rows in the order of lanes, and each lane in the order in which it came.
+    """Returns positions [n] that sort rows by lane, and keep each lane in the order in which its rows came.
 
     Args:
         lanes: [n] int64, the environment or trajectory that each row is of.

@@ -12,12 +12,12 @@ from torch import Tensor
 from torchrl_her.checks import check_finite
 from torchrl_her.goals.rewards import Outcome, RewardFunction, ask_reward, outcomes
 
-LEAST_COST = 1e-4  # relative: what is less is an error of rounding
+LEAST_COST = 1e-4  # relative: smaller differences are errors of rounding
 
 
 @dataclass(frozen=True)
 class TransitionKeys:
-    """Where a transition holds its goals, and what depends on them.
+    """Keys of a transition's goals, and of the entries that depend on them.
 
     Attributes:
         achieved, next_achieved: the goal achieved before the action, and the one achieved by it.
@@ -41,16 +41,16 @@ class TransitionKeys:
     layer: NestedKey
 
     def asked_for(self, rows: TensorDictBase) -> Tensor:
-        """The goals [..., g] that the task itself has asked for."""
+        """Returns the goals [..., g] that the task itself has set."""
         real = rows.get(self.real_goal, None)
         return entry_of(rows, self.goals[0]) if real is None else real
 
     def before(self, rows: TensorDictBase, reward_fn: RewardFunction) -> Outcome:
-        """The goals [n, g] that were achieved before the actions, with the info that is read."""
+        """Returns the goals [n, g] that were achieved before the actions, with the info that rewards read."""
         return outcomes(reward_fn, entry_of(rows, self.achieved), rows, rows.get("next"))
 
     def after(self, rows: TensorDictBase, reward_fn: RewardFunction) -> Outcome:
-        """The goals [n, g] that the actions achieved, with the info that is read."""
+        """Returns the goals [n, g] that the actions achieved, with the info that rewards read."""
         return outcomes(reward_fn, entry_of(rows, self.next_achieved), rows.get("next"), rows)
 
     def check(self, rows: TensorDictBase, what: str, *, k: int) -> None:
@@ -58,8 +58,8 @@ class TransitionKeys:
 
         Args:
             rows: [...], transitions.
-            what: what messages call them.
-            k: how many virtual goals a transition gets; without any, goals may be of any shape, or missing.
+            what: name of the transitions in messages.
+            k: number of virtual goals of a transition; if 0, goals may be of any shape, or missing.
 
         Raises:
             ValueError: there is NaN or infinity, or goals are no vectors of one width.
@@ -78,7 +78,7 @@ class TransitionKeys:
     def rewards(
         self, rows: TensorDictBase, reward_fn: RewardFunction, achieved_reward: float
     ) -> tuple[Tensor, Tensor]:
-        """Rewards [n] by a reward function, with what failures cost, and those that were collected."""
+        """Returns rewards [n] by a reward function, with the cost of failures, and the collected rewards."""
         computed, _ = ask_reward(reward_fn, self.after(rows, reward_fn), entry_of(rows, self.goals[1]))
         cost = failures(rows, self, reward_fn, achieved_reward)[1]
         return (computed + cost).flatten(), entry_of(rows, self.reward).flatten()
@@ -86,7 +86,7 @@ class TransitionKeys:
     def changes(
         self, goals: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor
     ) -> dict[NestedKey, Tensor]:
-        """The entries in which virtual transitions differ from the real ones they are made of.
+        """Returns the entries in which virtual transitions differ from the real ones they are made of.
 
         Args:
             goals: [V, g], the virtual goals.
@@ -104,13 +104,13 @@ class TransitionKeys:
 def failures(
     transitions: TensorDictBase, keys: TransitionKeys, reward_fn: RewardFunction, achieved_reward: float
 ) -> tuple[Tensor, Tensor]:
-    """Where an episode terminated although its goal was not achieved, as by a fall, and what that cost.
+    """Returns where an episode terminated without its goal, as by a fall, and the cost of that.
 
     It would have terminated there whatever the goal, and at the same cost, so it does for virtual goals, too.
 
     Args:
         transitions: [n], as collected.
-        keys: where entries are.
+        keys: keys of the entries.
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
         achieved_reward: the reward of an achieved goal.
 
@@ -132,7 +132,7 @@ def failures(
     reward, terminated = (entry_of(transitions, key).reshape(-1) for key in (keys.reward, keys.terminated))
     failed, cost = terminated & (reward < achieved_reward), torch.zeros_like(reward)
     at = failed.nonzero().squeeze(-1)
-    if len(at) > 0:  # what the reward function terminates was a success, though with another reward
+    if len(at) > 0:  # an end by the reward function is a success, even with another reward
         reached, wanted = keys.after(transitions, reward_fn)[at], entry_of(transitions, keys.goals[1])[at]
         own_reward, own_end = (answer.flatten() for answer in ask_reward(reward_fn, reached, wanted))
         failed[at] = ~own_end
@@ -154,7 +154,7 @@ def under_next(key: NestedKey) -> NestedKey:
 
 
 def in_root_and_next(keys: Sequence[NestedKey]) -> list[NestedKey]:
-    """Each key, and the same key under ``next``.
+    """Returns each key, and the same key under ``next``.
 
     Raises:
         TypeError: one key in place of several.
@@ -163,13 +163,13 @@ def in_root_and_next(keys: Sequence[NestedKey]) -> list[NestedKey]:
         >>> in_root_and_next(["state"])
         ['state', ('next', 'state')]
     """
-    if isinstance(keys, str):  # a sequence of letters
+    if isinstance(keys, str):  # a string is a sequence of letters
         raise TypeError(f"keys must be given as a list, got {keys!r}: write [{keys!r}]")
     return [twin for key in keys for twin in (unravel_key(key), under_next(key))]
 
 
 def device_of(transitions: TensorDictBase) -> torch.device:
-    """Where transitions are. A batch that a collector put together may not say so, but its entries do.
+    """Returns the device of transitions, from their entries if a collector's batch has none set.
 
     Example:
         >>> from tensordict import TensorDict
@@ -182,7 +182,7 @@ def device_of(transitions: TensorDictBase) -> torch.device:
 
 
 def stored_as(value: Tensor, entry: Tensor, key: NestedKey) -> Tensor:
-    """Values [n, ...] in the type and shape of an entry [m, ...] of the collected transitions.
+    """Converts values [n, ...] to the type and shape of an entry [m, ...] of the collected transitions.
 
     Raises:
         ValueError: the entry is of whole numbers that cannot hold a value.
@@ -206,7 +206,7 @@ def stored_as(value: Tensor, entry: Tensor, key: NestedKey) -> Tensor:
 
 
 def entry_of(transitions: TensorDictBase, key: NestedKey) -> Tensor:
-    """An entry that must be there.
+    """Returns an entry; raises if it is missing.
 
     Raises:
         KeyError: it is missing; the message lists the entries that are there.

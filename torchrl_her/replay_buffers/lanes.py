@@ -1,4 +1,4 @@
-"""Lanes: which environment, or which trajectory, each transition of a batch belongs to.
+"""Lanes: the environment or the trajectory that each transition of a batch belongs to.
 
 Batches come from one collector or from several, with or without ids. Transitions of one lane are in the order
 of time, one episode after the other, and a lane goes on from batch to batch.
@@ -21,7 +21,7 @@ _REMEDY = (
 
 
 def find_lanes(data: TensorDictBase, keys: TransitionKeys) -> tuple[str, Tensor]:
-    """The lanes of a batch [N, T], time last, or of a flat batch [n].
+    """Returns the lanes of a batch [N, T], time last, or of a flat batch [n].
 
     Environment ids are used if there are any. Without them, a row of a batch [N, T] is an environment; a flat
     batch is split by trajectory ids, or is a single environment's if it has none of these either.
@@ -46,7 +46,7 @@ def find_lanes(data: TensorDictBase, keys: TransitionKeys) -> tuple[str, Tensor]
 
 
 def in_order(lanes: Tensor) -> Tensor:
-    """Lanes [n], numbered in the order in which they first appear: random ids leave no trace in results.
+    """Renumbers lanes [n] in the order in which they first appear, so that random ids do not affect results.
 
     Example:
         >>> in_order(torch.tensor([7, 7, 3, 7, 5])).tolist()
@@ -70,7 +70,7 @@ def broken(
     held: int,
     resumed: bool,
 ) -> Tensor:
-    """Where an episode is over although its last transition does not say so, [n] of bool.
+    """Returns where an episode is over although its last transition is not done, [n] of bool.
 
     That is where another episode's transition follows in the same lane: an environment was reset from
     outside, or another collector uses the same ids again.
@@ -80,9 +80,9 @@ def broken(
         lanes: [n], of all rows.
         order: [n], of :func:`~torchrl_her.replay_buffers.episodes.time_order`.
         done: [n] of bool, where episodes are known to be over.
-        keys: where goals are.
-        kind: what lanes are known by.
-        held: how many were held back.
+        keys: keys of the goals.
+        kind: property that distinguishes lanes.
+        held: number of rows that were held back.
         resumed: whether they come from a checkpoint: their episodes may then end anywhere.
 
     Raises:
@@ -93,7 +93,7 @@ def broken(
     trajectory = rows.get(keys.trajectory, None)
     last, new = order[:-1], order[1:]
     same = lanes[last] == lanes[new]
-    if trajectory is None or kind == BY_TRAJECTORY:  # then goals have to tell
+    if trajectory is None or kind == BY_TRAJECTORY:  # without ids, goals show where episodes end
         # Rows that were held back have been compared with each other before.
         over[last] = _jumps(rows, keys, last, new, same & (new >= held))
     else:
@@ -110,7 +110,7 @@ def broken(
 
 
 def ends_of_held(lanes: Tensor, order: Tensor, held: int) -> Tensor:
-    """The last transition of each lane, among those that were held back: [n] of bool.
+    """Returns which transitions are the last of a lane among those that were held back: [n] of bool.
 
     Args:
         lanes, order, held: as for :func:`broken`.
@@ -122,7 +122,7 @@ def ends_of_held(lanes: Tensor, order: Tensor, held: int) -> Tensor:
 
 
 def _jumps(rows: TensorDictBase, keys: TransitionKeys, last: Tensor, new: Tensor, where: Tensor) -> Tensor:
-    """For neighbors [n - 1]: which of those that are asked for do not fit together, by their goals."""
+    """Returns which of the given pairs of neighbors [n - 1] are not of one episode, by their goals."""
     at = where.nonzero().squeeze(-1)
     jumps = torch.zeros_like(where)
     if len(at) == 0:

@@ -1,4 +1,4 @@
-"""How episodes are relabeled that carry the layer of a curriculum which they were played in."""
+"""Rules for relabeling episodes that carry the layer of a curriculum in which they were played."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from torchrl_her.replay_buffers.episodes import Episodes
 
 
 class LayerRule(NamedTuple):
-    """How :class:`~torchrl_her.HERWriter` relabels the episodes of one layer.
+    """Rule by which :class:`~torchrl_her.HERWriter` relabels the episodes of one layer.
 
     Attributes:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
-        weighted: whether the weights of goals apply, and are told of the goals that were written.
+        weighted: whether the weights of goals apply, and are updated with the goals that were written.
     """
 
     reward_fn: RewardFunction
@@ -27,14 +27,14 @@ class LayerRule(NamedTuple):
 def split_layers(
     rows: TensorDictBase, episodes: Episodes, run: Tensor | None, key: NestedKey, layers: int
 ) -> Iterator[tuple[int, Episodes, Tensor | None]]:
-    """The episodes of each layer, in the order in which they came.
+    """Yields the episodes of each layer, in the order in which they came.
 
     Args:
         rows: [n], transitions.
         episodes: positions among them.
         run: [E] int64, the run of each episode; None if there is only one.
-        key: of the layer [n, 1].
-        layers: how many there are.
+        key: key of the layer [n, 1].
+        layers: number of layers.
 
     Raises:
         KeyError: rows do not carry their layer.
@@ -57,7 +57,7 @@ def split_layers(
 
 
 def check_layers(layers: Sequence[LayerRule] | None) -> list[LayerRule]:
-    """The rules of layers as a list; empty without layers.
+    """Returns the rules of layers as a list; empty without layers.
 
     Raises:
         TypeError: one of them is no rule.

@@ -11,7 +11,7 @@ STEPS_KEY = "steps_to_next_obs"  # as TorchRL's MultiStep writes it, and as its 
 
 
 class NStepReturn(NamedTuple):
-    """Return, end and last step of transitions over several steps.
+    """Return, end and last step of each transition that spans several steps.
 
     Attributes:
         reward: [..., 1], the discounted sum.
@@ -25,12 +25,12 @@ class NStepReturn(NamedTuple):
 
     @property
     def steps(self) -> Tensor:
-        """[..., 1] int64, the number of steps."""
+        """Number of steps, [..., 1] of int64."""
         return (self.last + 1).unsqueeze(-1)
 
 
 def n_step_return(reward: Tensor, terminated: Tensor, inside: Tensor, gamma: float) -> NStepReturn:
-    """The discounted sum of rewards up to the first step that terminates, or to the window's end.
+    """Computes the discounted sum of rewards up to the first step that terminates, or to the window's end.
 
     ``G = r_0 + gamma r_1 + ... + gamma^(m-1) r_(m-1)``, with m the number of steps. Sutton and Barto,
     Reinforcement Learning, 2018, equation 7.1.
@@ -49,7 +49,7 @@ def n_step_return(reward: Tensor, terminated: Tensor, inside: Tensor, gamma: flo
         (-1.5, 2, True)
     """
     end = terminated.squeeze(-1)
-    before = end.cumsum(-1) - end.to(torch.int64)  # how often it terminated before this step
+    before = end.cumsum(-1) - end.to(torch.int64)  # number of terminations before this step
     used = inside & (before == 0)
     discount = gamma ** torch.arange(reward.shape[-2], device=reward.device, dtype=reward.dtype)
     total = (reward.squeeze(-1) * discount * used).sum(-1, keepdim=True)
@@ -58,7 +58,7 @@ def n_step_return(reward: Tensor, terminated: Tensor, inside: Tensor, gamma: flo
 
 
 def windows(start: Tensor, end: Tensor, n_steps: int) -> tuple[Tensor, Tensor]:
-    """The places of n steps that begin at ``start`` and stay in front of ``end``.
+    """Returns the places of n steps that begin at ``start`` and stay in front of ``end``.
 
     Args:
         start: [...] int64.

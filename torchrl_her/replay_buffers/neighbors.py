@@ -1,4 +1,4 @@
-"""The parts of a replay buffer beside which hindsight would silently be wrong; these are refused."""
+"""Refuses parts of a replay buffer beside which hindsight would silently be wrong."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MASK = ("collector", "mask")  # TorchRL's mark of what is not padding
 
 
 def samplers_of(storage: Storage) -> Iterator[Sampler]:
-    """The samplers of all buffers that read a storage, those of ensembles one by one."""
+    """Returns the samplers of all buffers that read a storage, those of ensembles one by one."""
     waiting: list[Any] = [getattr(buffer, "sampler", None) for buffer in buffers_of(storage)]
     while waiting:
         sampler = waiting.pop()
@@ -43,14 +43,14 @@ def samplers_of(storage: Storage) -> Iterator[Sampler]:
 def refuse_beside_writer(
     name: str, storage: Storage, transitions: TensorDictBase, options: HindsightOptions, *, runs: int
 ) -> None:
-    """Raises an error beside parts and batches that a writer with hindsight would write wrongly.
+    """Raises an error for a storage, sampler or batch with which a writer with hindsight would be wrong.
 
     Args:
-        name: of the writer, for messages.
-        storage: into which it writes.
+        name: name of the writer, for messages.
+        storage: storage into which it writes.
         transitions: the batch that it is to write.
         options: its own.
-        runs: for how many runs it was made.
+        runs: number of runs of the writer.
 
     Raises:
         ValueError: as in the functions below, or the storage has several dimensions.
@@ -77,7 +77,7 @@ def refuse_shared(name: str, storage: Storage) -> None:
 
 
 def refuse_unordered(name: str, storage: Storage) -> None:
-    """Raises an error if a storage's transitions are not real ones in the order of time.
+    """Raises an error unless a storage holds real transitions in the order of time.
 
     Raises:
         ValueError: a buffer of this storage writes them in another order, or relabels them.
@@ -104,12 +104,12 @@ def refuse_padded(name: str, transitions: TensorDictBase) -> None:
     """
     if MASK in transitions.keys(True):
         raise ValueError(
-            f"{name} takes batches as they are collected, not split and padded: split_trajs=False"
+            f"{name} needs batches that are not split and padded: make the collector with split_trajs=False"
         )
 
 
 def refuse_layers(name: str, transitions: TensorDictBase, options: HindsightOptions) -> None:
-    """Raises an error if transitions carry a layer, and one reward would relabel those of all layers.
+    """Raises an error if transitions carry a layer although one reward relabels those of all layers.
 
     Raises:
         ValueError: they do.
@@ -137,7 +137,7 @@ def refuse_priorities(name: str, storage: Storage, transitions: TensorDictBase) 
 
 
 def has_slices(storage: Storage) -> bool:
-    """Whether sequences are sampled from a storage."""
+    """Returns whether sequences are sampled from a storage."""
     units = (unit_of(buffer) for buffer in buffers_of(storage))
     return any(isinstance(sampler, SliceSampler) for sampler in samplers_of(storage)) or any(
         isinstance(unit, Sequence) for unit in units
@@ -145,7 +145,7 @@ def has_slices(storage: Storage) -> bool:
 
 
 def refuse_slices(name: str, storage: Storage) -> None:
-    """Raises an error if TorchRL's sequences from this storage are wrong by themselves.
+    """Raises an error if TorchRL samples wrong sequences from a storage of this kind.
 
     Raises:
         ValueError: a sampler writes its marks into a storage of lists, or what it takes for sequences in a
@@ -165,7 +165,7 @@ def refuse_slices(name: str, storage: Storage) -> None:
 
 
 def refuse_consuming(name: str, storage: Storage) -> None:
-    """Raises an error if transitions are removed as they are sampled.
+    """Raises an error if transitions are removed when they are sampled.
 
     Raises:
         ValueError: a buffer of this storage consumes its transitions.
@@ -213,10 +213,10 @@ def refuse_copies_in_slices(name: str, storage: Storage, options: HindsightOptio
 
 
 def refuse_other_runs(name: str, storage: Storage, transitions: TensorDictBase, *, runs: int) -> None:
-    """Raises an error if a batch, the storage or a sampler is not that of several runs.
+    """Raises an error if a batch, the storage or a sampler is not made for the writer's runs.
 
     Raises:
-        ValueError: one of them is not.
+        ValueError: one of them does not fit.
     """
     if runs == 1:
         return

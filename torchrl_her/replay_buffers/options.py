@@ -21,34 +21,34 @@ from torchrl_her.replay_buffers.keys import LEAST_COST, TransitionKeys, in_root_
 
 T = TypeVar("T")
 Per = Literal["transition", "episode"]
-_SUSPICIOUS = 10  # so many episodes, all of one step, hardly come by chance
+_SUSPICIOUS = 10  # that many episodes of one step hardly come by chance
 
 
 class _NotGiven(int):
-    """The default of a number, which tells that none was given."""
+    """Default that marks a number as not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HindsightOptions:
-    """How transitions are relabeled, and under which keys their entries are.
+    """Options of relabeling, and the keys of the entries that it reads and writes.
 
     Args:
         k: virtual transitions for each real one (on average, when relabeling while sampling); 0 makes none.
         strategy: which achieved goals of its episode a transition may take: ``"future"`` (those achieved by
             its action or later), ``"final"`` (the last one), ``"episode"`` (any), another name given to
             :func:`~torchrl_her.register_strategy`, or a function as described there.
-        goal_sources: how many virtual goals come from where, in place of ``k`` and ``strategy``, which are
-            short for a single source: ``k=4, strategy="future"`` is ``{"future": 4}``. Besides strategies
-            there are two sources that look beyond the own episode: ``"actual"``, goals that were really
-            wanted in recent episodes, and ``"achieved"``, goals that were achieved in them. ``weights`` and
-            filter act on all alike. None: ``k`` and ``strategy`` count.
-        recent_actual, recent_achieved: how many of the newest goals these two sources remember: one that was
-            wanted for each episode, and one that was achieved for each transition. Those of the episodes
-            that are just written are among them. If these alone have more, goals are taken from all of
-            them, evenly spread over environments and time. A sample unit looks at as many of the newest
-            episodes, and newest transitions, that are stored. Where the filter refuses nearly all, large
-            numbers cost time.
-        per: what gets a goal of its own. ``"transition"``: each transition, for learning from single
+        goal_sources: number of virtual goals by source, in place of ``k`` and ``strategy``, which are short
+            for a single source: ``k=4, strategy="future"`` is ``{"future": 4}``. Besides strategies there are
+            two sources that look beyond the own episode: ``"actual"``, goals that were really wanted in
+            recent episodes, and ``"achieved"``, goals that were achieved in them. ``weights`` and filter act
+            on the goals of all sources. None: ``k`` and ``strategy`` count.
+        recent_actual, recent_achieved: number of the newest goals that these two sources remember: one that
+            was wanted for each episode, and one that was achieved for each transition. Those of the episodes
+            that are just written are among them. If these alone have more, goals are taken from all of them,
+            evenly spread over environments and time. A sample unit looks at as many of the newest episodes,
+            and newest transitions, that are stored. Where the filter refuses nearly all, large numbers cost
+            time.
+        per: unit that gets a goal of its own. ``"transition"``: each transition, for learning from single
             transitions. ``"episode"``: each copy of a whole episode, for learning from sequences, as
             recurrent policies do; see :class:`~torchrl_her.HERWriter`.
         n_steps: transitions reach over up to n steps: ``reward`` is the discounted sum of the rewards for
@@ -76,8 +76,8 @@ class HindsightOptions:
         real_goal_key: the goal that the task itself asked for, where another one was proposed in its place
             (:class:`~torchrl_her.behavior.BehaviorGoals`); the entry may be missing, and is left out like
             those of ``exclude``. The source ``"actual"`` takes these.
-        layer_key: of the layer [..., 1] that an episode was played in, for writers with ``layers``.
-        virtual_key: where a bool [..., 1] marks virtual transitions; None for no mark.
+        layer_key: key of the layer [..., 1] that an episode was played in, for writers with ``layers``.
+        virtual_key: key of a bool [..., 1] that marks virtual transitions; None for no mark.
 
     Raises:
         ValueError: a number is not whole, not finite or too small, there is no such strategy or source,
@@ -150,14 +150,14 @@ class HindsightOptions:
 
     @property
     def sources(self) -> dict[Strategy, int]:
-        """How many virtual goals of each transition come from where; empty if there are none."""
+        """Number of virtual goals of each transition by source; empty if there are none."""
         if self.goal_sources is not None:
             return dict(self.goal_sources)
         return {self.strategy: int(self.k)} if self.k > 0 else {}
 
     @property
     def remembered(self) -> dict[str, int]:
-        """How many goals of recent episodes are to be remembered, for each source that takes them."""
+        """Number of goals to remember for each source that takes goals of recent episodes."""
         return {name: getattr(self, f"recent_{name}") for name in RECENT if name in self.sources}
 
     def changed(self, changes: dict[str, Any]) -> HindsightOptions:
@@ -188,7 +188,7 @@ class HindsightOptions:
         return replace(self, **changes)
 
     def transition_keys(self) -> TransitionKeys:
-        """The full keys of what relabeling reads and writes."""
+        """Full keys of the entries that relabeling reads and writes."""
         return TransitionKeys(
             achieved=unravel_key(self.achieved_goal_key),
             next_achieved=under_next(self.achieved_goal_key),
@@ -205,7 +205,7 @@ class HindsightOptions:
 
 
 def _twice(sources: GoalSources, **given: Any) -> str:
-    """The message about two ways to say which goals are drawn."""
+    """Returns the message about goal sources that are given together with ``k`` or ``strategy``."""
     shown = " and ".join(f"{name}={value!r}" for name, value in given.items())
     return f"{shown} and goal_sources={{{sources_name(sources)}}} say the same: give one of them"
 
@@ -268,7 +268,7 @@ class HindsightBase:
             raise TypeError(f"options must be HindsightOptions or None, got {options!r}")
         self.reward_fn, self.weights = reward_fn, weights
         self.options = (options or HindsightOptions()).changed(changes)
-        self._time_seen = False  # whether an episode had several steps, or their absence was said
+        self._time_seen = False  # whether an episode had several steps, or the warning was given
         self._compared = False  # whether rewards were compared with the reward function
 
     def __repr__(self) -> str:
@@ -276,7 +276,7 @@ class HindsightBase:
 
     @property
     def options(self) -> HindsightOptions:
-        """How transitions are relabeled."""
+        """The options of relabeling."""
         return self._options
 
     @options.setter
@@ -286,7 +286,7 @@ class HindsightBase:
         self._exclude = in_root_and_next([*options.exclude, options.real_goal_key])
 
     def _compare_rewards(self, rows: TensorDictBase) -> None:
-        """Warns, at the first rows [n] only, if their rewards are not those of the reward function."""
+        """Warns if the rewards of the first rows [n] ever written are not those of the reward function."""
         if self._compared or self.k == 0:
             return
         self._compared = True
@@ -302,7 +302,7 @@ class HindsightBase:
             )
 
     def _look_at_time(self, lengths: Tensor) -> None:
-        """Warns, once, if all of the first episodes [E] have a single step: time may be another dimension."""
+        """Warns once if the first episodes [E] all have a single step: time may be another dimension."""
         if self._time_seen or self.k == 0:
             return
         several = bool((lengths > 1).any())

@@ -66,15 +66,15 @@ class _Stored(NamedTuple):
     storage: Storage
     state: tuple[int, int]
     rows: TensorDictBase  # [n], a view
-    after: Tensor  # [n, g], those that the action achieved: the candidates
-    wanted: Tensor  # [n, g], those that were really wanted; of their type, if goals are drawn from them
+    after: Tensor  # [n, g], goals that the action achieved: the candidates
+    wanted: Tensor  # [n, g], desired goals; if they are candidates, in the type of ``after``
     episodes: EpisodeIndex
-    ends: Callable[[], bool]  # whether episodes end at their goals; the reward function is asked once
-    recent: dict[tuple[str, int], Tensor]  # rows of the newest episodes, as far as they were asked for
+    ends: Callable[[], bool]  # whether episodes end at their goals; the reward function is called once
+    recent: dict[tuple[str, int], Tensor]  # rows of the newest episodes, cached
 
 
 class _Ahead(NamedTuple):
-    """Contents of transitions over several steps."""
+    """Entries of transitions that span several steps."""
 
     next: TensorDictBase  # [B], of the last step
     returns: NStepReturn  # for the goals that were chosen
@@ -203,7 +203,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def expand(
         self, index: Tensor | tuple[Tensor, ...], info: dict[str, Any], storage: Storage
     ) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        """Chooses the goals that :meth:`relabel` puts in.
+        """Chooses virtual goals for a batch, which :meth:`relabel` then writes into it.
 
         Returns:
             ``(index, info)``, unchanged but for the metadata, if asked for; under a sampler of slices without
@@ -250,7 +250,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return index, info
 
     def relabel(self, data: TensorDictBase) -> TensorDictBase:
-        """Puts the chosen goals into a batch that was just sampled, with their rewards and ends.
+        """Writes the chosen goals into a batch that was just sampled, with their rewards and ends.
 
         Args:
             data: [B], as read from the storage; [S, T] under a sampler of slices with
@@ -276,7 +276,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return self._relabeled(data.reshape(-1), chosen).reshape(chosen.shape)
 
     def _relabeled(self, data: TensorDictBase, chosen: _Chosen) -> TensorDictBase:
-        """A batch [B] with the changes that it needs."""
+        """Returns a batch [B] with the chosen goals, rewards and ends."""
         out, rows = data.exclude(*self._exclude), chosen.rows
         if self.options.virtual_key is not None:
             marks = torch.zeros(len(data), 1, dtype=torch.bool, device=device_of(rows))
@@ -315,13 +315,13 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return self._token, get_ident()
 
     def _buffers(self, storage: Storage) -> Iterator[ReplayBuffer]:
-        """The buffers that sample with this unit."""
+        """Returns the buffers that sample with this unit."""
         for buffer in buffers_of(storage):
             if isinstance(buffer, ReplayBuffer) and unit_of(buffer) is self:
                 yield buffer
 
     def _may_relabel(self, storage: Storage) -> bool:
-        """Whether the buffer has a function of the user's that may call :meth:`relabel`."""
+        """Returns whether the buffer has a user's function that may call :meth:`relabel`."""
         for buffer in self._buffers(storage):
             own = functions_on_batches(buffer)
             if all(each is None or each.__module__.startswith("torchrl.") for each in own):
@@ -329,7 +329,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return True
 
     def _slice_sampler(self, storage: Storage) -> SliceSampler | None:
-        """The sampler of this unit's buffer, if it samples sequences."""
+        """Returns the sampler of this unit's buffer if it samples sequences, else None."""
         for buffer in self._buffers(storage):
             if isinstance(buffer.sampler, SliceSampler):
                 if self.options.n_steps > 1:
@@ -345,7 +345,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _choose(
         self, stored: _Stored, row: Tensor, own: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Places [V] in a batch of rows [B] that become virtual, and the goals [V, g] that they get.
+        """Draws which places [V] in a batch of rows [B] become virtual, and their goals [V, g].
 
         With metadata, also the rows [B] of their own episodes that achieved these goals; -1 for none.
 
@@ -355,7 +355,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         becomes = coin < self.k / (self.k + 1)
         sources = self.options.sources
         bounds = torch.tensor(list(sources.values()), device=row.device).cumsum(0)[:-1]
-        # The same coin tells the source.
+        # The same random number also selects the source.
         own, number = own[becomes], torch.bucketize(coin[becomes] * (self.k + 1), bounds, right=True)
         virtual = torch.zeros_like(row, dtype=torch.bool)
         goals = stored.after.new_zeros(len(row), *stored.after.shape[1:])
@@ -373,7 +373,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return rows, goals[rows], lenders
 
     def _ends(self, sampler: SliceSampler, info: dict[str, Any], device: torch.device) -> Tensor | None:
-        """Where a sampler of slices says that they end, [B, 1]; None if it does not."""
+        """Returns the ends of slices as their sampler marks them, [B, 1]; None if it does not."""
         key = sampler.truncated_key
         if key is not None and unravel_key(key) != self._keys.truncated:
             raise ValueError(
@@ -383,8 +383,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return _moved(info.get(key), device)
 
     def _look_ahead(self, stored: _Stored, row: Tensor, virtual: Tensor, goals: Tensor) -> _Ahead:
-        """The steps that follow rows [B], some of which are virtual and have other goals."""
-        gamma = self.options.gamma or 1.0  # there is one with several steps
+        """Computes the n-step returns of rows [B], some of which are virtual and have other goals."""
+        gamma = self.options.gamma or 1.0  # several steps always have one
         place = stored.episodes.place(row)
         places, inside = windows(place, stored.episodes.episode(place)[1], self.options.n_steps)
         window = stored.episodes.row(places)
@@ -403,7 +403,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return _Ahead(stored.rows.get("next")[last], returns)
 
     def _read(self, storage: Storage) -> _Stored:
-        """Goals and episodes of a storage; read again only after something was written."""
+        """Reads the goals and episodes of a storage; the result is cached until something is written."""
         if isinstance(storage, StorageEnsemble):
             raise ValueError(
                 "HERSampleUnit cannot work in a ReplayBufferEnsemble: relabel while writing, with HERWriter"
@@ -414,7 +414,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             refuse_consuming("HERSampleUnit", storage)
             refuse_unordered("HERSampleUnit", storage)
             refuse_shared("HERSampleUnit", storage)
-            if storage.ndim > 1:  # relabeling copies, so marks are not written into lists
+            if storage.ndim > 1:  # in flat ones, the sampler marks copies of rows
                 refuse_slices("HERSampleUnit", storage)
             rows = storage[:]  # a view
             if not is_tensor_collection(rows):
@@ -457,7 +457,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _draw(
         self, stored: _Stored, group: Tensor, source: Strategy, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """Rows [V] whose goals a source gives, and for which groups [V] there is one.
+        """Draws rows [V] whose goals a source gives to groups, and returns which groups [V] get one.
 
         Groups [V, L] are rows that get the same goal, which is one of their last row: single rows, or slices.
         """
@@ -478,7 +478,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             lent = episodes.row(draw_alike(first, end, 1, generator=generator).squeeze(-1))
         if not self.filter_achieved:
             return lent, valid
-        # Goals are proposed without the filter; only where it rejects one are all candidates looked at.
+        # Goals are proposed without the filter; only where it rejects one are all candidates checked.
         kept = self._kept(stored, group, stored.after[lent].unsqueeze(1)).squeeze(1)
         if not self.options.redraw:
             return lent, valid & kept
@@ -491,7 +491,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _draw_recent(
         self, stored: _Stored, group: Tensor, source: str, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """Draws goals that were wanted or achieved in the newest episodes."""
+        """Draws goals that were desired or achieved in the newest episodes."""
         goals, newest = stored.after, stored.episodes.newest
         if source == "actual":
             goals, newest = stored.wanted, stored.episodes.newest_episodes
@@ -515,7 +515,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return index.squeeze(-1), valid.squeeze(-1)
 
     def _kept(self, stored: _Stored, group: Tensor, goals: Tensor) -> Tensor:
-        """The filter: which of the goals [V, c, g] groups [V, L] may take, [V, c] of bool."""
+        """Applies the filter: returns which of the goals [V, c, g] groups [V, L] may take, [V, c] of bool."""
         rule = partial(missed, self.reward_fn, achieved_reward=self.achieved_reward)
         before = self._keys.before(stored.rows, self.reward_fn)
         kept = rule(before[group].unsqueeze(1), goals.unsqueeze(2)).all(-1)
@@ -554,7 +554,7 @@ def _moved(entry: Tensor | None, device: torch.device) -> Tensor | None:
 
 
 def _oldest(storage: Storage) -> int:
-    """The slot of a storage's oldest rows.
+    """Returns the slot of a storage's oldest rows.
 
     The writer's cursor tells; TorchRL does not restore that of the storage. If several buffers share a
     storage, it is the cursor of the one that has written most.
@@ -570,7 +570,7 @@ def _oldest(storage: Storage) -> int:
 
 
 def _flat(index: Tensor | tuple[Tensor, ...], shape: torch.Size) -> Tensor:
-    """Indices [B] of rows among all rows, slot after slot."""
+    """Converts indices of a storage to positions [B] among all rows, slot after slot."""
     if not isinstance(index, tuple):
         index = (index,) if len(shape) == 1 else index.unbind(-1)
     row = index[0].long()

@@ -9,7 +9,7 @@ from torch import Tensor
 def slice_positions(
     place: Tensor, episode: Tensor, ends: Tensor | None = None, inside: Tensor | None = None
 ) -> Tensor:
-    """Which transitions of a batch belong to the same slice.
+    """Groups the transitions of a batch by slice.
 
     Args:
         place: [B] int64, places in :class:`~torchrl_her.replay_buffers.EpisodeIndex`: those of a slice follow

@@ -50,18 +50,18 @@ OnWrite = Callable[[TensorDictBase, list[int], list[int]], Callable[[], None] | 
 
 
 class _Draft(NamedTuple):
-    """Real and virtual transitions of some episodes that are not yet written."""
+    """Real and virtual transitions of some episodes before they are written."""
 
     runs: list[int]
     real: WrittenRows
     virtual: WrittenRows | None
     numbers: dict[str, list[int]]  # as they are counted
-    weighted: bool  # whether weights are told the virtual goals
-    ids: int  # how many trajectory ids they take
+    weighted: bool  # whether weights are updated with the virtual goals
+    ids: int  # number of trajectory ids that they take
 
     @property
     def counts(self) -> list[int]:
-        """How many transitions each run has, real and virtual."""
+        """Number of transitions of each run, real and virtual."""
         if self.virtual is None:
             return self.real.counts
         return [sum(both) for both in zip(self.real.counts, self.virtual.counts, strict=True)]
@@ -205,7 +205,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._recent = self._no_goals(runs)
         self._episodes = 0  # copies of episodes ever written, if whole ones are
         self._process = os.getpid()
-        # Whether the held ones came with a state, or are over, and nothing was written since.
+        # Whether the rows held back come from a loaded state, or are over, and nothing was written since.
         self._loaded = self._all_over = self._overfull = False
 
     @property
@@ -215,45 +215,45 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     @property
     def counts(self) -> WriterCounts:
-        """Transitions written since the buffer was last emptied."""
+        """Counts of the transitions written since the buffer was last emptied."""
         return WriterCounts.sum(self._counts.counts)
 
     @property
     def totals(self) -> WriterCounts:
-        """Transitions ever written."""
+        """Counts of all transitions ever written."""
         return WriterCounts.sum(self._counts.totals)
 
     def counts_of(self, run: int) -> WriterCounts:
-        """Transitions of a run that were written since it was last emptied."""
+        """Returns the counts of a run's transitions written since it was last emptied."""
         return self._counts.counts[run]
 
     def totals_of(self, run: int) -> WriterCounts:
-        """Transitions of a run that were ever written."""
+        """Returns the counts of all transitions of a run that were ever written."""
         return self._counts.totals[run]
 
     @property
     def capacity(self) -> int:
-        """Rows of each run's block of the storage."""
+        """Number of rows in each run's block of the storage."""
         return self._storage.max_size // self.runs
 
     @property
     def sizes(self) -> list[int]:
-        """How many rows each run has in the storage."""
+        """Number of filled rows of each run in the storage."""
         return [len(self._storage)] if self.runs == 1 else list(self._rings.sizes)
 
     @property
     def goal_weights(self) -> list[GoalWeights]:
-        """The weights of each run's goals; empty if there are none."""
+        """Weights of each run's goals; empty if there are none."""
         if self.runs > 1:
             return self._weights
         return [] if self.weights is None else [self.weights]
 
     def reward_of(self, run: int) -> RewardFunction:
-        """The reward function of a run."""
+        """Returns the reward function of a run."""
         return self._own_rewards.get(run, self.reward_fn)
 
     def set_reward(self, reward_fn: RewardFunction | None, *, run: int) -> None:
-        """Relabels the next episodes of a run with a reward function of its own; None for the writer's.
+        """Sets the reward function that relabels the next episodes of a run; None for the writer's.
 
         Raises:
             ValueError: layers have rewards here, not runs.
@@ -292,7 +292,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         held = self._held
         batch = Batch.of(data, self._keys, runs=self.runs).after(held)
         index, left, recent = self._write_episodes(batch, len(held))
-        # Last of all, so that a batch that cannot be written loses nothing that was held back before.
+        # Last of all, so that a batch that cannot be written does not lose rows that were held back before.
         self._held, self._recent = batch.take(left), recent
         self._loaded = self._all_over = False
         if not self.layers and not self._own_rewards:
@@ -314,7 +314,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
         Args:
             data: [n], one episode after the other, as if of one environment; the last transition is done.
-            run: which one, from 0.
+            run: index of the run, from 0.
 
         Returns:
             The index of each transition in the storage, [n]; -1 as in :meth:`extend`.
@@ -356,7 +356,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave.
+        """Restores the state that :meth:`state_dict` returned.
 
         Episodes that were held back go on if the collector does
         (:func:`~torchrl_her.trainers.load_collector_state_dict`). They end if the next transitions do not
@@ -393,7 +393,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             self.empty_run(run)
 
     def empty_run(self, run: int) -> None:
-        """Forgets all that one of several runs has written, and its open episodes.
+        """Discards all rows of one of several runs, and its open episodes.
 
         Call :func:`~torchrl_her.replay_buffers.empty_run`, which tells the sampler, too.
         """
@@ -428,7 +428,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
         Args:
             batch: [held + n]; the first ones were held back.
-            held: how many.
+            held: number of rows that were held back.
 
         Returns:
             ``(index, left, recent)``: where the n new rows are in the storage, the positions in the batch of
@@ -445,7 +445,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         episodes, left = find_episodes(lanes, ends, order)
         if len(left) == 0:
             self._look_at_time(episodes.lengths)
-        if self.runs == 1:  # then TorchRL's own cursor counts
+        if self.runs == 1:  # a single run writes at TorchRL's own cursor
             self._rings.cursors[0] = self._cursor
         places = Places(run, len(batch), runs=self.runs, device=lanes.device)
         most = self.k * self.refill + 1  # copies of a transition
@@ -471,22 +471,22 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     def _by_layer(
         self, rows: TensorDictBase, episodes: Episodes, run: Tensor | None
     ) -> Iterable[tuple[int, Episodes, Tensor | None]]:
-        """The episodes of each layer; all of them where episodes have none."""
+        """Yields the episodes of each layer; all of them if episodes have no layers."""
         if not self.layers:
             return [(0, episodes, run)]
         return split_layers(rows, episodes, run, self._keys.layer, len(self.layers))
 
     def _rule(self, layer: int, run: int) -> LayerRule:
-        """How episodes of a layer, or of a run without layers, are relabeled."""
+        """Returns the rule for relabeling episodes of a layer, or of a run without layers."""
         return self.layers[layer] if self.layers else LayerRule(self.reward_of(run))
 
     def _settings(self) -> list[Hashable]:
-        """For each run, what must be the same for runs that are written at once."""
+        """Returns settings of each run that must be equal in runs that are written at once."""
         alike = [own.alike for own in self.goal_weights] or [True] * self.runs
         return [(id(self.reward_of(run)), alike[run], self._times(run)) for run in range(self.runs)]
 
     def _times(self, run: int) -> int:
-        """How many times as many goals a run's transitions get, to make up for those that get none."""
+        """Returns the factor for a run's number of goals, which makes up for transitions without goals."""
         counts = self._counts.counts[run]
         if self.refill == 1 or not counts.real:
             return 1
@@ -536,7 +536,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
                     goals = draft.virtual.changes[self._keys.goals[0]]
                     self._weights_of_runs().update(goals, draft.runs, draft.virtual.counts)
             for place, draft in enumerate(drafts):
-                # Not all at once if nobody has to see them: that would touch fresh memory.
+                # Not all at once unless ``on_write`` needs them: that would touch fresh memory.
                 self._store(shown[place] if shown else join(draft), draft.runs, draft.counts)
                 self._counts.add(draft.runs, **draft.numbers)
                 places.note(draft.runs, draft.real.root.split(draft.real.counts), draft.counts)
@@ -547,17 +547,17 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             raise
 
     def _weights_of_runs(self) -> WeightsOfRuns:
-        """The weights of all runs, of which there are some."""
+        """Returns the weights of all runs as one object; there must be weights."""
         own = self.goal_weights
         return own[0].of_runs(own) if isinstance(own[0], GoalWeights) else WeightsOfRuns(own)
 
     def _store(self, rows: TensorDictBase, runs: list[int], counts: list[int]) -> None:
-        """Writes rows as the plain writer does, but slice by slice: far faster than with an index for each.
+        """Writes rows slice by slice, which is far faster than the plain writer's index for each row.
 
         Args:
             rows: [m], run after run.
-            runs: those of a piece.
-            counts: how many rows each of them has.
+            runs: indices of the runs in a piece.
+            counts: number of rows of each of these runs.
         """
         moves, begin = [], 0
         for run, count in zip(runs, counts, strict=True):

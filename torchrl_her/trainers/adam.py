@@ -24,7 +24,7 @@ class RunsAdam(torch.optim.Adam):
     Args:
         loss: a loss module with stacked networks; all of its parameters are trained.
         lr: learning rate.
-        betas, eps: of Adam.
+        betas, eps: parameters of Adam.
 
     Keyword Args:
         runs: R.
@@ -52,7 +52,7 @@ class RunsAdam(torch.optim.Adam):
         super().__init__(loss.parameters(), lr=lr, betas=betas, eps=eps)
 
     def start(self, parameter: nn.Parameter) -> dict[str, Tensor]:
-        """Makes the state of a parameter before its first step."""
+        """Initializes the state of a parameter before its first step."""
         dim = self._dims[id(parameter)]
         shape = [size if own == dim else 1 for own, size in enumerate(parameter.shape)]
         state: dict[str, Tensor] = self.state[parameter]
@@ -61,7 +61,7 @@ class RunsAdam(torch.optim.Adam):
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Puts back what ``state_dict`` gave; torch's own Adam leaves the counts on the CPU."""
+        """Restores the state that ``state_dict`` returned; torch's own Adam leaves the counts on the CPU."""
         super().load_state_dict(state_dict)
         for parameter, state in self.state.items():
             state["step"] = state["step"].to(parameter.device)
@@ -87,6 +87,6 @@ class RunsAdam(torch.optim.Adam):
 
 
 def dim_of_runs(loss: nn.Module) -> dict[int, int]:
-    """The dimension of the runs in each parameter of a stacked loss, by the parameter's ``id``."""
+    """Returns the dimension of the runs in each parameter of a stacked loss, by the parameter's ``id``."""
     dims = run_dims(loss)
     return {id(parameter): dims.get(name, 0) for name, parameter in loss.named_parameters()}

@@ -34,7 +34,7 @@ from torchrl_her.torchrl_private import (
 from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_state_dict
 
 _MAGIC = b"torchrl-her checkpoint 1\n"
-_PIECE = 1 << 26  # bytes that are written before they are synced to disk
+_PIECE = 1 << 26  # bytes between two syncs to disk
 _BODY = len(_MAGIC) + hashlib.sha256().digest_size  # where it begins
 
 
@@ -46,7 +46,7 @@ class CheckpointError(ValueError):
 
 
 class _Stream:
-    """Sink of ``torch.save``: a file, and the checksum of what went into it."""
+    """Sink of ``torch.save``: writes to a file and computes a checksum."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.file, self.hash = file, hashlib.sha256()
@@ -78,7 +78,7 @@ def save_checkpoint(state: dict[str, Any], path: str | Path, *, keep: int = 1) -
         path: the file. It is written under another name beside it and renamed when it is on the disk.
 
     Keyword Args:
-        keep: how many checkpoints to keep: ``checkpoint.pt`` is the newest, ``checkpoint.1.pt`` the one
+        keep: number of checkpoints to keep: ``checkpoint.pt`` is the newest, ``checkpoint.1.pt`` the one
             before it, and so on.
 
     Raises:
@@ -96,7 +96,7 @@ def save_checkpoint(state: dict[str, Any], path: str | Path, *, keep: int = 1) -
 
 
 def _check_plain(value: Any, name: str) -> None:
-    """Raises a TypeError that names the entry that a safe load would refuse."""
+    """Raises a TypeError that names the first entry that a safe load would refuse."""
     if type(value) in (dict, OrderedDict):
         for key, entry in value.items():
             _check_plain(entry, f"{name}[{key!r}]")
@@ -108,7 +108,7 @@ def _check_plain(value: Any, name: str) -> None:
 
 
 def _write(state: dict[str, Any], file: BinaryIO) -> None:
-    """Writes mark, checksum and torch's file to disk, without ever holding the file in memory."""
+    """Writes mark, checksum and torch's file to disk, without holding the file in memory."""
     file.write(_MAGIC.ljust(_BODY, b"\0"))
     stream = _Stream(file)
     try:
@@ -116,7 +116,7 @@ def _write(state: dict[str, Any], file: BinaryIO) -> None:
         with config.patch("save.compute_crc32", False):  # type: ignore[attr-defined]
             torch.save(state, stream)  # type: ignore[arg-type]
     except RuntimeError as error:
-        if isinstance(error.__context__, OSError):  # torch hides why it could not write
+        if isinstance(error.__context__, OSError):  # torch hides the reason for which it could not write
             raise error.__context__ from None
         raise
     file.seek(len(_MAGIC))
@@ -125,7 +125,7 @@ def _write(state: dict[str, Any], file: BinaryIO) -> None:
 
 
 def _generations(path: Path, keep: int) -> list[Path]:
-    """The paths of a checkpoint and of those before it, the newest first."""
+    """Returns the paths of a checkpoint and its predecessors, the newest first."""
     return [path, *(path.with_name(f"{path.stem}.{age}{path.suffix}") for age in range(1, keep))]
 
 
@@ -136,8 +136,8 @@ def load_checkpoint(path: str | Path, *, map_location: torch.device | str = "cpu
         path: a file that :func:`~torchrl_her.save_checkpoint` wrote.
 
     Keyword Args:
-        map_location: where its tensors come, wherever they were; ``load_state_dict`` brings them to the
-            device of what they are loaded into.
+        map_location: device to load tensors to, whatever device they were on; ``load_state_dict`` brings them
+            to the device of what they are loaded into.
 
     Raises:
         CheckpointError: the file is damaged, not a checkpoint, or holds more than tensors and plain data.
@@ -165,7 +165,7 @@ def load_newest_checkpoint(path: str | Path, *, keep: int = 2) -> dict[str, Any]
         path: as given to :func:`~torchrl_her.save_checkpoint`.
 
     Keyword Args:
-        keep: as given to it, too.
+        keep: as given to :func:`~torchrl_her.save_checkpoint`.
 
     Raises:
         CheckpointError: all of them are damaged.
@@ -193,7 +193,7 @@ def load_newest_checkpoint(path: str | Path, *, keep: int = 2) -> dict[str, Any]
 
 
 def collector_state_dict(collector: BaseCollector) -> dict[str, Any]:
-    """The state of a collector between two batches, without its policy: counters and open episodes.
+    """Returns the state of a collector between two batches, without its policy: counters and open episodes.
 
     TorchRL's own state leaves out open episodes, since most environments cannot continue them. If the
     environment's state is restored too, a run continues exactly. Collectors in several processes do not
@@ -205,7 +205,7 @@ def collector_state_dict(collector: BaseCollector) -> dict[str, Any]:
 
 
 def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -> None:
-    """Puts back what :func:`~torchrl_her.trainers.collector_state_dict` gave.
+    """Restores the state that :func:`~torchrl_her.trainers.collector_state_dict` returned.
 
     Args:
         collector: made in the same way as the one that the state is of.
@@ -215,7 +215,7 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
     if state["carrier"] is None:
         collector.load_state_dict(own)
         return
-    collector.load_state_dict(own, strict=False)  # its policy stays
+    collector.load_state_dict(own, strict=False)  # the collector keeps its policy
     carrier: Any = carrier_of(collector)
     shown = TensorDict.from_dict(state["carrier"], batch_size=carrier.batch_size)
     set_carrier(collector, carrier.empty().update(shown))
@@ -224,7 +224,7 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
 
 
 def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> dict[str, Any]:
-    """The state of a replay buffer: stored transitions, writer and sampler.
+    """Returns the state of a replay buffer: stored transitions, writer and sampler.
 
     With it, the next batches are those of the unbroken buffer if the random numbers are, too. TorchRL's own
     state has the size of the whole capacity, and with a prioritized sampler it holds objects that a safe load
@@ -252,7 +252,7 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> d
 def _block(
     buffer: TensorDictReplayBuffer, begin: int, end: int, own: Callable[[Tensor], Tensor]
 ) -> dict[str, Any] | None:
-    """The stored rows from ``begin`` to ``end``, each tensor as ``own`` gives it; None if there are none."""
+    """Returns the stored rows from ``begin`` to ``end``, mapped by ``own``; None if there are none."""
     storage = buffer.storage
     if begin == end:
         return None
@@ -261,17 +261,17 @@ def _block(
             "packed": own(storage.packed[begin:end]),
             "fields": [tuple(field) for field in storage.fields],
         }
-    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # as stored, without what transforms add
+    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # without what transforms add
     return {"entries": rows.apply(own).to_dict(), "shape": list(rows.batch_size)}
 
 
 def _capacity(buffer: TensorDictReplayBuffer) -> int:
-    """The capacity; 0 for storages of several dimensions, which round it up when they are first written."""
+    """Returns the capacity; 0 for storages of several dimensions, which round it up at the first write."""
     return buffer.storage.max_size if buffer.storage.ndim == 1 else 0
 
 
 def _alone(rows: Tensor) -> Tensor:
-    """Some rows of a tensor as a tensor of their own, without copying; torch.save would write all rows."""
+    """Separates rows of a tensor from its memory without copying: torch.save would write all rows."""
     if not rows.is_contiguous():
         return rows.clone()
     start = rows.storage_offset() * rows.itemsize
@@ -280,7 +280,7 @@ def _alone(rows: Tensor) -> Tensor:
 
 
 def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:
-    """Puts back what :func:`~torchrl_her.trainers.buffer_state_dict` gave.
+    """Restores the state that :func:`~torchrl_her.trainers.buffer_state_dict` returned.
 
     Args:
         buffer: empty, and made in the same way as the one that the state is of.
@@ -300,13 +300,13 @@ def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]
     for (begin, end), block in zip(state["blocks"], state["rows"], strict=True):
         if block is not None:
             _load_block(buffer.storage, begin, end, block)
-    if state["cursor"] is not None:  # where slice samplers see the oldest row follow the newest
+    if state["cursor"] is not None:  # slice samplers see here where the oldest row follows the newest
         set_last_written(buffer.storage, state["cursor"])
     buffer.writer.load_state_dict(state["writer"])
 
 
 def _load_block(storage: Storage, begin: int, end: int, block: dict[str, Any]) -> None:
-    """Puts back rows of a storage that were ``begin`` to ``end``."""
+    """Restores the rows ``begin`` to ``end`` of a storage."""
     if "packed" in block:
         fields = [Field(*field) for field in block["fields"]]
         if isinstance(storage, PackedStorage) and storage.restore(begin, block["packed"], fields):

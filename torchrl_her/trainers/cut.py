@@ -1,4 +1,4 @@
-"""Ending episodes that are about to be cut, so that their transitions are stored."""
+"""Truncates open episodes before environments are reset, so that their transitions are stored."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def cut_episodes(batch: TensorDictBase) -> TensorDictBase:
     after = out.get("next")
     last = _last(batch)
     if (done := after.get("done", None)) is not None:
-        last &= ~done.reshape(batch.shape)  # what ended by itself is not truncated
+        last &= ~done.reshape(batch.shape)  # episodes that ended by themselves are not truncated
     for key in list(after.keys(True, True)):
         if (key if isinstance(key, str) else key[-1]) in ("truncated", "done"):
             flag = after.get(key)
@@ -45,7 +45,7 @@ def cut_episodes(batch: TensorDictBase) -> TensorDictBase:
 
 
 def _last(batch: TensorDictBase) -> Tensor:
-    """Which transitions are the last ones, in the shape of the batch."""
+    """Returns which transitions are the last ones, in the shape of the batch."""
     last = torch.zeros(batch.shape, dtype=torch.bool, device=device_of(batch))
     ids = batch.get(_TRAJECTORY, None)
     if batch.ndim > 1 or ids is None:

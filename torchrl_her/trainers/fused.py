@@ -44,7 +44,7 @@ class FusedLearner:
             :func:`~torchrl_her.objectives.make_dqn_loss` makes it, with networks of this library in float32
             or float64, on the CPU.
         optimizer: a plain ``torch.optim.Adam`` over the loss module's parameters.
-        target: of the loss.
+        target: update of the loss's target networks.
         max_grad_norm: to which the gradients of each network of each run are clipped separately; all
             critics count as one network.
         products: the type of the numbers that are multiplied between hidden layers of at least 32 units.
@@ -101,7 +101,7 @@ class FusedLearner:
 
     @property
     def tau(self) -> float:
-        """The share of the online weights in a soft update; 0 if targets are copied (``HardUpdate``)."""
+        """Fraction of the online weights in a soft update; 0 if targets are copied (``HardUpdate``)."""
         return 0.0 if isinstance(self.target, HardUpdate) else 1.0 - float(self.target.eps)
 
     @tau.setter
@@ -112,7 +112,7 @@ class FusedLearner:
 
     @torch.no_grad()
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
-        """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`.
+        """Makes gradient steps for each run; see :class:`~torchrl_her.trainers.Learner`.
 
         Raises:
             ValueError: the rows are not those of R runs, not a whole number of batches, not on the CPU, carry
@@ -136,7 +136,7 @@ class FusedLearner:
         return dict(zip(self._fused.losses, torch.cat(losses, 1), strict=False))
 
     def _call(self, rows: TensorDictBase, steps: int) -> FusedCall:
-        """The job of an update, but for its steps."""
+        """Prepares the arguments of an update, except for its steps."""
         outputs = self._actor[-1].outputs
         call = FusedCall(
             self.loss,
@@ -159,7 +159,7 @@ class FusedLearner:
         return call
 
     def _run(self, call: FusedCall, first: int, steps: int) -> Tensor:
-        """Makes some of the steps; returns what was measured, [3, steps, R]."""
+        """Makes some of the steps, and returns their losses, [3, steps, R]."""
         losses = torch.zeros(3, steps, self.runs, dtype=self._kinds.dtype)
         counts = self._weights.counts
         noise, adam = call.draw_noise(steps), self._adam(steps, counts)  # memory that the job points to
@@ -171,7 +171,7 @@ class FusedLearner:
         return losses
 
     def _adam(self, steps: int, counts: Sequence[float]) -> Any:
-        """Adam's numbers for each step of each run, [R, S], which has made so many before."""
+        """Returns Adam's numbers for each step of each run, [R, S], given the steps made before."""
         (group,) = self.optimizer.param_groups
         rate, (beta1, beta2), kind = float(group["lr"]), group["betas"], self._kinds.adam
 
@@ -188,7 +188,7 @@ class FusedLearner:
                 for step in range(1, steps + 1)
             ]
 
-        # As its step() would: schedulers of learning rates ask for it.
+        # As its step() would: schedulers of learning rates check it.
         self.optimizer._opt_called = True  # type: ignore[attr-defined]
         return (kind * (steps * self.runs))(
             *(own for run in range(self.runs) for own in numbers(counts[run % len(counts)]))
@@ -196,11 +196,11 @@ class FusedLearner:
 
     def _layers(self, name: str | None) -> Any:
         layers = [] if name is None else layers_of(network_of(getattr(self.loss, name)))
-        assert layers is not None  # asked by why_not_fused
+        assert layers is not None  # checked by why_not_fused
         return (Layer * len(layers))(*layers)
 
     def _check(self, rows: TensorDictBase, steps: int) -> None:
-        """Checks for changes since the learner was made."""
+        """Raises an error if something has changed since the learner was made that it does not support."""
         if rows.numel() == steps * self.runs and any(own.norm == Norm.BATCHNORM for own in self._critic):
             raise ValueError("batches must have at least 2 rows for batch normalization, got 1")
         if self.loss.reduction not in ("mean", "none"):
@@ -225,7 +225,7 @@ class FusedLearner:
 
 
 def bias_corrections(count: float, learning_rate: float, betas: tuple[float, float]) -> tuple[float, float]:
-    """Adam's step size at step number ``count``, and the divisor of the root of its second moment.
+    """Returns Adam's step size at step number ``count``, and the divisor of the root of its second moment.
 
     Example:
         >>> [round(number, 6) for number in bias_corrections(1, 0.001, (0.9, 0.999))]

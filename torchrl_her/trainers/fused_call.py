@@ -24,11 +24,11 @@ _DRAWS = {
     Algorithm.TD3: 1,
     Algorithm.SAC: 2,
     Algorithm.TQC: 2,
-}  # random numbers of a step: of next actions, then of present ones
+}  # random numbers of a step: first of next actions, then of present ones
 
 
 class FusedCall:
-    """The job of one update. Its attributes keep the memory that it points to.
+    """Arguments of one compiled update. Attributes keep the memory alive to which the arguments point.
 
     Args:
         loss: whose numbers are read anew for each update, since they may be scheduled.
@@ -42,7 +42,7 @@ class FusedCall:
         inputs: width of all that the networks see together.
         actions: width of the action, or how many discrete ones there are.
         keys: the entries that the networks see.
-        action_key: where the action is.
+        action_key: key of the action.
 
     Raises:
         ValueError: an entry has another width, a discrete action is none of those that there are, or the loss
@@ -83,13 +83,13 @@ class FusedCall:
         self._read_rows(rows, inputs, keys, action_key)
 
     def set_idle(self, idle: Sequence[int]) -> None:
-        """Chooses runs that do not learn."""
+        """Sets which runs do not learn."""
         flags = torch.zeros(self._runs, dtype=torch.uint8)
         flags[list(idle)] = 1
         self.job.idle = self._keep(flags)
 
     def draw_noise(self, steps: int) -> tuple[Tensor, ...]:
-        """The random numbers of some steps, in the order in which TorchRL's loss would draw them."""
+        """Draws the random numbers of some steps, in the order in which TorchRL's loss would draw them."""
         kinds = _DRAWS.get(self._algorithm, 0)
         if kinds == 0:
             return ()
@@ -99,13 +99,13 @@ class FusedCall:
         for step in range(steps):
             for kind in range(kinds):
                 drawn[kind, step] = noise(drawn[kind, step])
-                if kind == 0 and some:  # the next action comes first, then who values it
+                if kind == 0 and some:  # the next action comes first, then the critics that evaluate it
                     critics[step] = noise.subsets(some, self._loss.num_qvalue_nets)
         job.noise, job.own_noise, job.drawn = drawn[0].data_ptr(), drawn[-1].data_ptr(), critics.data_ptr()
         return drawn, critics
 
     def _keep(self, tensor: Tensor) -> int:
-        """The address of a tensor, which stays as long as this object."""
+        """Returns the address of a tensor, and keeps the tensor as long as this object."""
         self._kept.append(tensor)
         return tensor.data_ptr()
 
@@ -163,7 +163,7 @@ class FusedCall:
             job.action = self._entry(action, self._actions, action_key)
         job.reward = self._entry(rows.get(("next", "reward")), 1, ("next", "reward"))
         terminated = rows.get(("next", "terminated"), None)
-        if terminated is None:  # as TorchRL's targets
+        if terminated is None:  # as TorchRL's targets are
             terminated = rows.get(("next", "done"))
         job.terminated = self._entry(terminated, 1, ("next", "terminated"), torch.bool)
         weight = rows.get("priority_weight", None)
@@ -176,7 +176,7 @@ class FusedCall:
             job.discount = self._entry(discount, 1, STEPS_KEY)
 
     def _joined(self, rows: TensorDictBase, keys: Sequence[NestedKey], inputs: int) -> Any:
-        """The entries that networks see, which the steps join."""
+        """Returns the addresses of the networks' inputs, which the compiled steps join."""
         values = [rows.get(key) for key in keys]
         width = sum(value.shape[-1] for value in values)
         if width != inputs:
@@ -189,7 +189,7 @@ class FusedCall:
         return (kind * len(entries))(*entries)
 
     def _entry(self, value: Tensor, width: int, name: NestedKey, dtype: torch.dtype | None = None) -> int:
-        """The address of an entry [R, S * B, width], in the type of the weights unless told otherwise."""
+        """Returns the address of an entry [R, S * B, width], by default in the type of the weights."""
         if value.device.type != "cpu":
             raise ValueError(f"{name!r} must be on the CPU to be fused, got it on {value.device}")
         own = value.to(dtype or self._dtype).contiguous()

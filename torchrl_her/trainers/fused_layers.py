@@ -1,4 +1,4 @@
-"""A network's modules as the layers that compiled gradient steps know."""
+"""Converts a network's modules to the layers that compiled gradient steps support."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NORMS = {StackedLayerNorm: Norm.LAYERNORM, StackedBatchNorm: Norm.BATCHNORM}
 
 
 def layers_of(net: nn.Module) -> list[Layer] | None:
-    """The layers of one of this library's networks, from its input on; None if it has others.
+    """Returns the layers of one of this library's networks, from its input on; None if others occur.
 
     The tensors of the layers, in the same order, are those of ``net.state_dict()``: weight and bias, behind
     them scale and shift of a normalization, and the running mean and variance of one of batches.
@@ -59,7 +59,7 @@ def layers_of(net: nn.Module) -> list[Layer] | None:
 
 
 def tensor_shapes(layers: Sequence[Layer]) -> list[tuple[int, int]]:
-    """The last two dimensions of the parameters and running statistics that layers have, in order.
+    """Returns the last two dimensions of the parameters and running statistics of layers, in order.
 
     Example:
         >>> tensor_shapes(layers_of(ActorNet(4, 2, hidden=8, depth=2, norm="layer")))[:4]

@@ -15,23 +15,23 @@ from torchrl_her.trainers.fusing import FUSED
 
 State = dict[str, Tensor]
 
-_STATE = ("exp_avg", "exp_avg_sq", "step")  # what Adam keeps of a parameter
+_STATE = ("exp_avg", "exp_avg_sq", "step")  # Adam's state of a parameter
 
 
 class FusedWeights:
-    """The weights of a loss, network by network, as memory that the steps work on.
+    """The weights of a loss, network by network, as addresses that compiled steps work on.
 
     A stack of N critics has parameters [N, R, ...]; for the steps these are N networks. Running statistics
     have targets, but no moments.
 
     Args:
-        loss: one that can be fused.
+        loss: loss that can be fused.
         optimizer: a plain Adam over its parameters.
         kinds: the structures for the type of its weights.
 
     Attributes:
-        parameters: of the actor, the critics and SAC's temperature.
-        actor_tensors, critic_tensors: how many parameters and running statistics an actor and a critic have.
+        parameters: parameters of the actor, the critics and SAC's temperature.
+        actor_tensors, critic_tensors: number of parameters and running statistics of an actor and a critic.
         critics: N.
     """
 
@@ -58,11 +58,11 @@ class FusedWeights:
             ),
             *((own, delayed, 0, 1) for own, delayed in temperature),
         ]
-        self._memory: list[tuple[int, list[Tensor]]] = []  # what the table was made of
+        self._memory: list[tuple[int, list[Tensor]]] = []  # addresses from which the table was made
         self._table: Any = None
 
     def table(self) -> Any:
-        """The addresses of all tensors, found anew if some were replaced, as by loading a checkpoint.
+        """Returns the addresses of all tensors, updated if tensors were replaced, as by loading a checkpoint.
 
         Raises:
             ValueError: tensors do not fit each other, are not contiguous, not on the CPU or of another type
@@ -107,7 +107,7 @@ class FusedWeights:
 
     @property
     def counts(self) -> list[float]:
-        """How many steps Adam has made: of each run, or of all together."""
+        """Number of steps that Adam has made: for each run, or one for all."""
         return self._optimizer.state[self.parameters[0]]["step"].flatten().tolist()
 
     def _state(self, tensor: Tensor) -> State:
@@ -115,7 +115,7 @@ class FusedWeights:
         return self._optimizer.state.get(tensor, {})
 
     def _start(self, parameter: nn.Parameter) -> State:
-        """The first state of a parameter, as Adam itself makes it at its first step."""
+        """Returns the first state of a parameter, as Adam makes it at its first step."""
         if isinstance(self._optimizer, RunsAdam):
             return self._optimizer.start(parameter)
         state: State = self._optimizer.state[parameter]
@@ -132,7 +132,7 @@ class FusedWeights:
 
 
 def _tensors(loss: LossModule, network: str, *, delayed: bool) -> list[tuple[Tensor, Tensor | None]]:
-    """A network's parameters and running statistics with their targets, in the order of its layers."""
+    """Yields a network's parameters and running statistics with their targets, layer by layer."""
     names = getattr(loss, network).state_dict()
     online = getattr(loss, f"{network}_params").flatten_keys(".")
     if not delayed:

@@ -1,4 +1,4 @@
-"""Which losses, target updates and optimizers the fused gradient steps do justice to."""
+"""Checks which losses, target updates and optimizers fused gradient steps can reproduce."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from torchrl_her.trainers.fused_layers import layers_of, tensor_shapes
 
 @dataclass(frozen=True)
 class FusedLoss:
-    """Where a loss that can be fused keeps what the steps need.
+    """Names of the networks and options in a kind of loss that can be fused.
 
     Attributes:
         algorithm: the steps.
@@ -108,7 +108,7 @@ def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | Non
 
     Args:
         loss: any loss module.
-        target: what moves its target networks.
+        target: update of its target networks.
 
     Example:
         >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss
@@ -135,7 +135,7 @@ def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | Non
 
 
 def is_plain_adam(optimizer: torch.optim.Optimizer, loss: LossModule | None = None) -> bool:
-    """Whether a fused step can do the work of an optimizer: Adam with one group and without extras.
+    """Returns whether fused steps can replace an optimizer: Adam with one group and without extras.
 
     Args:
         optimizer: any optimizer.
@@ -153,14 +153,14 @@ def is_plain_adam(optimizer: torch.optim.Optimizer, loss: LossModule | None = No
 
 
 def network_of(module: nn.Module) -> nn.Module:
-    """The network within the TensorDict module that a loss keeps."""
+    """Returns the network within the TensorDict module that a loss keeps."""
     if isinstance(module, TensorDictSequential):
         module = module[0]
     return module.module  # type: ignore[return-value]
 
 
 def action_key(loss: LossModule) -> Any:
-    """The key of the actions: DDPG's loss has no name for it, but its actor has."""
+    """Returns the key of the actions; DDPG's loss does not name it, but its actor does."""
     if isinstance(loss, PenalizedDDPGLoss):
         return loss.actor_network.out_keys[0]
     return loss.tensor_keys.action
@@ -171,7 +171,7 @@ def _ids(parameters: Iterator[nn.Parameter] | list[nn.Parameter]) -> set[int]:
 
 
 def _obstacles(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
-    """All options that the fused step does not know."""
+    """Yields a description of each option that fused steps do not support."""
     for name, value in fused.fixed.items():
         if getattr(loss, name) != value:
             yield f"{name}={getattr(loss, name)!r}"
@@ -229,7 +229,7 @@ def _strange_networks(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
 
 
 def _is_plain_module(actor: nn.Module, fused: FusedLoss) -> bool:
-    """Whether an actor is a network and, for SAC, TQC and DQN, what makes an action of its outputs."""
+    """Returns whether an actor is a network, followed for SAC, TQC and DQN by their usual last module."""
     if fused.algorithm not in (*STOCHASTIC, Algorithm.DQN):
         return type(actor) is TensorDictModule
     if (

@@ -18,7 +18,7 @@ from torchrl_her.trainers.learner import WEIGHT, LossLearner, check_rows
 
 
 class GraphLearner(LossLearner):
-    """The gradient steps of a :class:`~torchrl_her.LossLearner`, as one launch of a GPU for several steps.
+    """Makes the gradient steps of a :class:`~torchrl_her.LossLearner`, several in one launch of a GPU.
 
     A gradient step of small networks is hundreds of small kernels, each of which takes longer to launch than
     to run. Here the kernels of several steps are recorded as a CUDA graph and then launched together. The
@@ -33,9 +33,9 @@ class GraphLearner(LossLearner):
 
     Args:
         loss: as for :class:`~torchrl_her.LossLearner`, on a GPU.
-        optimizer: as there; it is made ``capturable``.
-        target: one that moves the targets in the same way in each step, such as ``SoftUpdate``.
-        max_grad_norm: as there.
+        optimizer: as for :class:`~torchrl_her.LossLearner`; it is made ``capturable``.
+        target: update that moves the targets in the same way in each step, such as ``SoftUpdate``.
+        max_grad_norm: as for :class:`~torchrl_her.LossLearner`.
         runs: R.
 
     Keyword Args:
@@ -114,7 +114,7 @@ class GraphLearner(LossLearner):
         return self._recorded[key]
 
     def _steps(self, rows: TensorDictBase, steps: int) -> TensorDictBase:
-        """Makes gradient steps: what they measured, [S, R] each, and the new priorities."""
+        """Makes gradient steps; returns their losses, [S, R] each, and the new priorities."""
         last = rows.ndim - 1
         parts = rows.split(rows.shape[last] // steps, last)
         measured = [self._step(part) for part in parts]
@@ -126,12 +126,12 @@ class GraphLearner(LossLearner):
 
 
 class _Recorded:
-    """Function that is called as it is at first, then recorded, and launched from then on.
+    """Function that is called directly at first, then recorded as a CUDA graph, and launched from then on.
 
     Args:
         call: always computes the same of rows of the same shape.
-        device: where.
-        generators: of its random numbers, beside torch's own.
+        device: GPU on which it runs.
+        generators: generators of its random numbers, besides torch's own.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class _Recorded:
     ) -> None:
         self._call, self._device, self._generators = call, device, generators
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._rows = self._out = TensorDict()  # what the graph reads and writes
+        self._rows = self._out = TensorDict()  # tensors that the graph reads and writes
         self._was_called = False
 
     def __call__(self, rows: TensorDictBase) -> TensorDictBase:
@@ -174,7 +174,7 @@ class _Recorded:
         try:
             # A stream of this device: torch's default for graphs is one of the device that was first used.
             with torch.cuda.graph(graph, stream=torch.cuda.Stream(self._device)):
-                self._out = self._call(self._rows.copy())  # which entries are added to
+                self._out = self._call(self._rows.copy())  # adds entries to the given tensordict
         except RuntimeError as error:
             first: BaseException = error
             while first.__context__ is not None:  # the end of the recording fails, too
@@ -189,14 +189,14 @@ class _Recorded:
 
 @contextmanager
 def _uncaptured() -> Iterator[None]:
-    """Steps of a ``capturable`` optimizer without a graph, which torch warns of."""
+    """Suppresses torch's warning about steps of a ``capturable`` optimizer without a graph."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*capturable=True.*")
         yield
 
 
 def why_not_recorded(loss: LossModule, target: TargetNetUpdater | None = None) -> str | None:
-    """Why gradient steps cannot be recorded as a CUDA graph, or None if they can.
+    """Returns why gradient steps cannot be recorded as a CUDA graph, or None if they can.
 
     Args:
         loss: any of TorchRL's.

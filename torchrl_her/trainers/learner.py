@@ -14,11 +14,11 @@ from torchrl.objectives.utils import TargetNetUpdater
 
 from torchrl_her.trainers.runs import clip_by_run, keep_runs, run_dims
 
-WEIGHT = "priority_weight"  # of importance sampling, as TorchRL's samplers and losses call it
+WEIGHT = "priority_weight"  # key of importance weights in TorchRL's samplers and losses
 
 
 class Learner(Protocol):
-    """Algorithm as the training loop uses it: gradient steps of each run."""
+    """Protocol of an algorithm in the training loop: makes gradient steps for each run."""
 
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
         """Learns from transitions (rows), and writes their new priorities into them.
@@ -29,7 +29,7 @@ class Learner(Protocol):
             idle: runs that do not learn; their rows are ignored.
 
         Returns:
-            What was measured, [S, R] each.
+            The losses and other measurements, [S, R] each.
         """
         ...
 
@@ -45,7 +45,7 @@ def check_rows(rows: TensorDictBase, steps: int, runs: int) -> None:
 def check_idle(
     optimizer: torch.optim.Optimizer, target: TargetNetUpdater | None, idle: Sequence[int]
 ) -> None:
-    """Refuses idle runs where gradient steps of all runs are counted together, which changes later ones.
+    """Refuses idle runs if the steps of all runs are counted together, which would change later steps.
 
     Raises:
         ValueError: the optimizer is a plain Adam, or the target update a plain HardUpdate.
@@ -64,7 +64,7 @@ def check_idle(
 
 @contextmanager
 def idle_runs(loss: LossModule, target: TargetNetUpdater | None, idle: Sequence[int]) -> Iterator[None]:
-    """Lets a loss and its target update know, in the ``with`` block, which runs do not learn."""
+    """Marks in a loss and its target update, in the ``with`` block, the runs that do not learn."""
     parts: list[Any] = [own for own in (getattr(loss, "noise", None), target) if hasattr(own, "idle")]
     for own in parts:
         own.idle = tuple(idle)
@@ -88,7 +88,7 @@ class LossLearner:
         optimizer: over the loss module's parameters; must be elementwise, as Adam is, if there are several
             runs, and a :class:`~torchrl_her.trainers.RunsAdam` if some of them may be idle.
         target: moves the target networks; None for a loss without them.
-        max_grad_norm: to which the gradients of each network of each run are clipped separately.
+        max_grad_norm: norm to which the gradients are clipped, for each network of each run separately.
         runs: R.
 
     Example:
@@ -112,7 +112,7 @@ class LossLearner:
         self._networks = self._find_networks()
 
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
-        """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`.
+        """Makes gradient steps for each run; see :class:`~torchrl_her.trainers.Learner`.
 
         Raises:
             ValueError: the rows are not those of R runs or not a whole number of batches, or the loss does
@@ -151,7 +151,7 @@ class LossLearner:
         return {key: value.detach() for key, value in losses.items()}
 
     def _mean(self, name: str, value: Tensor, batch: TensorDictBase) -> Tensor:
-        """The mean loss [R] of each run."""
+        """Returns the mean loss [R] of each run."""
         if self.runs > 1 and value.numel() != batch.numel():
             raise ValueError(
                 f"with {self.runs} runs, {name} must have one number for each of {batch.numel()} rows "
@@ -166,7 +166,7 @@ class LossLearner:
             clip_by_run(parameters, self.max_grad_norm, runs=self.runs, dim=dim)
 
     def _find_networks(self) -> list[tuple[list[nn.Parameter], int]]:
-        """The parameters of each network (each child of the loss module), and the runs' dimension in them."""
+        """Returns the parameters of each network (child of the loss), and the runs' dimension in them."""
         groups: dict[str, list[nn.Parameter]] = {}
         dims, dim_of = run_dims(self.loss), {}
         for name, parameter in self.loss.named_parameters():

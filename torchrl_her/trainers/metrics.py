@@ -13,7 +13,7 @@ from torchrl_her.goals.rewards import RewardFunction, distance, is_achieved
 
 
 def first_episode(done: Tensor) -> Tensor:
-    """Tells which steps belong to the first episode.
+    """Returns which steps belong to the first episode.
 
     Args:
         done: [..., T] of bool.
@@ -29,7 +29,7 @@ def first_episode(done: Tensor) -> Tensor:
 
 
 def at_the_end(rollout: TensorDictBase, values: Tensor) -> Tensor:
-    """Values [N, T] at the last step of the first episode, [N]."""
+    """Returns the values [N, T] at the last step of the first episode, [N]."""
     last = first_episode(rollout.get(("next", "done")).squeeze(-1)).sum(-1, keepdim=True) - 1
     return values.gather(-1, last).squeeze(-1)
 
@@ -37,7 +37,7 @@ def at_the_end(rollout: TensorDictBase, values: Tensor) -> Tensor:
 def success(
     rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
 ) -> Tensor:
-    """Whether the goal is achieved at the last step of the episode, as Fetch's papers measure success.
+    """Returns whether the goal is achieved at the last step of the episode, the success of Fetch's papers.
 
     Args:
         rollout: [N, T].
@@ -63,13 +63,13 @@ def success(
 def reached(
     rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
 ) -> Tensor:
-    """Whether the goal is achieved at some step of the episode; arguments as for :func:`success`."""
+    """Returns whether the goal is achieved at some step of the episode; arguments as for :func:`success`."""
     inside = first_episode(rollout.get(("next", "done")).squeeze(-1))
     return (inside & is_achieved(rollout["next"], reward_fn, achieved_reward=achieved_reward)).any(-1)
 
 
 def final_distance(rollout: TensorDictBase) -> Tensor:
-    """Distance of the achieved goal from the desired goal at the last step of the episode.
+    """Returns the distance of the achieved goal from the desired goal at the last step of the episode.
 
     Args:
         rollout: [N, T].
@@ -82,7 +82,7 @@ def final_distance(rollout: TensorDictBase) -> Tensor:
 
 
 def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: float | Tensor = -1.0) -> Tensor:
-    """The return of the first episode, from its first state, [N].
+    """Computes the discounted return of the first episode, from its first state, [N].
 
     After a truncation, ``tail_reward`` is counted forever, because a critic bootstraps there and so
     estimates such a return as well.
@@ -117,5 +117,5 @@ def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: flo
 
 
 def q_bias(initial_value: Tensor, returns: Tensor) -> Tensor:
-    """The critic's bias: estimated value of initial states minus the actual return, both [N]."""
+    """Computes the critic's bias: estimated value of initial states minus the actual return, both [N]."""
     return initial_value.reshape(returns.shape) - returns

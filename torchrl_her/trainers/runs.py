@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 
 def run_dims(loss: nn.Module) -> dict[str, int]:
-    """The dimension of the runs in each entry of a stacked loss's state, by name.
+    """Returns the dimension of the runs in each entry of a stacked loss's state, by name.
 
     It is the first one; in the parameters of a stack of N critics [N, R, ...] it is the second.
 
@@ -30,7 +30,7 @@ def run_dims(loss: nn.Module) -> dict[str, int]:
 def keep_runs(
     loss: nn.Module, optimizer: torch.optim.Optimizer, kept: Sequence[int], *, runs: int
 ) -> Iterator[None]:
-    """Leaves some runs of a stacked loss and its optimizer unchanged by what happens in the ``with`` block.
+    """Protects some runs of a stacked loss and its optimizer from all changes in the ``with`` block.
 
     Args:
         loss: its tensors have a dimension of R equal blocks, in the order of the runs (see ``run_dims``).
@@ -64,7 +64,7 @@ def keep_runs(
 
 
 def _entries(loss: nn.Module, optimizer: torch.optim.Optimizer, runs: int) -> list[tuple[int, Tensor, int]]:
-    """All tensors that are divided among R runs: a key, the tensor, and the dimension of the runs."""
+    """Yields all tensors that are divided among R runs: a key, the tensor, and the dimension of the runs."""
     dims = run_dims(loss)
     entries = [(entry, dims[name]) for name, entry in loss.state_dict().items()]
     of = {id(parameter): dims.get(name, 0) for name, parameter in loss.named_parameters()}
@@ -86,7 +86,7 @@ def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float, *, runs: in
     """Clips the gradient of each run separately.
 
     Args:
-        parameters: of one stacked network; each has R equal blocks, in the order of the runs.
+        parameters: parameters of one stacked network; each has R equal blocks, in the order of the runs.
         max_norm: greatest norm of a run's gradient, over all parameters together.
         runs: R.
         dim: the dimension of the runs.
@@ -105,7 +105,7 @@ def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float, *, runs: in
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     blocks = [gradient.unflatten(dim, (runs, -1)).movedim(dim, 0) for gradient in gradients]
     norms = torch.cat([block.reshape(runs, -1) for block in blocks], 1).norm(dim=1)
-    scale = (max_norm / (norms + 1e-6)).clamp(max=1.0)  # as torch's clip_grad_norm_
+    scale = (max_norm / (norms + 1e-6)).clamp(max=1.0)  # as in torch's clip_grad_norm_
     for block in blocks:
         block.mul_(scale.view(-1, *[1] * (block.ndim - 1)))
     return norms

@@ -14,11 +14,11 @@ _REMAINING = "_remaining_batches"  # until a pass over the data is over; TorchRL
 
 
 def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
-    """All that decides, with the random numbers, what a sampler draws next.
+    """Returns the state that decides, together with random numbers, which rows a sampler draws next.
 
     Args:
-        sampler: of any of TorchRL's kinds.
-        size: how many rows its storage holds; a prioritized sampler's state is of these only.
+        sampler: sampler of any of TorchRL's kinds.
+        size: number of filled rows in its storage; a prioritized sampler's state has only these.
 
     Example:
         >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -30,7 +30,7 @@ def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
         [2, 3, 4]
     """
     if isinstance(sampler, SamplerEnsemble):
-        # Of parts with priorities the whole trees: how much each storage holds is not known here.
+        # Whole trees of the ensemble's members: the number of filled rows of each is not known here.
         own: dict[str, Any] = {
             str(i): sampler_state_dict(part, capacity_of(part)) for i, part in enumerate(samplers_in(sampler))
         }
@@ -42,7 +42,7 @@ def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
 
 
 def load_sampler_state_dict(sampler: Sampler, state: dict[str, Any]) -> None:
-    """Puts back what :func:`sampler_state_dict` gave.
+    """Restores the state that :func:`sampler_state_dict` returned.
 
     Raises:
         ValueError: the state is that of another kind of sampler.
@@ -66,7 +66,7 @@ def _copy(value: Any) -> Any:
 
 
 def _priorities(sampler: PrioritizedSampler, size: int) -> dict[str, Any]:
-    """Of the filled part: TorchRL's state holds trees that a safe load refuses."""
+    """Returns the priorities of filled rows: TorchRL's state holds trees that a safe load refuses."""
     state, filled = sampler.state_dict(), torch.arange(size)
     return {
         "sum": torch.as_tensor(state["_sum_tree"][filled]) if size else None,

@@ -22,32 +22,32 @@ from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.cut import cut_episodes
 from torchrl_her.trainers.learner import Learner
 
-_IDLE = -torch.inf  # measured by a run that did not learn; NaN would hide runs that diverged
+_IDLE = -torch.inf  # measurement of a run that did not learn; NaN would hide runs that diverged
 
 
 class Schedule(Protocol):
-    """Something that changes from epoch to epoch and keeps its own state."""
+    """Protocol of a part that changes from epoch to epoch and has a state, such as a schedule of epsilon."""
 
     def step(self) -> None:
-        """Called when an epoch has ended."""
+        """Moves to the next epoch; called when an epoch has ended."""
         ...
 
 
 class Replay(Protocol):
-    """Replay buffer as the training loop uses it: TorchRL's own, or one that mixes several."""
+    """Protocol of a replay buffer in the training loop: TorchRL's own, or one that mixes several."""
 
     @property
     def writer(self) -> Any:
-        """Where what is collected goes, for one run or several."""
+        """Writer of collected batches, for one run or several."""
         ...
 
     @property
     def priority_key(self) -> str:
-        """Under which new priorities are found."""
+        """Key of new priorities."""
         ...
 
     def __len__(self) -> int:
-        """Rows that a single run can learn from."""
+        """Number of rows that a single run can learn from."""
         ...
 
     def extend(self, data: TensorDictBase) -> Tensor:
@@ -55,20 +55,20 @@ class Replay(Protocol):
         ...
 
     def sample(self, batch_size: int) -> TensorDictBase:
-        """Rows of whole batches, R equal blocks; with an entry ``index``."""
+        """Samples rows of whole batches, R equal blocks, with an entry ``index``."""
         ...
 
     def update_tensordict_priority(self, rows: TensorDictBase) -> None:
-        """Takes new priorities of sampled rows."""
+        """Updates the priorities of sampled rows."""
         ...
 
 
 @runtime_checkable
 class CollectsAhead(Protocol):
-    """Collector that can collect during the gradient steps."""
+    """Protocol of a collector that can collect during the gradient steps."""
 
     def collect_ahead(self) -> None:
-        """Begins to collect the next batch, with the policy as it is now."""
+        """Starts to collect the next batch, with the present policy."""
         ...
 
 
@@ -76,7 +76,7 @@ _MUST_BE_FINITE = ("action", "observation", "achieved_goal", "desired_goal", "re
 
 
 def _check_batch(batch: TensorDictBase) -> None:
-    """Refuses a batch that holds NaN or infinity where networks or rewards would see it."""
+    """Refuses a batch that has NaN or infinity in entries that networks or rewards read."""
     names = [name for key in _MUST_BE_FINITE for name in (key, ("next", key))]
     entries = {name: batch.get(name, None) for name in names}
     check_finite({f"the collected {name!r}": own for name, own in entries.items() if own is not None})
@@ -97,8 +97,8 @@ class Trainer:
     Args:
         collector: yields batches [R * E, T] that the exploring policy played. One that
             :class:`CollectsAhead` collects the next batch while this loop learns from the last one.
-        buffer: for one run any replay buffer, usually with a :class:`~torchrl_her.HERWriter`; for several one
-            whose writer (``HERWriter(..., runs=R)``) and sampler are for R runs. With demonstrations a
+        buffer: replay buffer: for one run any, usually with a :class:`~torchrl_her.HERWriter`; for several
+            one whose writer (``HERWriter(..., runs=R)``) and sampler are for R runs. With demonstrations a
             :class:`~torchrl_her.demonstrations.MixedReplay`.
         learner: learns from what is sampled.
         schedules: take a step after each epoch, for example exploration and weights of goals.
@@ -156,16 +156,16 @@ class Trainer:
         self.average = average
         self.frames = self.updates = self.epochs = 0
         self._credit = 0.0  # gradient steps that the frames so far allow and that were not made yet
-        self._measured: list[dict[str, Tensor]] | None = None  # in the epoch under way
+        self._measured: list[dict[str, Tensor]] | None = None  # in the present epoch
         self._outside = 0  # frames that were collected by run(), which are part of no epoch
 
     @property
     def in_epoch(self) -> bool:
-        """Whether an epoch is under way."""
+        """Whether an epoch has begun and not ended."""
         return self._measured is not None
 
     def epoch(self, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
-        """Runs one epoch, or the rest of one; returns the means [R] of what the learner measured.
+        """Runs one epoch, or the rest of one; returns the means [R] of the learner's measurements.
 
         Args:
             on_batch: called after each batch, for example for a progress bar.
@@ -195,7 +195,7 @@ class Trainer:
         return _means(measured)
 
     def _reset_collector(self) -> None:
-        """Begins new episodes everywhere. Those that were under way are written as far as they got."""
+        """Begins new episodes in all environments. Open episodes are truncated and written."""
         self.collector.reset()
         if isinstance(self.buffer.writer, HERWriter):
             self.buffer.writer.end_episodes()
@@ -208,7 +208,7 @@ class Trainer:
         *,
         cut: bool,
     ) -> None:
-        """Collects and learns up to a number of frames, and notes what the learner measures.
+        """Collects and learns up to a number of frames, and records the learner's measurements.
 
         ``cut`` truncates the episodes that are open at the end, since a reset follows.
         """
@@ -250,7 +250,7 @@ class Trainer:
         return measured
 
     def _learn_from(self, idle: list[int], steps: int) -> dict[str, Tensor]:
-        """Gradient steps of all runs but the idle ones; returns what was measured, [steps, R] each."""
+        """Makes gradient steps for all runs but the idle ones; returns measurements, [steps, R] each."""
         drawn = self.buffer.sample(self.runs * self.batch_size * steps)
         rows = drawn.view(self.runs, -1)
         measured = self.learner.update(rows, steps, idle=idle)
@@ -260,21 +260,21 @@ class Trainer:
         return {key: _without(value, idle) for key, value in measured.items()}
 
     def _set_priorities(self, drawn: TensorDictBase, rows: TensorDictBase, idle: list[int]) -> None:
-        """Gives the sampler the new priorities of the transitions that were learned from."""
+        """Passes the new priorities of sampled transitions to the sampler."""
         key = self.buffer.priority_key
         priority = rows.get(key, None)
         if priority is None:
             return
         own = drawn.select("index")
-        # The type of trees, also for networks in float64.
+        # The type of the sampler's trees, also for networks in float64.
         own.set(key, priority.flatten(0, 1).float())
-        if idle:  # the rows that they were given are of other runs
+        if idle:  # idle runs were given rows of other runs
             learned = [run for run in range(self.runs) if run not in idle]
             own = own.view(self.runs, -1)[learned].flatten()
         self.buffer.update_tensordict_priority(own)  # does nothing under a sampler without priorities
 
     def state_dict(self) -> dict[str, Any]:
-        """The counters, what was measured in the epoch under way, and the state of TorchRL's schedulers.
+        """Returns counters, the measurements of the present epoch, and the state of TorchRL's schedulers.
 
         All other parts keep their own state.
         """
@@ -289,7 +289,7 @@ class Trainer:
         return {**counters, "credit": self._credit, "measured": measured, "schedules": schedules}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave."""
+        """Restores the state that :meth:`state_dict` returned."""
         self.frames, self.updates, self.epochs = state["frames"], state["updates"], state["epochs"]
         self._credit, self._outside = state["credit"], state["outside"]
         measured = state["measured"]
@@ -303,20 +303,20 @@ class Trainer:
 
 
 def _without(value: Tensor, idle: list[int]) -> Tensor:
-    """Returns measurements [S, R], marked where runs were idle."""
+    """Returns measurements [S, R] with a mark in place of those of idle runs."""
     return value.index_fill(1, torch.tensor(idle, dtype=torch.int64, device=value.device), _IDLE)
 
 
 def _joined(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """All steps [..., R] of each entry, joined."""
+    """Joins the steps [..., R] of each entry."""
     if not measured:
         return {}
-    # What was measured before a stop comes from a file, so perhaps from another device.
+    # Measurements from before a stop come from a file, so perhaps from another device.
     return {key: torch.cat([own[key].to(last) for own in measured]) for key, last in measured[-1].items()}
 
 
 def _means(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """The means [R] of each entry over the steps in which a run learned; NaN where it never did."""
+    """Returns the means [R] of each entry over the steps in which a run learned; NaN where it never did."""
     return {key: _mean(values) for key, values in _joined(measured).items()}
 
 

@@ -17,7 +17,7 @@ from torchrl_her_envs.common.goal_env import GoalEnv
 from torchrl_her_envs.common.seeding import block_keys
 
 _ENDS = ("done", "terminated", "truncated")
-_COUNTERS = ("step", "episode")  # of the state: what is counted and not physical
+_COUNTERS = ("step", "episode")  # entries of the state that are counters and not physical
 
 
 class BatchedEnv(GoalEnv):
@@ -50,17 +50,17 @@ class BatchedEnv(GoalEnv):
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(device="cpu", batch_size=(num_envs,))
-        self._packed = False  # whether what is shown was checked
+        self._packed = False  # whether observations were checked
 
-    # What subclasses say
+    # Methods that subclasses implement
 
     @abstractmethod
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Whether the goal is achieved, which ends an episode: [..., 1] of bool."""
+        """Returns whether the goal is achieved, which ends an episode: [..., 1] of bool."""
 
     @abstractmethod
     def _start_episodes(self, which: Tensor) -> None:
-        """Draws the starts of new episodes in the given environments [M]; they are counted already."""
+        """Draws the starts of new episodes in the given environments [M], after updating counters."""
 
     @abstractmethod
     def _advance(self, action: Tensor) -> Tensor | None:
@@ -72,16 +72,16 @@ class BatchedEnv(GoalEnv):
 
     @abstractmethod
     def _check_action(self, action: Tensor) -> None:
-        """Raises a ValueError for actions that cannot be taken."""
+        """Raises a ValueError for invalid actions."""
 
     def _is_achieved(self, shown: dict[str, Tensor]) -> Tensor:
-        """Whether each environment is at its goal: [N, 1] of bool."""
+        """Returns whether each environment is at its goal: [N, 1] of bool."""
         return self.compute_terminated(shown["achieved_goal"], shown["desired_goal"])
 
-    # What they get
+    # Methods that subclasses inherit
 
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """The reward of having achieved one goal when another was desired.
+        """Computes the reward of having achieved one goal when another was desired.
 
         Args:
             achieved_goal: [..., g], as the agent sees it.
@@ -96,7 +96,7 @@ class BatchedEnv(GoalEnv):
         return self.compute_terminated(achieved_goal, desired_goal).to(achieved_goal.dtype) - 1.0
 
     def world_state_dict(self) -> dict[str, Tensor]:
-        """A copy of the whole state, row by row; loading it resumes exactly from here."""
+        """Returns a copy of the whole state, with a row for each environment, to resume exactly from here."""
         state: dict[str, Tensor] = {
             field.name: getattr(self.worlds, field.name).clone(memory_format=torch.contiguous_format)
             for field in fields(self.worlds)
@@ -104,7 +104,7 @@ class BatchedEnv(GoalEnv):
         return state | {"key": torch.from_numpy(self._keys.view(np.int64).copy())}
 
     def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts the environments back to where ``world_state_dict`` was taken.
+        """Restores the environments to the state that ``world_state_dict`` returned.
 
         Raises:
             ValueError: the state is of another number of environments, or of others than these; nothing has
@@ -116,7 +116,7 @@ class BatchedEnv(GoalEnv):
         self._keys = state["key"].numpy().copy().view(np.uint64)
 
     def start_at(self, states: Mapping[str, Tensor], which: Tensor) -> dict[str, Tensor]:
-        """Lets the episodes of some environments begin at given states, with their goals.
+        """Begins the episodes of some environments at given states, with the goals of these.
 
         The episodes have all of their steps before them. Seeds, the count of episodes and all other
         environments stay as they are, so what is drawn later is the same as without this call.
@@ -207,14 +207,14 @@ class BatchedEnv(GoalEnv):
         return self._pack(self._take(action))
 
     def _begin(self, which: Tensor) -> dict[str, Tensor]:
-        """Begins the next episodes of the given environments [M]; returns what all N of them show."""
+        """Begins the next episodes of the given environments [M]; returns the observations of all N."""
         self.worlds.episode[which] += 1
         self.worlds.step[which] = 0
         self._start_episodes(which)
         return self._show()
 
     def _take(self, action: Tensor) -> dict[str, Tensor]:
-        """Takes a step with checked actions; returns all that the environments show and say after it."""
+        """Takes a step with checked actions; returns observations, rewards and ends."""
         self.worlds.step = self.worlds.step + 1
         cut = self._advance(action)
         shown = self._show()
@@ -235,7 +235,7 @@ class BatchedEnv(GoalEnv):
         return TensorDict._new_unsafe(entries, **made)
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
-        """TorchRL completes here what a step left out, and brings it into shape: there is nothing to do."""
+        """Skips TorchRL's completion of missing entries and shapes, which these steps do not need."""
         if self.run_type_checks:
             return super()._step_proc_data(next_tensordict_out)
         return next_tensordict_out
@@ -255,14 +255,14 @@ class BatchedEnv(GoalEnv):
         for key, own in tensordict.items():
             if key in entries:
                 entries[key] = torch.where(done, entries[key], own)
-            else:  # what is over: an action, the ends, or the memory of a policy
+            else:  # entries of the old episode: an action, the ends, or the memory of a policy
                 entries[key] = _cleared(own, done)
         return self._pack(entries)
 
     def _make_specs(
         self, observed: int, goals: int, *, seen: Callable[[tuple[int, int]], TensorSpec], action: TensorSpec
     ) -> None:
-        """Says what goes in and out.
+        """Sets the specs of observations, actions, rewards and ends.
 
         Args:
             observed: numbers in an observation.
@@ -288,7 +288,7 @@ class BatchedEnv(GoalEnv):
 
 
 def _cleared(entry: Tensor | TensorDictBase, rows: Tensor) -> Any:
-    """An entry [N, ...] with zeros in some rows [N, 1]."""
+    """Returns an entry [N, ...] with zeros in some rows [N, 1]."""
     if isinstance(entry, Tensor):
         return entry.masked_fill(rows.view(-1, *[1] * (entry.ndim - 1)), 0)
     return entry.apply(lambda own: _cleared(own, rows))

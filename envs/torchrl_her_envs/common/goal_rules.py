@@ -1,4 +1,4 @@
-"""Rewards and ends of an environment that is not of this package, found by trying."""
+"""Finds out by trial how environments of other packages reward goals and end episodes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _said: set[str] = set()
 
 
 def say_once(line: str) -> None:
-    """Logs a line, the first time that it is said in this process; nothing if it is empty."""
+    """Logs a line once per process; nothing if it is empty."""
     if line and line not in _said:
         _said.add(line)
         _LOGGER.info(line)
 
 
 def warn_once(line: str) -> None:
-    """Logs a warning, the first time in this process; nothing if the line is empty.
+    """Logs a warning once per process; nothing if it is empty.
 
     Without any handler, Python prints such a record as one line; a ``UserWarning`` would be two, with code.
     """
@@ -36,7 +36,7 @@ def warn_once(line: str) -> None:
 
 
 def check_termination(word: str) -> Termination:
-    """Returns the word, if it is one of the values of ``termination``.
+    """Returns a value of ``termination``, checked.
 
     Raises:
         ValueError: it is none of them.
@@ -53,19 +53,19 @@ def check_termination(word: str) -> Termination:
 
 
 class GoalEnds:
-    """Rule for the ends of episodes at goals, and what the environment itself was seen to do there.
+    """Rule for the ends of episodes at goals, and counts of what the environment itself did there.
 
     Args:
-        name: of the environment, for messages.
+        name: name of the environment, for messages.
         own: whether any goal ends an episode by the environment's ``compute_terminated``; None if it has no
             such function.
-        tells_success: whether steps say ``is_success``.
+        tells_success: whether the infos of steps have ``is_success``.
 
     Attributes:
         rule: which of the environment's own function (``"own"``), its ``is_success`` (``"success"``) or the
             reward of a goal (``"reward"``) ends episodes; ``"never"`` if goals end none; ``"watch"`` while
-            the environment ends episodes as it does by itself, and nobody has decided.
-        steps: that were seen.
+            the environment's own ends count and no rule is set.
+        steps: number of steps so far.
         ended, went_on: steps at achieved goals in which the environment itself ended the episode, or went on.
 
     Example:
@@ -88,11 +88,11 @@ class GoalEnds:
 
     @property
     def asks_success(self) -> bool:
-        """Whether ``is_success`` tells which steps achieve their goals, and not the reward of their goals."""
+        """Whether ``is_success``, and not the reward, decides which steps achieve their goals."""
         return self.tells_success and self.rule != "reward"
 
     def decide(self, termination: Termination) -> None:
-        """Sets the rule to what the user said, or by what was found.
+        """Sets the rule to the user's choice, or to the one that was found.
 
         Raises:
             ValueError: the environment lacks what is asked for.
@@ -115,7 +115,7 @@ class GoalEnds:
             self.rule = termination
 
     def found(self) -> Ends | None:
-        """The rule that fits what the environment was seen to do; None while it has met no goal.
+        """Returns the rule that fits the environment's behavior so far; None before it has met a goal.
 
         Its own function decides if it has one. If not, and it went on at a goal, goals never end an episode.
         """
@@ -126,7 +126,7 @@ class GoalEnds:
         return ("success" if self.tells_success else "reward") if self.ended else None
 
     def line(self) -> str:
-        """Why the rule is what was found; empty if the environment's own function decides."""
+        """Returns a line that explains the rule; empty if the environment's own function decides."""
         if self.own is not None:
             return ""
         by, where = "reward", "the reward is that of an achieved goal"
@@ -146,11 +146,11 @@ class GoalEnds:
         return f"{self.name} has no compute_terminated: {why} (task.options.termination={rule})"
 
     def apply(self, met: Any, terminated: Any, truncated: Any) -> tuple[Any, Any]:
-        """The ends of some steps by the rule, after it was noted what the environment did at achieved goals.
+        """Returns the ends of steps by the rule, and counts what the environment did at achieved goals.
 
         Args:
-            met: of bool, steps that achieved their goals.
-            terminated, truncated: what the environment said, likewise.
+            met: bool for each step that achieved their goals.
+            terminated, truncated: flags of these steps by the environment.
 
         Returns:
             ``(terminated, truncated)``. Where goals never end an episode, one that the environment ended at
@@ -180,10 +180,10 @@ class GoalEnds:
 
 
 def check_stateless(name: str, before: np.ndarray, after: np.ndarray) -> None:
-    """Raises a ValueError if ``compute_reward`` gives the same goals other rewards in another state.
+    """Raises a ValueError if ``compute_reward`` gives the same goals different rewards in different states.
 
     Args:
-        name: of the environment, for the message.
+        name: name of the environment, for the message.
         before, after: rewards [n] of the same pairs of goals, with some steps between them.
     """
     differ = ~np.isclose(before, after, rtol=1e-4, atol=1e-5, equal_nan=True)
@@ -198,10 +198,10 @@ def check_stateless(name: str, before: np.ndarray, after: np.ndarray) -> None:
 def check_rewards(
     name: str, equal: float, others: Sequence[float] | np.ndarray, given: float | None
 ) -> tuple[float, float, bool]:
-    """Tells a sparse reward, and one that is dense.
+    """Finds the reward of an achieved goal; raises if rewards are dense and none was given.
 
     Args:
-        name: of the environment, for messages.
+        name: name of the environment, for messages.
         equal: the least reward of two equal goals.
         others: rewards of further pairs of goals.
         given: the reward from which on a goal counts as achieved, if the user said so.
@@ -252,12 +252,12 @@ def check_rewards(
 
 
 def equal_with_info(name: str, equal: np.ndarray, others: np.ndarray, given: float | None) -> float:
-    """The reward of equal goals for :func:`check_rewards`, where rewards depend on infos as well.
+    """Finds the reward of equal goals for :func:`check_rewards`, if rewards depend on infos as well.
 
     Equal goals are achieved with some infos at least, which random steps may not have met.
 
     Args:
-        name: of the environment, for the message.
+        name: name of the environment, for the message.
         equal: rewards [n] of equal goals, with different infos.
         others: rewards of other pairs.
         given: the reward from which on a goal counts as achieved, if the user said so.
@@ -281,7 +281,7 @@ def equal_with_info(name: str, equal: np.ndarray, others: np.ndarray, given: flo
 
 
 def is_dense(equal: float, others: Sequence[float] | np.ndarray) -> bool:
-    """Whether goals that are not achieved have different rewards; arguments as for :func:`check_rewards`.
+    """Returns whether goals that are not achieved differ in reward; arguments as for :func:`check_rewards`.
 
     Example:
         >>> is_dense(0.0, [-1.0, 0.0]), is_dense(0.0, [-3.0, -1.0, -2.5, -0.5])
@@ -291,13 +291,13 @@ def is_dense(equal: float, others: Sequence[float] | np.ndarray) -> bool:
 
 
 def _missed(equal: float, others: Sequence[float] | np.ndarray) -> np.ndarray:
-    """The different rewards of other pairs that are less than those of equal ones, in their order."""
+    """Returns the distinct rewards of unequal pairs of goals below that of equal ones, ascending."""
     seen = np.unique(np.round(others, _DIGITS) + 0.0)
     return seen[seen < equal]
 
 
 def check_same_rewards(name: str, stepped: np.ndarray, computed: np.ndarray) -> str:
-    """A warning for rewards of steps [n] that differ from those computed for their goals; empty if none does.
+    """Returns a warning if rewards of steps [n] differ from those computed for their goals, else nothing.
 
     Steps in which an episode failed are left out: what that cost is kept in virtual transitions.
 

@@ -19,7 +19,7 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 class LiveEpisodes:
-    """Greedy episode in each of several environments, played step by step on request.
+    """Plays a greedy episode in each of several environments, step by step.
 
     The picture of an environment whose episode is over stays as it was, with a green border if it achieved
     its goal in some step and a red one if not. The environment itself begins a new episode, which is not
@@ -37,7 +37,7 @@ class LiveEpisodes:
 
     Attributes:
         frame: the present picture [height, width, 3] of uint8.
-        running: indices of the environments whose episodes go on.
+        running: indices of the environments whose episodes are not over.
         step_count: steps since the start.
 
     Raises:
@@ -81,17 +81,17 @@ class LiveEpisodes:
 
     @property
     def achieved(self) -> int:
-        """How many of the environments that are shown have their goals achieved now, or at their end."""
+        """Number of shown environments whose goals are achieved now, or were at the end of their episodes."""
         return int(self._success[self._worlds].sum())
 
     @property
     def worlds(self) -> int:
-        """How many environments are shown."""
+        """Number of environments that are shown."""
         return len(self._worlds)
 
     @property
     def max_steps(self) -> int:
-        """The steps of an episode, at most."""
+        """Maximum number of steps of an episode."""
         return self._base.max_steps
 
     @property
@@ -103,7 +103,7 @@ class LiveEpisodes:
         """Begins a new episode in all environments.
 
         Args:
-            seed: of their starts and goals; None goes on with the random numbers of the environments.
+            seed: seed of their starts and goals; None continues the random numbers of the environments.
         """
         if seed is not None:
             self._base.set_seeds([seed])
@@ -115,21 +115,21 @@ class LiveEpisodes:
         self._shoot(self._shown["done"])
 
     def step(self) -> None:
-        """Takes a step in all environments; nothing happens when all of their episodes are over."""
+        """Takes a step in all environments; does nothing if all episodes are over."""
         if not self.running:
             return
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             stepped = self._env.step(self._policy(self._shown))
             after = stepped["next"]
             self.step_count += 1
-            out_of_time = self.step_count == self._base.max_steps  # whatever the transforms say
+            out_of_time = self.step_count == self._base.max_steps  # also if transforms override the ends
             self._success[self.running] = self._achieved(after)[self.running]
             self._shoot(after["done"] | out_of_time)
             if self.running:
                 self._shown = self._env.maybe_reset(self._env.step_mdp(stepped))
 
     def _achieved(self, after: TensorDictBase) -> Tensor:
-        """Whether goals are achieved after a step, [N, 1]: by the environment's own word, or its reward."""
+        """Returns whether goals are achieved after a step, [N, 1], by the environment's flag or reward."""
         word = after.get("is_success", None)
         if word is not None:
             return word
@@ -138,7 +138,7 @@ class LiveEpisodes:
         return reward >= reward_range(self._base)[1]
 
     def _shoot(self, done: Tensor) -> None:
-        """Makes the picture, and stops the environments that are ``done`` [N, 1]."""
+        """Renders the picture, and stops the environments that are ``done`` [N, 1]."""
         env, running = self._base, self.running
         drawn = env.render(running, size=self._size, trail=self._trail, caption=self._caption)
         for world, picture in zip(running, drawn, strict=True):

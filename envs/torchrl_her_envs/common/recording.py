@@ -1,4 +1,4 @@
-"""Films of a policy at work in several environments at once."""
+"""Videos of a policy that acts in several environments at once."""
 
 from __future__ import annotations
 

@@ -92,12 +92,12 @@ def uniform(keys: np.ndarray, episodes: Tensor, count: int) -> Tensor: ...
 
 
 def uniform(keys: np.ndarray, episodes: np.ndarray | Tensor, count: int) -> np.ndarray | Tensor:
-    """Uniform numbers in [0, 1) for given episodes of given environments.
+    """Draws uniform numbers in [0, 1) for given episodes of given environments.
 
     Args:
         keys: [M] uint64, from :func:`env_keys`.
         episodes: [M] int64, the number of the episode in its environment.
-        count: how many numbers an episode needs, at most 256.
+        count: number of numbers that an episode needs, at most 256.
 
     Returns:
         [M, count] of float64: an array for an array, a tensor for a tensor.

@@ -1,4 +1,4 @@
-"""Checks on one gymnasium environment before many are made: does it follow GoalEnv, and what does it lack?"""
+"""Checks on one gymnasium environment, before many are made, that it follows GoalEnv."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from torchrl_her_envs.gym.quiet import make_quietly
 KEYS = ("observation", "achieved_goal", "desired_goal")
 REWARD, TERMINATED = "compute_reward", "compute_terminated"
 SUCCESS = "is_success"
-# Of make_gym_env, for every environment.
+# Options of make_gym_env that every environment takes.
 _OUR_OPTIONS = (
     *("max_steps", "parallel", "termination", "achieved_reward", "info_keys"),
     *(f"{key}_key" for key in KEYS),
     "pictures",
 )
-EPISODES = 8  # whose goals the environment's functions are tried with
+EPISODES = 8  # states whose goals the environment's functions are tried with
 _TRIED_STEPS = 100
 _LIMIT_STEPS = 1_000  # that are played to see where an environment truncates an episode itself
 _LIMIT = 100  # of episodes that it does not truncate
@@ -38,21 +38,21 @@ _COARSE = 0.05  # steps of float32, relative to the standard deviation of a goal
 
 
 def spec_of(env: gymnasium.Env) -> EnvSpec:
-    """The spec by which gymnasium made an environment."""
+    """Returns the spec by which gymnasium made an environment."""
     return cast(EnvSpec, env.spec)
 
 
 def shown_of(space: spaces.Space) -> spaces.Dict:
-    """The space of observations of an environment that was checked."""
+    """Returns the space of observations of a checked environment."""
     return cast(spaces.Dict, space)
 
 
 def make_one(id: str, names: Mapping[str, Names] | None, options: dict[str, Any]) -> gymnasium.Env:
-    """Makes one environment; where that fails, the message has one line and names what is wrong.
+    """Makes one environment; if that fails, a message of one line names the reason.
 
     Args:
-        id: of the environment.
-        names: of its entries, see :func:`~torchrl_her_envs.gym.quiet.make_quietly`.
+        id: id of the environment.
+        names: names of its entries, see :func:`~torchrl_her_envs.gym.quiet.make_quietly`.
         options: for it.
 
     Raises:
@@ -107,10 +107,10 @@ def _cannot_make(id: str, error: Exception) -> str:
 
 
 def _register_robotics(id: str) -> str:
-    """Registers the environments of gymnasium-robotics; returns what to say if they are not installed."""
+    """Registers the environments of gymnasium-robotics; returns a hint if they are not installed."""
     if ":" not in id and id not in gymnasium.registry:
         try:
-            with redirect_stderr(io.StringIO()):  # what it says there is of environments without goals
+            with redirect_stderr(io.StringIO()):  # its notices are about environments without goals
                 importlib.import_module("gymnasium_robotics")
         except ModuleNotFoundError:
             return " (gymnasium-robotics is not installed: pip install '.[robotics]')"
@@ -174,20 +174,20 @@ def _form(given: object) -> str:
 
 
 def has_compute_terminated(env: gymnasium.Env, achieved: Any, desired: Any) -> bool:
-    """Whether an environment tells which goals end an episode; a base class may have the mere name of it."""
+    """Returns whether an environment implements ``compute_terminated``, and not just a base class's stub."""
     if not env.has_wrapper_attr(TERMINATED):
         return False
     try:
         env.get_wrapper_attr(TERMINATED)(achieved, desired, {})
     except NotImplementedError:
         return False
-    except Exception:  # it says what is wrong when it is tried as a GoalFunction
+    except Exception:  # GoalFunction reports errors when it tries the function
         return True
     return True
 
 
 def goals_to_try(env: gymnasium.Env, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Goals [M, g] of the first states of some episodes: equal pairs, then each achieved and desired one."""
+    """Collects goals [M, g] of first states: equal pairs, then each achieved with the desired one."""
     shown = [env.reset(seed=seed)[0] for seed in range(EPISODES)]
     achieved, desired = (np.stack([layout.flatten(own[key]) for own in shown]) for key in KEYS[1:])
     pairs = np.repeat(achieved, EPISODES, 0), np.tile(desired, (EPISODES, 1))
@@ -218,13 +218,13 @@ class Trial:
     infos: list[dict[str, Any]]
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """The steps [m] of up to 8 achieved goals, each with each of up to 8 desired ones."""
+        """Returns the steps [m] of up to 8 achieved goals, each paired with each of up to 8 desired ones."""
         chosen = np.unique(np.linspace(0, len(self.reward) - 1, EPISODES).astype(int))
         return np.repeat(chosen, len(chosen)), np.tile(chosen, len(chosen))
 
 
 def coarse_goals(id: str, achieved: np.ndarray) -> str:
-    """A warning for achieved goals [n, g] so far from 0 that float32 rounds their changes, or nothing."""
+    """Returns a warning if achieved goals [n, g] are so far from 0 that float32 rounds their changes."""
     size, spread = np.abs(achieved).max(0), achieved.std(0, dtype=np.float64)
     steps = np.spacing(size.astype(np.float32))
     coarse = (spread > 0) & (steps > _COARSE * spread)
@@ -238,7 +238,7 @@ def coarse_goals(id: str, achieved: np.ndarray) -> str:
 
 
 def find_limit(env: gymnasium.Env) -> int:
-    """The length of the longest episode of random actions that an environment truncates; 100 without one."""
+    """Returns the length of the longest random episode that an environment truncates; 100 without one."""
     env.action_space.seed(0)
     longest = length = 0
     env.reset(seed=0)
@@ -256,13 +256,13 @@ def find_limit(env: gymnasium.Env) -> int:
 def find_achieved_reward(
     env: gymnasium.Env, layout: Layout, reward: GoalFunction, achieved: np.ndarray, desired: np.ndarray
 ) -> float | None:
-    """The reward from which on an environment's own ``_is_success`` calls a goal achieved.
+    """Finds the least reward at which an environment's own ``_is_success`` counts a goal as achieved.
 
     Fetch and highway-env have this method. It is asked on the way from each desired goal to the achieved one.
 
     Args:
         env: with a dense reward.
-        layout: of its goals.
+        layout: layout of its goals.
         reward: its reward function.
         achieved, desired: [m, g] goals, most of which are not achieved.
 
@@ -294,7 +294,7 @@ def find_achieved_reward(
 
 
 def try_steps(env: gymnasium.Env, layout: Layout) -> Trial:
-    """Plays episodes of random actions, the same whenever it is called."""
+    """Plays episodes of random actions, the same ones in each call."""
     env.action_space.seed(0)
     rows: list[tuple[Any, ...]] = []
     done = True

@@ -1,4 +1,4 @@
-"""How gymnasium's environments are drawn, and what to say where they cannot be."""
+"""Rendering of gymnasium's environments, and messages for those that cannot be rendered."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _DRAWN_BY = "MUJOCO_GL"
 
 
 def draws(env: gymnasium.Env) -> bool:
-    """Whether an environment gives pictures if it is made with ``render_mode="rgb_array"``."""
+    """Returns whether an environment gives pictures if it is made with ``render_mode="rgb_array"``."""
     return PICTURES in env.metadata.get("render_modes", [])
 
 
 def choose_renderer() -> None:
-    """Lets MuJoCo draw by EGL where there is no display, unless ``MUJOCO_GL`` says what to draw by.
+    """Makes MuJoCo render by EGL if there is no display, unless ``MUJOCO_GL`` is set.
 
     By itself it would try to open a window there, and fail.
     """
@@ -27,7 +27,7 @@ def choose_renderer() -> None:
 
 
 def cannot_draw(name: str, error: Exception) -> str:
-    """Returns a message of one line about an environment that cannot be drawn."""
+    """Returns a message of one line that an environment cannot be rendered."""
     hint = ""
     if "mujoco" in sys.modules:
         by = os.environ.get(_DRAWN_BY)

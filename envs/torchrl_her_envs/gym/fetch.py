@@ -1,4 +1,4 @@
-"""The Fetch tasks of gymnasium-robotics: names for what they show, and the layers of a curriculum.
+"""The Fetch tasks of gymnasium-robotics: names for entries of their states, and layers of a curriculum.
 
 A Fetch robot's gripper has to be brought to a point, or an object, which the gripper pushes, slides or
 carries: Plappert et al., Multi-goal reinforcement learning, 2018.
@@ -35,7 +35,7 @@ def _shown(id: str) -> dict[str, int] | None:
 
 
 def fetch_names(id: str) -> dict[str, list[int]]:
-    """Names for entries of the state of a Fetch task; none for another environment.
+    """Returns names for entries of a Fetch task's state; none for another environment.
 
     Args:
         id: gymnasium's.
@@ -51,7 +51,7 @@ def fetch_names(id: str) -> dict[str, list[int]]:
 
 
 def fetch_layers(id: str) -> list[dict[str, Any]]:
-    """The layers of a Fetch task: to reach the object, and then to move it; none for another environment.
+    """Returns the layers of a Fetch task: reach the object, then move it; none for another environment.
 
     What the first layer wants, the place of the object, is what the second one observes at the same inputs.
     To reach a point is a single layer. A block that is to be picked up has to be between the fingers.

@@ -15,7 +15,7 @@ _NOTHING: Info = {}
 
 
 class _OneInfo(dict[str, Any]):
-    """An info that notes which entries were asked for in vain."""
+    """An info that records which missing entries were read."""
 
     def __init__(self, entries: Mapping[str, Any], lacking: set[str]) -> None:
         super().__init__(entries)
@@ -50,12 +50,12 @@ class GoalFunction:
         achieved: [M, g] goals to try it with. Some rows should be equal to those of ``desired`` and others
             not, and M should not be g, so that the two dimensions cannot be mistaken for each other.
         desired: [M, g].
-        name: of the function, for messages.
+        name: name of the function, for messages.
         info: entries [M, ...] of the infos to try it with.
 
     Attributes:
-        form: what it takes for one pair of goals: the two goals (``"pair"``), a batch of one (``"rows"``), or
-            a batch of one with an array of infos.
+        form: form of arguments that it takes for one pair of goals: the two goals (``"pair"``), a batch of
+            one (``"rows"``), or a batch of one with an array of infos.
         answers: ``"batch"`` if it takes batches, ``"one"`` if one value answers for all, ``"loop"`` if it
             has to be called pair by pair.
         tried: [M], its answers to the goals that it was tried with.
@@ -88,7 +88,7 @@ class GoalFunction:
         self.answers: Answers = self._find_out(achieved, desired, info)
 
     def __call__(self, achieved: np.ndarray, desired: np.ndarray, info: Info = _NOTHING) -> np.ndarray:
-        """The answers [B] of float64 to goals [B, g], with the entries [B, ...] of their infos."""
+        """Returns the results [B] of float64 for goals [B, g], with the entries [B, ...] of their infos."""
         if self.answers == "loop" or not len(achieved):
             return self._loop(achieved, desired, info)
         answer = self._batch(achieved, desired, info, self._batched)
@@ -105,7 +105,7 @@ class GoalFunction:
         return _OneInfo({key: entries[row] for key, entries in info.items()}, self.lacking)
 
     def _try_forms(self, achieved: np.ndarray, desired: np.ndarray, info: Info) -> np.ndarray:
-        """The answers [M] in the first form that the function takes; the error of a pair if it takes none."""
+        """Calls the function in the first form that it takes; returns [M] results, or raises an error."""
         errors: list[ValueError] = []
         for form in get_args(Form):
             self.form: Form = form
@@ -120,7 +120,7 @@ class GoalFunction:
         return np.array([self._ask(achieved, desired, info, row) for row in rows], np.float64)
 
     def _ask(self, achieved: np.ndarray, desired: np.ndarray, info: Info, row: int) -> float:
-        """The answer to one pair of goals."""
+        """Calls the function for one pair of goals."""
         try:
             if self.form == "pair":
                 own = self._function(achieved[row], desired[row], self._one(info, row))
@@ -144,7 +144,7 @@ class GoalFunction:
         return answer.item()
 
     def hint(self, info: Collection[str]) -> str:
-        """Returns the message about infos that lack what the function reads besides the named keys."""
+        """Returns a hint about entries of infos that the function reads besides the named keys."""
         if not self.lacking:
             return ""
         keys = sorted(self.lacking)
@@ -158,7 +158,7 @@ class GoalFunction:
         for self._batched in forms:
             try:
                 answer = self._batch(achieved, desired, info, self._batched)
-            except Exception:  # whatever it is that a function for single goals stumbles over
+            except Exception:  # a function for single goals may fail with any error
                 continue
             if answer.size in (1, len(achieved)) and np.allclose(answer.reshape(-1), self.tried):
                 return "one" if answer.size == 1 else "batch"

@@ -1,4 +1,4 @@
-"""The entries of ``info`` that an environment's rewards read, as entries of transitions."""
+"""Converts the entries of ``info`` that an environment's rewards read to entries of transitions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Infos:
     """Named entries of ``info``: numbers, or arrays of one shape.
 
     Args:
-        names: of the entries.
+        names: names of the entries.
         seen: the infos of some steps, each of which must have all of them.
         env: its name, for messages.
 
@@ -39,7 +39,7 @@ class Infos:
         self._kinds = {name: self._kind(name, seen) for name in names}
 
     def _kind(self, name: str, seen: Sequence[Mapping[str, Any]]) -> tuple[tuple[int, ...], np.dtype]:
-        """Shape and type of an entry."""
+        """Returns shape and type of an entry."""
         lacking = [info for info in seen if name not in info]
         if lacking:
             raise ValueError(self._lacks(name, lacking[0]))
@@ -61,11 +61,11 @@ class Infos:
 
     @property
     def keys(self) -> list[tuple[str, str]]:
-        """Where transitions have the entries."""
+        """Keys of the entries in transitions."""
         return [(INFO, name) for name in self._kinds]
 
     def spec(self, count: int) -> Composite:
-        """The spec of the entries of some environments: single numbers are [count, 1]."""
+        """Returns the spec of the entries of some environments: single numbers are [count, 1]."""
         specs = {
             name: Unbounded((count, *(shape or (1,))), dtype=torch.from_numpy(np.empty(0, dtype)).dtype)
             for name, (shape, dtype) in self._kinds.items()
@@ -73,11 +73,11 @@ class Infos:
         return Composite(specs, shape=(count,))
 
     def stack(self, infos: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-        """The entries [n, ...] of single environments' infos."""
+        """Stacks the infos of single environments to entries [n, ...]."""
         return {name: np.array([info[name] for info in infos], own[1]) for name, own in self._kinds.items()}
 
     def of_batch(self, infos: Mapping[str, Any], count: int, *, reset: bool = False) -> dict[str, np.ndarray]:
-        """The entries [count, ...] of a vector environment's info; after a reset, 0 where there is none.
+        """Returns the entries [count, ...] of a vector environment's info; 0 where a reset gives none.
 
         Raises:
             ValueError: an environment's step lacks an entry.
@@ -93,7 +93,7 @@ class Infos:
         return out
 
     def rows(self, entries: Mapping[str, np.ndarray]) -> TensorDict:
-        """Entries [n, ...] of :meth:`of_batch` as transitions hold them, [n, 1] for single numbers."""
+        """Converts entries [n, ...] of :meth:`of_batch` for transitions, [n, 1] for single numbers."""
         count = len(next(iter(entries.values())))
         own = {
             name: torch.from_numpy(value).view(count, *(self._kinds[name][0] or (1,)))
@@ -102,6 +102,6 @@ class Infos:
         return TensorDict(own, [count])
 
     def read(self, transitions: TensorDictBase, shape: torch.Size) -> dict[str, np.ndarray]:
-        """The entries of transitions, broadcast to a shape [...], as rows [B, ...]."""
+        """Reads the entries of transitions, broadcast to a shape [...], as rows [B, ...]."""
         own = info_rows(transitions, self._kinds, shape)
         return {name: entry.reshape(-1, *self._kinds[name][0]).cpu().numpy() for name, entry in own.items()}

@@ -14,7 +14,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class _Leaf:
-    """Array of a nested dictionary: the keys that lead to it, its shape and type."""
+    """An array in a nested dictionary: the keys that lead to it, its shape and type."""
 
     path: tuple[str, ...]
     shape: tuple[int, ...]
@@ -35,7 +35,7 @@ class Layout:
 
     Args:
         space: an array, a whole number, or a dictionary of these and further dictionaries.
-        name: of the space, for messages.
+        name: name of the space, for messages.
 
     Raises:
         ValueError: something in it is not an array of numbers.
@@ -58,12 +58,12 @@ class Layout:
 
     @property
     def entries(self) -> list[str]:
-        """The entries of a nested dictionary in their order, with dots between keys; empty for a vector."""
+        """Names of a nested dictionary's entries in order, with dots between keys; empty for a vector."""
         return [".".join(leaf.path) for leaf in self._leaves if leaf.path]
 
     @property
     def places(self) -> dict[str, list[int]]:
-        """The places in the row of each entry of a nested dictionary; empty for a vector."""
+        """Positions in the row of each entry of a nested dictionary; empty for a vector."""
         places, first = {}, 0
         for leaf in self._leaves:
             if leaf.path:
@@ -73,16 +73,16 @@ class Layout:
 
     @property
     def sizes(self) -> set[int]:
-        """The sizes of all dimensions."""
+        """Sizes of all dimensions."""
         return {size for leaf in self._leaves for size in leaf.shape}
 
     @property
     def shapes(self) -> list[tuple[tuple[str, ...], tuple[int, ...]]]:
-        """The keys and the shape of each entry: equal for goals that can be compared."""
+        """Keys and shape of each entry. Two spaces of goals can be compared if these are equal."""
         return [(leaf.path, leaf.shape) for leaf in self._leaves]
 
     def flatten(self, values: Any) -> np.ndarray:
-        """Values of the space, each with the same leading dimensions [...], as rows [..., width].
+        """Flattens values of the space, with the same leading dimensions [...], to rows [..., width].
 
         Raises:
             ValueError: a value is not a finite number of float32; the message names it.
@@ -102,7 +102,7 @@ class Layout:
         return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, -1)
 
     def unflatten(self, rows: np.ndarray) -> Any:
-        """Rows [..., width] in the form of the space, rounded to its types; all arrays are copies."""
+        """Converts rows [..., width] to values of the space, rounded to its types; all arrays are copies."""
         nested: Any = {}
         first = 0
         for leaf in self._leaves:

@@ -18,10 +18,10 @@ from torchrl_her_envs.gym.renamed import RenamedKeys
 def make_quietly(
     id: str | EnvSpec, names: Mapping[str, Names] | None = None, /, **options: Any
 ) -> gymnasium.Env:
-    """Calls ``gymnasium.make``; PyBullet prints its arguments for each environment, which is left out.
+    """Calls ``gymnasium.make``, and suppresses the arguments that PyBullet prints for each environment.
 
     Args:
-        id: of the environment.
+        id: id of the environment.
         names: its entries, see :class:`~torchrl_her_envs.gym.renamed.RenamedKeys`; None for GoalEnv's.
         options: for the environment.
     """
@@ -32,7 +32,7 @@ def make_quietly(
 
 @contextmanager
 def _python_alone() -> Iterator[None]:
-    """Discards what compiled code writes to the standard output; Python still prints, and debuggers do."""
+    """Discards output of compiled code; Python and debuggers still print."""
     sys.stdout.flush()
     with os.fdopen(os.dup(1), "w", buffering=1) as terminal:
         with open(os.devnull, "w") as nothing:

@@ -1,4 +1,4 @@
-"""The ids under which gymnasium knows our tasks."""
+"""Registers the tasks with gymnasium, under ids."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NAMESPACE = "torchrl_her"
 
 
 def gym_id(task: Task) -> str:
-    """The id by which ``gymnasium.make`` knows a task.
+    """Returns the id of a task for ``gymnasium.make``.
 
     Example:
         >>> gym_id(TASKS["hand_wall_v1"]), gym_id(TASKS["robot_reach"])

@@ -1,4 +1,4 @@
-"""Gymnasium environments whose observation and goals have names of their own, or are several entries each."""
+"""Support for gymnasium environments whose observation and goals have other names, or several entries."""
 
 from __future__ import annotations
 

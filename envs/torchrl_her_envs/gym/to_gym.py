@@ -24,12 +24,12 @@ _NO_LIMIT = 1 << 60  # steps: gymnasium's TimeLimit truncates
 
 
 class GoalRules:
-    """The functions of goals that gymnasium's GoalEnv asks for, for one pair of goals or many."""
+    """The functions of goals that gymnasium's GoalEnv requires, for one pair of goals or many."""
 
     _core: ThrowingCore
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        """The reward of having achieved one goal when another was desired.
+        """Computes the reward of having achieved one goal when another was desired.
 
         Args:
             achieved_goal: [..., 2].
@@ -44,11 +44,11 @@ class GoalRules:
         return rewards.astype(np.result_type(achieved_goal, np.float16))[()]
 
     def compute_terminated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        """Whether the goal is achieved, which ends an episode: [...] of bool."""
+        """Returns whether the goal is achieved, which ends an episode: [...] of bool."""
         return self._achieved(achieved_goal, desired_goal)[()]
 
     def compute_truncated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        """Never, whatever the goals: the time limit alone cuts episodes off. [...] of bool."""
+        """Returns False for all goals, [...] of bool: only the time limit truncates episodes."""
         shape = np.broadcast_shapes(np.shape(achieved_goal), np.shape(desired_goal))
         return np.zeros(shape[:-1], np.bool_)[()]
 
@@ -57,7 +57,7 @@ class GoalRules:
 
 
 class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
-    """Gymnasium environment of a task.
+    """A throwing or reaching task as a gymnasium environment.
 
     Observations are a dict of ``observation``, ``achieved_goal`` and ``desired_goal`` (float32), actions
     are in [-1, 1], the reward is 0 where the goal is achieved and -1 elsewhere: see
@@ -110,7 +110,8 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         """Begins an episode.
 
         Args:
-            seed: of this episode and the following ones; they go on from the last seed if None.
+            seed: seed of this episode and the following ones; None continues the random numbers of the last
+                seed.
             options: not used.
         """
         super().reset(seed=seed, options=options)
@@ -137,20 +138,20 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         return shown, reward_of(terminated), terminated, False, {"is_success": terminated}
 
     def render(self) -> np.ndarray | None:
-        """A picture [size, size, 3] of uint8; None where a window shows it, or without a render mode."""
+        """Renders a picture [size, size, 3] of uint8; None if a window shows it, or without a render mode."""
         return self._picture() if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Closes the window, if there is one."""
+        """Closes the window if there is one."""
         if self._window is not None:
             self._window.close()
             self._window = None
 
     def _observation(self) -> Observation:
-        (state,) = self._core.show_state()  # a new array: nobody else has it
+        (state,) = self._core.show_state()  # a new array, which no other object shares
         return {
             "observation": state[:-2],
-            "achieved_goal": state[self._core.achieved_index].copy(),  # it is in the observation, too
+            "achieved_goal": state[self._core.achieved_index].copy(),  # the grip is in the observation, too
             "desired_goal": state[-2:],
         }
 
@@ -158,7 +159,7 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         return render(self._core, 0, size=self._size).numpy()
 
     def _show(self) -> None:
-        """Shows the present picture in the window, if one was asked for."""
+        """Shows the present picture in the window if the render mode is ``human``."""
         if self.render_mode != "human":
             return
         if self._window is None:
@@ -173,7 +174,7 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
 def make_core(
     task: str, num_envs: int, max_steps: int, *, world: WorldConfig | None = None, **options: Any
 ) -> ThrowingCore:
-    """A batch of worlds whose episodes have a given length."""
+    """Makes a batch of worlds whose episodes have a given length."""
     return ThrowingCore(
         get_task(task),
         num_envs,
@@ -183,14 +184,14 @@ def make_core(
 
 
 def check_pictures(mode: str | None, modes: list[str], size: int) -> None:
-    """Raises a ValueError for a render mode that there is not, or a size that is too small."""
+    """Raises a ValueError for an unknown render mode, or a size that is too small."""
     check_size(size)
     if mode is not None and mode not in modes:
         raise ValueError(f"render_mode must be one of {', '.join(modes)}, or None, got {mode!r}")
 
 
 def as_seed(seed: int | None) -> int:
-    """A seed of gymnasium's, which may be any number, as one of ours, which is below 2**64.
+    """Converts a seed of gymnasium's, which may be any number, to one below 2**64.
 
     Example:
         >>> as_seed(7), as_seed((1 << 64) + 7)
@@ -200,7 +201,7 @@ def as_seed(seed: int | None) -> int:
 
 
 def spaces_of(core: ThrowingCore) -> tuple[spaces.Dict, spaces.Box]:
-    """The spaces of observations and actions of a single environment."""
+    """Returns the spaces of observations and actions of a single environment."""
     limit = _largest(core)
     widths = dict(zip(KEYS, (core.observation_size, 2, 2), strict=True))
     shown: dict[str, spaces.Space] = {
@@ -210,6 +211,6 @@ def spaces_of(core: ThrowingCore) -> tuple[spaces.Dict, spaces.Box]:
 
 
 def _largest(core: ThrowingCore) -> float:
-    """A bound on all numbers that are shown: positions are about [-1, 1], but falling balls are fast."""
+    """Returns a bound on all observed numbers: positions are about [-1, 1], but falling balls are fast."""
     places = max(abs(2 * side - 1) for side in (0.0, 1.0, *core.effector.reach))
     return 1.01 * max(places, core.fastest_ball / core.world.hand_speed)

@@ -1,4 +1,4 @@
-"""Many environments of a task as one of gymnasium's vectors, on our own batch."""
+"""Many environments of a task as a vector environment of gymnasium's."""
 
 from __future__ import annotations
 
@@ -92,8 +92,8 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         """Begins episodes.
 
         Args:
-            seed: of the first environment (each further one has one more), or one for each environment, where
-                None draws one.
+            seed: seed of the first environment (each further one has one more), or one for each environment,
+                where None draws one.
             options: ``{"reset_mask": [N] of bool}`` resets those environments alone.
 
         Raises:
@@ -145,7 +145,7 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         return _dict(shown), reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A picture [size, size, 3] of uint8 for each environment; None without a render mode."""
+        """Renders a picture [size, size, 3] of uint8 for each environment; None without a render mode."""
         if self.render_mode is None:
             return None
         return tuple(render(self._core, None, size=self._size).numpy())
@@ -179,7 +179,7 @@ def _dict(shown: Shown) -> Observation:
 
 
 def _ended(shown: Observation, terminated: np.ndarray, over: np.ndarray) -> dict[str, Any]:
-    """The info about episodes that are over, as gymnasium's own vectors give it."""
+    """Returns the info about ended episodes, in the form of gymnasium's own vectors."""
     final = np.full(len(over), None, object)
     for index in over.nonzero()[0]:
         final[index] = {key: values[index] for key, values in shown.items()}

@@ -1,4 +1,4 @@
-"""The arm: a chain of equal links whose joints turn at the velocity that is asked for."""
+"""The arm: a chain of equal links whose joints turn at the velocity that the action sets."""
 
 from __future__ import annotations
 

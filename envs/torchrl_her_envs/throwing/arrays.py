@@ -1,4 +1,4 @@
-"""Functions and constants that let one rule serve numbers, NumPy arrays and tensors."""
+"""Functions and constants by which the same code works on numbers, NumPy arrays and tensors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def functions_of(values: Any) -> Any:
 
 
 def like(constant: np.ndarray, values: Array) -> Array:
-    """A constant as an array, or as a tensor with the type and on the device of others.
+    """Converts a constant to an array, or to a tensor with the type and device of another one.
 
     Example:
         >>> like(np.array([0.5]), torch.zeros(2)).dtype
@@ -40,7 +40,7 @@ def like(constant: np.ndarray, values: Array) -> Array:
 
 
 def confined(value: Any, low: Any, high: Any) -> Any:
-    """A value, or each of an array's, or the bound that it goes beyond.
+    """Clamps a number, or each one of an array, to bounds.
 
     Example:
         >>> confined(3.5, -1.0, 1.0)
@@ -53,11 +53,11 @@ def confined(value: Any, low: Any, high: Any) -> Any:
 
 
 def within(dx: Any, dy: Any, distance: float) -> Any:
-    """Whether offsets are shorter than a distance: of numbers a bool, of arrays [...] an array of bool.
+    """Returns whether offsets are shorter than a distance: a bool for numbers, [...] of bool for arrays.
 
     Example:
         >>> within(0.3, 0.4, 0.5), within(0.3, 0.4, 0.51)
         (False, True)
     """
-    # One coordinate beside the other: summing over a dimension of two takes several times as long.
+    # By coordinates: summing over a dimension of two takes several times as long.
     return dx * dx + dy * dy < distance**2

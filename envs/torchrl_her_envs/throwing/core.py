@@ -1,4 +1,4 @@
-"""The rules of the throwing tasks on NumPy arrays: what moves, what is caught, what is seen, what ends.
+"""The throwing tasks on NumPy arrays: motion, catching, observations, goals and ends of episodes.
 
 TorchRL's environments and gymnasium's both take their steps here. On arrays this small a call of NumPy costs
 a tenth of one of torch's, and the state is one matrix, so that a step needs few calls.
@@ -27,12 +27,12 @@ from torchrl_her_envs.throwing.tasks import Task, WorldConfig
 
 # What moves, in the order of ``WorldState`` and ``Bodies``.
 _BODIES = ("joints", "joint_velocity", "grip", "grip_velocity", "ball", "ball_velocity")
-_FEW = 3  # worlds up to which numbers are quicker than arrays
+_FEW = 3  # number of worlds up to which plain numbers are faster than arrays
 _HELD_FROM_THE_START = {"held": 1.0, "away": 0.0, "mixed": 0.5}
 
 
 class Shown(NamedTuple):
-    """Entries that the agent sees: ``state`` is the observation [N, ...] with the goal [N, 2] behind it.
+    """Observed entries: ``state`` is the observation [N, ...] with the goal [N, 2] behind it.
 
     Each is an array of its own, so whoever gets them may keep or change them.
     """
@@ -47,7 +47,7 @@ class ThrowingCore:
     """N worlds in which a hand or an arm reaches for a ball or throws it into a black hole.
 
     Args:
-        task: what is to be done.
+        task: the task, see :data:`~torchrl_her_envs.TASKS`.
         num_envs: N, the number of worlds.
 
     Keyword Args:
@@ -57,14 +57,14 @@ class ThrowingCore:
         dtype: type of what is shown; the physics is in float64.
 
     Attributes:
-        task: what is to be done.
+        task: the task, see :data:`~torchrl_her_envs.TASKS`.
         world: the constants of the physics.
         effector: the hand or the arm.
         threshold: how near to the goal is achieved, in shown coordinates.
         fastest_ball: a bound on the speed of the ball, in meters a second.
-        achieved_index: where the achieved goal is in an observation.
-        observation_size: how many numbers an observation has.
-        goal_distribution: of desired goals, in the coordinates that the agent sees.
+        achieved_index: positions of the achieved goal in an observation.
+        observation_size: number of entries of an observation.
+        goal_distribution: distribution of desired goals, in the coordinates that the agent sees.
         worlds: all that changes: tensors that share memory with the arrays that steps write to.
         keys: [N] of uint64, see ``common.seeding``.
 
@@ -125,13 +125,13 @@ class ThrowingCore:
     # The state
 
     def _lay_out(self) -> None:
-        """Makes the state: a matrix whose first rows are what is seen, in meters, radians and seconds.
+        """Allocates the state: a matrix whose first rows are observed, in meters, radians and seconds.
 
         A quantity is a row, or several, and a world is a column: so a step has a few long loops.
         """
         task, world, joints = self.task, self.world, self.effector.num_joints
         to_screen, to_speed = 2.0 / world.size, 1.0 / world.hand_speed
-        quantities = {  # rows, factor and shift to what is shown
+        quantities = {  # rows, and factor and shift to observed coordinates
             "cosines": (joints, 1.0, 0.0),
             "sines": (joints, 1.0, 0.0),
             "grip": (2, to_screen, -1.0),
@@ -194,7 +194,7 @@ class ThrowingCore:
         self.draw_starts(which)
 
     def draw_starts(self, which: np.ndarray) -> None:
-        """Puts the given worlds [M] where the episodes that they are counted to be in start."""
+        """Draws the starts of the present episodes of the given worlds [M]."""
         n = self.effector.num_joints
         u = uniform(self.keys[which], self._episode[which] - 1, n + 5)
         joints = self.effector.sample(u[:, :n])
@@ -264,7 +264,7 @@ class ThrowingCore:
         self._flags[:] = after[6:]
         self._step += 1
 
-    # What is seen, and what it says
+    # Observations and ends
 
     def show(self) -> Shown:
         """Returns the present observations of the agent."""
@@ -272,7 +272,7 @@ class ThrowingCore:
         return Shown(state, state[:, :-2].copy(), state[:, self.achieved_index].copy(), state[:, -2:].copy())
 
     def show_state(self) -> np.ndarray:
-        """The observations with the desired goals behind them: a new array [N, ...]."""
+        """Returns the observations with the desired goals behind them, as a new array [N, ...]."""
         self._closed_shown[:] = self._closed
         if self._angles:
             cosines, sines = self._angles
@@ -283,25 +283,25 @@ class ThrowingCore:
         return shown.T.astype(self.dtype, order="C")
 
     def achieved(self, achieved_goal: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
-        """Whether goals [..., 2], as they are shown, are nearer to each other than the threshold: [...]."""
+        """Returns where observed goals [..., 2] are nearer to each other than the threshold: [...]."""
         dx, dy = (achieved_goal - desired_goal).T
         return within(dx, dy, self.threshold).T
 
     def out_of_time(self) -> np.ndarray:
-        """Whether each episode has had its last step: [N] of bool."""
+        """Returns whether each episode has had its last step: [N] of bool."""
         return self._step >= self.world.max_steps
 
-    # Made once
+    # Parts that are made once
 
     def _fastest_throw(self) -> float:
-        """A bound on the speed of the grip, in meters a second."""
+        """Returns a bound on the speed of the grip, in meters a second."""
         if self.task.effector == "hand":
             return math.sqrt(2.0) * self.world.hand_speed
         # each joint turns all links behind it
         return self.world.joint_speed * self.world.arm_length * (self.effector.num_joints + 1) / 2
 
     def _make_ball_starts(self) -> GoalDistribution:
-        """Where a ball that is not held starts, in meters."""
+        """Makes the distribution of starts of balls that are not held, in meters."""
         config = self.world
         if self.task.effector == "hand":
             left, _, right, _ = (side * config.size for side in self.effector.reach)
@@ -312,7 +312,7 @@ class ThrowingCore:
         return SectorGoals(base, angle=config.arm_ball_angle, radius=(shortest, longest))
 
     def _make_goals(self) -> GoalDistribution:
-        """Where goals start, as the agent sees them."""
+        """Makes the distribution of goals, in observed coordinates."""
         config = self.world
         if self.task.throws:
             box = config.hand_goals if self.task.effector == "hand" else config.arm_goals

@@ -1,4 +1,4 @@
-"""The interface of what the agent moves: a hand or an arm."""
+"""Interface of the body that the agent moves: a hand or an arm."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Effector(Protocol):
     grip_index: tuple[int, int]
 
     def sample(self, u: Array) -> Array:
-        """Start positions of the joints, [..., num_joints], from as many numbers in [0, 1)."""
+        """Maps numbers in [0, 1) to start positions of the joints, both [..., num_joints]."""
         ...
 
     def move(self, joints: Array, change: Array) -> Array:
-        """The joints after a change of [..., num_joints], kept within their limits."""
+        """Returns the joints after a change of [..., num_joints], kept within their limits."""
         ...
 
     def move_one(self, joints: list[float], change: list[float]) -> list[float]:
@@ -40,7 +40,7 @@ class Effector(Protocol):
         ...
 
     def grip(self, joints: Array) -> Array:
-        """Position [..., 2] of what grips."""
+        """Returns the position [..., 2] of the grip."""
         ...
 
     def grip_one(self, joints: list[float]) -> list[float]:
@@ -48,5 +48,5 @@ class Effector(Protocol):
         ...
 
     def skeleton(self, joints: Array) -> Array:
-        """Points [..., n, 2] to draw lines between, the grip last."""
+        """Returns points [..., n, 2] between which lines are drawn, the grip last."""
         ...

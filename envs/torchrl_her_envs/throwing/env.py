@@ -25,7 +25,7 @@ from torchrl_her_envs.throwing.rules import reward_of
 from torchrl_her_envs.throwing.state import WorldState
 from torchrl_her_envs.throwing.tasks import Task, WorldConfig
 
-_PICTURE = 300  # pixels of a side, unless told otherwise
+_PICTURE = 300  # pixels of a side, by default
 _OF_NUMPY: dict[torch.dtype, type[np.floating]] = {  # types that NumPy has too
     torch.float16: np.float16,
     torch.float32: np.float32,
@@ -48,9 +48,10 @@ class ThrowingEnv(BatchedEnv):
     hand, arm, catching, goals and rewards are array code.
 
     Args:
-        task: what is to be done; see :data:`~torchrl_her_envs.TASKS`.
+        task: the task, one of :data:`~torchrl_her_envs.TASKS`.
         num_envs: N, the number of environments.
-        seed: of all random starts and goals; R seeds for R equal blocks of environments, each as if alone.
+        seed: seed of all random starts and goals; R seeds for R equal blocks of environments, each as if
+            alone.
         world: the constants of the physics.
         num_links: number of links of the arm, for the robot's tasks.
         threshold: how near to the goal is achieved, in shown coordinates; the task's own if None.
@@ -110,7 +111,7 @@ class ThrowingEnv(BatchedEnv):
         )
         self.set_seeds(as_seeds(seed))
 
-    # What the task is
+    # Properties of the task
 
     @property
     def task_name(self) -> str:
@@ -118,7 +119,7 @@ class ThrowingEnv(BatchedEnv):
 
     @property
     def goal_distribution(self) -> GoalDistribution:
-        """The distribution of desired goals, in the coordinates that the agent sees."""
+        """Distribution of desired goals, in the coordinates that the agent sees."""
         return self._core.goal_distribution
 
     @property
@@ -127,7 +128,7 @@ class ThrowingEnv(BatchedEnv):
 
     @property
     def starts_near_goals(self) -> bool:
-        """True where the goal is the ball: it lies where hands and arms start."""
+        """Whether goals lie where hands and arms start: True if the goal is the ball."""
         return not self.task.throws
 
     @property
@@ -135,12 +136,12 @@ class ThrowingEnv(BatchedEnv):
         return True
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Whether goals [..., 2] are nearer to each other than the threshold: [..., 1] of bool."""
+        """Returns whether goals [..., 2] are nearer to each other than the threshold: [..., 1] of bool."""
         (x, y), (other_x, other_y) = achieved_goal.unbind(-1), desired_goal.unbind(-1)
         return within(x - other_x, y - other_y, self.threshold).unsqueeze(-1)
 
     def layers(self) -> list[dict[str, Any]]:
-        """Two layers: reach the ball; then throw it into the black hole.
+        """Returns two layers: reach the ball; then throw it into the black hole.
 
         In the first layer the agent sees the hand or the arm, and wants its grip at the ball. In the second
         it also sees the ball, at the place in its input where the first layer had its goal, and wants the
@@ -173,7 +174,7 @@ class ThrowingEnv(BatchedEnv):
         ]
 
     def state_names(self) -> dict[str, list[int]]:
-        """Names for entries of the state.
+        """Returns names for entries of the state.
 
         They are ``hand`` or ``arm`` (all that is seen of it), ``grip`` (where its end is), ``ball`` and, if
         it is thrown, ``ball_speed`` and ``hole``; besides ``observation`` and ``desired_goal``.
@@ -186,16 +187,16 @@ class ThrowingEnv(BatchedEnv):
         return own | super().state_names()
 
     def goal_box(self) -> Box:
-        """The screen; a stretched arm's end goes less than 0.01 beyond its left side."""
+        """Returns the box of goals: the screen. A stretched arm reaches up to 0.01 beyond its left side."""
         return [-1.0, -1.0], [1.0, 1.0]
 
     def picture_box(self) -> Box:
-        """The screen with the margin that pictures have around it."""
+        """Returns the box of a picture: the screen and its margin."""
         edge = 1.0 + 2.0 * MARGIN  # the screen is two wide
         return [-edge, -edge], [edge, edge]
 
     def regions(self) -> dict[str, Box]:
-        """The boxes around where goals lie (``"goals"``) and what the hand or arm reaches (``"reach"``)."""
+        """Returns boxes around all goals (``"goals"``) and the reach of the hand or arm (``"reach"``)."""
         left, bottom, right, top = (2.0 * side - 1.0 for side in self.effector.reach)
         return {
             "goals": (self.goal_distribution.low.tolist(), self.goal_distribution.high.tolist()),
@@ -203,7 +204,7 @@ class ThrowingEnv(BatchedEnv):
         }
 
     def trail_points(self) -> Tensor:
-        """The balls [N, 2] in meters."""
+        """Returns the positions of the balls [N, 2] in meters."""
         return self.worlds.ball.clone()
 
     def render(
@@ -246,10 +247,10 @@ class ThrowingEnv(BatchedEnv):
             getattr(self.worlds, field.name).copy_(state[field.name])
         self._keys = state["key"].numpy().copy().view(np.uint64)
 
-    # One step, and the start of an episode
+    # Steps and starts of episodes
 
     def _check_action(self, action: Tensor) -> None:
-        """The core checks actions when it takes them, before anything moves."""
+        """Does nothing: the core checks actions itself, before anything moves."""
 
     def _start_episodes(self, which: Tensor) -> None:
         self._core.draw_starts(which.numpy())
@@ -266,7 +267,7 @@ class ThrowingEnv(BatchedEnv):
         core = self._core
         arrays = core.show()
         shown = self._tensors(**arrays._asdict())
-        # Goals are compared as they are shown, so that rewards are those of compute_reward.
+        # Goals are compared in observed coordinates, so that rewards are those of compute_reward.
         if self._native:
             achieved = core.achieved(arrays.achieved_goal, arrays.desired_goal)[:, None]
         else:
@@ -280,13 +281,13 @@ class ThrowingEnv(BatchedEnv):
         }
 
     def _tensors(self, **arrays: np.ndarray) -> dict[str, Tensor]:
-        """Arrays as tensors of the type that is shown."""
+        """Converts arrays to tensors of the observations' type."""
         tensors = {key: torch.from_numpy(own) for key, own in arrays.items()}
         return tensors if self._native else {key: own.to(self.dtype_shown) for key, own in tensors.items()}
 
 
 def base_env(env: EnvBase) -> ThrowingEnv:
-    """The throwing environment below any transforms.
+    """Returns the throwing environment below any transforms.
 
     Raises:
         TypeError: there is none.
@@ -304,7 +305,7 @@ def base_env(env: EnvBase) -> ThrowingEnv:
 
 
 def _as_dtype(dtype: torch.dtype | str) -> torch.dtype:
-    """A floating-point type, which may be given by name."""
+    """Converts a type or its name to a floating-point type."""
     named = getattr(torch, dtype, None) if isinstance(dtype, str) else dtype
     if not isinstance(named, torch.dtype) or not named.is_floating_point:
         raise ValueError(f"dtype must be a floating-point type such as float32 or float64, got {dtype!r}")

@@ -1,4 +1,4 @@
-"""Distributions that the goals of a task are drawn from."""
+"""Distributions from which the goals of a task are drawn."""
 
 from __future__ import annotations
 
@@ -115,5 +115,5 @@ class SectorGoals(_Sampled):
 
 
 def _beside(u: Array, constant: Tensor) -> Array:
-    """A constant of float64 as an array, if that is what it is to be used with."""
+    """Converts a constant of float64 to an array if it is to be combined with one."""
     return constant.numpy() if isinstance(u, np.ndarray) else constant

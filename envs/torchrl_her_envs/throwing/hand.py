@@ -1,4 +1,4 @@
-"""The hand: moves freely within the left half of the screen, at the velocity that is asked for."""
+"""The hand: moves freely within the left half of the screen, at the velocity that the action sets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torchrl_her_envs.throwing.tasks import WorldConfig
 
 
 class Hand:
-    """A hand that is its own grip; its joints are its position. See :class:`~.effector.Effector`.
+    """A hand, whose position serves both as joints and as grip. See :class:`~.effector.Effector`.
 
     Args:
         world: the constants of the world.
@@ -24,7 +24,11 @@ class Hand:
     """
 
     num_joints = 2
-    shown: tuple[str, ...] = ("grip", "grip_velocity", "closed")  # its joints are its grip: shown once
+    shown: tuple[str, ...] = (
+        "grip",
+        "grip_velocity",
+        "closed",
+    )  # joints and grip are the same: observed once
     observation_size = 5
     grip_index = (0, 1)
 

@@ -9,7 +9,7 @@ from torchrl_her_envs.throwing.arrays import Array, functions_of
 
 
 def walk(angles: Sequence[Any], base: Sequence[Any], link: float) -> Iterator[tuple[Any, Any]]:
-    """The end of each link in turn.
+    """Yields the end of each link in turn.
 
     Args:
         angles: n numbers, arrays or tensors in radians, each relative to the link before,
@@ -35,7 +35,7 @@ def walk(angles: Sequence[Any], base: Sequence[Any], link: float) -> Iterator[tu
 
 
 def chain(angles: Array, base: Array, length: float) -> Array:
-    """Positions of all joints and of the end of a chain.
+    """Computes the positions of all joints and of the end of a chain.
 
     Args:
         angles: [..., n] in radians, see :func:`walk`.
@@ -58,7 +58,7 @@ def chain(angles: Array, base: Array, length: float) -> Array:
 
 
 def chain_end(angles: Array, base: Array, length: float) -> Array:
-    """The position [..., 2] of the end of a chain alone; see :func:`chain`.
+    """Computes the position [..., 2] of the end of a chain alone; see :func:`chain`.
 
     Example:
         >>> import math
@@ -72,5 +72,5 @@ def chain_end(angles: Array, base: Array, length: float) -> Array:
 
 
 def _parts(values: Array) -> list[Array]:
-    """The entries [...] of values [..., n]."""
+    """Returns the entries [...] of values [..., n], one by one."""
     return [values[..., k] for k in range(values.shape[-1])]

@@ -28,7 +28,7 @@ _ITERATIONS = 4  # of the solver: a ball touches at most a side and a corner at 
 _MOST = 64  # balls in the space at once: each is compared with all that are near it
 _APART = 4.0  # meters between the edges of parked balls, and of the first and the screen's right side
 _PATIENCE = 64  # steps after which balls that none of them needed are removed
-_FEW = 12  # balls up to which numbers are quicker than arrays
+_FEW = 12  # number of balls up to which plain numbers are faster than arrays
 
 
 class BallPhysics:
@@ -64,7 +64,7 @@ class BallPhysics:
         self._space = _Space(world, wall=wall)
 
     def step(self, position: Tensor, velocity: Tensor, free: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Lets balls move for one time step.
+        """Moves free balls by one time step.
 
         Args:
             position: [num_worlds, 2] float64, meters within the world.
@@ -80,7 +80,7 @@ class BallPhysics:
         return after[:, :2], after[:, 2:]
 
     def advance(self, balls: np.ndarray, free: np.ndarray) -> None:
-        """Lets balls move for one time step, in place.
+        """Moves free balls by one time step, in place.
 
         Args:
             balls: [4, num_worlds] float64: x, y and their velocities, in meters within the world.
@@ -104,7 +104,7 @@ class BallPhysics:
             balls[:, index[near]] = self._bounce(index[near], before[:, near])
 
     def advance_one(self, world: int, ball: list[float]) -> list[float]:
-        """Lets one ball move for one time step, as :meth:`advance` does.
+        """Moves one free ball by one time step, as :meth:`advance` does.
 
         Args:
             world: the index of its world.
@@ -118,7 +118,7 @@ class BallPhysics:
         return after
 
     def _fly(self, x: Any, y: Any, speed_x: Any, speed_y: Any) -> tuple[Any, Any, Any, Any, Any]:
-        """A time step without contacts, in numbers or in arrays: the sums that Chipmunk makes, in its order.
+        """Computes a time step without contacts, on numbers or arrays, with Chipmunk's sums in its order.
 
         Returns:
             x, y, their velocities, and whether the ball may touch something on its way.
@@ -135,7 +135,7 @@ class BallPhysics:
         return to_x, to_y, speed_x, falls, self._limits.reached((x, to_x), (y, low), (y, high))
 
     def _bounce(self, worlds: np.ndarray, before: np.ndarray) -> np.ndarray:
-        """A time step in the space of the balls of some worlds [K], from states [4, K] to states [4, K]."""
+        """Simulates a time step of the balls of some worlds [K] in the space, from and to states [4, K]."""
         after = np.empty_like(before)
         for start in range(0, len(worlds), _MOST):
             part = slice(start, start + _MOST)
@@ -147,7 +147,7 @@ class BallPhysics:
 
 
 class _Limits:
-    """Where a ball may touch something: beyond these coordinates, or around the wall."""
+    """Coordinates beyond which, or around the wall, a ball may touch something."""
 
     def __init__(self, world: WorldConfig, *, wall: bool) -> None:
         reach = world.ball_radius * world.size + 2 * _SKIN  # one skin more than needed, whatever the rounding
@@ -158,7 +158,7 @@ class _Limits:
             self._wall = (middle - half, middle + half, world.wall_height * world.size + reach)
 
     def reached(self, xs: tuple[Any, Any], lows: tuple[Any, Any], highs: tuple[Any, Any]) -> Any:
-        """Whether a box, in numbers or in arrays, is not clear of everything.
+        """Returns whether a ball within a box, in numbers or arrays, may touch something.
 
         Args:
             xs: its left and right sides, in any order.
@@ -199,7 +199,7 @@ class _Space:
         self._resize(1)
 
     def simulate(self, before: np.ndarray, substep: float, substeps: int) -> np.ndarray:
-        """The states [4, K] after some substeps of balls in states [4, K]."""
+        """Simulates some substeps of balls in states [4, K], and returns their new states."""
         count = before.shape[1]
         self._make_room(count)
         space, state = self._space, self._state
@@ -215,7 +215,7 @@ class _Space:
         return np.frombuffer(self._result.float_buf()).reshape(-1, 4)[:count].T.copy()
 
     def _make_room(self, count: int) -> None:
-        """Sees to it that there are enough balls, and now and then that there are not many more."""
+        """Adds balls to the space if there are too few, and now and then removes those not needed."""
         self._calls += 1
         self._needed = max(self._needed, count)
         if count > len(self._balls):
@@ -226,7 +226,7 @@ class _Space:
             self._calls = self._needed = 0
 
     def _resize(self, count: int) -> None:
-        """Adds or removes balls until there are so many, and says where they are parked.
+        """Adds or removes balls up to the given number, and parks them.
 
         A body keeps its old contacts, and the push that still moves it out of a surface, for one substep
         more. Nobody can read or write these, so all balls spend a substep parked, each by itself and far
@@ -254,7 +254,7 @@ class _Space:
 
 
 def _sides(body: pymunk.Body, world: WorldConfig, wall: bool) -> list[pymunk.Shape]:
-    """The four sides of the screen, and the wall."""
+    """Makes the four sides of the screen, and the wall."""
     low, high = -_BORDER, world.size + _BORDER
     corners = [(low, low), (high, low), (high, high), (low, high)]
     shapes: list[pymunk.Shape] = [

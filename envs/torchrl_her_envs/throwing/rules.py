@@ -17,7 +17,7 @@ from torchrl_her_envs.throwing.tasks import WorldConfig
 
 
 class Bodies(NamedTuple):
-    """All that a step changes. Points and joints are [2, N] and [J, N], and flags [N] of bool.
+    """Everything that a step changes: points [2, N], joints [J, N] and flags [N] of bool.
 
     For one world they are lists of 2 or J numbers, and a bool.
     """
@@ -34,22 +34,22 @@ class Bodies(NamedTuple):
 
 
 class Kind(Protocol):
-    """Operations that differ between numbers and arrays."""
+    """Protocol of the operations that differ between numbers and arrays."""
 
     def move(self, joints: Any, action: Any) -> Any:
-        """The joints after an action of one step."""
+        """Returns the joints after an action of one step."""
         ...
 
     def grip(self, joints: Any) -> Any:
-        """Where their grip is."""
+        """Returns the position of the grip."""
         ...
 
     def rate(self, after: Any, before: Any) -> Any:
-        """The velocity at which something moved in this step."""
+        """Returns the velocity at which something moved in this step."""
         ...
 
     def fly(self, ball: Any, velocity: Any, free: Any) -> tuple[Any, Any]:
-        """Positions and velocities of the balls after one step of those that are free."""
+        """Returns positions and velocities of the balls after one step, in which free ones fly."""
         ...
 
     def pick(self, condition: Any, one: Any, other: Any) -> Any:
@@ -92,7 +92,7 @@ def take_step(now: Bodies, action: Any, closed: Any, kind: Kind, *, catch: float
 
 
 def reward_of(achieved: Any) -> Any:
-    """0 where a goal is achieved and -1 elsewhere, from a bool or an array of bool.
+    """Returns 0 where a goal is achieved and -1 elsewhere, from a bool or an array of bool.
 
     Example:
         >>> reward_of(True), reward_of(False)
@@ -102,7 +102,7 @@ def reward_of(achieved: Any) -> Any:
 
 
 class Numbers:
-    """World in plain numbers; ``world`` is its index among those of the physics."""
+    """Operations on one world in plain numbers; ``world`` is its index in the physics."""
 
     world = 0
 
@@ -130,7 +130,7 @@ class Numbers:
 
 
 class Arrays:
-    """All worlds in arrays."""
+    """Operations on all worlds in arrays."""
 
     def __init__(self, effector: Effector, physics: BallPhysics, world: WorldConfig) -> None:
         self._effector, self._physics = effector, physics

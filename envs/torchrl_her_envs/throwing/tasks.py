@@ -88,7 +88,7 @@ class WorldConfig:
             object.__setattr__(self, name, int(given))  # 4.0, as from a file, counts as 4
 
     def fastest_ball(self, thrown: float) -> float:
-        """A bound on the speed of a ball, in meters a second.
+        """Upper bound on the speed of a ball, in meters a second.
 
         A bounce takes energy from a ball and gives it none, so nothing but the throw and a fall across the
         whole screen makes it faster.
@@ -138,13 +138,13 @@ class WorldConfig:
 
     @staticmethod
     def shown(length: float) -> float:
-        """A length given as a fraction of the screen, in the coordinates that the agent sees."""
+        """Converts a length from fractions of the screen to the coordinates that the agent sees."""
         return 2.0 * length
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Task: who moves, where the ball starts, whether there is a wall, what the goal is.
+    """A task: the body that moves, the start of the ball, whether there is a wall, and the goal.
 
     Args:
         name: the name that ``make_env`` takes.
@@ -154,7 +154,7 @@ class Task:
         throws: the goal is a black hole for the ball; otherwise it is the ball, for the effector.
         wall: whether a wall stands in the middle.
         goal_sigma: how far around a goal others teach it, as a share of the screen: the final sigma of IBS.
-        summary: one line for people.
+        summary: one-line description for users.
 
     Raises:
         ValueError: an unknown effector or start.
@@ -218,7 +218,7 @@ TASKS: dict[str, Task] = {
 
 
 def get_task(name: str) -> Task:
-    """The throwing or reaching task of a name.
+    """Returns the throwing or reaching task of a name.
 
     Raises:
         ValueError: there is none; the message lists those that there are.

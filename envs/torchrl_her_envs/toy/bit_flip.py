@@ -15,7 +15,7 @@ _MOST_BITS = 127  # a start takes two random numbers a bit and one more, and a s
 
 
 class BitFlip(ToyEnv):
-    """A row of bits that is to become the wanted row; each action flips one bit.
+    """A row of bits that must become the desired row; each action flips one bit.
 
     Thesis, section 5.1, after Andrychowicz et al. (2017): the two rows are drawn uniformly (here:
     among those that differ), and each step costs 1. The thesis adds an action that changes nothing
@@ -32,7 +32,7 @@ class BitFlip(ToyEnv):
         useless_action: whether there is an action n, which does nothing and ends the episode.
         max_steps: steps of an episode; n if None.
         num_envs: number of environments.
-        seed: of all starts and goals; R seeds for R equal blocks of environments, each as if alone.
+        seed: seed of all starts and goals; R seeds for R equal blocks of environments, each as if alone.
 
     Raises:
         ValueError: an option out of its range, or environments that cannot be shared out among the seeds.
@@ -86,5 +86,5 @@ class BitFlip(ToyEnv):
         return goal ^ flips, goal
 
     def _move(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
-        flipped = torch.arange(self.bits) == action.unsqueeze(-1)  # no bit, if it is the useless action
+        flipped = torch.arange(self.bits) == action.unsqueeze(-1)  # the useless action flips none
         return self.worlds.place ^ flipped, (action == self.bits if self.useless_action else None)

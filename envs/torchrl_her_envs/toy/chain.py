@@ -41,7 +41,7 @@ class Chain(ToyEnv):
         reset_state: whether going back leads to the first place (the thesis's "reset-state game").
         max_steps: steps of an episode; n if None.
         num_envs: number of environments.
-        seed: of all transitions; R seeds for R equal blocks of environments, each as if alone.
+        seed: seed of all transitions; R seeds for R equal blocks of environments, each as if alone.
 
     Raises:
         ValueError: an option out of its range, or environments that cannot be shared out among the seeds.
@@ -99,7 +99,7 @@ class Chain(ToyEnv):
         self._all = torch.arange(num_envs)
 
     def layers(self) -> list[dict[str, Any]]:
-        """A layer for each part of the chain: the links of that part are to be closed."""
+        """Returns a layer for each part of the chain, whose goal is to close the links of that part."""
         links = self.length // self.num_layers
         return [
             {
@@ -114,7 +114,7 @@ class Chain(ToyEnv):
         ]
 
     def state_names(self) -> dict[str, list[int]]:
-        """Names for entries of the state: ``part_1``, ... besides ``observation`` and ``desired_goal``."""
+        """Returns names for entries of the state: ``observation``, ``desired_goal``, ``part_1``, ..."""
         links = self.length // self.num_layers
         ends = range(links, self.length + 1, links)
         parts = {f"part_{end // links}": list(range(end - links, end)) for end in ends}

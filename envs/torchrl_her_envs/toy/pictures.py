@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchrl_her_envs.common.rendering.colors import FAILURE, INK, MARGIN, SUCCESS, Color
 
-WIDTH = 300  # pixels, if nobody says how many
+WIDTH = 300  # pixels of the width, by default
 _HEIGHT = 0.6  # of the width
-_FINER = 2  # times as large is it drawn, so that edges are smooth
+_FINER = 2  # factor by which it is drawn larger, for smooth edges
 _MOST_CELLS = 400  # of a chain that are drawn one by one
 _LIGHT: Color = (252, 251, 248)
 _HAT: Color = (58, 56, 62)
@@ -39,22 +39,22 @@ class Sheet:
         self._draw = ImageDraw.Draw(self._image)
 
     def box(self, box: Box, fill: Color, *, outline: Color | None = None, line: float = 0.0) -> None:
-        """A rectangle with round corners."""
+        """Draws a rectangle with round corners."""
         radius = min(box[2] - box[0], box[3] - box[1]) / 8
         self._draw.rounded_rectangle(
             self._pixels(box), radius * self._unit, fill, outline, max(1, round(line * self._unit))
         )
 
     def disk(self, box: Box, fill: Color, *, part: tuple[float, float] = (0, 360)) -> None:
-        """An ellipse, or a part of it between two angles in degrees, clockwise from the right."""
+        """Draws an ellipse, or a part of it between two angles in degrees, clockwise from the right."""
         self._draw.pieslice(self._pixels(box), *part, fill=fill)
 
     def line(self, first: tuple[float, float], second: tuple[float, float], width: float) -> None:
-        """A straight line."""
+        """Draws a straight line."""
         self._draw.line(self._pixels((*first, *second)), fill=INK, width=max(1, round(width * self._unit)))
 
     def finish(self) -> Tensor:
-        """The picture [height, width, 3] of uint8."""
+        """Returns the finished picture [height, width, 3] of uint8."""
         small = self._image.resize(self._shape, Image.Resampling.BOX)
         return torch.from_numpy(np.array(small))
 
@@ -80,14 +80,14 @@ def draw(width: int, on: Callable[[Sheet], None]) -> Tensor:
 
 
 def draw_bits(sheet: Sheet, bits: list[int], wanted: list[int]) -> None:
-    """Bits, dark where they are set; with a green edge where they are right, and a red one where not."""
+    """Draws bits, dark if they are set, with a green edge if they are right and a red one if not."""
     for box, bit, goal in zip(_cells(len(bits)), bits, wanted, strict=True):
         width = (box[2] - box[0]) / 8
         sheet.box(box, INK if bit else _LIGHT, outline=SUCCESS if bit == goal else FAILURE, line=width)
 
 
 def draw_treasure(sheet: Sheet, pirate: float, treasure: float) -> None:
-    """A pirate on a line from 0 to 1, and a treasure."""
+    """Draws a pirate on a line from 0 to 1, and a treasure."""
     ground, unit = 0.42, 0.05
     left, right = 0.08, 0.92
     sheet.line((left - unit, ground), (right + unit, ground), 0.008)
@@ -107,7 +107,7 @@ def draw_treasure(sheet: Sheet, pirate: float, treasure: float) -> None:
 
 
 def draw_chain(sheet: Sheet, closed: int, length: int) -> None:
-    """The links of a chain, those that are closed filled; the last one, which is the goal, has a green edge.
+    """Draws the links of a chain, closed ones filled; the last one, the goal, has a green edge.
 
     Of very long chains, how much is closed.
     """
@@ -122,7 +122,7 @@ def draw_chain(sheet: Sheet, closed: int, length: int) -> None:
 
 
 def _cells(count: int) -> Iterator[Box]:
-    """Places of equal squares, row by row."""
+    """Yields the places of equal squares, row by row."""
     columns = max(1, min(count, math.ceil(math.sqrt(count / _HEIGHT))))
     rows = math.ceil(count / columns)
     pitch = min(0.92 / columns, 0.92 * _HEIGHT / rows, 0.2)

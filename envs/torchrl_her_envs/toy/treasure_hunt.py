@@ -28,7 +28,7 @@ class TreasureHunt(ToyEnv):
     Keyword Args:
         max_steps: steps of an episode; 100 / ``step``, which is enough from anywhere, if None.
         num_envs: number of environments.
-        seed: of all starts and goals; R seeds for R equal blocks of environments, each as if alone.
+        seed: seed of all starts and goals; R seeds for R equal blocks of environments, each as if alone.
 
     The agent sees a place x as ``x / 50 - 1``.
 

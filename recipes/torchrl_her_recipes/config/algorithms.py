@@ -23,7 +23,7 @@ class Algorithm:
         filter: whether virtual goals that were already achieved are left out.
         curriculum: whether runs learn the layers of a curriculum (CHER).
         weights: the weights of virtual goals; None if recipes choose them.
-        summary: one line for people.
+        summary: one-line description for users.
     """
 
     name: str

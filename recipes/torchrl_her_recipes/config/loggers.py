@@ -14,7 +14,7 @@ class LoggerSpec:
     """A logger that ``log=[NAME]`` chooses.
 
     Args:
-        name: of the logger, and of its folder in that of a run.
+        name: name of the logger, and of its folder in that of a run.
         factory: what opens it, as ``module:function``; it is imported when a run begins. It is called with
             the :class:`~torchrl_her_recipes.RunView` and a number of frames. It takes everything behind these
             out of what it has logged before, and returns a TorchRL ``Logger`` and up to which frames that has

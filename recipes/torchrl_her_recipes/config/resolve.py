@@ -25,7 +25,7 @@ class EnvFacts:
     Args:
         max_steps: steps of an episode, at most.
         batched: whether the environments of a batch are stepped together, at little cost for each of them.
-        layers: of a curriculum, if what is achieved seldom changes without one.
+        layers: layers of a curriculum, if the achieved goal seldom changes without one.
         ends: what ends an episode at its goal, as ``task.options.termination`` takes it; None if the task has
             no such option.
     """

@@ -25,7 +25,7 @@ def load_preset(name: str) -> dict[str, Any]:
     A preset may begin with another one, ``preset: demo``, whose values hold where it has none of its own.
 
     Args:
-        name: of ``preset_names()``, or the path of a YAML file.
+        name: one of ``preset_names()``, or the path of a YAML file.
 
     Raises:
         ValueError: there is no such preset, or it begins with itself.

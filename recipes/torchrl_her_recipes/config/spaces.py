@@ -204,7 +204,7 @@ def load_space(name: str) -> Space:
     """A space by its name, or from a file.
 
     Args:
-        name: of ``space_names()``, or the path of a YAML file with a mapping of options by name:
+        name: one of ``space_names()``, or the path of a YAML file with a mapping of options by name:
             ``learning_rate: {kind: log_float, low: 1e-4, high: 1e-2}``, or
             ``hidden: {kind: choice, values: [64, 128]}``.
 

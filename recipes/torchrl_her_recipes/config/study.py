@@ -79,7 +79,7 @@ class Study:
     """A comparison of recipes.
 
     Args:
-        name: of the study.
+        name: name of the study.
         summary: what it compares, in one line.
         recipe: options that all runs have in common; ``num_runs`` is the number of seeds.
         vary: the values that are compared, by the name of their option. All combinations are run. The

@@ -27,11 +27,11 @@ class PolicyInfo:
 
     Attributes:
         task: that it is for.
-        widths: of ``observation`` and ``desired_goal``: each is [..., width].
-        dtype: of both.
-        action_shape: of one action: [width], or [] for an integer.
+        widths: widths of ``observation`` and ``desired_goal``: each is [..., width].
+        dtype: type of both.
+        action_shape: shape of one action: [width], or [] for an integer.
         action_dtype: ``"int64"`` for an integer, otherwise that of the inputs.
-        task_dtype: of the actions that the task itself takes, to which :meth:`Policy.predict` rounds.
+        task_dtype: type of the actions that the task itself takes, to which :meth:`Policy.predict` rounds.
         low, high: the least and the greatest actions that the task takes, one number for each entry.
         normalize_clip: normalized inputs are clipped to plus and minus this; None if the policy does not
             normalize. It normalizes by itself: what it reads is what the task shows.
@@ -39,7 +39,7 @@ class PolicyInfo:
         success: share of 1,000 greedy episodes of the task at whose last step the goal is achieved, with
             starts and goals that no training has seen.
         reached: share of them in which it is achieved at some step; NaN if it was not measured.
-        versions: of the packages that exported it; may be empty.
+        versions: versions of the packages that exported it; may be empty.
 
     Raises:
         ValueError: a value that no policy has.

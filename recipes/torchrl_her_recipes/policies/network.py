@@ -117,7 +117,7 @@ class TensorPolicy(nn.Module):
     """A policy as a function of tensors alone, in float32, with its normalization inside.
 
     Args:
-        policy: of :func:`load_network`; it is copied.
+        policy: policy from :func:`load_network`; it is copied.
 
     Attributes:
         net: the network behind the normalization.

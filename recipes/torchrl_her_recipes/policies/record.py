@@ -66,7 +66,7 @@ def record_demonstrations(
         episodes: how many are written. At most ten times as many are played.
         policy: ``"expert"``, which is the task's scripted controller; the name of a trained policy that comes
             with the package; or the file of an exported one. None: the scripted controller.
-        seed: of starts and goals.
+        seed: seed of starts and goals.
         keep_all: whether episodes that fail are written, too; then no more than ``episodes`` are played.
         force: whether a file that is there is replaced.
 

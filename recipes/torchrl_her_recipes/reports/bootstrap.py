@@ -70,9 +70,9 @@ def bootstrap(
     Args:
         samples: the runs of each algorithm on each task.
         groups: which samples are taken together in each mean.
-        pairs: of groups, whose means are subtracted: the first minus the second.
-        repetitions: of the bootstrap.
-        seed: of its random numbers.
+        pairs: pairs of groups, whose means are subtracted: the first minus the second.
+        repetitions: number of repetitions of the bootstrap.
+        seed: seed of its random numbers.
 
     Returns:
         One interval for each group, and one for each pair. The ends of those that one run alone stands

@@ -156,7 +156,7 @@ def judge(cells: Sequence[Combination], orders: Sequence[Order], found: Sequence
     for intervals of the two algorithms that lie apart, which is said, too.
 
     Args:
-        cells: of the study.
+        cells: combinations of the study.
         orders: the expected ones; those of algorithms that the study does not have are left out.
         found: all differences.
     """

@@ -32,8 +32,8 @@ def plot_measure(
 
     Args:
         curves: label to table of metrics.
-        name: of the metric.
-        stem: of the pictures, without an ending.
+        name: name of the metric.
+        stem: path of the pictures, without an ending.
         title: above it.
         palette: label to color.
         beside: a second metric, the median of which is drawn dashed.

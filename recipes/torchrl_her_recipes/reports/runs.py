@@ -22,7 +22,7 @@ def read_runs(folders: Sequence[Path]) -> Results:
     """Reads some runs; those that differ only in their seeds are one algorithm on the page.
 
     Args:
-        folders: of runs, or of batches of seeds (``seeds_*``), or with such folders in them.
+        folders: folders of runs, or of batches of seeds (``seeds_*``), or with such folders in them.
     """
     paths = [path for folder in folders for path in _runs_in(folder)]
     groups = _by_recipe(paths)
@@ -42,7 +42,7 @@ def write_runs_report(folders: Sequence[Path], out: Path) -> Path:
     """Writes a page about single runs, of which some may not be at their end; trains nothing.
 
     Args:
-        folders: of runs, or of folders with runs in them.
+        folders: folders of runs, or of folders with runs in them.
         out: where the page goes, its tables, and its pictures into `figures`.
 
     Returns:

@@ -40,8 +40,8 @@ class Results:
     """Results of a study.
 
     Attributes:
-        name: of the study.
-        summary: one line for people.
+        name: name of the study.
+        summary: one-line description for users.
         cells: its combinations.
         kind: what they are: of a ``"study"``, or single ``"runs"``.
         expect, published: as in :class:`~torchrl_her_recipes.Study`.
@@ -66,7 +66,7 @@ def read_study(study: Study, folder: Path) -> Results:
     """Reads the results of a study, from the folders of its runs or from the files made of them.
 
     Args:
-        study: which one.
+        study: study that is meant.
         folder: with a folder of each combination, or with the files of :func:`write_results`.
     """
     if not is_results(folder):
@@ -99,7 +99,7 @@ def write_results(
       combination.
 
     Args:
-        study: which one.
+        study: study that is meant.
         folder: with a folder of each of its combinations; some may be missing or not at their end.
         out: where the files go.
         command: the command, or several, that made the runs; by default ``torchrl-her study NAME``.

@@ -30,7 +30,7 @@ class RunFolder:
     """Paths and the table of one run.
 
     Args:
-        path: of the folder; :meth:`create` makes it.
+        path: path of the folder; :meth:`create` makes it.
 
     Example:
         >>> print(RunFolder("runs/mine"))

@@ -48,7 +48,7 @@ def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) ->
 
     Args:
         rows: the table of metrics so far, one row for each epoch and run.
-        recipe: of the runs.
+        recipe: recipe of the runs.
         bounds: the least and the greatest reward; infinite if there are none.
 
     Returns:

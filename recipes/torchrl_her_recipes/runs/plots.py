@@ -78,7 +78,7 @@ def plot_comparison(
 
     Args:
         panels: title of each panel to the curves in it, label to table of metrics.
-        path: of the picture.
+        path: path of the picture.
         metrics: what is drawn, one panel each; those of several titles have a row each.
     """
     columns = [(title, curves, name) for name in metrics for title, curves in panels.items()]

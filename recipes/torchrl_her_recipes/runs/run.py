@@ -154,7 +154,7 @@ def resume(
     environment must draw from the generator that it seeds alone, and begin episodes without earlier state.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         components: newly made ones, if those of the run were not the ones of its recipe.
         options: other values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``, ``keep_buffer``,
             ``pictures`` or ``log``, which are written into the folder's configuration.

@@ -23,7 +23,7 @@ def show_file(logger: Logger, name: str, path: Path, step: int) -> None:
     Args:
         logger: who is to show it.
         name: what it is called there.
-        path: of the file.
+        path: path of the file.
         step: when it was made, in frames.
     """
     if path.suffix == ".gif":

@@ -101,7 +101,7 @@ def run_state(parts: dict[str, Any], *, buffer: bool = True) -> dict[str, Any]:
     """The states of parts, as tensors and plain data. Rows are the buffer's own: save it at once.
 
     Args:
-        parts: of :func:`parts_of`.
+        parts: parts from :func:`parts_of`.
 
     Keyword Args:
         buffer: whether with the replay buffer and that of demonstrations, without which a run cannot go on.

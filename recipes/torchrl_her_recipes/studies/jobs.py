@@ -153,7 +153,7 @@ def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:
     """The files of a run's folder, to be sent to another machine.
 
     Args:
-        folder: of the run; there may be none yet.
+        folder: folder of the run; there may be none yet.
         checkpoints: whether to take them along. They hold the replay buffers: gigabytes, for many runs.
 
     Returns:

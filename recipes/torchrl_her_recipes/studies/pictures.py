@@ -14,7 +14,7 @@ def plot_virtual_goals(folder: Path, out: Path) -> None:
     """Draws a heat map of virtual goals beside the target q*.
 
     Args:
-        folder: of a run, or of the batches of a study's combination.
+        folder: folder of a run, or of the batches of a study's combination.
         out: path of the figure.
 
     Raises:

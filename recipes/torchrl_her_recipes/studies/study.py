@@ -33,8 +33,8 @@ class StudyResult:
 
     Attributes:
         figure: the picture of a study, if all of it is done.
-        successes: of each run in its last evaluation, by the name of its combination if all runs of that are
-            done; of a single run by its own name.
+        successes: success of each run in its last evaluation, by the name of its combination if all runs of
+            that are done; of a single run by its own name.
         failed: reasons by the label of the job. The others are not held back by it.
         interrupted: whether it was stopped; it can be resumed.
     """

@@ -20,8 +20,8 @@ class InUnits(GoalEnv):
     """Environments with goals whose observations and goals are multiplied by a factor; actions are not.
 
     Args:
-        env: of :func:`~torchrl_her_envs.make_env`.
-        factor: of all observations and goals, and of how near to a goal is achieved.
+        env: environments from :func:`~torchrl_her_envs.make_env`.
+        factor: factor of all observations and goals, and of how near to a goal is achieved.
     """
 
     def __init__(self, env: EnvBase, factor: float) -> None:

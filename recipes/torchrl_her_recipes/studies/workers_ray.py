@@ -41,7 +41,7 @@ class RayWorkers:
     Ray does a job again, up to three times, if its node or process dies.
 
     Args:
-        address: of the cluster, HOST:PORT, or ``auto`` for the one that this machine is a node of.
+        address: address of the cluster, HOST:PORT, or ``auto`` for the one that this machine is a node of.
         gpus_per_job: the share of a GPU that each job gets, such as 0.25; 0 for none.
 
     Raises:

@@ -37,9 +37,9 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
 
     Args:
         search: that the trials belong to.
-        study: of Optuna.
+        study: study of Optuna.
         trials: that count.
-        folder: of the search.
+        folder: folder of the search.
     """
     names = list(search.space.ranges)
     table = io.StringIO()

@@ -89,7 +89,7 @@ def tune(
 
     Args:
         search: recipe, space, sampler and pruner.
-        folder: of the search.
+        folder: folder of the search.
 
     Keyword Args:
         trials: number of trials in the folder at the end; 50 if ``minutes`` is not given either.

@@ -109,7 +109,7 @@ def changed(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"lengths": torch.tensor([3, 3])}, r"episodes of 6 transitions in all cannot have rows \[5\]"),
+        ({"lengths": torch.tensor([3, 3])}, r"rows must be \[6\], the sum of all lengths, got \[5\]"),
         ({"lengths": torch.tensor([2, 3])}, "the last transition of each demonstration must be done, and no"),
         ({"lengths": torch.tensor([5, 0])}, r"lengths \[E\] of at least 1, got \[5, 0\]"),
         ({"lengths": torch.empty(0, dtype=torch.int64)}, r"lengths \[E\] of at least 1, got \[\]"),

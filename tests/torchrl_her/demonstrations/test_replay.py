@@ -198,7 +198,7 @@ def test_what_is_no_whole_number_of_batches_is_refused() -> None:
 
 
 def test_buffers_of_other_numbers_of_runs_are_refused() -> None:
-    with pytest.raises(ValueError, match="the buffers must be for as many runs, got 2 and 1"):
+    with pytest.raises(ValueError, match="buffers must have equally many runs, got 2 and 1"):
         MixedReplay(make_buffer(range(2), 10), make_buffer(range(1), 10), batch_size=B)
 
 
@@ -206,11 +206,11 @@ def test_runs_without_demonstrations_are_refused() -> None:
     own, shown = make_buffer(range(2), 100), make_buffer(range(2), 100)
     own.extend(collected(2))
     write_demonstrations(shown, walks(3), run=1)
-    with pytest.raises(RuntimeError, match="there are runs without demonstrations"):
+    with pytest.raises(RuntimeError, match="some runs have no demonstrations"):
         MixedReplay(own, shown, share=0.5, batch_size=B).sample(2 * B)
 
 
 def test_a_buffer_that_does_not_relabel_is_refused() -> None:
     plain = TensorDictReplayBuffer(storage=LazyTensorStorage(9))
-    with pytest.raises(TypeError, match="demonstrations are written by a HERWriter, the buffer has a Tensor"):
+    with pytest.raises(TypeError, match="demonstrations need a buffer with a HERWriter, got a Tensor"):
         write_demonstrations(plain, walks(3))

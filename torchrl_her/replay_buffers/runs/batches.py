@@ -1,4 +1,4 @@
-"""Transitions of one or several runs, each with what it belongs to: a batch, or what is held back of it."""
+"""Transitions of one or several runs with their runs and lanes: a batch, or the part that is held back."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl_her.replay_buffers.keys import TransitionKeys
 from torchrl_her.replay_buffers.lanes import BY_ENV, find_lanes, in_order
 from torchrl_her.replay_buffers.runs.rows import take_rows
 
-_NO_ROWS = TensorDict(batch_size=[0])  # made once: most batches hold nothing back; nobody writes into it
+_NO_ROWS = TensorDict(batch_size=[0])  # made once, as most batches hold nothing back; it is never written to
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Batch:
 
     Attributes:
         rows: [n]; without entries if n = 0.
-        kind: what environments are told apart by.
+        kind: property that distinguishes environments.
         ids: [n] int64, the environment or trajectory that each transition is of.
         run: [n] int64, the run that each is of; None if there is only one.
 
@@ -43,13 +43,13 @@ class Batch:
 
     @classmethod
     def none(cls, runs: int) -> Batch:
-        """No transitions of R runs."""
+        """Returns an empty batch of R runs."""
         ids = torch.empty(0, dtype=torch.int64)
         return cls(_NO_ROWS, "", ids, None if runs == 1 else ids)
 
     @classmethod
     def of(cls, data: TensorDictBase, keys: TransitionKeys, *, runs: int) -> Batch:
-        """A collector's batch of R runs; if there are several, R equal blocks in their order."""
+        """Makes a batch from a collector's rows, which are R equal blocks in the order of the runs."""
         kind, ids = find_lanes(data, keys)
         run = None
         if runs > 1:
@@ -60,7 +60,7 @@ class Batch:
         return len(self.ids)
 
     def after(self, held: Batch) -> Batch:
-        """The transitions that were held back, and then these.
+        """Returns the transitions that were held back, followed by these.
 
         Raises:
             ValueError: their environments are told apart by something else.
@@ -72,31 +72,31 @@ class Batch:
                 f"episodes that are still open were told apart by {held.kind}, this batch by {self.kind}: "
                 "hand over all batches in one form, [N, T] or flat, and with the same ids"
             )
-        place = self.ids.device  # what is held may have come with a checkpoint
+        place = self.ids.device  # rows that are held back may come from a checkpoint
         run = None if held.run is None or self.run is None else torch.cat((held.run.to(place), self.run))
         ids, rows = torch.cat((held.ids.to(place), self.ids)), held.rows.to(place)
-        if self.rows.device is None:  # lazy stacks are joined only if both or none say where they are
+        if self.rows.device is None:  # lazy stacks can be joined only if both or none have a device set
             rows = rows.copy().clear_device_()
         return Batch(torch.cat((rows, self.rows)), self.kind, ids, run)
 
     def lanes(self) -> Tensor:
-        """Numbers [n] of environments or trajectories, those of one run above those of the run before."""
+        """Returns a number [n] for each environment or trajectory; numbers increase from run to run."""
         lanes = in_order(self.ids) if self.kind == BY_ENV else self.ids
         return lanes if self.run is None else lanes + self.run * (int(lanes.max()) + 1)
 
     def take(self, index: Tensor) -> Batch:
-        """Copies of some of the transitions, [m]."""
+        """Returns copies of some of the transitions, [m]."""
         rows = take_rows(self.rows, index) if len(index) else _NO_ROWS
         run = None if self.run is None else self.run[index]
         return replace(self, rows=rows, ids=self.ids[index], run=run)
 
     def without_run(self, run: int) -> Batch:
-        """The transitions of all other runs."""
+        """Returns the transitions of all runs but one."""
         stays = self.run != run if self.run is not None else torch.zeros_like(self.ids, dtype=torch.bool)
         return self.take(stays.nonzero().squeeze(-1))
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain data that :meth:`from_state` takes, under the names of what is held back."""
+        """Returns tensors and plain data that :meth:`from_state` takes."""
         return {
             "held_runs": torch.empty(0, dtype=torch.int64) if self.run is None else self.run.clone(),
             "held": self.rows.to_dict() if len(self) else None,
@@ -106,7 +106,7 @@ class Batch:
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, runs: int) -> Batch:
-        """The transitions of which this is the state; of R runs."""
+        """Restores a batch of R runs from a :meth:`state_dict`."""
         ids, run, held = state["held_lanes"].clone(), state["held_runs"].clone(), state["held"]
         rows: TensorDictBase = _NO_ROWS
         if held is not None:

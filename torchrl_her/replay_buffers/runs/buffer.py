@@ -1,4 +1,4 @@
-"""A replay buffer of several runs, or of one, asked about single runs."""
+"""Access to single runs in a replay buffer of one or several runs."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from torchrl_her.torchrl_private import count_a_write
 
 
 def runs_of(buffer: ReplayBuffer) -> int:
-    """For how many runs a buffer was made: 1, unless its writer is for more."""
+    """Returns the number of runs of a buffer: that of its writer, or 1."""
     return getattr(buffer.writer, "runs", 1)
 
 
 def sizes_of(buffer: ReplayBuffer) -> list[int]:
-    """How many rows of each run can be sampled from a buffer."""
+    """Returns the number of rows of each run that can be sampled from a buffer."""
     return [len(buffer)] if runs_of(buffer) == 1 else buffer.writer.sizes
 
 
 def rows_of_run(buffer: ReplayBuffer, run: int = 0) -> TensorDictBase:
-    """A run's stored rows [n], in the order in which they lie in its block; a view.
+    """Returns a run's stored rows [n], in the order of its block, as a view.
 
     Example:
         >>> import torch
@@ -37,7 +37,7 @@ def rows_of_run(buffer: ReplayBuffer, run: int = 0) -> TensorDictBase:
 
 
 def bounds_of_run(buffer: ReplayBuffer, run: int) -> tuple[int, int]:
-    """The first row of a run's block in the storage, and the one behind its last row."""
+    """Returns the first row of a run's block in the storage, and the one behind its last row."""
     _check(buffer, run)
     if runs_of(buffer) == 1:
         return 0, len(buffer.storage)
@@ -49,8 +49,8 @@ def empty_run(buffer: ReplayBuffer, run: int = 0) -> None:
     """Empties one run's block: rows, priorities, counts, weights of goals and open episodes.
 
     Args:
-        buffer: of several runs, or of a single one, which is emptied as a whole.
-        run: which one, from 0.
+        buffer: buffer of several runs, or of a single one, which is emptied as a whole.
+        run: index of the run, from 0.
 
     Raises:
         ValueError: there is no such run.

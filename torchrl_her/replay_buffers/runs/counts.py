@@ -1,4 +1,4 @@
-"""Counting what a writer has written for each of its runs, and how much of it achieved its goal."""
+"""Counts of the transitions that a writer has written for each run, and of those that achieved their goal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_her.replay_buffers.runs.written import WrittenRows
 
 @dataclass
 class WriterCounts:
-    """How many transitions were written; the positive ones are those that achieved their goal.
+    """Numbers of transitions that were written; positive ones are those that achieved their goal.
 
     ``relabeled`` counts the real transitions that got goals of their own episode. ``useful_virtual_positive``
     leaves out virtual transitions whose goal was already achieved in the state before. It counts what the
@@ -31,12 +31,12 @@ class WriterCounts:
 
     @classmethod
     def sum(cls, counts: Iterable[WriterCounts]) -> WriterCounts:
-        """The sums over several."""
+        """Returns the sums over several counts."""
         return cls(*map(sum, zip(*map(astuple, counts), strict=True)))
 
 
 class RunCounts:
-    """The counts of R runs.
+    """Counts of R runs.
 
     Args:
         runs: R.
@@ -81,7 +81,7 @@ class RunCounts:
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave."""
+        """Restores the state that :meth:`state_dict` returned."""
         self.counts = [WriterCounts(**counts) for counts in state_dict["counts"]]
         self.totals = [WriterCounts(**counts) for counts in state_dict["totals"]]
 
@@ -108,5 +108,5 @@ def virtual_positives(chunk: Chunk, virtual: WrittenRows) -> dict[str, list[int]
 
 
 def _set(flags: Tensor, counts: Sequence[int]) -> list[int]:
-    """How many of some flags are set, for each run."""
+    """Returns the number of flags that are set for each run."""
     return [int(part.count_nonzero()) for part in flags.split(list(counts))]

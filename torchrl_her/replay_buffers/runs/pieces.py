@@ -1,4 +1,4 @@
-"""Sharing out episodes of several runs in pieces that are written at once."""
+"""Splits episodes of several runs into pieces, each of which is written at once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Piece(NamedTuple):
 
     Attributes:
         runs: m numbers of runs that have episodes among these.
-        episodes: those of one run after those of the other.
+        episodes: episodes, run after run.
         position: [E] int64, ascending: the position in ``runs`` of each episode's run; None for a single run.
     """
 
@@ -25,13 +25,13 @@ class Piece(NamedTuple):
     position: Tensor | None = None
 
     def sums(self, number: Tensor) -> list[int]:
-        """The sums of numbers [E] of episodes for each of the runs, m of them."""
+        """Sums numbers [E] of the episodes for each of the m runs."""
         if self.position is None:
             return [int(number.sum())]
         return number.new_zeros(len(self.runs)).index_add_(0, self.position, number).tolist()
 
     def counts(self, index: Tensor, run: Tensor | None) -> list[int]:
-        """How many of some transitions are of each of the runs, m of them.
+        """Counts some transitions for each of the m runs.
 
         Args:
             index: [V] int64, positions of transitions of these episodes in a batch.
@@ -46,12 +46,12 @@ class Piece(NamedTuple):
 def split_runs(
     episodes: Episodes, run: Tensor | None, settings: Sequence[Hashable], *, each: int, together: int
 ) -> Iterator[Piece]:
-    """Splits episodes in pieces whose tables have at most so many entries.
+    """Splits episodes into pieces whose tables have a limited number of entries.
 
     How the episodes of a run are split does not depend on the other runs.
 
     Args:
-        episodes: those of one run after those of the other.
+        episodes: episodes, run after run.
         run: [E] int64, ascending: the run of each episode, of R; None if there is only one.
         settings: R, one of each run: only episodes of runs with the same are written at once.
 
@@ -77,12 +77,12 @@ def split_runs(
 
 
 class _Share(NamedTuple):
-    """Some episodes of a run that follow each other."""
+    """Consecutive episodes of one run."""
 
     run: int
     begin: int
     number: int
-    horizon: int  # the longest of that run
+    horizon: int  # length of the run's longest episode
 
 
 def _shares(episodes: Episodes, run: Tensor, runs: int, each: int) -> Iterator[_Share]:
@@ -97,7 +97,7 @@ def _shares(episodes: Episodes, run: Tensor, runs: int, each: int) -> Iterator[_
 
 
 def _join(episodes: Episodes, shares: list[_Share]) -> Piece:
-    """The episodes of some shares as a piece; no two of them are of the same run."""
+    """Joins episodes of different runs to a piece."""
     horizon = max(share.horizon for share in shares)
     first, last = shares[0], shares[-1]
     if last.begin + last.number - first.begin == sum(share.number for share in shares):  # without a gap

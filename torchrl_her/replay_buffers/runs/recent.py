@@ -1,4 +1,4 @@
-"""The goals of recent episodes, which transitions of other episodes may take, too."""
+"""Goals of recent episodes, which transitions of other episodes may take, too."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Goals = tuple[Tensor | None, ...]
 
 @dataclass(frozen=True)
 class RecentGoals:
-    """Goals that were wanted and achieved in recent episodes of each of R runs.
+    """Memory of the goals that were desired and achieved in recent episodes of each of R runs.
 
     Attributes:
         goals: for ``"actual"`` and ``"achieved"``, those of each run, [m, g] with the newest last; None for
@@ -42,7 +42,7 @@ class RecentGoals:
 
     @classmethod
     def none(cls, runs: int) -> RecentGoals:
-        """No goals of R runs."""
+        """Returns an empty memory of R runs."""
         return cls(dict.fromkeys(RECENT, (None,) * runs))
 
     def after(
@@ -60,17 +60,17 @@ class RecentGoals:
             rows: [n], transitions.
             episodes: positions among them; those of one run after those of the other.
             run: [E] int64, the run of each episode; None if there is only one.
-            keys: where goals are.
+            keys: keys of the goals.
 
         Keyword Args:
-            sizes: how many goals a run keeps, of each kind that is to be remembered. If the episodes have
+            sizes: number of goals that a run keeps, for each kind that is remembered. If the episodes have
                 more, those that are kept are spread over all of them.
         """
         if len(episodes.lengths) == 0 or not sizes:
             return self
         out, lengths, achieved = dict(self.goals), episodes.lengths, entry_of(rows, keys.next_achieved)
         for name, size in sizes.items():
-            if name == "actual":  # one of each episode
+            if name == "actual":  # one goal of each episode
                 number, goals, row = torch.ones_like(lengths), keys.asked_for(rows), episodes.rows[:, 0]
             else:
                 number, goals, row = lengths, achieved, episodes.rows[episodes.inside]
@@ -88,7 +88,7 @@ class RecentGoals:
         return RecentGoals({name: (*own[:run], None, *own[run + 1 :]) for name, own in self.goals.items()})
 
     def lines(self, name: str, runs: Sequence[int]) -> tuple[Tensor, Episodes]:
-        """The goals of one kind of some runs, which have some.
+        """Joins the goals of one kind of some runs, which all have goals.
 
         Returns:
             ``(goals, lines)``: [p, g], and where those of each run lie in there, as those of an episode do.
@@ -110,7 +110,7 @@ class RecentGoals:
 
 
 def _last(before: Tensor | None, new: Tensor, size: int) -> Tensor | None:
-    """The last goals, at most so many, of some [m, g] and new ones; of too many new ones, some of all."""
+    """Returns the last ``size`` of old [m, g] and new goals; of too many new ones, evenly spread ones."""
     if len(new) == 0:
         return before
     if len(new) > size:

@@ -1,4 +1,4 @@
-"""Where the rows of each run go: R equal blocks of a storage, each of them written round and round."""
+"""Rows for each run to write to: R equal blocks of a storage, each a ring buffer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchrl_her.replay_buffers.runs.storage import Move
 
 
 class Rings:
-    """R blocks of rows, one of each run. When a block is full, its oldest rows are overwritten.
+    """Cursors of R ring buffers, one for each run. When a ring is full, its oldest rows are overwritten.
 
     How many rows a block can hold is told with each call, because it is known only once there is a storage.
 
@@ -36,14 +36,14 @@ class Rings:
         self.cursors, self.sizes = [0] * runs, [0] * runs
 
     def moves(self, run: int, *, begin: int, count: int, capacity: int) -> list[Move]:
-        """Where the next rows of a run go, and moves its cursor on. Rows that do not fit are left out.
+        """Returns the slices for a run's next rows, as far as they fit, and advances its cursor.
 
         Args:
-            run: which one.
+            run: index of the run.
 
         Keyword Args:
             begin: position of the first of these rows among all that are to be written.
-            count: how many they are; they lie one after the other. Of more than ``capacity``, only the last
+            count: number of these rows, which are consecutive. Of more than ``capacity``, only the last
                 ones are moved.
             capacity: rows of a block.
 
@@ -68,13 +68,13 @@ class Rings:
 
 
 class Places:
-    """Where the rows of a batch are, counted in the order in which the rows of their run are written.
+    """Finds the storage rows that the rows of a batch were written to.
 
     Args:
         run: [n] int64, the run of each row; None if all are of one.
         n: number of rows.
         runs: R.
-        device: where to count.
+        device: device of the result.
 
     Example:
         >>> rings, places = Rings(1), Places(None, 3, runs=1)
@@ -90,12 +90,12 @@ class Places:
         self._written = [0] * runs
 
     def note(self, runs: Sequence[int], last: Sequence[Tensor], counts: Sequence[int]) -> None:
-        """Notes that more rows of some runs were written.
+        """Records that more rows of some runs were written.
 
         Args:
             runs: m numbers of runs.
             last: m tensors [c] int64, for each of these runs the positions in the batch of the rows that were
-                written last, in that order. Rows before them are copies, whose places nobody asks for.
+                written last, in that order. Rows before them are copies, whose places are not needed.
             counts: m numbers of all rows that were written, of each of these runs.
         """
         for run, positions, count in zip(runs, last, counts, strict=True):
@@ -104,7 +104,7 @@ class Places:
             self._place[positions] = torch.arange(end - len(positions), end, device=self._place.device)
 
     def rows(self, cursors: Sequence[int], capacity: int) -> Tensor:
-        """The rows of the storage [n] where the batch's rows are; -1 for those that are not there (any more).
+        """Returns the storage row [n] of each row of the batch; -1 if it was not written or is overwritten.
 
         Args:
             cursors: R, of :class:`Rings`, after everything was written.
@@ -114,7 +114,7 @@ class Places:
         begins = [cursor - count for cursor, count in zip(cursors, self._written, strict=True)]
         lost = [max(0, count - capacity) for count in self._written]
         if run is None:
-            gone = place < lost[0]  # -1 among them: not written at all
+            gone = place < lost[0]  # also -1, for rows that were not written at all
             return place.add(begins[0]).remainder_(capacity).masked_fill_(gone, -1)
         gone = place < place.new_tensor(lost)[run]
         rows = (place.new_tensor(begins)[run] + place).remainder_(capacity)

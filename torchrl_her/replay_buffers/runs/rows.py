@@ -1,4 +1,4 @@
-"""The rows that are written, put together of collected transitions and of what their copies change."""
+"""Builds the rows to be written from collected transitions and the entries that copies of them change."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ def join_rows(
     exclude: Sequence[NestedKey],
     virtual_key: NestedKey | None,
 ) -> TensorDictBase:
-    """Transitions as they are stored, run after run; of each run first the virtual and then the real ones.
+    """Builds transitions for the storage, run after run, in each run first virtual and then real ones.
 
     Args:
         rows: [n], collected transitions.
-        virtual: those of some runs; None if there are none.
-        real: those of the same runs.
+        virtual: virtual transitions of some runs; None if there are none.
+        real: real transitions of the same runs.
 
     Keyword Args:
         exclude: entries of ``rows`` that are left out.
-        virtual_key: where virtual transitions are marked, a bool [..., 1]; None for no mark.
+        virtual_key: key of a bool [..., 1] that marks virtual transitions; None for no mark.
     """
     both = [real] if virtual is None else [virtual, real]
 
     def join(parts: list[Tensor]) -> Tensor:
-        """A tensor of the virtual and one of the real transitions, as one in the order of runs."""
+        """Joins a tensor of the virtual and one of the real transitions, run after run."""
         split = [part.split(written.counts) for part, written in zip(parts, both, strict=True)]
         return torch.cat([part for run in zip(*split, strict=True) for part in run])
 
     changed = list(dict.fromkeys(key for written in both for key in written.changes))
     same = rows.exclude(*exclude, *changed)
     root = join([written.root for written in both])
-    if all(written.last is written.root for written in both):  # over single steps
+    if all(written.last is written.root for written in both):  # transitions of single steps
         out = take_rows(same, root)
     else:
         out = take_rows(same.exclude("next"), root)
@@ -56,7 +56,7 @@ def join_rows(
 
 
 def take_rows(transitions: TensorDictBase, index: Tensor) -> TensorDictBase:
-    """Copies of some transitions [m], also of entries that are no tensors.
+    """Copies some transitions [m], with their entries that are not tensors.
 
     Args:
         transitions: [n].
@@ -72,7 +72,7 @@ def take_rows(transitions: TensorDictBase, index: Tensor) -> TensorDictBase:
 
 
 def _take(entry: Any, index: Tensor) -> Any:
-    """Rows of an entry. Torch indexes single numbers several times faster than rows of one number."""
+    """Copies rows of an entry. Torch indexes single numbers several times faster than rows of one number."""
     if not isinstance(entry, Tensor):
         return entry[index]
     if entry.shape[1:].numel() == 1:

@@ -1,4 +1,4 @@
-"""Samplers for a buffer of several runs: as many transitions of each run, in one call."""
+"""Samplers for a buffer of several runs, which draw the same number of transitions of each in one call."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STATE_FILE = "runs_sampler.pt"
 
 
 class RunsSampler(Sampler):
-    """Draws transitions of each of R runs, all of a run's being equally likely.
+    """Draws the same number of transitions of each of R runs; those of a run are equally likely.
 
     The storage is R equal blocks of rows, as :class:`~torchrl_her.HERWriter` fills them. A batch is R equal
     blocks, too, in the order of the runs. What a run draws does not depend on the other runs. In place of a
@@ -35,7 +35,7 @@ class RunsSampler(Sampler):
         runs: R.
         generators: R sources of random numbers, on the device; None for the buffer's (``buffer.set_rng``),
             with one run.
-        device: where rows are drawn. The storage may be elsewhere.
+        device: device on which rows are drawn. The storage may be on another one.
 
     Raises:
         ValueError: there is no run, or not a generator for each of several; when sampling, the batch cannot
@@ -56,11 +56,11 @@ class RunsSampler(Sampler):
 
     @property
     def device(self) -> torch.device:
-        """Where rows are drawn."""
+        """Device on which rows are drawn."""
         return self._sizes.device
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
-        """Indices [batch_size] of rows: R equal blocks."""
+        """Draws indices [batch_size] of rows: R equal blocks."""
         n, sizes = _share(self, storage, batch_size), self._sizes.tolist()
         place = torch.zeros(self.runs, n, dtype=torch.int64, device=self.device)
         for own, size, generator in zip(place, sizes, generators_of(self), strict=True):
@@ -69,7 +69,7 @@ class RunsSampler(Sampler):
         return rows_of(place, [size > 0 for size in sizes], self.capacity), {}
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
-        """Notes rows that were written."""
+        """Registers rows that were written."""
         note_sizes(self._sizes, *run_and_place(index, self.capacity, self.device))
 
     def empty_run(self, run: int) -> None:
@@ -115,9 +115,9 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         runs: R.
         generators: R sources of random numbers, on the device; None for the buffer's (``buffer.set_rng``),
             with one run.
-        device: where rows are drawn. The storage may be elsewhere.
+        device: device on which rows are drawn. The storage may be on another one.
         eps: added to priorities.
-        reduction: of priorities that come as several numbers for a row.
+        reduction: reduction of priorities that come as several numbers for a row.
 
     Raises:
         ValueError: there is no run, or not a generator for each of several; alpha or beta is negative; when
@@ -153,7 +153,7 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         super().__init__(runs * capacity, alpha, beta, eps=eps, reduction=reduction)
 
     def _init(self) -> None:
-        """Makes the trees, for TorchRL's own constructor."""
+        """Makes the trees; called by TorchRL's constructor."""
         device = self._home
         self._trees = SumTrees(self.capacity, runs=self.runs, device=device)
         self._sizes = torch.zeros(self.runs, dtype=torch.int64, device=device)
@@ -162,12 +162,12 @@ class RunsPrioritizedSampler(PrioritizedSampler):
 
     @property
     def device(self) -> torch.device:
-        """Where priorities are kept, and rows drawn."""
+        """Device on which priorities are kept and rows are drawn."""
         return self._home
 
     @property
     def alpha(self) -> float:
-        """How much priorities count. It cannot be changed once there are some, which are kept as powers."""
+        """Exponent of priorities. It cannot change once there are priorities, which are stored as powers."""
         return self._alpha
 
     @alpha.setter
@@ -180,11 +180,11 @@ class RunsPrioritizedSampler(PrioritizedSampler):
 
     @property
     def default_priority(self) -> Tensor | float:
-        """The priority of new rows; [R] if there are several runs."""
+        """Priority of new rows; [R] if there are several runs."""
         return float(self._most[0]) if self.runs == 1 else self._most.clone()
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
-        """Indices [batch_size] of rows, R equal blocks, and their weights."""
+        """Draws indices [batch_size] of rows, R equal blocks, with their importance weights."""
         n = _share(self, storage, batch_size)
         filled = (self._sizes > 0).tolist()
         counts = [n * own for own in filled]
@@ -234,7 +234,7 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         value = (priority + self._eps).pow(self._alpha)
         sizes = self._sizes
         if self.runs == 1 and storage is not None:
-            # A buffer that is made around a filled storage tells its sampler of the rows in this way only.
+            # A buffer that is made around a filled storage registers the rows only by this call.
             sizes = sizes.clamp_min(len(storage))
         if not self._all_known(run, place, sizes) or not _all_finite(priority, value):
             written = place < sizes.index_select(0, run)
@@ -247,12 +247,12 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         self._trees.set(run, place, value)
 
     def _all_known(self, run: Tensor, place: Tensor, sizes: Tensor) -> bool:
-        """Whether all of some rows [n] are among those of their runs, whose sizes are [R]."""
-        # Full blocks, as most of the time, need no look at each row.
+        """Returns whether rows [n] are all filled, given the sizes [R] of the runs."""
+        # If all blocks are full, as most of the time, rows need no check.
         return int(sizes.min()) >= self.capacity or bool((place < sizes.index_select(0, run)).all())
 
     def _warn_of(self, run: Tensor) -> None:
-        """Warns of runs [n] that had priorities that are not finite, of each of them once."""
+        """Warns about priorities that are not finite, once for each run [n]."""
         for own in sorted(set(run.tolist()) - self._warned):
             self._warned.add(own)
             warnings.warn(
@@ -280,7 +280,7 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         """Does nothing: :meth:`mark_update` has already set the new rows' priorities."""
 
     def state_dict(self) -> dict[str, Any]:
-        """The powers of the priorities of the rows that are filled, as tensors and plain data."""
+        """Returns the powers of the priorities of filled rows, as tensors and plain data."""
         sizes = self._sizes.tolist()
         return {
             "sizes": self._sizes.clone(),
@@ -292,7 +292,7 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave."""
+        """Restores the state that :meth:`state_dict` returned."""
         _check_runs(state_dict["sizes"], self.runs)
         self._init()
         self._sizes.copy_(state_dict["sizes"])
@@ -316,7 +316,7 @@ AnyRunsSampler = RunsSampler | RunsPrioritizedSampler
 
 
 def _share(sampler: AnyRunsSampler, storage: Storage, batch_size: int) -> int:
-    """How many transitions of each run a batch has."""
+    """Returns the number of transitions of each run in a batch, checked."""
     if not bool(sampler._sizes.any()):
         raise RuntimeError("an empty buffer cannot be sampled from")
     if batch_size % sampler.runs:
@@ -330,12 +330,12 @@ def _share(sampler: AnyRunsSampler, storage: Storage, batch_size: int) -> int:
 
 
 def generators_of(sampler: AnyRunsSampler) -> Generators:
-    """A source of random numbers for each run."""
+    """Returns a generator for each run."""
     return [generator_of(sampler)] if sampler.generators is None else sampler.generators
 
 
 def rows_of(place: Tensor, filled: Sequence[bool], capacity: int) -> Tensor:
-    """Rows [R * n] of places [R, n] in the runs' blocks; those of the first filled run for empty ones."""
+    """Converts places [R, n] in the runs' blocks to rows [R * n]; empty runs get those of a filled one."""
     row = place + torch.arange(0, len(filled) * capacity, capacity, device=place.device).unsqueeze(-1)
     if not all(filled):
         stand_in = list(filled).index(True)
@@ -348,7 +348,7 @@ def rows_of(place: Tensor, filled: Sequence[bool], capacity: int) -> Tensor:
 def run_and_place(
     index: int | Tensor, capacity: int, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The run of each row that was written, and its place in that run's block, on a device."""
+    """Returns the run of each row that was written and its place in the run's block, on a device."""
     index = torch.as_tensor(index, dtype=torch.int64, device=device).flatten()
     if len(index) and int(index.min()) < 0:
         index = index[index >= 0]  # writers give -1 for rows that they did not write
@@ -362,7 +362,7 @@ def note_sizes(sizes: Tensor, run: Tensor, place: Tensor) -> None:
 
 
 def _all_finite(priority: Tensor, value: Tensor) -> bool:
-    """Whether priorities [n] of at least 0 and their powers are finite; with alpha = 0 all powers are 1."""
+    """Returns whether priorities [n] and their powers are finite; with alpha 0 all powers are 1."""
     return len(value) == 0 or math.isfinite(float(priority.max()) + float(value.max()))  # NaN is the largest
 
 

@@ -18,7 +18,7 @@ _ALIGNED = 8  # bytes: rows begin at a multiple of it, so that numbers of any ty
 
 
 class Field(NamedTuple):
-    """Where a row holds an entry."""
+    """Position of an entry within a packed row."""
 
     key: NestedKey
     dtype: torch.dtype
@@ -28,7 +28,7 @@ class Field(NamedTuple):
 
 
 class Move(NamedTuple):
-    """Rows that are written, and where they go: slices of the same length."""
+    """Slice of new rows, and the slice of the storage that they are copied to."""
 
     source: slice
     to: slice
@@ -48,7 +48,7 @@ class PackedStorage(LazyTensorStorage):
         max_size: number of rows.
 
     Keyword Args:
-        device: where they are.
+        device: device of the rows.
 
     Example:
         >>> storage = PackedStorage(4)
@@ -70,22 +70,22 @@ class PackedStorage(LazyTensorStorage):
 
     @property
     def packed(self) -> Tensor | None:
-        """All rows, [max_size, m] of int64, whatever types the entries have; None if they are not packed."""
+        """All rows as [max_size, m] of int64, whatever the types of entries; None if they are not packed."""
         return self._packed if self._packed is not None and self._storage is self._views else None
 
     @property
     def fields(self) -> tuple[Field, ...]:
-        """Where a row holds each entry."""
+        """Position of each entry within a row."""
         return self._fields
 
     def get(self, index: int | Sequence[int] | slice) -> Any:
         packed = self.packed
         if packed is None or not isinstance(index, Tensor) or index.dtype != torch.int64 or index.ndim != 1:
             return super().get(index)
-        # A full storage needs no look at the numbers: there is no row behind the last one.
+        # A full storage needs no check of the indices: there is no row behind the last one.
         length = self._len
         if length < self.max_size and len(index) and int(index.max()) >= length:
-            return super().get(index)  # which raises
+            return super().get(index)  # the parent class raises an error
         try:
             rows = packed.index_select(0, index)
         except IndexError:  # negative numbers count from the end
@@ -98,7 +98,7 @@ class PackedStorage(LazyTensorStorage):
             self._pack()  # rows came with new entries, which are not among the packed ones
 
     def _init_standard(self, data: Any) -> None:
-        """Allocates the storage for rows like one that is given."""
+        """Allocates the storage for rows like the given one."""
         fields = layout(torch.empty_like(data).unsqueeze(0)) if isinstance(data, TensorDictBase) else ()
         if not fields:
             super()._init_standard(data)
@@ -118,7 +118,7 @@ class PackedStorage(LazyTensorStorage):
             self._pack()
 
     def restore(self, begin: int, packed: Tensor, fields: Sequence[Field]) -> bool:
-        """Puts packed rows [n, m] at ``begin``; returns False if this storage holds rows in another way."""
+        """Copies packed rows [n, m] to ``begin``; returns False if this storage has another layout."""
         if not self.initialized:
             self._allocate(tuple(fields), packed.device if self.device == "auto" else self.device)
             self.initialized = True
@@ -142,7 +142,7 @@ class PackedStorage(LazyTensorStorage):
         self._number = _number_of_keys(self._views)
 
     def _pack(self) -> None:
-        """Replaces the storage by a packed one with the same rows; lets it be if they cannot be packed."""
+        """Replaces the storage by a packed one with the same rows, unless they cannot be packed."""
         self._packed = self._views = None
         rows = self._storage
         fields = layout(rows[:1]) if isinstance(rows, TensorDictBase) else ()
@@ -153,19 +153,19 @@ class PackedStorage(LazyTensorStorage):
 
 
 def write_slices(storage: TensorStorage, rows: TensorDictBase, moves: Sequence[Move]) -> None:
-    """Writes rows into a storage, which is as long as the last row that was ever written.
+    """Writes rows into a storage, slice by slice, and updates its length.
 
     Args:
-        storage: of one dimension.
+        storage: storage of one dimension.
         rows: [m].
-        moves: which of them go where.
+        moves: slices of these rows, and the slices of the storage to copy them to.
     """
     entries = dict(rows.items(True, True))
     kept = dict(whole_of(storage).items(True, True)) if storage.initialized else {}
     if kept.keys() != entries.keys():  # also the first time, when the storage is made
         for move in moves:
             storage.set(move.to, rows[move.source], set_cursor=False)
-    else:  # entry by entry: a tensordict would take longer to be cut than to be copied
+    else:  # entry by entry: slicing a tensordict takes longer than copying it
         for key, entry in entries.items():
             for source, to in moves:
                 kept[key][to] = entry[source]
@@ -176,7 +176,7 @@ def write_slices(storage: TensorStorage, rows: TensorDictBase, moves: Sequence[M
 
 
 def layout(rows: TensorDictBase) -> tuple[Field, ...]:
-    """Where packed rows hold the entries of rows [n], the largest types first; empty if that cannot be.
+    """Computes the positions of entries in packed rows, largest types first; empty if rows cannot be packed.
 
     Example:
         >>> rows = TensorDict({"x": torch.zeros(1, 3), "done": torch.zeros(1, 1, dtype=torch.bool)}, [1])
@@ -193,7 +193,7 @@ def layout(rows: TensorDictBase) -> tuple[Field, ...]:
         return ()
     out: list[Field] = []
     begin = 0
-    # The largest types first, so that each is aligned; then by key, so that such rows always lie alike.
+    # The largest types first, so that each is aligned; then by key, so that the layout is always the same.
     for key, entry in sorted(entries, key=lambda pair: (-pair[1].itemsize, _path(pair[0]))):
         size = entry[0].numel() * entry.itemsize
         out.append(Field(key, entry.dtype, entry.shape[1:], begin, begin + size))
@@ -202,7 +202,7 @@ def layout(rows: TensorDictBase) -> tuple[Field, ...]:
 
 
 def unpack(packed: Tensor, fields: Sequence[Field]) -> TensorDict:
-    """Packed rows [n, m] of int64 as a tensordict [n] of views."""
+    """Returns packed rows [n, m] of int64 as a tensordict [n] of views."""
     shape, device = packed.shape[:1], packed.device
     typed: dict[torch.dtype, Tensor] = {}
     source: dict[Any, Any] = {}
@@ -222,7 +222,7 @@ def unpack(packed: Tensor, fields: Sequence[Field]) -> TensorDict:
 
 
 def _tensordict(source: dict[Any, Any], shape: torch.Size, device: torch.device) -> TensorDict:
-    """A tensordict of tensors that are known to fit, without checks, which would take most of the time."""
+    """Makes a tensordict of tensors that fit, without checks, which would take most of the time."""
     own = {
         key: _tensordict(entry, shape, device) if isinstance(entry, dict) else entry
         for key, entry in source.items()
@@ -231,14 +231,14 @@ def _tensordict(source: dict[Any, Any], shape: torch.Size, device: torch.device)
 
 
 def _is_plain_node(entry: Any, shape: torch.Size) -> bool:
-    """Whether an entry is a nested tensordict that can be told from the keys of its tensors alone."""
+    """Returns whether an entry is a nested tensordict that can be rebuilt from the keys of its tensors."""
     if not isinstance(entry, TensorDictBase) or is_non_tensor(entry):
         return False
     return entry.batch_size == shape and not entry.is_empty()
 
 
 def _number_of_keys(rows: TensorDictBase) -> int:
-    """How many keys there are, those of nested tensordicts among them."""
+    """Counts keys, those of nested tensordicts included."""
     return len(list(rows.keys(True, is_leaf=is_leaf_nontensor)))
 
 

@@ -20,7 +20,7 @@ def uniform(
     dtype: torch.dtype | None = None,
     device: torch.device | None = None,
 ) -> Tensor:
-    """Numbers in [0, 1) for several runs. What a run gets does not depend on the others.
+    """Draws numbers in [0, 1) for several runs. The numbers of a run do not depend on the other runs.
 
     Args:
         counts: R numbers of rows; a run without rows draws nothing.
@@ -28,7 +28,7 @@ def uniform(
         generators: R, one of each run; None for torch's own.
 
     Keyword Args:
-        dtype, device: of the numbers.
+        dtype, device: type and device of the numbers.
 
     Returns:
         [sum of counts, width], one run after the other.
@@ -49,7 +49,7 @@ def uniform(
 
 
 class RunDraws:
-    """Uniform numbers for transitions, from the generator of the run that each is of.
+    """Uniform numbers for transitions, from the generator of each transition's run.
 
     Args:
         generators: R.
@@ -75,7 +75,7 @@ class RunDraws:
 
 
 def check_generators(runs: int, generators: Sequence[torch.Generator] | None) -> list[torch.Generator] | None:
-    """The generators of R runs as a list; None for the buffer's, which only a single run may use.
+    """Returns the generators of R runs as a list; None for the buffer's, which only a single run may use.
 
     Raises:
         ValueError: there is no run, or not a generator for each of several runs.

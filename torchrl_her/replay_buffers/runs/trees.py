@@ -16,7 +16,7 @@ _TOPS = 32  # nodes without a parent, at most
 
 
 class SumTrees:
-    """Trees of R runs, all drawn from and updated in the same few tensor operations.
+    """Sum trees of R runs, drawn from and updated together in a few tensor operations.
 
     Each run has up to ``capacity`` leaves of at least 0, the sums of each 16 of them, of each 16 sums, and so
     on. A draw goes down from the top: at each node it takes the child in which its random number lies.
@@ -29,7 +29,7 @@ class SumTrees:
     Keyword Args:
         runs: R.
         native: whether draws and updates are made in C++ where that can be compiled, with the same result.
-        device: where the leaves are.
+        device: device of the leaves.
 
     Raises:
         MemoryError: there is not enough memory for so many leaves.
@@ -56,16 +56,16 @@ class SumTrees:
             self._levels = [
                 torch.zeros(runs, tops * _FAN**level, device=device) for level in range(height, -1, -1)
             ]
-        except RuntimeError as error:  # which torch raises in place of a MemoryError
+        except RuntimeError as error:  # torch raises a RuntimeError in place of a MemoryError
             raise MemoryError(f"there is not enough memory for {runs} x {capacity:,} priorities") from error
 
     @property
     def totals(self) -> Tensor:
-        """The sum of each run's leaves, [R] of float64."""
+        """Returns the sum of each run's leaves, [R] of float64."""
         return self._levels[-1].double().sum(-1)
 
     def get(self, run: int, count: int) -> Tensor:
-        """A copy of a run's first leaves, [count]."""
+        """Returns a copy of a run's first leaves, [count]."""
         return self._levels[0][run, :count].clone()
 
     def set(self, run: Tensor, leaf: Tensor, value: Tensor, *, sorted: bool = False) -> None:
@@ -88,7 +88,7 @@ class SumTrees:
         self._levels[0].view(-1).index_copy_(0, node, value)
         for below, level in pairwise(self._levels):
             children = below.view(-1, _FAN)
-            if len(node) >= len(children):  # then all sums are computed just as fast
+            if len(node) >= len(children):  # with many leaves, computing all sums is just as fast
                 level.copy_(_total(children).view_as(level))
                 continue
             node = node // _FAN
@@ -134,7 +134,7 @@ class SumTrees:
         return load_trees() if self.native and self._levels[0].device.type == "cpu" else None
 
     def _pointers(self) -> tuple[Any, Any, int, int]:
-        """The levels as C++ takes them."""
+        """Returns the levels in the form that the C++ functions take."""
         height = len(self._levels)
         levels = (ctypes.c_void_p * height)(*[level.data_ptr() for level in self._levels])
         widths = (ctypes.c_int64 * height)(*[level.shape[1] for level in self._levels])
@@ -142,12 +142,12 @@ class SumTrees:
 
 
 def _total(children: Tensor) -> Tensor:
-    """The sums [n] over children [n, 16]: the last of the running sums, as a draw computes them."""
+    """Returns the sums [n] over children [n, 16], by running sums: draws round in the same way."""
     return children.cumsum(-1)[:, -1]
 
 
 def _descend(sums: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
-    """The children [..., 1] in which masses [..., 1] lie, and what is left of the masses.
+    """Returns the children [..., 1] in which masses [..., 1] lie, and the rest of each mass.
 
     The running sums of the children are [..., c]. A child of value 0 is never taken, unless all are 0.
     """

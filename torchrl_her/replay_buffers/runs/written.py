@@ -35,7 +35,7 @@ class WrittenRows:
     counts: list[int]
 
     def entry(self, rows: TensorDictBase, key: NestedKey) -> Tensor:
-        """An entry of these transitions, [m, ...]."""
+        """Returns an entry of these transitions, [m, ...]."""
         if key not in self.changes:
             order = self.last if isinstance(key, tuple) and key[0] == "next" else self.root
             return entry_of(rows, key).index_select(0, order)
@@ -50,7 +50,7 @@ class WrittenRows:
         changes = dict(self.changes)
         for key, value in self.changes.items():
             if (entry := rows.get(key, None)) is not None:
-                # The discounted sum of whole numbers is none.
+                # The discounted sum of whole numbers is not a whole number.
                 summed = STEPS_KEY in changes and value.is_floating_point()
                 changes[key] = value.view(-1, *entry.shape[1:]) if summed else stored_as(value, entry, key)
         return replace(self, changes=changes)
@@ -87,7 +87,7 @@ def real_rows(chunk: Chunk, *, first_id: int) -> WrittenRows:
 
 
 def virtual_rows(chunk: Chunk, source: Tensor, goals: Tensor, *, first_id: int) -> WrittenRows:
-    """Returns transitions of a chunk for other goals, each for its own.
+    """Returns copies of a chunk's transitions, each for a virtual goal.
 
     Over several steps, a transition ends where it terminates: by the reward function, or because the episode
     did so although its goal was not achieved. What such a failure cost besides the goal's reward is kept.
@@ -149,19 +149,19 @@ def _virtual_episodes(chunk: Chunk, source: Tensor, goals: Tensor, first_id: int
 
 
 def _episode_numbers(episodes: Episodes) -> Tensor:
-    """Which episode each of the transitions ``episodes.rows[episodes.inside]`` belongs to, [n]."""
+    """Returns the episode of each transition in ``episodes.rows[episodes.inside]``, [n]."""
     number = torch.arange(len(episodes.lengths), device=episodes.rows.device)
     return number.repeat_interleave(episodes.lengths)
 
 
 def _by_row(chunk: Chunk, numbers: Tensor) -> Tensor:
-    """Numbers of the transitions ``rows[inside]`` at the positions of these rows, [n]; 0 at other rows."""
+    """Scatters numbers of the transitions ``rows[inside]`` to their positions, [n]; 0 elsewhere."""
     episodes = chunk.episodes
     return episodes.rows.new_zeros(len(chunk.rows)).index_copy_(0, episodes.rows[episodes.inside], numbers)
 
 
 def _windows(chunk: Chunk, source: Tensor) -> tuple[Tensor, Tensor]:
-    """For transitions [V], the positions [V, m] of up to n steps from them on; which are in the episode."""
+    """Returns positions [V, m] of up to n steps from each transition on, and which are in its episode."""
     episodes = chunk.episodes
     real = episodes.rows[episodes.inside]  # one episode after the other: a place is a position in here
     place = _by_row(chunk, torch.arange(len(real), device=real.device))

@@ -1,1 +1,1 @@
-"""Films and windows of any environment that gives pictures."""
+"""Videos and windows of any environment that can be rendered."""

@@ -1,4 +1,4 @@
-"""The colors that films of all environments share."""
+"""Colors that the videos of all environments share."""
 
 from __future__ import annotations
 

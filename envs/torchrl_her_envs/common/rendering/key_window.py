@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-_SHOW_NOTHING = ("dummy", "offscreen")  # what SDL falls back to where there is no display
+_SHOW_NOTHING = ("dummy", "offscreen")  # drivers that SDL falls back to if there is no display
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 _LEAST = 160  # pixels of a side
 _NO_DISPLAY = (
@@ -30,10 +30,10 @@ class Command(Enum):
 
 
 class KeyWindow:
-    """A window for pictures, in which some keys are commands. Its size can be changed by the mouse.
+    """A resizable window for pictures, in which some keys are commands.
 
     Args:
-        title: of the window.
+        title: title of the window.
 
     Raises:
         ImportError: pygame is not installed.
@@ -80,7 +80,7 @@ class KeyWindow:
         self._pygame.display.set_caption(title)
 
     def show(self, picture: np.ndarray) -> None:
-        """Shows a picture [height, width, 3] of uint8, as large as the window is.
+        """Shows a picture [height, width, 3] of uint8, scaled to the window.
 
         The first picture, and each one of other proportions, gives the window its size.
         """
@@ -114,7 +114,7 @@ class KeyWindow:
         return asked
 
     def wait(self, rate: float) -> None:
-        """Waits so long that it is called ``rate`` times a second."""
+        """Waits so that calls return ``rate`` times a second."""
         self._clock.tick(rate)
 
     def close(self) -> None:

@@ -18,12 +18,12 @@ _LINE, _LEAST_LINE, _MOST_LINE = 0.055, 11, 18  # of a line below a picture, of 
 
 
 def as_picture(drawn: Any, name: str, *, size: int | None = None) -> Tensor:
-    """A copy of what the method ``render`` of an environment gave, [height, width, 3] of uint8.
+    """Returns a checked copy of a picture from an environment's ``render``, [height, width, 3] of uint8.
 
     Args:
-        drawn: what it gave.
-        name: of the environment, for the message.
-        size: of the longer side in pixels; as it was drawn if None.
+        drawn: result of ``render``.
+        name: name of the environment, for the message.
+        size: length of the longer side in pixels; None keeps the size.
 
     Raises:
         ValueError: it is something else.
@@ -41,7 +41,7 @@ def as_picture(drawn: Any, name: str, *, size: int | None = None) -> Tensor:
 
 
 def resized(picture: Tensor, size: int) -> Tensor:
-    """A picture [height, width, 3] of uint8 whose longer side has a given number of pixels.
+    """Scales a picture [height, width, 3] of uint8 so that its longer side has a given number of pixels.
 
     Raises:
         ValueError: ``size`` is below 1.
@@ -59,7 +59,7 @@ def resized(picture: Tensor, size: int) -> Tensor:
 
 
 def captioned(picture: Tensor, words: str) -> Tensor:
-    """A picture [height, width, 3] of uint8 with a line of text at the top right, on a plain strip.
+    """Adds a line of text at the top right of a picture [height, width, 3] of uint8, on a plain strip.
 
     Example:
         >>> plain = torch.zeros(60, 90, 3, dtype=torch.uint8)
@@ -79,7 +79,7 @@ def captioned(picture: Tensor, words: str) -> Tensor:
 
 
 def underlined(picture: Tensor, lines: Sequence[str]) -> Tensor:
-    """A picture [height, width, 3] of uint8 with lines of text below it; long ones are set smaller.
+    """Adds lines of text below a picture [height, width, 3] of uint8; long lines are set smaller.
 
     Example:
         >>> underlined(torch.zeros(60, 90, 3, dtype=torch.uint8), ["5 of 6", "step 3"]).shape
@@ -99,7 +99,7 @@ def underlined(picture: Tensor, lines: Sequence[str]) -> Tensor:
 
 
 def beside(pictures: Sequence[Tensor], *, gap: int) -> Tensor:
-    """Pictures [height, width, 3] of uint8 in a row, with a gap between them, aligned at the top.
+    """Joins pictures [height, width, 3] of uint8 in a row, with a gap between them, aligned at the top.
 
     Example:
         >>> high, low = (torch.zeros(height, 2, 3, dtype=torch.uint8) for height in (4, 3))
@@ -119,7 +119,7 @@ def _plain(height: int, width: int) -> Tensor:
 
 
 def bordered(picture: Tensor, color: Color) -> Tensor:
-    """A picture [height, width, 3] of uint8 with a border drawn over its edge.
+    """Draws a border over the edge of a picture [height, width, 3] of uint8.
 
     Example:
         >>> bordered(torch.zeros(60, 60, 3, dtype=torch.uint8), (0, 255, 0))[0, 0].tolist()
@@ -132,7 +132,7 @@ def bordered(picture: Tensor, color: Color) -> Tensor:
 
 
 def tile(pictures: Sequence[Tensor], *, columns: int) -> Tensor:
-    """Pictures of one size in a grid, filled row by row; places left over have the color of the margins.
+    """Joins pictures of one size in a grid, row by row; empty places have the color of the margins.
 
     Args:
         pictures: [height, width, 3] of uint8 each.

@@ -1,4 +1,4 @@
-"""Frames to files: GIF, and MP4 if the optional extra is there."""
+"""Writes frames to files: GIF, and MP4 if the optional extra is installed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SAMPLES = 12  # frames that a GIF's colors are chosen from
 
 
 def write_video(frames: Sequence[Tensor], path: str | Path, *, fps: float = 25) -> Path:
-    """Writes frames to a file, as the suffix of its name says.
+    """Writes frames to a video file in the format of its suffix.
 
     A GIF loops for ever and shares one palette. A run of equal frames in it is stored as one that
     lasts longer, and its frames last a multiple of 0.01 s. An MP4 (H.264) needs
@@ -60,7 +60,7 @@ def write_video(frames: Sequence[Tensor], path: str | Path, *, fps: float = 25) 
     if fps <= 0:
         raise ValueError(f"fps must be above 0, got {fps}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_stem(f"{path.stem}.part")  # so that nobody sees a film of which the end is missing
+    part = path.with_stem(f"{path.stem}.part")  # so that there is never a video without its end
     try:
         _WRITERS[suffix](frames, part, fps)
         part.replace(path)
@@ -96,7 +96,7 @@ _WRITERS = {".gif": _write_gif, ".mp4": _write_mp4}
 
 
 def _shared_palette(frames: Sequence[Tensor]) -> Image.Image:
-    """A palette for all frames, chosen from some that are evenly spread, the last one included."""
+    """Computes a palette for all frames from some that are evenly spread, the last one included."""
     which = torch.linspace(0, len(frames) - 1, min(_SAMPLES, len(frames))).round().long().tolist()
     sample = _image(torch.cat([frames[index] for index in which]))
     counted = sample.getcolors(maxcolors=sample.width * sample.height) or []
@@ -110,6 +110,6 @@ def _image(frame: Tensor) -> Image.Image:
 
 
 def _even(frame: Tensor) -> np.ndarray:
-    """With even sides, as H.264 asks for, the last row and column repeated where needed."""
+    """Makes the sides of a frame even, as H.264 requires, by repeating the last row and column."""
     height, width, _ = frame.shape
     return np.pad(frame.numpy(), ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

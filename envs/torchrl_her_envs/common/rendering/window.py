@@ -13,12 +13,12 @@ _INCHES = 5.0
 
 
 class Window:
-    """A window of matplotlib's, which is there without a further package.
+    """A window of matplotlib's, which needs no further package.
 
     Without a display it shows nothing, and warns once.
 
     Args:
-        title: of the window.
+        title: title of the window.
         fps: pictures a second, at most.
 
     Example:
@@ -45,7 +45,7 @@ class Window:
             self._figure.show()
 
     def show(self, picture: np.ndarray) -> None:
-        """Shows a picture [height, width, 3] of uint8 when it is due; not if the window was closed."""
+        """Shows a picture [height, width, 3] of uint8 at the frame rate, unless the window was closed."""
         if not plt.fignum_exists(self._figure.number):
             return
         if self._image is None:

@@ -1,4 +1,4 @@
-"""The arm as a scripted controller uses it: how to turn to a point, and how to throw."""
+"""Scripted motions of the arm: turning to a point, and throwing."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _READY = (math.radians(120.0), 0.0)  # stretched up and back: from around here a
 
 
 class ArmSkill:
-    """The part of a controller of an arm of two links. See :class:`~.controller.Skill`.
+    """Skill of a controller for an arm of two links. See :class:`~.controller.Skill`.
 
     Args:
         world: the constants of the world.
-        num_links: of the arm.
+        num_links: number of links of the arm.
 
     Raises:
         ValueError: the arm has not two links.
@@ -48,7 +48,7 @@ class ArmSkill:
 
 
 def arm_throw(joints: Tensor, goal: Tensor, arm: Effector, world: WorldConfig, *, within: float) -> Tensor:
-    """The next velocity of the joints of an arm that swings a ball at the goal, or gets ready to.
+    """Computes the next velocity of an arm's joints to swing a ball at the goal, or to get ready to.
 
     A throw is: turn each joint at a constant speed (one of a grid) for some steps, let go, fly. The
     quickest is taken; where none works from here, the arm turns to where all goals can be thrown at. No
@@ -81,7 +81,7 @@ def arm_throw(joints: Tensor, goal: Tensor, arm: Effector, world: WorldConfig, *
 
 
 def _swings(joints: Tensor, arm: Effector, world: WorldConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Constant speeds of the joints [speeds, 2], and where the ball is after 1, 2, ... steps at each of them.
+    """Returns constant speeds of the joints [speeds, 2], and the ball's positions after 1, 2, ... steps.
 
     That is its position and its velocity, each [B, speeds, steps, 2].
     """
@@ -93,6 +93,8 @@ def _swings(joints: Tensor, arm: Effector, world: WorldConfig) -> tuple[Tensor, 
 
 
 def _steps_to_column(gap: Tensor, speed: Tensor, world: WorldConfig) -> Tensor:
-    """The two numbers [..., 2] of whole steps between which a ball passes a horizontal gap in meters."""
-    steps = (gap / (speed.clamp(min=1e-3) * world.time_step)).floor()  # a ball that goes left never does
+    """Returns the whole steps [..., 2] before and after a ball crosses a horizontal gap in meters."""
+    steps = (
+        gap / (speed.clamp(min=1e-3) * world.time_step)
+    ).floor()  # a ball that moves left never crosses it
     return torch.stack((steps, steps + 1), -1).clamp(1, LONGEST_FLIGHT)

@@ -16,7 +16,7 @@ LONGEST_FLIGHT = 30  # time steps that controllers look ahead: in 1.2 s a ball f
 
 
 def fallen(substeps: Tensor, world: WorldConfig) -> Tensor:
-    """How far gravity has drawn a ball off its straight line.
+    """Returns how far gravity has drawn a ball off its straight line.
 
     Args:
         substeps: [...], number of substeps flown; may be fractional.
@@ -34,7 +34,7 @@ def fallen(substeps: Tensor, world: WorldConfig) -> Tensor:
 
 
 def fly(start: Tensor, velocity: Tensor, substeps: Tensor, world: WorldConfig) -> Tensor:
-    """Where a ball is after a while of free flight.
+    """Returns the position of a ball after some time of free flight.
 
     Args:
         start: [..., 2].
@@ -55,7 +55,7 @@ def fly(start: Tensor, velocity: Tensor, substeps: Tensor, world: WorldConfig) -
 
 
 def throw_velocity(start: Tensor, target: Tensor, steps: Tensor, world: WorldConfig) -> Tensor:
-    """The velocity of a hand that swings for one step, lets go, and so sends a ball to a target.
+    """Computes the velocity of a hand that swings for one step and lets go, so that the ball hits a target.
 
     Args:
         start: [..., 2], where the swing of one step begins.
@@ -79,7 +79,7 @@ def throw_velocity(start: Tensor, target: Tensor, steps: Tensor, world: WorldCon
 
 
 def quickest(steps: Tensor, works: Tensor) -> tuple[Tensor, ...]:
-    """For each row the throw that takes the fewest steps among those that work.
+    """Selects for each row the throw that takes the fewest steps among those that hit.
 
     Args:
         steps: [B, ...], of as many further dimensions as throws are told apart by.

@@ -1,4 +1,4 @@
-"""Whether a ball flies past what stands in its way. Pure functions, any batch shape.
+"""Checks whether a ball flies clear of obstacles. Pure functions, any batch shape.
 
 Points and velocities are [..., 2] in meters and meters a second.
 """
@@ -15,7 +15,7 @@ _SLOP = 1e-3  # meters that a ball may sink into a side without bouncing: roundi
 
 
 def clears_ceiling(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tensor:
-    """Whether the highest point of a flight is below the ceiling: [...] of bool.
+    """Returns whether the highest point of a flight is below the ceiling: [...] of bool.
 
     Example:
         >>> start, velocity = torch.tensor([0.0, 4.9]), torch.tensor([[0.0, 4.0], [0.0, 5.0]])
@@ -28,7 +28,7 @@ def clears_ceiling(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tenso
 
 
 def clears_wall(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tensor:
-    """Whether a flight to the right, from left of the wall, passes above it: [...] of bool.
+    """Returns whether a flight to the right, from left of the wall, passes above it: [...] of bool.
 
     A parabola that is above both upper corners is above all between them.
 
@@ -47,7 +47,7 @@ def clears_wall(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tensor:
 
 
 def is_free(points: Tensor, world: WorldConfig, *, wall: bool) -> Tensor:
-    """Whether a ball at these points touches nothing: [...] of bool for [..., 2].
+    """Returns whether a ball at points [..., 2] touches nothing: [...] of bool.
 
     Example:
         >>> points = torch.tensor([[3.0, 2.0], [3.0, 4.0], [0.1, 4.0]])  # in the wall, above it, in the side
@@ -66,7 +66,7 @@ def is_free(points: Tensor, world: WorldConfig, *, wall: bool) -> Tensor:
 def will_hit(
     start: Tensor, velocity: Tensor, goal: Tensor, world: WorldConfig, *, wall: bool, within: float
 ) -> Tensor:
-    """Whether a ball that is left to itself comes to a goal before it touches anything.
+    """Returns whether a ball in free flight reaches a goal before it touches anything.
 
     Args:
         start: [..., 2], of the ball.
@@ -89,12 +89,12 @@ def will_hit(
     points = fly(start.unsqueeze(-2), velocity.unsqueeze(-2), substeps, world)
     untouched = is_free(points, world, wall=wall).cummin(-1).values
     near = (points - goal.unsqueeze(-2)).square().sum(-1) < within**2
-    last = slice(world.substeps - 1, None, world.substeps)  # goals are looked at between time steps only
+    last = slice(world.substeps - 1, None, world.substeps)  # goals are checked after each time step only
     return (untouched & near)[..., last].any(-1)
 
 
 def _wall_box(world: WorldConfig) -> tuple[float, float, float]:
-    """Left, right and top, in meters, of where the wall keeps the center of a ball out."""
+    """Returns left, right and top, in meters, of the box that the center of a ball cannot enter."""
     radius, half = world.ball_radius, world.wall_thickness / 2
     return (
         (world.wall_x - half - radius) * world.size,

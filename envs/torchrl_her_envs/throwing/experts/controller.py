@@ -1,4 +1,4 @@
-"""Scripted controllers: they know the physics, and show that every task can be solved."""
+"""Scripted controllers that compute with the physics, and show that every task can be solved."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ class Skill(Protocol):
     effector: Effector
 
     def joints(self, state: Tensor) -> Tensor:
-        """The joints [B, J] that a state [B, S] shows."""
+        """Returns the joints [B, J] in a state [B, S]."""
         ...
 
     def reach(self, joints: Tensor, target: Tensor) -> Tensor:
-        """Velocity [B, J] of the joints that would bring the grip to a point [B, 2] in one step."""
+        """Returns the velocity [B, J] of the joints to bring the grip to a point [B, 2] in one step."""
         ...
 
     def throw(self, joints: Tensor, goal: Tensor, *, within: float) -> Tensor:
-        """The next velocity [B, J] of the joints that carry or swing a held ball towards its goal [B, 2]."""
+        """Returns the next velocity [B, J] of the joints to carry or swing a ball towards its goal [B, 2]."""
         ...
 
 
@@ -60,11 +60,11 @@ class Controller(TensorDictModuleBase):
     shape.
 
     Args:
-        task: what is to be done.
+        task: the task, see :data:`~torchrl_her_envs.TASKS`.
         world: the constants of the world.
         threshold: how near to the goal is achieved, in shown coordinates; the task's if None. Far below
             that the arm may find no throw, since it tries a grid of them.
-        num_links: of the arm, for the robot's tasks.
+        num_links: number of links of the arm, for the robot's tasks.
 
     Raises:
         ValueError: an arm that has not two links.
@@ -100,7 +100,7 @@ class Controller(TensorDictModuleBase):
         return tensordict.set("action", action.view(*state.shape[:-1], -1).to(state.dtype))
 
     def act(self, state: Tensor) -> Tensor:
-        """The actions [B, J + 1] for states [B, S] of float32."""
+        """Returns the actions [B, J + 1] for states [B, S] of float32."""
         seen, speed = self._read(state), self.skill.effector.action_speed
         flying, within = self._flies_home(seen), _PLANNED * self._threshold
         target = seen.ball + seen.ball_velocity * self.world.time_step
@@ -115,7 +115,7 @@ class Controller(TensorDictModuleBase):
 
     def _read(self, state: Tensor) -> _Seen:
         joints, goal = self.skill.joints(state), self._meters(state[:, -2:])
-        if not self.task.throws:  # then the goal is the ball, at rest
+        if not self.task.throws:  # in reaching tasks the goal is the ball, at rest
             return _Seen(joints, goal, torch.zeros_like(goal), goal, torch.zeros(len(goal), dtype=torch.bool))
         ball, velocity = self._meters(state[:, -6:-4]), state[:, -4:-2] * self.world.hand_speed
         closed = state[:, -7] > 0.5
@@ -123,7 +123,7 @@ class Controller(TensorDictModuleBase):
         return _Seen(joints, ball, velocity, goal, closed & self._can_catch(joints, ball))
 
     def _flies_home(self, seen: _Seen) -> Tensor:
-        """Whether to let the ball fly. A held ball has the velocity that it would be released with."""
+        """Returns whether a ball that is released now flies into the goal."""
         if not self.task.throws:
             return torch.zeros_like(seen.held)
         wall, within = self.task.wall, _LET_GO * self._threshold
@@ -138,7 +138,7 @@ class Controller(TensorDictModuleBase):
 
 
 def make_controller(env: EnvBase) -> Controller:
-    """The scripted controller for an environment's task.
+    """Makes the scripted controller for an environment's task.
 
     Args:
         env: a :class:`~torchrl_her_envs.ThrowingEnv`, transformed or not. Only its task and its constants

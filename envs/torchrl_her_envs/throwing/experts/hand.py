@@ -1,4 +1,4 @@
-"""The hand as a scripted controller uses it: how to go to a point, and how to throw."""
+"""Scripted motions of the hand: going to a point, and throwing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _PLACES = (11, 10)  # columns and rows of places to throw from; columns count fo
 
 
 class HandSkill:
-    """The hand's part of a controller. See :class:`~.controller.Skill`.
+    """Skill of a controller for the hand. See :class:`~.controller.Skill`.
 
     Args:
         world: the constants of the world.
@@ -39,7 +39,7 @@ class HandSkill:
 def hand_throw(
     grip: Tensor, goal: Tensor, hand: Effector, world: WorldConfig, *, wall: bool, within: float
 ) -> Tensor:
-    """The next velocity of a hand that carries a ball to where it can be thrown, or throws it.
+    """Computes the next velocity of a hand to carry a ball to where it can be thrown, or to throw it.
 
     A throw is: move to a place (one of a grid, or just here), swing for one step with the velocity of
     :func:`~.ballistics.throw_velocity`, let go, fly. The quickest is taken. No plan is
@@ -76,25 +76,27 @@ def hand_throw(
 
 
 def _grid(hand: Effector, world: WorldConfig) -> Tensor:
-    """Places [places, 2] all over the box that the hand reaches."""
+    """Returns places [places, 2] all over the box that the hand reaches."""
     left, bottom, right, top = (side * world.size for side in hand.reach)
     columns, rows = _PLACES
     return torch.cartesian_prod(torch.linspace(left, right, columns), torch.linspace(bottom, top, rows))
 
 
 def _aims(goal: Tensor, world: WorldConfig, *, within: float) -> Tensor:
-    """Points [B, 2, 2] to throw at: the goal's middle and, for goals close behind the wall, its far edge."""
+    """Returns points [B, 2, 2] to throw at: the goal's middle and, close behind the wall, its far edge."""
     aims = goal.unsqueeze(1) + torch.tensor([[0.0, 0.0], [within, 0.0]])
     return aims.clamp(max=(1.0 - world.ball_radius) * world.size)
 
 
 def _steps_to(gap: Tensor, stride: float) -> Tensor:
-    """Steps that a hand needs for a way [..., 2], if it moves by up to a stride in each direction."""
-    return (gap.abs().amax(-1) / stride - 1e-3).ceil()  # rounding: a thousandth of a stride away is there
+    """Returns the steps that a hand needs for a way [..., 2], at up to a stride a step in each direction."""
+    return (
+        gap.abs().amax(-1) / stride - 1e-3
+    ).ceil()  # rounding: a thousandth of a stride away counts as arrived
 
 
 def _can_throw(start: Tensor, velocity: Tensor, hand: Effector, world: WorldConfig, *, wall: bool) -> Tensor:
-    """Whether a swing of one step stays within the hand's speed and reach, and the flight touches nothing."""
+    """Returns whether a swing stays within the hand's speed and reach, and the flight touches nothing."""
     launch = start + velocity * world.time_step
     x, y = launch.unbind(-1)
     left, bottom, right, top = (side * world.size for side in hand.reach)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def turn(start: Tensor, end: Tensor) -> Tensor:
-    """The shortest turn from one angle to another, in (-pi, pi].
+    """Returns the shortest turn from one angle to another, in (-pi, pi].
 
     Example:
         >>> turn(torch.tensor(3.0), torch.tensor(-3.0))  # over the back, not around the front
@@ -17,7 +17,7 @@ def turn(start: Tensor, end: Tensor) -> Tensor:
 
 
 def two_link_angles(point: Tensor, base: Tensor, length: float) -> Tensor:
-    """Angles that bring the end of an arm to a point, or as near to it as the arm reaches.
+    """Computes the angles that bring the end of an arm to a point, or as near to it as the arm reaches.
 
     Args:
         point: [..., 2].
@@ -44,7 +44,7 @@ def two_link_angles(point: Tensor, base: Tensor, length: float) -> Tensor:
 
 
 def nearest_turn(joints: Tensor, point: Tensor, base: Tensor, length: float) -> Tensor:
-    """The turn [..., 2] of the joints to the solution that the slower joint reaches sooner.
+    """Returns the turn [..., 2] of the joints to the solution that the slower joint reaches sooner.
 
     Args:
         joints: [..., 2], the angles now.

@@ -13,13 +13,13 @@ from torchrl_her_envs.throwing.rendering.palette import Color
 
 Point = tuple[float, float]
 
-MARGIN = 0.04  # of the screen, on each side: a hand at the edge, and the floor, need room
-OVERSAMPLING = 3  # pictures are drawn this much larger and scaled down, which makes edges smooth
-SMALLEST = 32  # pixels; nothing could be told apart on less
+MARGIN = 0.04  # margin on each side, as a fraction of the screen, for a hand at the edge and for the floor
+OVERSAMPLING = 3  # factor by which pictures are drawn larger and then scaled down, for smooth edges
+SMALLEST = 32  # pixels: smaller pictures would show nothing
 
 
 def to_pixel(point: Point, size: int) -> tuple[int, int]:
-    """The row and column of a picture at which a point of the screen is drawn.
+    """Returns the row and column of a picture at which a point of the screen is drawn.
 
     Args:
         point: fractions of the screen, (0, 0) at the bottom left.
@@ -34,13 +34,13 @@ def to_pixel(point: Point, size: int) -> tuple[int, int]:
 
 
 def check_size(size: int) -> None:
-    """Raises a ValueError for a picture on which nothing could be told apart."""
+    """Raises a ValueError for a picture that is too small to show anything."""
     if size < SMALLEST:
         raise ValueError(f"a picture needs a size of at least {SMALLEST} pixels, got {size}")
 
 
 class Canvas:
-    """Shapes in fractions of the screen; colors with an opacity are blended with what lies below.
+    """Draws shapes, in fractions of the screen; colors with an opacity are blended with those below.
 
     Args:
         size: side of the finished picture in pixels.
@@ -63,18 +63,18 @@ class Canvas:
         self._use(Image.new("RGB", (size * OVERSAMPLING, size * OVERSAMPLING), background))
 
     def copy(self) -> Canvas:
-        """A canvas that starts with what was drawn on this one."""
+        """Returns a canvas with a copy of this one's shapes."""
         other = object.__new__(Canvas)
         other.size, other._scale = self.size, self._scale
         other._use(self._image.copy())
         return other
 
     def finish(self) -> Tensor:
-        """The picture as [size, size, 3] of uint8."""
+        """Returns the picture as [size, size, 3] of uint8."""
         return torch.from_numpy(np.array(self._image.reduce(OVERSAMPLING)))
 
     def pixels(self, length: float) -> int:
-        """A length on the large picture, at least 1."""
+        """Converts a length to pixels of the large picture, at least 1."""
         return max(1, round(length * self._scale))
 
     def disc(
@@ -86,7 +86,7 @@ class Canvas:
         edge: Color | None = None,
         width: float = 0,
     ) -> None:
-        """A disc, a ring, or both; ``radius`` is the outer one and the edge lies within it."""
+        """Draws a disc, a ring, or both; ``radius`` is the outer one and the edge lies within it."""
         x, y = self._at(center)
         r = radius * self._scale
         self._draw.ellipse((x - r, y - r, x + r, y + r), fill=fill, outline=edge, width=self.pixels(width))
@@ -101,7 +101,7 @@ class Canvas:
         width: float = 0,
         rounding: float = 0,
     ) -> None:
-        """An upright rectangle, with round corners if asked for."""
+        """Draws an upright rectangle, optionally with round corners."""
         (left, bottom), (right, top) = self._at(low), self._at(high)
         self._draw.rounded_rectangle(
             (left, top, right, bottom),
@@ -119,24 +119,24 @@ class Canvas:
         edge: Color | None = None,
         width: float = 0,
     ) -> None:
-        """A closed polygon."""
+        """Draws a closed polygon."""
         points = [self._at(corner) for corner in corners]
         self._draw.polygon(points, fill=fill, outline=edge, width=self.pixels(width))
 
     def bar(self, start: Point, end: Point, *, thickness: float, fill: Color) -> None:
-        """A line with round ends."""
+        """Draws a line with round ends."""
         self._draw.line((self._at(start), self._at(end)), fill=fill, width=self.pixels(thickness))
         self.disc(start, thickness / 2, fill=fill)
         self.disc(end, thickness / 2, fill=fill)
 
     def stamp(self, sprite: Image.Image, center: Point) -> None:
-        """A picture with opacity, made for the large picture, around a point."""
+        """Draws a small picture with opacity, in pixels of the large one, around a point."""
         x, y = self._at(center)
         corner = (round(x - sprite.width / 2), round(y - sprite.height / 2))
         self._image.paste(sprite, corner, sprite)
 
     def text(self, place: Point, words: str, *, height: float, fill: Color) -> None:
-        """A line of text whose top right corner is given."""
+        """Draws a line of text with its top right corner at a place."""
         font = ImageFont.load_default(size=height * self._scale)
         self._draw.text(self._at(place), words, fill=fill, font=font, anchor="ra")
 

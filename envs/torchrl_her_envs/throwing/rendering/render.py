@@ -21,7 +21,7 @@ _TEXT = 0.045  # of the screen: height of a caption
 
 
 class Scene(Protocol):
-    """Contents of a picture of a :class:`~torchrl_her_envs.ThrowingEnv`, or of its core."""
+    """Contents of a picture of a :class:`~torchrl_her_envs.ThrowingEnv` or of its core."""
 
     task: Task
     world: WorldConfig
@@ -103,7 +103,7 @@ def _draw_reach(canvas: Canvas, env: Scene) -> None:
 
 
 def _draw_goals(canvas: Canvas, env: Scene) -> None:
-    """The region of the goals, whatever its shape, unless it is a mere line."""
+    """Draws the region of the goals, whatever its shape, unless it is a line."""
     goals = env.goal_distribution
     if (goals.high > goals.low).all():
         along = torch.linspace(0, 1, 33, dtype=torch.float64)

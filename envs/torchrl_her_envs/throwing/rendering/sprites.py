@@ -1,4 +1,4 @@
-"""How the things in the pictures look: each function draws one of them."""
+"""Objects of the pictures: each function draws one of them."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ _GRIPPER = 0.042  # outer radius of the arm's end effector: the ball fits in
 
 
 def draw_ball(canvas: Canvas, center: Point, radius: float) -> None:
-    """A basketball."""
+    """Draws a basketball."""
     canvas.stamp(basketball(canvas.pixels(radius)), center)
 
 
 def draw_hole(canvas: Canvas, center: Point, radius: float) -> None:
-    """A black hole; its glow ends where the goal does."""
+    """Draws a black hole, whose glow ends where the goal does."""
     canvas.stamp(black_hole(canvas.pixels(radius)), center)
 
 
 def draw_trail(canvas: Canvas, points: Sequence[Point]) -> None:
-    """Where a ball was, oldest first: dots that fade with age."""
+    """Draws past positions of a ball, oldest first, as dots that fade with age."""
     for age, point in enumerate(reversed(points)):
         freshness = 1 - age / len(points)
         canvas.disc(point, 0.004 + 0.005 * freshness, fill=(*palette.TRAIL[:3], round(60 + 110 * freshness)))
 
 
 def draw_wall(canvas: Canvas, low: Point, high: Point) -> None:
-    """A column of bricks."""
+    """Draws a column of bricks."""
     canvas.box(low, high, fill=palette.BRICK)
     thickness = high[0] - low[0]
     courses = round((high[1] - low[1]) / (0.7 * thickness))
@@ -50,7 +50,7 @@ def draw_wall(canvas: Canvas, low: Point, high: Point) -> None:
 
 
 def draw_palm(canvas: Canvas, center: Point, *, closed: bool) -> None:
-    """The part of a hand behind the ball: the palm, and the fingers of an open hand."""
+    """Draws the part of a hand behind the ball: the palm, and the fingers of an open hand."""
     x, y = center
     wrist, elbow = (x, y - 0.6 * _PALM), (x, y - 1.55 * _PALM)
     _outlined_bar(canvas, wrist, elbow, 1.15 * _PALM)
@@ -64,7 +64,7 @@ def draw_palm(canvas: Canvas, center: Point, *, closed: bool) -> None:
 
 
 def draw_fist(canvas: Canvas, center: Point) -> None:
-    """The part of a closed hand in front of the ball: fingers bent over its top, and the thumb."""
+    """Draws the part of a closed hand in front of the ball: fingers bent over its top, and the thumb."""
     x, y = center
     for finger in (-1.5, -0.5, 0.5, 1.5):
         along = x + finger * 1.08 * _FINGER
@@ -74,7 +74,7 @@ def draw_fist(canvas: Canvas, center: Point) -> None:
 
 
 def draw_arm(canvas: Canvas, joints: Sequence[Point], *, closed: bool) -> None:
-    """Links with round joints on a base plate, and a red circle at the end: full if closed."""
+    """Draws links with round joints on a base plate, and a red circle at the end: full if closed."""
     _draw_base(canvas, joints[0])
     *elbows, end = joints
     for start, stop in zip(elbows, [*elbows[1:], _before(elbows[-1], end)], strict=True):
@@ -86,7 +86,7 @@ def draw_arm(canvas: Canvas, joints: Sequence[Point], *, closed: bool) -> None:
 
 
 def draw_gripper(canvas: Canvas, center: Point, *, closed: bool) -> None:
-    """The end of an arm, wide enough for the ball."""
+    """Draws the end of an arm, wide enough for the ball."""
     fill = palette.GRIPPER if closed else None
     canvas.disc(center, _GRIPPER, fill=fill, edge=palette.GRIPPER, width=1.5 * _LINE)
 
@@ -103,7 +103,7 @@ def _draw_base(canvas: Canvas, center: Point) -> None:
 
 
 def _before(start: Point, end: Point) -> Point:
-    """The point of a link at which the circle at its end begins."""
+    """Returns the point of a link at which the circle at its end begins."""
     share = max(0.0, 1 - (_GRIPPER + _LINK / 2 - _LINE) / math.dist(start, end))
     return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
 

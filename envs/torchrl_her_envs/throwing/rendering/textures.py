@@ -22,7 +22,7 @@ _SWIRL = 2.2  # how far the arms of the glow are wound up, in radians for each f
 
 @lru_cache(maxsize=16)
 def basketball(radius: int) -> Image.Image:
-    """A basketball of a radius in pixels, with the rest of the square left transparent.
+    """Shades a basketball of a radius in pixels; the rest of the square is transparent.
 
     Example:
         >>> basketball(10).size
@@ -43,7 +43,7 @@ def basketball(radius: int) -> Image.Image:
 
 @lru_cache(maxsize=16)
 def black_hole(radius: int) -> Image.Image:
-    """A black hole whose swirling glow ends at a radius in pixels.
+    """Shades a black hole whose swirling glow ends at a radius in pixels.
 
     Example:
         >>> black_hole(10).getpixel((11, 11))  # opaque and dark in the middle
@@ -61,7 +61,7 @@ def black_hole(radius: int) -> Image.Image:
 
 
 def _grid(radius: int) -> tuple[Array, Array, Array]:
-    """x, y (upwards) and the distance from the center, in radii, of each pixel of the square."""
+    """Returns x, y (upwards) and the distance from the center, in radii, of each pixel of the square."""
     along = (np.arange(2 * radius + 2) - radius - 0.5) / radius
     x, y = np.meshgrid(along, -along)
     return x, y, np.hypot(x, y)
@@ -76,7 +76,7 @@ def _rotation() -> Array:
 
 
 def _step(inside: Array, radius: int) -> Array:
-    """1 where ``inside`` (in radii) is positive, 0 where not, with an edge one pixel wide."""
+    """Returns 1 where ``inside`` (in radii) is positive, 0 elsewhere, with an edge one pixel wide."""
     return np.clip(inside * radius + 0.5, 0, 1)
 
 

@@ -20,7 +20,7 @@ class TensorboardEvents(TensorboardLogger):
     """Writes events of TensorBoard; those that are there already are dropped from some step on.
 
     Args:
-        exp_name: of the folder.
+        exp_name: name of the folder.
         log_dir: where it is.
 
     Keyword Args:
