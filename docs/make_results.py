@@ -130,6 +130,30 @@ def print_speed(cells: Sequence[Combination], success: float) -> None:
         print(f"| `{cell.algorithm}` | **{middle:,.0f}** ({low:,.0f} to {high:,.0f}) | {never} |")
 
 
+def print_from_change(cells: Sequence[Combination], every: Sequence[int], within: int) -> None:
+    """Success some frames after a run has come to the full task, where the thesis's curves of windows begin.
+
+    Args:
+        cells: combinations of runs in two stages.
+        every: numbers of frames since then.
+        within: frames whose evaluations count, up to each of these.
+    """
+    columns = " | ".join(f"{frames:,} frames later" for frames in every)
+    print(f"\n| combination | first stage, frames | {columns} |")
+    print(f"| --- | --- |{' --- |' * len(every)}")
+    for cell in cells:
+        changes, later = [], []
+        for run in sorted({row["run"] for row in cell.rows}):
+            rows = [row for row in cell.rows if row["run"] == run]
+            changes.append(next(row["frames"] for row in rows if row["layer"] > 0))
+            since = [(row["frames"] - changes[-1], row["success"]) for row in rows]
+            later.append(
+                [np.mean([own for frames, own in since if end - within < frames <= end]) for end in every]
+            )
+        shown = [spread(column, ".0%") for column in zip(*later, strict=True)]
+        print(f"| `{cell.algorithm}` | {' | '.join([spread(changes, ',.0f'), *shown])} |")
+
+
 def beginning_of_fetch(other: Combination) -> Combination:
     """As many steps of the study ``fetch`` as another combination has: the same without weights of goals."""
     (cell,) = [cell for cell in read_results(RESULTS / "fetch").cells if cell.task == other.task]
@@ -233,6 +257,8 @@ def main() -> None:
             print_table(cells)
             if name == "wall":
                 print_speed(cells, 0.8)
+            if name == "window":
+                print_from_change(cells, (25_600, 51_200, 76_800, 102_400, 126_720), within=6_400)
             if name == "fetch":
                 cells = [cell for cell in every if not cell.missing]
             if name == "fetch_ibs":

@@ -92,7 +92,7 @@ def rule_orders(rows: Sequence[Judged]) -> str:
     return rule([(one in (Verdict.APART, Verdict.HOLDS), one is Verdict.REVERSED) for one in verdicts])
 
 
-def orders(study: str, *, measure: str, expected: Sequence[str], verdict: str = "") -> Finding:
+def orders(study: str, *, measure: str, expected: Sequence[str]) -> Finding:
     """Difference between the two sides of each order; bold where the interval excludes 0."""
     rows, lines = judged(study, measure, expected), []
     for text in expected:
@@ -100,7 +100,7 @@ def orders(study: str, *, measure: str, expected: Sequence[str], verdict: str = 
         shown = [_bold(show_gap(row), row.verdict is not Verdict.UNDECIDED) for row in found]
         tasks = [f"{_name(row.task)} {number}" for row, number in zip(found, shown, strict=True)]
         lines.append(f"`{text}`: {', '.join(tasks)}")
-    return "; ".join(lines), verdict or rule_orders(rows)
+    return "; ".join(lines), rule_orders(rows)
 
 
 def levels(
