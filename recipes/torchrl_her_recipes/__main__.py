@@ -1,4 +1,4 @@
-"""Where the command line starts: versions are checked before anything that depends on them is imported."""
+"""Entry of the command line: checks versions before it imports anything that depends on them."""
 
 from __future__ import annotations
 

@@ -297,7 +297,7 @@ class HindsightBase:
             warnings.warn(
                 f"the reward function gives {one:g} where the collected reward is {other:g}, and other ones "
                 f"in {len(differ):,} of {len(reward):,} rows; pass the environment's own rule, or virtual "
-                "transitions have rewards by another one (this is said once)",
+                "transitions have rewards by another one (this warning appears once)",
                 stacklevel=4,
             )
 
@@ -311,7 +311,7 @@ class HindsightBase:
             warnings.warn(
                 f"all {len(lengths)} episodes have one step: does time run along the last dimension of "
                 "batches [N, T]? For storages of two dimensions TorchRL itself transposes them "
-                "(this is said once)",
+                "(this warning appears once)",
                 stacklevel=5,
             )
         self._time_seen = several or suspicious

@@ -36,7 +36,7 @@ _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 
 
 class _Commands(click.Group):
-    """Names the nearest command where there is none of the given name; ``folder=DIR`` is ``--folder DIR``."""
+    """Group that suggests the nearest command for an unknown one; ``folder=DIR`` is ``--folder DIR``."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -50,7 +50,7 @@ class _Commands(click.Group):
         return name, command, rest
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self.commands)  # in the order in which people use them, not alphabetically
+        return list(self.commands)  # in the order of use, not alphabetically
 
 
 def _import(context: click.Context, _parameter: click.Parameter, modules: tuple[str, ...]) -> None:
@@ -101,7 +101,7 @@ group.add_command(listing)
 
 
 class _Notices(logging.Handler):
-    """Shows what environments say about themselves, each in a line like a warning's."""
+    """Log handler that prints notices of environments, each in a line like a warning's."""
 
     def emit(self, record: logging.LogRecord) -> None:
         say_line(("warning: " if record.levelno >= logging.WARNING else "") + record.getMessage())
@@ -133,7 +133,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BAD_INPUT_ERRORS as error:
         return fail(one_line(error))
     except RuntimeError as error:
-        # Those of torch's allocators, on a GPU and on a processor; torch is not imported for every command.
+        # Messages of torch's allocators, on a GPU and on a CPU; torch is not imported for every command.
         if type(error).__name__ != "OutOfMemoryError" and "Allocator" not in str(error):
             raise
         return fail(f"there is not enough memory: {one_line(error).rpartition('Allocator: ')[2]}")

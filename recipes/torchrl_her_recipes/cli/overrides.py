@@ -17,7 +17,7 @@ _OPENING, _CLOSING = "[{(", "]})"
 
 
 def parse_override(text: str, also: Sequence[str] = ()) -> tuple[str, str]:
-    """The name and the text of the value of one argument; the name is checked.
+    """Splits an argument into the name and the text of the value, and checks the name.
 
     Args:
         text: ``NAME=VALUE``.
@@ -41,7 +41,7 @@ def parse_override(text: str, also: Sequence[str] = ()) -> tuple[str, str]:
 
 
 def _path(name: str, value: str) -> tuple[str, ...]:
-    """The place of an option: group, name, and the entry of a mapping."""
+    """Returns group, option and mapping entry that a name refers to."""
     if name in GROUPS and value.startswith("{"):  # a whole group
         return (name,)
     head = name.split(".", 2)
@@ -49,7 +49,7 @@ def _path(name: str, value: str) -> tuple[str, ...]:
 
 
 def check_once(arguments: Sequence[tuple[str, str]], also: Sequence[str] = ()) -> None:
-    """Refuses two values for one option, of which one would be ignored.
+    """Raises a ValueError for two values of one option.
 
     Example:
         >>> check_once([("seed", "1"), ("run.seed", "2")])
@@ -67,7 +67,7 @@ def check_once(arguments: Sequence[tuple[str, str]], also: Sequence[str] = ()) -
 
 
 def _meant(text: str) -> str:
-    """A hint for the name of a task or the like that lacks ``task=``; empty if there is none."""
+    """Returns a hint for a task's or another name that lacks ``task=``; empty if there is none."""
     for name, known in (
         ("task", task_names()),
         ("algo", ALGORITHMS),
@@ -80,7 +80,7 @@ def _meant(text: str) -> str:
 
 
 def parse_value(text: str) -> Any:
-    """A value as YAML reads it; None is written ``null``, or as in Python.
+    """Parses a value as YAML; None is written ``null``, or as in Python.
 
     Example:
         >>> parse_value("3"), parse_value("{bits: 8}"), parse_value("gym:FetchReach-v4")
@@ -95,7 +95,7 @@ def parse_value(text: str) -> Any:
 
 
 def split_sweep(text: str) -> list[str]:
-    """The values of a sweep, which are separated by commas outside of brackets and quotes.
+    """Splits the values of a sweep at commas outside of brackets and quotes.
 
     Example:
         >>> split_sweep("her,filtered_her"), split_sweep("{bits: 8, useless_action: true}")
@@ -116,7 +116,7 @@ def split_sweep(text: str) -> list[str]:
 
 
 def sweep(arguments: Sequence[tuple[str, str]]) -> Iterator[dict[str, Any]]:
-    """All combinations of the values of a sweep, the last option varying fastest.
+    """Returns all combinations of the values of a sweep, the last option varying fastest.
 
     Example:
         >>> list(sweep([("algo", "her,cher"), ("seed", "0,1")]))[1]

@@ -1,4 +1,4 @@
-"""``torchrl-her play`` and ``export``: a policy as a film, and as a file."""
+"""``torchrl-her play`` and ``export``: show a policy in a video or window, and write it to a file."""
 
 from __future__ import annotations
 
@@ -91,12 +91,12 @@ def _check_source(source: str) -> None:
 
 
 def _film_of(source: Path, *, compared: bool) -> Path:
-    """Where the film of a policy goes: in the folder of its run, or beside its file."""
+    """Returns the path for a policy's video: in the folder of its run, or beside its file."""
     name = "compare.gif" if compared else "play.gif"
     if source.is_dir():
         return source / name
     if source == recipes.RunFolder(source.parent).policy and source.is_file():
-        return source.with_name(name)  # policy.gif is what the run itself filmed at its end
+        return source.with_name(name)  # policy.gif is the video that the run itself made at its end
     return source.with_name(f"{source.stem if source.is_file() else source.name}{'_compare' * compared}.gif")
 
 
@@ -144,7 +144,7 @@ def export(
 
 
 def _file_of(source: str, task: str | None, suffix: str) -> Path:
-    """Where a policy goes if nothing is said: in the folder of its run, or beside its file."""
+    """Returns the default path for a policy: in the folder of its run, or beside its file."""
     path = Path(source)
     home = recipes.RunFolder.of(path)
     if home is not None:

@@ -1,4 +1,4 @@
-"""``torchrl-her record``: demonstrations of a task, as a file."""
+"""``torchrl-her record``: writes demonstrations of a task to a file."""
 
 from __future__ import annotations
 

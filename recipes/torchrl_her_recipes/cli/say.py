@@ -1,4 +1,4 @@
-"""How the command line prints errors and warnings, in one line each, and its exit codes."""
+"""Prints errors and warnings of the command line in one line each; defines its exit codes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
-if TYPE_CHECKING:  # it comes with torch
+if TYPE_CHECKING:  # importing it would import torch
     from torchrl_her_recipes.studies.study import StudyResult
 
 FAILED = 1
@@ -40,7 +40,7 @@ def say_line(message: str) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an error, without letters that a terminal would act on."""
+    """Returns the message of an error in one line, without control characters."""
     return "".join(letter if letter.isprintable() else "?" for letter in _message(error))
 
 
@@ -53,10 +53,10 @@ def _message(error: BaseException) -> str:
 
 
 def say_result(result: StudyResult, *, of: str = "") -> None:
-    """Prints what failed in a study or a sweep, and the success of what is done.
+    """Prints failed jobs of a study or sweep, and the success of finished ones.
 
     Args:
-        of: what stands before the names of jobs that failed.
+        of: text before the names of failed jobs.
     """
     for label, reason in result.failed.items():
         fail(f"{of}{label} failed: {reason}")
@@ -65,7 +65,7 @@ def say_result(result: StudyResult, *, of: str = "") -> None:
 
 
 def success_line(successes: Sequence[float]) -> str:
-    """Success of runs: the median, the worst, and the number of runs that have hardly learned anything.
+    """Describes the success of runs: median, worst, and the number of runs that have hardly learned anything.
 
     Example:
         >>> success_line([0.9])
@@ -82,7 +82,7 @@ def success_line(successes: Sequence[float]) -> str:
 
 
 def file_name(task: str) -> str:
-    """The name of a task as part of a file's name: gym:ID has letters that some file systems refuse.
+    """Converts a task's name to a part of a file name: gym:ID has characters that some file systems refuse.
 
     Example:
         >>> file_name("gym:torchrl_her/HandThrow-v1")

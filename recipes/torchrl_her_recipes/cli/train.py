@@ -90,7 +90,7 @@ def _train(wanted: RunRequest) -> recipes.RunResult:
 
 
 def _sweep(wanted: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
-    """Several runs, on all cores: if one fails, the others are trained nevertheless."""
+    """Trains several runs on all cores; if one fails, the others are still trained."""
     runs = {each.folder.name: each.recipe for each in wanted}
     folder = wanted[0].folder.parent
     if anew:  # the same command resumes an unfinished sweep

@@ -1,4 +1,4 @@
-"""The arguments of ``torchrl-her train``: their help and completion, and the runs they ask for."""
+"""The arguments of ``torchrl-her train``: their help and completion, and the runs that they describe."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ folder_option = click.option("--folder", metavar="DIR", help="output folder")
 
 
 def with_folder(options: tuple[str, ...], folder: str | None) -> tuple[str, ...]:
-    """The arguments, with the folder of ``--folder`` among them."""
+    """Adds the folder of ``--folder`` to the arguments."""
     return options if folder is None else (*options, f"folder={folder}")
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """A run that was asked for, and its folder."""
+    """A requested run, and its folder."""
 
     recipe: Recipe
     folder: Path
 
 
 def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest]:
-    """The runs that arguments ask for."""
+    """Returns the runs that arguments describe."""
     pairs = [parse_override(text, ARGUMENTS) for text in options]
     check_once(pairs, ARGUMENTS)
     given = dict(pairs)
@@ -63,7 +63,7 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
 
 
 def single(options: tuple[str, ...]) -> dict[str, Any]:
-    """The values that arguments give, where each is one value."""
+    """Returns the values of arguments, none of which may be a sweep."""
     pairs = [parse_override(text, ARGUMENTS) for text in options]
     check_once(pairs, ARGUMENTS)
     for name, text in pairs:
@@ -73,7 +73,7 @@ def single(options: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _check_single(name: str, text: str) -> None:
-    """Raises a ValueError for several values where no sweep was asked for."""
+    """Raises a ValueError for several values without ``-m``."""
     if len(split_sweep(text)) > 1:
         raise ValueError(f"{name} must be one value, got {text}; several are a sweep: torchrl-her train -m")
 
@@ -89,7 +89,7 @@ def _recipe(values: Mapping[str, Any]) -> Recipe:
 
 
 def label(recipe: Recipe) -> str:
-    """The name of a run's folder; its letters are allowed on every file system."""
+    """Returns the name of a run's folder, in characters that every file system allows."""
     algo = recipe.hindsight.algo
     return "_".join([file_name(recipe.task.name), *([algo] if algo != AUTO else []), f"s{recipe.run.seed}"])
 
@@ -109,7 +109,7 @@ class OptionsCommand(click.Command):
 
 
 def _rows(group: str) -> Iterator[tuple[str, str]]:
-    """The options of a group and their help, with the choices that have them if the default has not."""
+    """Returns the options of a group and their help, and names the choices that an option is limited to."""
     if kind := KINDS.get(group):
         known = f"one of {', '.join(kind)}; `torchrl-her list` describes them"
         yield _written(group, "name", kind.default), known
@@ -126,7 +126,7 @@ def _rows(group: str) -> Iterator[tuple[str, str]]:
 
 
 def _written(group: str, name: str, default: Any) -> str:
-    """How an option is given on the command line, with its default."""
+    """Returns an option with its default in the form of the command line."""
     key = group if name == "name" else f"{group}.{name}" if group in LONG_ONLY else name
     shown = str(default).lower() if isinstance(default, bool) else default
     shown = f"[{','.join(default)}]" if isinstance(default, tuple) else shown
@@ -148,7 +148,7 @@ def complete(_context: click.Context, _parameter: click.Parameter, incomplete: s
 
 
 def _values() -> dict[str, list[str]]:
-    """The values of options that are names or one of a few choices."""
+    """Returns the possible values of options that are names or one of a few choices."""
     classes = [kind for group in GROUPS for kind in reversed(choices_of(group).values())]
     choices = {own.name: list(own.metadata["choices"]) for kind in classes for own in fields(kind)}
     return {**choices, **{group: list(kind) for group, kind in KINDS.items()}} | {

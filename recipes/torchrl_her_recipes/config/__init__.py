@@ -1,1 +1,1 @@
-"""What a run is to be: plain values. Nothing in here imports torch."""
+"""Configuration of runs as plain values. No module in here imports torch."""

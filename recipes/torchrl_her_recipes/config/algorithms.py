@@ -15,7 +15,7 @@ _STRATEGY_REGISTRY = "torchrl_her.goals.strategies"
 
 @dataclass(frozen=True, kw_only=True)
 class Algorithm:
-    """One way to use hindsight on top of a learner.
+    """An algorithm: a combination of hindsight, weights, curriculum and so on, on top of any learner.
 
     Args:
         name: the name that recipes take.
@@ -101,11 +101,11 @@ ALGORITHMS: dict[str, Algorithm] = {
 }
 
 
-_UNRESOLVED = Algorithm(name=AUTO, filter=True)  # until the environment tells which one it is
+_UNRESOLVED = Algorithm(name=AUTO, filter=True)  # until the environment decides which one it is
 
 
 def register_algorithm(algorithm: Algorithm) -> None:
-    """Makes an algorithm known by its name.
+    """Registers an algorithm by its name.
 
     Raises:
         ValueError: the name is taken.
@@ -116,7 +116,7 @@ def register_algorithm(algorithm: Algorithm) -> None:
 
 
 def get_algorithm(name: str) -> Algorithm:
-    """The algorithm of a name; for ``auto`` what all that it may become have in common.
+    """Returns the algorithm of a name; for ``auto`` the options that all its possible values share.
 
     Raises:
         ValueError: there is none; the message lists those that there are.
@@ -135,7 +135,7 @@ def get_algorithm(name: str) -> Algorithm:
 
 
 def check_strategy(name: str) -> None:
-    """Refuses a goal strategy that does not exist.
+    """Raises a ValueError for an unknown goal strategy.
 
     Other strategies exist only if the library was imported to register them. So if it was not imported,
     the names that it comes with are all there are, and it need not be imported for the check.
@@ -152,7 +152,7 @@ def check_strategy(name: str) -> None:
 
 
 def check_goal_sources(sources: object) -> dict[str, int]:
-    """Checks how many virtual goals come from where.
+    """Checks the number of virtual goals for each source.
 
     Example:
         >>> check_goal_sources({"future": 2, "actual": 2})
@@ -163,7 +163,7 @@ def check_goal_sources(sources: object) -> dict[str, int]:
         raise ValueError(f"goal_sources must be numbers of goals by source, {example}, got {sources!r}")
     known = [*_known_strategies(), *RECENT]
     for name, number in sources.items():
-        if isinstance(name, str) and ":" in name and number is None:  # YAML took it for a name
+        if isinstance(name, str) and ":" in name and number is None:  # without the space, YAML reads a name
             raise ValueError(f"goal_sources needs a space behind each colon, {example}, got {dict(sources)}")
         if name not in known:
             raise ValueError(

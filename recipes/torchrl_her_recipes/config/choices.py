@@ -1,4 +1,4 @@
-"""Choices of a recipe: sections that do one of several things, each a class with options of its own."""
+"""Choices of a recipe: sections that are one of several classes, each with options of its own."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl_her_recipes.config.options import REGISTERED, nearest
 
 @dataclass(frozen=True, kw_only=True)
 class Choice(Group):
-    """One of the things that a section can do, with its options; its docstring begins with a summary.
+    """Base of the alternatives of a section, with their options; the docstring begins with a summary.
 
     Attributes:
         name: Name that recipes take.
@@ -49,7 +49,7 @@ class Kind(dict[str, type[C]]):
         return choice(**values)
 
     def register(self, choice: type[C]) -> type[C]:
-        """Makes a choice known by its name; decorates its class."""
+        """Registers a choice by its name; decorates its class."""
         if choice.name in self:
             raise ValueError(f"there is a {self.section} {choice.name!r} already")
         self[choice.name] = choice

@@ -192,12 +192,12 @@ class HindsightConfig(Group):
         check_strategy(self.strategy)
         if self.goal_sources not in (None, AUTO):
             object.__setattr__(self, "goal_sources", check_goal_sources(self.goal_sources))
-        elif (self.k, self.strategy) != (4, "future"):  # given, in place of auto
+        elif (self.k, self.strategy) != (4, "future"):  # given by the user, in place of auto
             object.__setattr__(self, "goal_sources", None)
 
     @property
     def sources(self) -> dict[str, int]:
-        """How many virtual goals of each transition come from where; empty if there are none."""
+        """Number of virtual goals of each transition by source; empty if there are none."""
         if self.goal_sources == AUTO:
             return dict(FUTURE_AND_ACTUAL)
         if self.goal_sources is not None:
@@ -255,7 +255,7 @@ def _read_layers(path: Path) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class DemonstrationsConfig(Group):
-    """Episodes that somebody else played, as `torchrl-her record` writes them."""
+    """Episodes played by another policy, from a file of `torchrl-her record`."""
 
     prefix = "demonstrations."
     needs: ClassVar[Needs] = (
@@ -302,7 +302,7 @@ class DemonstrationsConfig(Group):
 
     @property
     def in_batches(self) -> bool:
-        """Whether batches have demonstrations."""
+        """Whether batches contain demonstrations."""
         return self.episodes > 0 and self.share > 0
 
     @property
@@ -322,7 +322,7 @@ class EvaluationConfig(Group):
     )
 
 
-_SEEDS = 1 << 31  # so that those of evaluations, which are made of it, have room
+_SEEDS = 1 << 31  # leaves room for the seeds of evaluations, which are derived from it
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,8 @@
-"""Modules of users: which are imported because the user said so, and which a recipe may name.
+"""Modules of users: imports those that the user names, and refuses those that only a file names.
 
 A recipe can name code, as ``task=module:function`` or ``task=gym:module:ID``. Such a module is imported if
 the user named it (in :func:`~torchrl_her_recipes.make_recipe`, on the command line, by ``--import``), but not
-because a file says so: a run's folder, a policy, a preset or a study may come from somebody else. There it
+because a file says so: a run's folder, a policy, a preset or a study may come from another user. There it
 needs a permission: ``with allow_imports():``, or ``--allow-import`` on the command line.
 """
 
@@ -16,12 +16,12 @@ from pathlib import Path
 
 from torchrl_her_envs.registry import GYM, module_of
 
-# Whose import is harmless. That holds for gymnasium's ids alone: a function could be any of the module's.
+# Modules with harmless imports, for gymnasium's ids only: a function could be any of the module's.
 _HARMLESS = ("gymnasium", "gymnasium_robotics", "torchrl_her_envs")
 
 _imported: list[str] = []  # worker processes of studies import them, too
 _permitted: set[str] = set()
-_everything: list[bool] = []  # not empty while all modules are permitted
+_everything: list[bool] = []  # has an entry while all modules are permitted
 
 
 def import_modules(names: Sequence[str]) -> None:
@@ -50,19 +50,19 @@ def import_modules(names: Sequence[str]) -> None:
 
 
 def imported_modules() -> list[str]:
-    """The modules that :func:`import_modules` has imported, in this order."""
+    """Returns the modules that :func:`import_modules` has imported, in this order."""
     return list(_imported)
 
 
 def look_here() -> None:
-    """Lets modules in the current folder be imported."""
+    """Makes modules in the current folder importable."""
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)  # at the end, so that no file in this folder hides an installed package
 
 
 def foreign_module(task: str) -> str:
-    """The module that a task imports and that is not known to be harmless; empty if there is none.
+    """Returns the module that a task imports unless it is known to be harmless; empty if there is none.
 
     Example:
         >>> foreign_module("gym:my_module:MyEnv-v0"), foreign_module("gym:FetchReach-v4")
@@ -73,7 +73,7 @@ def foreign_module(task: str) -> str:
 
 
 def needs_permission(task: str, named: Collection[str] = ()) -> bool:
-    """Whether a task imports a module that is neither among the named ones nor imported already, nor in one.
+    """Returns whether a task imports a module that is neither permitted nor imported already.
 
     Example:
         >>> needs_permission("package.envs:make_env"), needs_permission("package.envs:f", ["package"])

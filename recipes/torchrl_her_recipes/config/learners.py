@@ -47,7 +47,7 @@ class LearnerConfig(Choice):
 
     @property
     def hidden_weights(self) -> int:
-        """How many weights there are between hidden layers, of the actor and all critics."""
+        """Number of weights between hidden layers, in the actor and all critics."""
         return (self.depth - 1) * self.hidden**2 * (1 + getattr(self, "critics", 1))
 
     device: str = option("cpu", "where the networks are: cpu, cuda, cuda:1, ..., or auto")
@@ -97,12 +97,12 @@ class LearnerConfig(Choice):
 
     @property
     def critic_shape(self) -> dict[str, Any]:
-        """What the hidden layers of critics are like, as the functions that make networks take it."""
+        """Arguments for the hidden layers of critics in the functions that make networks."""
         return {"hidden": self.hidden, "depth": self.depth, "activation": self.activation, "norm": self.norm}
 
     @property
     def actor_shape(self) -> dict[str, Any]:
-        """The same for actors, which have no batch normalization."""
+        """Arguments for the hidden layers of actors, which have no batch normalization."""
         return self.critic_shape | ({"norm": "none"} if self.norm == "batch" else {})
 
 
@@ -111,7 +111,7 @@ LEARNERS = Kind("learner", LearnerConfig, default="auto")
 
 @dataclass(frozen=True, kw_only=True)
 class EpsilonConfig(LearnerConfig):
-    """A learner with a deterministic policy: a share epsilon of its actions explores."""
+    """A learner with a deterministic policy: a fraction epsilon of its actions explores."""
 
     has_epsilon: ClassVar[bool] = True
 

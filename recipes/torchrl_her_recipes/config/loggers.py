@@ -1,4 +1,4 @@
-"""The loggers by name: who is told the numbers of a run besides its own table."""
+"""The loggers by name, which receive a run's metrics in addition to its own table."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class LoggerSpec:
 
     Args:
         name: name of the logger, and of its folder in that of a run.
-        factory: what opens it, as ``module:function``; it is imported when a run begins. It is called with
-            the :class:`~torchrl_her_recipes.RunView` and a number of frames. It takes everything behind these
-            out of what it has logged before, and returns a TorchRL ``Logger`` and up to which frames that has
-            the table already: 0 for a new one.
+        factory: function that opens it, as ``module:function``; it is imported when a run begins. It is
+            called with the :class:`~torchrl_her_recipes.RunView` and a number of frames. It takes everything
+            behind these out of what it has logged before, and returns a TorchRL ``Logger`` and up to which
+            frames that has the table already: 0 for a new one.
         needs: the package that it needs, which is also the name of the extra; empty for none.
     """
 
@@ -32,7 +32,7 @@ LOGGERS: dict[str, LoggerSpec] = {}
 
 
 def register_logger(spec: LoggerSpec) -> None:
-    """Makes a logger known by its name.
+    """Registers a logger by its name.
 
     Raises:
         ValueError: the name is taken.
@@ -50,7 +50,7 @@ for _spec in (
 
 
 def check_loggers(value: Any) -> tuple[str, ...]:
-    """The names of some loggers, in their order; none for None.
+    """Returns the names of loggers, checked, in their order; none for None.
 
     Example:
         >>> check_loggers("wandb"), check_loggers(["tensorboard", "wandb"]), check_loggers(None)
@@ -69,7 +69,7 @@ def check_loggers(value: Any) -> tuple[str, ...]:
 
 
 def _instead(name: object) -> str:
-    """Returns what to choose in place of an unknown logger, as the end of a message."""
+    """Returns a suggestion for an unknown logger, as the end of a message."""
     if name == "csv":
         return "; metrics.csv has the same numbers, or choose LogTo(CSVLogger(...)) in Python"
     if name == "mlflow":

@@ -1,4 +1,4 @@
-"""Options of a recipe: what each of them may be, said where it is defined, and checked in one place."""
+"""Options of a recipe: their definitions with help and allowed values, and one function that checks them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl_her_recipes.config.values import as_kind
 _KINDS = {"str": str, "bool": bool, "int": int, "float": float}
 
 Needs = tuple[tuple[str, Callable[[Any], object], str], ...]  # see `idle_options`
-AUTO = "auto"  # the value of an option that is chosen by what the task's environment is, see `.resolve`
+AUTO = "auto"  # the value of an option that is chosen for the task's environment, see `.resolve`
 
 
 def option(
@@ -28,7 +28,7 @@ def option(
     infinite: bool = False,
     shown_as: str = "",
 ) -> Any:
-    """A field of a group of options.
+    """Defines an option: a field of a group of options.
 
     Args:
         default: the value that works for most tasks; None where the task or the learner has its own, and
@@ -37,7 +37,7 @@ def option(
         at_least, above, at_most, below: the range of a number.
         choices: the values that are allowed.
         infinite: whether a number may be infinite, as a limit that limits nothing.
-        shown_as: what messages call it, if not by the field's name.
+        shown_as: name in messages, if not the field's name.
     """
     limits = {"at_least": at_least, "above": above, "at_most": at_most, "below": below}
     about = {"help": help, "choices": choices, "infinite": infinite, "shown_as": shown_as}
@@ -108,7 +108,7 @@ REGISTERED = "; one of your own must be registered by a module, as in torchrl-he
 
 
 def nearest(name: object, known: Any) -> str:
-    """A hint for a name that was probably mistyped; empty if nothing is near.
+    """Returns a hint for a name that was probably mistyped; empty if no name is near.
 
     Example:
         >>> nearest("lerning_rate", ["learning_rate", "gamma"])
@@ -119,7 +119,7 @@ def nearest(name: object, known: Any) -> str:
 
 
 def what_there_is(name: object, known: Any, kind: str) -> str:
-    """The end of a message about an unknown name: the nearest known one, and all of them.
+    """Returns the end of a message about an unknown name: the nearest known one, and all of them.
 
     Example:
         >>> what_there_is("cherr", ["her", "cher"], "algorithms")

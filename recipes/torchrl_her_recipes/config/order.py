@@ -12,7 +12,7 @@ _MAKERS = "torchrl_her_recipes.components.curricula"
 
 @dataclass(frozen=True, kw_only=True)
 class Order(Choice):
-    """In which order the layers of a curriculum are learned.
+    """Order in which the layers of a curriculum are learned.
 
     The maker takes the options and the :class:`~torchrl_her.Curriculum`, and by keyword ``runs`` and
     ``generators`` (of random numbers, one for each run). It returns the
@@ -28,7 +28,7 @@ ORDER = Kind("order", Order, default="threshold")
 @ORDER.register
 @dataclass(frozen=True, kw_only=True)
 class Threshold(Order):
-    """One layer after the other, each until it is learned."""
+    """Trains layer after layer, each until it is learned."""
 
     name = "threshold"
     maker = f"{_MAKERS}:make_threshold"
@@ -51,7 +51,7 @@ class AllAtOnce(Order):
 @ORDER.register
 @dataclass(frozen=True, kw_only=True)
 class Teacher(Order):
-    """Episodes are rather played in layers whose success changes (Matiisen et al., 2017)."""
+    """Episodes prefer layers whose success changes (Matiisen et al., 2017)."""
 
     name = "teacher_student"
     maker = f"{_MAKERS}:make_teacher"

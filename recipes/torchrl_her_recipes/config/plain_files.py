@@ -1,4 +1,4 @@
-"""Reading files that may come from anybody: text, YAML, JSON and tables, none of which can be a trap.
+"""Safe reading of files from untrusted sources: text, YAML, JSON and tables.
 
 Nothing of them is executed, they may not be larger than such files are, and whatever is wrong with one is a
 ValueError of one line that names it.
@@ -18,13 +18,13 @@ import yaml
 _LARGEST = 1 << 20  # bytes of a configuration
 LARGEST_TABLE = 1 << 28
 _DEPTH = 30
-# What damaged content may lead to, whatever reads it. A RuntimeError is torch's, or a RecursionError.
+# Errors that damaged content may raise in any reader. A RuntimeError is torch's, or a RecursionError.
 _DAMAGE = (ArithmeticError, AttributeError, AssertionError, LookupError, RuntimeError, TypeError, ValueError)
-_SHOWN = 300  # letters of a reason
+_SHOWN = 300  # characters of a reason
 
 
 def shown(value: object, most: int = 80) -> str:
-    """A value in a message: in one line, of printable letters, and not endless.
+    """Formats a value for a message: in one line of printable characters and limited length.
 
     Example:
         >>> shown({"a": "\\x1b[2J"}), shown("x" * 100, 10)
@@ -35,7 +35,7 @@ def shown(value: object, most: int = 80) -> str:
 
 
 def reason(error: BaseException | str) -> str:
-    """The message of an error as the end of a line."""
+    """Formats the message of an error as the end of a line."""
     text = "".join(letter if letter.isprintable() else " " for letter in str(error)[: 10 * _SHOWN])
     text = " ".join(text.split()) or type(error).__name__
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
@@ -43,7 +43,7 @@ def reason(error: BaseException | str) -> str:
 
 @contextmanager
 def naming(path: Path, what: str = "cannot be read") -> Iterator[None]:
-    """Turns whatever is wrong with the content of a file into a ValueError that names the file."""
+    """Turns errors about the content of a file into a ValueError that names the file."""
     try:
         yield
     except _DAMAGE as error:
@@ -54,7 +54,7 @@ def naming(path: Path, what: str = "cannot be read") -> Iterator[None]:
 
 
 def read_text(path: Path, *, largest: int = _LARGEST) -> str:
-    """The text of a file.
+    """Reads the text of a file.
 
     Raises:
         ValueError: it has more than ``largest`` bytes, or is no text in UTF-8.
@@ -71,7 +71,7 @@ def read_text(path: Path, *, largest: int = _LARGEST) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads plain values, as deep as configurations are. A few aliases of aliases would make millions."""
+    """YAML loader for plain values of limited depth, without aliases, which could expand to millions."""
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
@@ -89,7 +89,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> Any:
-    """The plain values that a text spells in YAML.
+    """Parses a text in YAML to plain values.
 
     Raises:
         ValueError: it is not YAML, or repeats values by name.
@@ -115,19 +115,19 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a YAML file."""
+    """Reads the content of a YAML file."""
     text = read_text(path)
     with naming(path):
         return parse_yaml(text)
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The names and values that a YAML file holds."""
+    """Reads the names and values in a YAML file."""
     return _mapping(path, read_yaml(path))
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The names and values that a JSON file holds."""
+    """Reads the names and values in a JSON file."""
     text = read_text(path)
     with naming(path):
         values = json.loads(text)
@@ -141,7 +141,7 @@ def _mapping(path: Path, values: Any) -> dict[str, Any]:
 
 
 def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, float]]:
-    """The rows of a file of comma-separated numbers, by the names in its first line.
+    """Reads the rows of a file of comma-separated numbers, by the names in its first line.
 
     Args:
         path: the file.
@@ -164,5 +164,5 @@ def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, floa
 
 
 def number(text: str) -> float:
-    """The number that a text spells: whole ones as int."""
+    """Parses a number: whole ones as int."""
     return int(text) if text.isdigit() else float(text)

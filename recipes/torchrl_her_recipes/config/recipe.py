@@ -19,7 +19,7 @@ from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, Nested, chosen, 
 from torchrl_her_recipes.config.weights import WEIGHTS, Weights
 from torchrl_her_recipes.config.without_effect import without_effect
 
-# What a run that goes on may set anew, since it leaves what was trained as it is.
+# Options that may change when a run resumes, since they do not affect training so far.
 EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints", "keep_buffer", "pictures", "log")
 
 
@@ -95,7 +95,7 @@ class Recipe:
         return [self.run.seed + run for run in range(self.run.num_runs)]
 
     def replace(self, **values: Any) -> Recipe:
-        """The same recipe with some other values, by their short names; see :func:`make_recipe`.
+        """Returns a copy with other values of some options, by their short names; see :func:`make_recipe`.
 
         Example:
             >>> Recipe().replace(seed=7).run.seed
@@ -104,7 +104,7 @@ class Recipe:
         return compose(self.to_dict(), values)
 
     def extended(self, **values: Any) -> Recipe:
-        """The same recipe for a run that has begun, with some other values that leave what was trained alone.
+        """Returns a copy for a run that has begun, with other values of options that may change on resuming.
 
         Raises:
             ValueError: another option than ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``,
@@ -118,14 +118,14 @@ class Recipe:
         return self.replace(**values)
 
     def to_dict(self) -> Nested:
-        """All values, by group and name, without the name of weights that the algorithm has."""
+        """Returns all values by group and name, except the name of weights that the algorithm implies."""
         named = {group: {"name": getattr(self, group).name} for group in KINDS}
         if get_algorithm(self.hindsight.algo).weights is not None:
             del named["weights"]
         return {group: named.get(group, {}) | asdict(own) for group, own in vars(self).items()}
 
     def changed(self) -> Nested:
-        """The values that are not the defaults, by group and name.
+        """Returns the values that differ from the defaults, by group and name.
 
         Example:
             >>> Recipe().replace(seed=3, gamma=0.9).changed()
@@ -140,7 +140,7 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
-        """A recipe from the values that :meth:`to_dict` gives, or some of them; the rest are defaults.
+        """Makes a recipe from the values of :meth:`to_dict`, or some of them; the rest are defaults.
 
         Raises:
             ValueError: a group or an option that does not exist, or a value that cannot work.
@@ -155,25 +155,25 @@ class Recipe:
 
 
 def check_extending(values: Mapping[str, Any]) -> None:
-    """Refuses options that would change what a run has trained already.
+    """Refuses options that would change the training that a run has done already.
 
     Example:
         >>> check_extending({"epochs": 80})
         >>> check_extending({"gamma": 0.9})
         Traceback (most recent call last):
-        ValueError: a run that goes on takes epochs, checkpoint_interval, keep_checkpoints, keep_buffer,
-        pictures, log only; gamma=0.9 would change what it has trained: start a new run
+        ValueError: a resumed run takes epochs, checkpoint_interval, keep_checkpoints, keep_buffer,
+        pictures, log only; gamma=0.9 would change its training so far: start a new run
     """
     for name, value in values.items():
         if name.removeprefix("run.") not in EXTENDING:
             raise ValueError(
-                f"a run that goes on takes {', '.join(EXTENDING)} only; {name}={value} would change what it "
+                f"a resumed run takes {', '.join(EXTENDING)} only; {name}={value} would change what it "
                 "has trained: start a new run"
             )
 
 
 def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Recipe:
-    """A recipe from options by their names: ``make_recipe(task="hand_v0", algo="her", seed=3)``.
+    """Makes a recipe from options by name: ``make_recipe(task="hand_v0", algo="her", seed=3)``.
 
     An option is named by itself (``gamma``) or with its group (``{"learner.gamma": 0.95}``); ``task``,
     ``learner`` and ``curriculum`` are the names of theirs.
@@ -200,7 +200,7 @@ def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Reci
 
 
 def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe:
-    """The same recipe as :func:`make_recipe`, where no value was named by the user."""
+    """Makes a recipe like :func:`make_recipe`, but from values that the user has not named one by one."""
     below = place(base or {})
     given = place(values, below)
     if get_algorithm(chosen("hindsight", given, below)).weights is not None:
@@ -232,7 +232,7 @@ def _meant(group: str, *values: Nested) -> str:
 
 
 def _drop_options_of_other_choices(below: Nested, given: Nested) -> None:
-    """Leaves those options of the base's choices that the choices that are asked for take as well.
+    """Drops options of the base's choices that the requested choices do not have.
 
     What is merely a default of the base's choice is left out, too: the other one may have its own.
 
@@ -256,7 +256,7 @@ def _drop_options_of_other_choices(below: Nested, given: Nested) -> None:
 
 
 def _drop_options_of_another_task(below: Nested, given: Nested) -> None:
-    """Leaves those options of the base's task that the task that is asked for takes as well."""
+    """Drops options of the base's task that the requested task does not take."""
     name, options = given.get("task", {}).get("name"), below.get("task", {}).get("options")
     if name is None or not isinstance(options, Mapping) or name == below["task"].get("name"):
         return

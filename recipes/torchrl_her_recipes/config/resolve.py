@@ -12,7 +12,7 @@ from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.without_effect import without_effect
 
-TERMINATION = "termination"  # the option of a task that says what ends an episode at its goal
+TERMINATION = "termination"  # option of a task: the rule that ends an episode at its goal
 _WARMUP = 1_000  # environment steps, at least
 _EPISODES = 100  # in an epoch, where environments are stepped one by one
 _LAYER_EPOCHS = 10  # epochs after which a layer that was not asked for ends, learned or not
@@ -20,14 +20,14 @@ _LAYER_EPOCHS = 10  # epochs after which a layer that was not asked for ends, le
 
 @dataclass(frozen=True, kw_only=True)
 class EnvFacts:
-    """What the values of ``auto`` depend on.
+    """Facts about a task's environment on which the values of ``auto`` depend.
 
     Args:
         max_steps: steps of an episode, at most.
         batched: whether the environments of a batch are stepped together, at little cost for each of them.
         layers: layers of a curriculum, if the achieved goal seldom changes without one.
-        ends: what ends an episode at its goal, as ``task.options.termination`` takes it; None if the task has
-            no such option.
+        ends: rule that ends an episode at its goal, as ``task.options.termination`` takes it; None if the
+            task has no such option.
     """
 
     max_steps: int
@@ -37,7 +37,7 @@ class EnvFacts:
 
 
 def _num_envs(recipe: Recipe, facts: EnvFacts) -> int:
-    """Few environments that are slow, so that they learn from each episode soon; some for each process."""
+    """Returns the number of environments: fewer if they are slow, to learn from each episode soon."""
     processes = max(recipe.collection.processes, 1)
     return math.ceil((64 if facts.batched else 8) / processes) * processes
 
@@ -46,7 +46,7 @@ def _epoch_frames(recipe: Recipe, facts: EnvFacts) -> int:
     own = recipe.collection
     episodes = _EPISODES if not facts.batched else 4 * own.num_envs
     frames = episodes * facts.max_steps
-    if recipe.run.frames is not None:  # a short run is one epoch, and no longer than it should be
+    if recipe.run.frames is not None:  # a run shorter than an epoch is one epoch of its own length
         frames = min(frames, recipe.run.frames)
     return max(frames, own.num_envs * own.steps_per_batch)
 
@@ -60,13 +60,13 @@ _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
     "num_envs": _num_envs,
     "frames_per_update": lambda _recipe, facts: 5.0 if facts.batched else 1.0,
     "epoch_frames": _epoch_frames,
-    # until each environment has ended an episode: no transition is stored before
+    # until each environment has ended an episode, no transition is stored
     "warmup_frames": lambda recipe, facts: max(recipe.collection.num_envs * facts.max_steps, _WARMUP),
 }
 
 
 def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
-    """Group and name of each option that is ``auto``, depends on the environment, and has an effect.
+    """Returns group and name of each option that is ``auto``, depends on the environment, and has an effect.
 
     Example:
         >>> auto_options(Recipe().replace(gamma=0.95))[1:3]
@@ -79,7 +79,7 @@ def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
 
 
 def ends_open(recipe: Recipe) -> bool:
-    """Whether it depends on the environment what ends an episode at its goal.
+    """Returns whether the environment decides what ends an episode at its goal.
 
     Example:
         >>> task = "gym:FetchPush-v4"
@@ -92,7 +92,7 @@ def ends_open(recipe: Recipe) -> bool:
 
 
 def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
-    """The same recipe with a value for each option that was ``auto``.
+    """Returns a copy of a recipe with a value for each option that was ``auto``.
 
     Example:
         >>> recipe = resolve(Recipe(), EnvFacts(max_steps=50))

@@ -1,4 +1,4 @@
-"""A search for good options: what it varies, around which recipe, and how it chooses."""
+"""Settings of a search for good options: the recipe, the options that vary, and the sampler."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Search:
     """A search for good options.
 
     Args:
-        recipe: what a trial runs, but for the options that are varied. Its ``num_runs`` runs are the seeds of
-            each trial, and its ``seed`` is also that of the sampler.
+        recipe: recipe of the trials, except for the options that are varied. Its ``num_runs`` runs are the
+            seeds of each trial, and its ``seed`` is also that of the sampler.
         space: the options that are varied.
         sampler: ``tpe``, ``random`` or ``cmaes``.
         pruner: which trials are ended early: ``median``, those below the median of the others at the same
@@ -66,7 +66,7 @@ class Search:
                 )
 
     def to_plain(self) -> dict[str, Any]:
-        """The search as plain values, as its folder keeps them."""
+        """Returns the search as plain values, in the form of its folder."""
         return {
             "sampler": self.sampler,
             "pruner": self.pruner,

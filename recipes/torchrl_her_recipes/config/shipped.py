@@ -15,12 +15,12 @@ _TRAINED = Path(__file__).parent.parent / "trained"
 
 
 def preset_names() -> list[str]:
-    """All presets that come with the package."""
+    """Returns the names of all presets that come with the package."""
     return sorted(path.stem for path in (CONF / "preset").glob("*.yaml"))
 
 
 def load_preset(name: str) -> dict[str, Any]:
-    """The values of a preset, by the names of options.
+    """Returns the values of a preset, by the names of options.
 
     A preset may begin with another one, ``preset: demo``, whose values hold where it has none of its own.
 
@@ -40,14 +40,14 @@ def _load(name: str, above: tuple[Path, ...]) -> dict[str, Any]:
     values = read_mapping(path)
     first = values.pop("preset", None)
     with naming(path):
-        place(values)  # names that there are not
+        place(values)  # unknown names
         if first is not None:
             _path(first)
     return values if first is None else merge(_load(first, (*above, path)), values)
 
 
 def preset_summary(name: str) -> str:
-    """What a preset is for, in one line: the comment that its file begins with."""
+    """Returns the purpose of a preset in one line: the comment that its file begins with."""
     first, *_ = [*_path(name).read_text().splitlines(), ""]
     return first.lstrip("# ") if first.startswith("#") else ""
 
@@ -60,7 +60,7 @@ def _path(name: str) -> Path:
 
 
 def policy_names() -> list[str]:
-    """The tasks whose policies come with the package."""
+    """Returns the tasks whose policies come with the package."""
     return sorted(path.stem for path in _TRAINED.glob(f"*{POLICY_SUFFIX}"))
 
 

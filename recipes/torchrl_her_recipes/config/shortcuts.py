@@ -35,15 +35,17 @@ KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)
 # groups that had options before, and the groups that have them now
 FORMER = {"ibs": ("weights", "behavior"), "novelty": ("weights",), "curriculum": ("order",)}
 
-LONG_ONLY = ("demonstrations",)  # its options are always named with it: of what would ``file`` be?
+LONG_ONLY = (
+    "demonstrations",
+)  # its options are always named with the group: ``file`` alone would be unclear
 
 
-# what tasks of gymnasium and of one's own take, whatever else they take
+# options that tasks of gymnasium and of users take in any case
 TASK_OPTIONS = ("max_steps", "termination", "achieved_reward", "parallel", "info_keys")
 
 
 class Entries(dict[str, Any]):
-    """Some entries of a mapping, as ``task.options.bits=8`` gives them: the other entries stay."""
+    """Entries that are set in a mapping, as by ``task.options.bits=8``; its other entries stay."""
 
 
 def choices_of(group: str) -> dict[str, type[groups.Group]]:
@@ -53,7 +55,7 @@ def choices_of(group: str) -> dict[str, type[groups.Group]]:
 
 
 def option_names() -> dict[str, list[str]]:
-    """Returns the options of each group, for a kind of choices those of all of them."""
+    """Returns the names of the options of each group, in groups with choices those of all choices."""
     names = {group: ["name"] if group in KINDS else [] for group in GROUPS}
     for group, known in names.items():
         known += dict.fromkeys(own.name for kind in choices_of(group).values() for own in fields(kind))
@@ -61,7 +63,7 @@ def option_names() -> dict[str, list[str]]:
 
 
 def chosen(group: str, *values: Nested) -> str:
-    """Returns the name that the first of some values have for a group, or its default."""
+    """Returns the chosen name of a group from the first values that have one, or its default."""
     key = "algo" if group == "hindsight" else "name"
     if name := next(filter(None, (own.get(group, {}).get(key) for own in values)), None):
         return name
@@ -83,7 +85,7 @@ def renamed(name: str) -> list[str]:
 
 
 def renewed(values: Mapping[str, Any]) -> tuple[Nested, Nested]:
-    """Places values of a file, and apart from them those whose names were other ones before."""
+    """Sorts values of a file into groups; returns those with former names separately."""
     groups = [name for name in FORMER if isinstance(values.get(name), Mapping)]
     every = {name: value for name, value in values.items() if name not in groups}
     every |= {f"{group}.{own}": value for group in groups for own, value in values[group].items()}
@@ -92,7 +94,7 @@ def renewed(values: Mapping[str, Any]) -> tuple[Nested, Nested]:
 
 
 def locate(name: str, *values: Nested) -> tuple[str, str]:
-    """The group and the name of an option.
+    """Finds the group and the name of an option.
 
     Args:
         name: short (``seed``), with its group (``run.seed``), or a group that has a name (``task``). Those of
@@ -117,7 +119,7 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
         if group not in names:
             home = next((each for each, known in names.items() if group in known and group != "name"), None)
             if home is not None:
-                raise ValueError(f"{group} is an option of the group {home}: {name!r} has one name too many")
+                raise ValueError(f"no option {name!r}: {group} is an option of the group {home}")
             raise ValueError(f"no group {group!r}{what_there_is(group, names, 'groups')}")
         if own not in names[group]:
             raise ValueError(f"no option {name!r}{what_there_is(own, names[group], f'options of {group}')}")
@@ -146,7 +148,7 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
 
 
 def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
-    """Values by short or long names, or whole groups as mappings, sorted into their groups.
+    """Sorts values, by short or long names or as whole groups, into groups.
 
     Short names that several groups have are looked up among the choices of the values and of ``base``, so
     they come last. Of values for the same option the last one counts.
@@ -184,7 +186,7 @@ def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
 
 
 def merge(*values: Mapping[str, Any]) -> Nested:
-    """Several sets of values as one, by group; later ones replace earlier ones.
+    """Merges several sets of values by group; later values replace earlier ones.
 
     Example:
         >>> merge({"seed": 1, "epochs": 2}, {"run.seed": 3})
@@ -197,7 +199,7 @@ def merge(*values: Mapping[str, Any]) -> Nested:
 
 
 def over(below: Nested, above: Nested) -> Nested:
-    """The values of ``above``, and those of ``below`` that it says nothing of.
+    """Merges two sets of values by group; values of ``above`` replace those of ``below``.
 
     Example:
         >>> over({"task": {"options": {"bits": 8, "max_steps": 9}}}, place({"task.options.bits": 4}))

@@ -1,4 +1,4 @@
-"""Spaces: which options a search varies, and in which ranges."""
+"""Search spaces: the options that a search varies, and their ranges."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _RANGE = ("low", "high")
 _KINDS = {"float": _RANGE, "log_float": _RANGE, "int": _RANGE, "log_int": _RANGE, "choice": ("values",)}
 _MOST = 100  # values of a choice
 _LARGEST = 1e15
-# Trials must be of the same length and start, or they could not be compared; files are the search's own.
+# Options that cannot vary: trials must have the same length and start to be compared.
 _SAME_FOR_ALL = ("task", "seed", "num_runs", "epochs", "epoch_frames", "checkpoint_interval", "keep_buffer")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Space:
-    """The options that a search varies.
+    """Search space: the options that a search varies, and their ranges.
 
     With Optuna itself::
 
@@ -69,7 +69,7 @@ class Space:
         return {name: _distribution(**values) for name, values in self.ranges.items()}
 
     def without(self, names: Mapping[str, Any]) -> Space:
-        """The space without options whose values are given.
+        """Returns the space without options whose values are given.
 
         Raises:
             ValueError: nothing is left.
@@ -84,13 +84,13 @@ class Space:
         return replace(self, ranges=left)
 
     def with_effect(self, recipe: Recipe) -> Space:
-        """The space without options that have no effect on a recipe."""
+        """Returns the space without options that have no effect on a recipe."""
         idle = _idle(recipe)
         left = {name: values for name, values in self.ranges.items() if locate(name) not in idle}
         return replace(self, ranges=left)
 
     def check(self, recipe: Recipe) -> None:
-        """Makes sure that a recipe takes the ends of all ranges, and all values of choices.
+        """Checks that a recipe accepts the ends of all ranges, and all values of choices.
 
         Raises:
             ValueError: it does not; the message names the option.
@@ -103,7 +103,7 @@ class Space:
                     raise ValueError(f"the space {self.name} does not fit: {error}") from error
 
     def recipe(self, base: Recipe, values: Mapping[str, Any]) -> Recipe:
-        """A recipe with some values of the options that are varied.
+        """Makes a recipe with given values of the options that are varied.
 
         Values without effect besides the others are left out; k and strategy replace goal_sources.
 
@@ -115,7 +115,7 @@ class Space:
         return compose(merge(base.to_dict(), given), {})
 
     def values_of(self, recipe: Recipe) -> dict[str, Any]:
-        """A recipe's values of the options that have an effect, in the space or outside."""
+        """Returns a recipe's values of the options that have an effect, inside the ranges or not."""
         idle = _idle(recipe)
         places = {name: locate(name, recipe.to_dict()) for name in self.ranges}
         return {
@@ -125,7 +125,7 @@ class Space:
         }
 
     def inside(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns those of some values that the ranges of their options include.
+        """Returns the given values that lie inside the ranges of their options.
 
         Example:
             >>> load_space("ddpg").inside({"gamma": 0.95, "hidden": 100})
@@ -183,7 +183,7 @@ def _includes(values: Mapping[str, Any], value: Any) -> bool:
 
 
 def _idle(recipe: Recipe) -> set[tuple[str, str]]:
-    """The options that have no effect on a recipe, as (group, name)."""
+    """Returns the options that have no effect on a recipe, as (group, name)."""
     idle = set(without_effect(recipe))
     if recipe.hindsight.goal_sources == AUTO:  # sources that a run takes in place of k and strategy
         idle |= {("hindsight", "k"), ("hindsight", "strategy")}
@@ -191,17 +191,17 @@ def _idle(recipe: Recipe) -> set[tuple[str, str]]:
 
 
 def space_names() -> list[str]:
-    """All spaces that come with the package: one for each of its learners."""
+    """Returns the names of all spaces that come with the package, one for each learner."""
     return sorted(path.stem for path in _SPACES.glob("*.yaml"))
 
 
 def space_summary(name: str) -> str:
-    """The options that a space varies, in one line, as far as it holds them."""
+    """Returns the options that a space varies, in one line, shortened if need be."""
     return shorten(", ".join(load_space(name).ranges), 85, placeholder=" ...")
 
 
 def load_space(name: str) -> Space:
-    """A space by its name, or from a file.
+    """Loads a space by its name, or from a file.
 
     Args:
         name: one of ``space_names()``, or the path of a YAML file with a mapping of options by name:
@@ -223,7 +223,7 @@ def load_space(name: str) -> Space:
 
 
 def space_for(recipe: Recipe) -> Space:
-    """The space of a recipe's learner, without options that have no effect.
+    """Returns the space of a recipe's learner, without options that have no effect.
 
     Raises:
         ValueError: the learner has none.

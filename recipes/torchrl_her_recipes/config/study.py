@@ -1,4 +1,4 @@
-"""Studies: which combinations of options are compared, each with several seeds, and in which figure."""
+"""Studies: comparisons of combinations of options, each with several seeds, and their figures."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _QUICK: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Order:
-    """An expected order of two algorithms.
+    """Expected order of two algorithms in a metric.
 
     Attributes:
         measure: Metric that is compared.
@@ -80,7 +80,7 @@ class Study:
 
     Args:
         name: name of the study.
-        summary: what it compares, in one line.
+        summary: subject of the comparison, in one line.
         recipe: options that all runs have in common; ``num_runs`` is the number of seeds.
         vary: the values that are compared, by the name of their option. All combinations are run. The
             figure has a panel for each task, and in it a curve for each combination of the others.
@@ -146,16 +146,16 @@ class Study:
             known = ", ".join(AXES)
             raise ValueError(f"figure of {self.name} must be some of {known}; got {self.figure!r}")
         object.__setattr__(self, "figure", drawn)
-        read_orders(self.expect)  # refuses what is no order
+        read_orders(self.expect)  # raises if an order is not valid
 
     def combinations(self) -> Iterator[dict[str, Any]]:
-        """What each combination has of its own, in the order of :meth:`cells`; ``case`` names one."""
+        """Yields the options that are specific to each combination, in the order of :meth:`cells`."""
         for values in product(*self.vary.values()):
             own = dict(zip(self.vary, values, strict=True))
             yield from ({**own, "case": case} for case in self.cases) if self.cases else (own,)
 
     def cells(self) -> Iterator[tuple[str, Recipe]]:
-        """The names and recipes of all combinations; the runs of a recipe are its seeds.
+        """Yields the names and recipes of all combinations; the runs of a recipe are its seeds.
 
         Raises:
             ValueError: a recipe cannot work, two combinations have the same name or the same recipe, or
@@ -169,7 +169,9 @@ class Study:
             if label in before:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
             for_task = self.for_task.get(_task_of(own.get("task")), {})
-            asked = merge(self.cases.get(case, {}), own)  # unlike the study's own, none is left out silently
+            asked = merge(
+                self.cases.get(case, {}), own
+            )  # unlike options of the whole study, these are never dropped silently
             try:
                 recipe = compose(merge(self.recipe, for_task), asked)
             except ValueError as error:
@@ -181,7 +183,7 @@ class Study:
 
 
 def curve_label(label: str, recipe: Recipe) -> str:
-    """The name of a combination without its task, as in the legend of a panel.
+    """Returns the name of a combination without its task, for the legend of a panel.
 
     Example:
         >>> curve_label("hand_v1_her", compose(None, {"task": "hand_v1", "algo": "her"}))
@@ -194,7 +196,7 @@ def curve_label(label: str, recipe: Recipe) -> str:
 
 
 def _word(name: str, value: Any, values: Sequence[Any]) -> str:
-    """The part of a name for one of the ``values`` of an option; of mappings, the entries that differ."""
+    """Returns the part of a name for one of an option's ``values``; for mappings, the entries that differ."""
     if all(isinstance(each, Mapping) for each in values):
         entries = {key: [each.get(key) for each in values] for key in value}
         differing = {key: own for key, own in entries.items() if any(other != own[0] for other in own)}
@@ -206,14 +208,14 @@ def _word(name: str, value: Any, values: Sequence[Any]) -> str:
 
 
 def study_names() -> list[str]:
-    """All studies that come with the package."""
+    """Returns the names of all studies that come with the package."""
     return sorted(path.stem for path in _STUDIES.glob("*.yaml"))
 
 
 def load_study(
     name: str, *, seeds: int | None = None, frames: int | None = None, quick: bool = False
 ) -> Study:
-    """A study that comes with the package, or one from a YAML file.
+    """Loads a study that comes with the package, or one from a YAML file.
 
     Args:
         name: one of :func:`study_names`, or the path of a .yaml file.
@@ -234,10 +236,10 @@ def load_study(
     preset = values.pop("preset", None)
     known = [field.name for field in fields(Study) if field.name != "name"]
     if unknown := [key for key in values if key not in known]:
-        raise ValueError(f"{path}: a study has no {', '.join(unknown)}; it has preset, {', '.join(known)}")
+        raise ValueError(f"{path}: unknown {', '.join(unknown)}; a study has preset, {', '.join(known)}")
     with naming(path):
         study = _shortened(path, values, preset, seeds=seeds, frames=frames, quick=quick)
-        cells = list(study.cells())  # whether all of them can work
+        cells = list(study.cells())  # raises if a combination is not valid
         combined = dict.fromkeys(curve_label(label, recipe) for label, recipe in cells)
         named = (name for order in read_orders(study.expect) for name in (order.more, order.less))
         if strange := next((name for name in named if name not in combined), None):
@@ -258,10 +260,10 @@ def _shortened(
     frames: int | None,
     quick: bool,
 ) -> Study:
-    """The study that a file describes, at the size that is asked for."""
+    """Makes the study that a file describes, at the requested size."""
     study = Study(name=path.stem, **values)
     if not study.name.strip("."):
-        raise ValueError("a study is called as its file, which needs a name before the suffix")
+        raise ValueError("a study has the name of its file, which must not be a bare suffix")
     sizes = {"num_runs": seeds, "frames": frames}
     asked = merge(_QUICK if quick else {}, {name: size for name, size in sizes.items() if size is not None})
     recipe = merge(load_preset(preset) if preset else {}, study.recipe, asked)
@@ -270,11 +272,11 @@ def _shortened(
 
 
 def _set_in(own: Mapping[str, Any], names: Iterable[str]) -> list[str]:
-    """Which of some options are set, by their names within their groups."""
+    """Returns which of some options are set, by their names within their groups."""
     places = {locate(name) for name in names}
     return [name for group, values in place(own).items() for name in values if (group, name) in places]
 
 
 def _task_of(task: Any) -> Any:
-    """The name of a task that varies, which may be given with its options."""
+    """Returns the name of a task that varies, which may be given with its options."""
     return task.get("name") if isinstance(task, Mapping) else task

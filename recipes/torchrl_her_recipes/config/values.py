@@ -11,7 +11,7 @@ from torchrl_her_recipes.config.plain_files import shown
 
 
 def as_kind(name: str, value: object, kind: type) -> Any:
-    """A value as an option of a given type takes it.
+    """Converts a value to the type of an option.
 
     YAML reads ``1e-3`` as text, so text that spells a number is accepted for one.
 

@@ -1,4 +1,4 @@
-"""Whether the installed versions of torch, tensordict and torchrl fit together."""
+"""Checks that the installed versions of torch, tensordict and torchrl fit together."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TRIED = {
 
 
 def own_version() -> str:
-    """The installed version of this project."""
+    """Returns the installed version of this project."""
     return metadata.version("torchrl-her")
 
 

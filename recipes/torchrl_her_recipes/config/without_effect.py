@@ -1,4 +1,4 @@
-"""Options that have no effect together with others. They are refused by name, so that nobody tunes them."""
+"""Rules about options that have no effect together with others, and are therefore refused by name."""
 
 from __future__ import annotations
 
@@ -27,12 +27,16 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
 
 
 def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
-    """Conditions on options of other groups: whether one holds, its text, and the options without effect."""
+    """Yields conditions on other options: whether one holds, its text, and options without effect."""
     algorithm = get_algorithm(groups.hindsight.algo)
     learner, sources = groups.learner, groups.hindsight.sources
     takes, with_task = get_task_spec(groups.task.name).options, f"with task={groups.task.name}"
     yield "threshold" not in takes, with_task, ["task.threshold"]
-    yield "termination" not in takes, with_task, ["task.failure"]  # such tasks end at their goals alone
+    yield (
+        "termination" not in takes,
+        with_task,
+        ["task.failure"],
+    )  # episodes of such tasks end at their goals in any case
     yield "dtype" not in takes, with_task, ["run.dtype"]
 
     given = algorithm.virtual and groups.hindsight.goal_sources not in (None, AUTO)

@@ -1,1 +1,1 @@
-"""Trained policies: loaded from runs and files, measured, saved, exported, shown and recorded."""
+"""Trained policies: loading from runs and files, measuring, saving, exporting, showing and recording."""

@@ -35,7 +35,7 @@ class PolicyInfo:
         low, high: the least and the greatest actions that the task takes, one number for each entry.
         normalize_clip: normalized inputs are clipped to plus and minus this; None if the policy does not
             normalize. It normalizes by itself: what it reads is what the task shows.
-        algorithm, learner, seed, frames: what trained it, for so many environment steps.
+        algorithm, learner, seed, frames: origin of the policy; frames are environment steps.
         success: share of 1,000 greedy episodes of the task at whose last step the goal is achieved, with
             starts and goals that no training has seen.
         reached: share of them in which it is achieved at some step; NaN if it was not measured.
@@ -104,21 +104,21 @@ class PolicyInfo:
 
     @property
     def discrete(self) -> bool:
-        """Whether an action is one integer."""
+        """Whether actions are single integers."""
         return not self.action_shape
 
     @property
     def whole(self) -> bool:
-        """Whether the task takes whole numbers alone."""
+        """Whether the task takes only whole numbers as actions."""
         return self.task_dtype in _WHOLE
 
     def to_dict(self) -> dict[str, Any]:
-        """All values, as plain data."""
+        """Returns all values as plain data."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> PolicyInfo:
-        """Returns the info that :meth:`to_dict` gave, with lists in place of tuples.
+        """Restores the info from :meth:`to_dict`, with lists in place of tuples.
 
         Raises:
             ValueError: A value is missing or unknown, or one that no policy has.
@@ -130,7 +130,7 @@ class PolicyInfo:
             raise ValueError(f"its info is damaged: {error}") from error
 
     def expects(self) -> str:
-        """Describes inputs and outputs in words.
+        """Describes inputs and outputs in words, for messages.
 
         Example:
             >>> from torchrl_her_recipes import load_policy
@@ -140,11 +140,11 @@ class PolicyInfo:
         return _words(self.widths, self.action_shape, self.high)
 
     def check_plays(self, env: EnvBase, task: str) -> None:
-        """Refuses environments that show or want something else than what the policy reads and writes.
+        """Refuses environments whose observations or actions do not fit the policy.
 
         Args:
             env: the environments.
-            task: what theirs is called.
+            task: name of their task.
 
         Raises:
             ValueError: they do; the message has both.
@@ -161,7 +161,7 @@ class PolicyInfo:
 
 
 def describe_env(env: EnvBase) -> dict[str, Any]:
-    """The entries of a :class:`PolicyInfo` that environments tell: widths, actions and their limits.
+    """Returns the entries of a :class:`PolicyInfo` that follow from environments: widths, actions and limits.
 
     Example:
         >>> from torchrl_her_envs import make_env
@@ -186,7 +186,7 @@ def describe_env(env: EnvBase) -> dict[str, Any]:
 
 
 def present_versions() -> dict[str, str]:
-    """The installed versions of this library and what it is made of."""
+    """Returns the installed versions of this library and its main dependencies."""
     return {name: version(name) for name in _PACKAGES}
 
 

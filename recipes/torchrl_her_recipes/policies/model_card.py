@@ -22,7 +22,7 @@ _MARK = "<!-- written by torchrl-her export; it may be replaced by the next expo
 
 
 def card_path(policy: str | Path) -> Path:
-    """Where the model card of a policy's file goes: beside it.
+    """Returns the path for the model card of a policy's file, beside it.
 
     Example:
         >>> card_path("mine.onnx").name
@@ -57,7 +57,7 @@ def write_model_card(path: Path, file: str, card: PolicyInfo, recipe: Recipe) ->
 
 
 def training_command(recipe: Recipe) -> str:
-    """The command that trains a recipe.
+    """Returns the command that trains a recipe.
 
     Example:
         >>> from torchrl_her_recipes import make_recipe
@@ -75,7 +75,7 @@ def training_command(recipe: Recipe) -> str:
 
 
 def _short(group: str, name: str) -> str:
-    """The name of an option, with its group where it is not unique."""
+    """Returns the name of an option, with its group if it is not unique."""
     try:
         return name if locate(name) == (group, name) else f"{group}.{name}"
     except ValueError:
@@ -83,11 +83,11 @@ def _short(group: str, name: str) -> str:
 
 
 def _text(value: Any) -> str:
-    """A value as YAML on one line."""
+    """Formats a value as YAML on one line."""
     text = yaml.safe_dump(value, default_flow_style=True, width=1 << 20).strip()
     return text.removesuffix("...").strip()
 
 
 def _side(values: tuple[float, ...]) -> str:
-    """The limits of actions: one number if all are the same."""
+    """Formats the limits of actions: one number if all are the same."""
     return f"{values[0]:g}" if len(set(values)) == 1 else f"[{', '.join(f'{each:g}' for each in values)}]"

@@ -20,17 +20,17 @@ from torchrl_her_recipes.components.normalization import acting, make_norm
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.policies.info import KEYS, PolicyInfo
 
-_CONSTANTS = ("mean", "std", "limit")  # of the normalization of an entry
+_CONSTANTS = ("mean", "std", "limit")  # buffers of an entry's normalization
 
 
 def _action_spec(info: PolicyInfo) -> TensorSpec:
     if info.discrete:
         return Categorical(int(info.high[0]) + 1, dtype=torch.int64)
-    return Bounded(-1.0, 1.0, shape=info.action_shape, dtype=torch.float32)  # as learners take them
+    return Bounded(-1.0, 1.0, shape=info.action_shape, dtype=torch.float32)  # arguments of learners
 
 
 def load_network(info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor]) -> TensorDictModuleBase:
-    """The greedy policy of some weights: reads ``observation`` and ``desired_goal``, writes ``action``.
+    """Makes the greedy policy of given weights, from ``observation`` and ``desired_goal`` to ``action``.
 
     Args:
         info: says the widths.
@@ -69,7 +69,7 @@ def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> Non
     own = {key: tuple(value.shape) for key, value in weights.items()}
     if builder.options.depth > len(weights):
         raise ValueError(f"these are not the weights of an actor of learner={name}")
-    with torch.device("meta"):  # shapes alone
+    with torch.device("meta"):  # without memory: only the shapes matter
         actor = builder.player(1)
         wanted = {key: tuple(value.shape) for key, value in _with_norm(builder, actor).state_dict().items()}
     if own != wanted:
@@ -87,7 +87,7 @@ def _with_norm(builder: LearnerBuilder, actor: TensorDictModule) -> TensorDictMo
 
 
 class ScaledActions(nn.Module):
-    """A network whose actions from -1 to 1 become those between a task's bounds.
+    """A network whose actions are scaled from [-1, 1] to a task's bounds.
 
     Args:
         net: gives actions [..., actions] from -1 to 1.
@@ -108,7 +108,7 @@ class ScaledActions(nn.Module):
         self.register_buffer("high", greatest)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[..., widths] of the inputs to [..., actions]."""
+        """Maps inputs [..., width] to actions [..., actions]."""
         action = self.middle + self.reach * self.net(*inputs)
         return action.minimum(self.high).maximum(self.low)  # rounding may lead out of the bounds
 
@@ -147,26 +147,26 @@ class TensorPolicy(nn.Module):
         return [normalize(value, *own) for value, own in zip(inputs, constants, strict=True)]
 
     def forward(self, observation: Tensor, desired_goal: Tensor) -> Tensor:
-        """[rows, widths] of the inputs to [rows, actions], or to integers [rows]."""
+        """Maps inputs [rows, width] to actions [rows, actions], or to integers [rows]."""
         return self.net(*self.normalized(observation, desired_goal))
 
     @torch.no_grad()
     def deviation(self, action: Tensor, observation: Tensor, desired_goal: Tensor) -> Tensor:
-        """How far actions are from this policy's own, [rows].
+        """Returns how far actions are from this policy's, [rows].
 
         It is the greatest difference of an action's entries. For integers it is by how much the value of
         the action is below the greatest one, since two actions may have the same value.
         """
         seen = self.normalized(observation, desired_goal)
         if not action.is_floating_point():
-            if not hasattr(self.net, "regret"):  # a network of somebody else's learner
+            if not hasattr(self.net, "regret"):  # a network of a user's learner
                 return (action != self.net(*seen)).float()
             return self.net.regret(action, *seen)
         return (action - self.net(*seen)).abs().amax(-1)
 
 
 def _constants(norm: RunningNorm, key: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, deviation and limit of an entry, as :meth:`RunningNorm.normalize` uses them."""
+    """Returns mean, deviation and limit of an entry, as :meth:`RunningNorm.normalize` uses them."""
     n, mean, _ = norm.moments_of(key)
     std = norm.std[0, norm.columns_of(key)]
     limit = torch.where(n > 0, norm.clip, torch.inf)

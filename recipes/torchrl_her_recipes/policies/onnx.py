@@ -34,7 +34,7 @@ _OPSET = 18  # the lowest that torch's exporter writes without converting; runti
 
 
 def need_onnx() -> ModuleType:
-    """Returns the package ``onnxruntime``, if all that writing ONNX files takes is installed."""
+    """Returns the package ``onnxruntime``, if all packages for writing ONNX files are installed."""
     try:
         # All are an extra that few need, and take a second to import.
         import onnx  # noqa: F401, PLC0415
@@ -110,8 +110,8 @@ def _check_actions(own: TensorPolicy, action: Tensor, info: PolicyInfo, seen: di
 
 
 def _graph_of(own: TensorPolicy, info: PolicyInfo) -> Any:
-    """The policy as a protobuf, without what tells of the machine that made it."""
-    inputs = tuple(torch.zeros(2, info.widths[key]) for key in KEYS)  # 2: torch takes 1 for a constant
+    """Converts the policy to a protobuf without traces of the machine that made it."""
+    inputs = tuple(torch.zeros(2, info.widths[key]) for key in KEYS)  # 2 rows: torch takes 1 for a constant
     batch = torch.export.Dim("batch")
     with _silent():
         program = torch.onnx.export(
@@ -128,7 +128,7 @@ def _graph_of(own: TensorPolicy, info: PolicyInfo) -> Any:
     assert program is not None
     proto = program.model_proto
     for each in (*proto.graph.node, *proto.graph.initializer, *proto.graph.value_info):
-        each.ClearField("metadata_props")  # stack traces, which have paths of files
+        each.ClearField("metadata_props")  # stack traces, which contain paths of files
         each.ClearField("doc_string")
     for each in (*proto.graph.input, *proto.graph.output, proto.graph, proto):
         each.ClearField("metadata_props")
@@ -138,13 +138,15 @@ def _graph_of(own: TensorPolicy, info: PolicyInfo) -> Any:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Without notices of torch's exporter that say nothing about the policy."""
+    """Suppresses notices of torch's exporter that do not concern the policy."""
     log = logging.getLogger("torch.onnx")
     level = log.level
-    log.setLevel(logging.ERROR)  # that torchvision is not installed
+    log.setLevel(logging.ERROR)  # suppresses: torchvision is not installed
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that both inputs have the same batch; its own old calls
+            warnings.simplefilter(
+                "ignore"
+            )  # suppresses: both inputs have the same batch, deprecated calls of its own
             yield
     finally:
         log.setLevel(level)

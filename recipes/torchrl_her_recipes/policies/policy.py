@@ -36,8 +36,8 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.policy_file import read_policy, write_policy
 from torchrl_her_recipes.runs.scores import median_run
 
-_MEASURED = 1 << 41  # seeds that no training uses: of the episodes that measure a policy,
-_COMPARED = 1 << 42  # and of those on whose states an ONNX file is compared with it
+_MEASURED = 1 << 41  # seeds that no training uses: for episodes that measure a policy,
+_COMPARED = 1 << 42  # and for those on whose states an ONNX file is compared with it
 
 
 class Policy(TensorDictModuleBase):
@@ -98,7 +98,7 @@ class Policy(TensorDictModuleBase):
         """
         home = RunFolder.of(source)
         if best and (home is None or home.path != Path(source)):
-            raise ValueError(f"best goes with the folder of a run, and {source} is none")
+            raise ValueError(f"best needs the folder of a run, got {source}")
         if home is not None:
             file = Path(source) if home.path != Path(source) else home.best if best else home.policy
             return cls._of_run(home, file, run, str(source))
@@ -110,9 +110,9 @@ class Policy(TensorDictModuleBase):
         described, weights = read_policy(path)
         if not {"info", "recipe"} <= set(described):
             raise ValueError(
-                f"{path} is no exported policy: `torchrl-her export RUN` writes one of a run's folder"
+                f"{path} is not an exported policy: `torchrl-her export RUN` writes one from a run's folder"
             )
-        with naming(path, "is no exported policy"):
+        with naming(path, "is not an exported policy"):
             info, recipe = PolicyInfo.from_dict(described["info"]), Recipe.from_dict(described["recipe"])
             return cls(info, recipe, weights, str(source))
 
@@ -265,7 +265,7 @@ def export_policy(
     best: bool = False,
     card: bool = True,
 ) -> Policy:
-    """Writes the policy of a run as a small file of its own, measured on 1,000 episodes, and a page about it.
+    """Exports the policy of a run, measured on 1,000 episodes, to a small file, and writes a page about it.
 
     Args:
         source: The policy, as for :meth:`Policy.load`.
@@ -302,7 +302,7 @@ def export_policy(
 
 
 def _check_out(path: Path, *, card: bool) -> None:
-    """Refuses a file that cannot be written, before anything takes long."""
+    """Refuses a file that cannot be written, before any long computation."""
     if path.suffix not in (POLICY_SUFFIX, SUFFIX):
         raise ValueError(f"a policy's file must end with {POLICY_SUFFIX} or {SUFFIX}, got {path.name!r}")
     if card:
@@ -320,12 +320,14 @@ def _path_of(source: str | Path) -> Path:
         raise ValueError(f"there is no policy {str(source)!r}; there are {', '.join(policy_names())}")
     if path.suffix != POLICY_SUFFIX:
         why = "is for onnxruntime" if path.suffix == SUFFIX else f"does not end with {POLICY_SUFFIX}"
-        raise ValueError(f"{path} {why} and cannot be loaded: `torchrl-her export RUN` writes what can")
+        raise ValueError(
+            f"{path} {why} and cannot be loaded: `torchrl-her export RUN` writes a file that can"
+        )
     return path
 
 
 def _as_shown(actor: dict[str, Tensor], places: Tensor, width: int) -> dict[str, Tensor]:
-    """Returns an actor's weights for inputs in other places; inputs that no place names have no effect.
+    """Returns an actor's weights for reordered inputs; unused inputs get weight 0.
 
     Args:
         actor: Weights of the actor and its normalization.

@@ -33,9 +33,9 @@ class Recorded:
     """Result of a recording.
 
     Attributes:
-        demonstrations: what the file holds.
-        played: how many episodes were played for it.
-        achieved: in how many of these the goal was achieved.
+        demonstrations: contents of the file.
+        played: number of episodes that were played for it.
+        achieved: number of these episodes that achieved their goal.
     """
 
     demonstrations: Demonstrations
@@ -63,7 +63,7 @@ def record_demonstrations(
         out: the file.
 
     Keyword Args:
-        episodes: how many are written. At most ten times as many are played.
+        episodes: number of episodes to write; at most ten times as many are played.
         policy: ``"expert"``, which is the task's scripted controller; the name of a trained policy that comes
             with the package; or the file of an exported one. None: the scripted controller.
         seed: seed of starts and goals.
@@ -89,7 +89,7 @@ def record_demonstrations(
 
 
 def _find_policy(recipe: Recipe, env: EnvBase, policy: str | Path | None) -> tuple[Player, str]:
-    """A policy that plays in some environments, and its name."""
+    """Finds a policy that plays in some environments, and its name."""
     task = recipe.task.name
     if policy is None or str(policy) == EXPERT:
         try:
@@ -114,7 +114,7 @@ def _play(
         own = demonstrate(env, player, max_steps=goal_env(env).max_steps, achieved_reward=reward)
         own = own.select(range(min(len(own), (episodes if keep_all else _MOST * episodes) - played)))
         good = own.achieved.nonzero().flatten()
-        if not keep_all and len(good) >= episodes - kept:  # episodes behind the last one were in vain
+        if not keep_all and len(good) >= episodes - kept:  # later episodes are dropped
             good = good[: episodes - kept]
             own = own.select(range(int(good[-1]) + 1))
         played, achieved = played + len(own), achieved + len(good)

@@ -1,4 +1,4 @@
-"""Policies at work side by side: as pictures, and as a film."""
+"""Shows policies that act side by side: as pictures, and as a video."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _HOLD = 25  # times that the last frame of a film is repeated
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """How policies are shown.
+    """Options for showing policies.
 
     Args:
         goals: Number of goals, side by side.
@@ -41,7 +41,7 @@ class View:
 
 
 class Seen(NamedTuple):
-    """Goals that a policy achieved, and all that it had."""
+    """Number of goals that a policy achieved, of those that it had."""
 
     achieved: int
     goals: int
@@ -68,7 +68,7 @@ class Viewer:
                     raise ValueError(f"{policy.source} cannot be filmed: its environment gives no pictures")
                 self._episodes.append(LiveEpisodes(env, policy, size=view.size))
             self._opened = opened.pop_all()
-        self._before = [Seen(0, 0)] * len(self._episodes)  # in earlier episodes
+        self._before = [Seen(0, 0)] * len(self._episodes)  # counts of earlier episodes
         self._round = -1
 
     def __enter__(self) -> Self:
@@ -99,12 +99,12 @@ class Viewer:
 
     @property
     def desired_goal(self) -> Tensor:
-        """The goals [goals, g], as the first policy sees them."""
+        """Goals [goals, g], in the coordinates of the first policy."""
         return self._episodes[0].desired_goal
 
     @property
     def seen(self) -> list[Seen]:
-        """Achieved goals of each policy since the first start, and all whose episode has ended."""
+        """Achieved goals of each policy since the first start, and the number of ended episodes."""
         pairs = zip(self._before, self._episodes, strict=True)
         return [
             Seen(before.achieved + own.achieved, before.goals + own.worlds - len(own.running))
@@ -112,7 +112,7 @@ class Viewer:
         ]
 
     def start(self) -> None:
-        """Begins episodes with the next goals; open episodes are given up and do not count."""
+        """Begins episodes with the next goals; open episodes are dropped and do not count."""
         if self._round >= 0:
             self._before = self.seen
         self._round += 1
@@ -120,7 +120,7 @@ class Viewer:
             own.start(seed=self.view.seed + self._round)
 
     def step(self) -> None:
-        """Takes a step with each policy whose episodes are open."""
+        """Takes a step with each policy that has open episodes."""
         for own in self._episodes:
             own.step()
 
@@ -172,7 +172,7 @@ def _task_of(policy: Policy) -> TaskConfig:
 
 
 def _described(task: TaskConfig) -> str:
-    """Returns a task with those of its options that are not as usual, in words."""
+    """Describes a task and its options that differ from their defaults, in words."""
     usual: dict[str, Any] = dict(get_task_spec(task.name).options)
     own = {**usual, **(task.options or {})}
     if task.threshold is not None:

@@ -1,4 +1,4 @@
-"""Policies at work, live in a window or as a film."""
+"""Shows policies live in a window, or writes a video of them."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class Viewing:
 
     @property
     def rate(self) -> int:
-        """Steps a second."""
+        """Number of steps a second."""
         return _RATES[self._rate]
 
     def handle(self, command: Command) -> None:
@@ -130,23 +130,23 @@ class Viewing:
             self._rate = max(self._rate - 1, 0)
 
     def tick(self) -> None:
-        """Takes a step if it is not paused; about a second after the last one, the next goals begin."""
+        """Takes a step unless paused; starts the next goals about a second after the last step."""
         if not self.paused and not self.over:
             self._go_on(hold=self.rate)
 
     def frame(self) -> Tensor:
-        """The present picture [height, width, 3] of uint8, with what there is to know below it."""
+        """The present picture [height, width, 3] of uint8, with lines of information below it."""
         return underlined(self._viewer.frame(), [self.status(), _KEYS])
 
     def status(self) -> str:
-        """Which goals, which step, and how fast."""
+        """Describes goals, step and speed in a line."""
         own, goals, first = self._viewer, self._viewer.view.goals, self._viewer.first_goal
         which = f"goal {first}{self._where()}" if goals == 1 else f"goals {first} to {first + goals - 1}"
         speed = "paused" if self.paused else f"{self.rate} steps a second"
         return f"{which}, step {own.step_count} of {own.max_steps}, {speed}"
 
     def _where(self) -> str:
-        """The coordinates of the goal, if there are few."""
+        """Formats the coordinates of the goal, if there are few."""
         goal = self._viewer.desired_goal[0].flatten().tolist()
         return f" at ({', '.join(f'{x:.2f}' for x in goal)})" if len(goal) <= _MOST_NUMBERS else ""
 

@@ -1,1 +1,1 @@
-"""Reports: what a study's runs say together."""
+"""Reports: pages and tables about the runs of a study."""

@@ -1,4 +1,4 @@
-"""Interquartile means and their bootstrap intervals: those of SciPy and `arch`, put together.
+"""Interquartile means and their bootstrap intervals, by SciPy and `arch`.
 
 What Agarwal et al., *Deep Reinforcement Learning at the Edge of the Statistical Precipice*, 2021, recommend
 for few runs on several tasks.
@@ -19,19 +19,19 @@ except ImportError as error:  # they are large, and only reports need them
 
 REPETITIONS = 2_000
 _SIZE = 0.95
-_CUT = 0.25  # of the runs at either end
+_CUT = 0.25  # fraction of the runs that is cut off at either end
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A number, and where it is with 95 % confidence; the ends are NaN where there is too little to tell."""
+    """A number with its 95 % confidence interval, whose ends are NaN if there are too few samples."""
 
     value: float
     low: float
     high: float
 
     def overlaps(self, other: Interval) -> bool:
-        """Whether the two have a point in common.
+        """Returns whether two intervals have a point in common.
 
         Example:
             >>> Interval(0.2, 0.1, 0.3).overlaps(Interval(0.5, 0.3, 0.6))
@@ -41,7 +41,7 @@ class Interval:
 
 
 def interquartile_means(groups: Sequence[Sequence[float] | np.ndarray]) -> np.ndarray:
-    """The mean of the middle half of each group of values, [G].
+    """Computes the mean of the middle half of each group of values, [G].
 
     Example:
         >>> interquartile_means([[0.0, 0.5, 0.7, 9.0], [1.0, 2.0]]).tolist()
@@ -62,14 +62,14 @@ def bootstrap(
     repetitions: int = REPETITIONS,
     seed: int = 0,
 ) -> tuple[list[Interval], list[Interval]]:
-    """Interquartile means of groups of samples and differences of such means, with 95 % intervals.
+    """Computes interquartile means of groups of samples, and their differences, with 95 % intervals.
 
     The bootstrap is stratified: each repetition draws every sample anew from its own runs, so a group (an
     algorithm on several tasks) always has as many runs of each task as there are.
 
     Args:
         samples: the runs of each algorithm on each task.
-        groups: which samples are taken together in each mean.
+        groups: indices of the samples in each mean.
         pairs: pairs of groups, whose means are subtracted: the first minus the second.
         repetitions: number of repetitions of the bootstrap.
         seed: seed of its random numbers.

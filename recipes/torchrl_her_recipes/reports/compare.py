@@ -17,7 +17,7 @@ from torchrl_her_recipes.reports.bootstrap import Interval, bootstrap
 from torchrl_her_recipes.reports.results import LAST, Combination, at_the_end
 
 ALL_TASKS = "all tasks"
-_COUNTED = ("kl", "rows_")  # metrics that sum up all of a run: the last one stands for it
+_COUNTED = ("kl", "rows_")  # metrics accumulated over a run, of which only the last evaluation counts
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Final:
 
     @property
     def interval(self) -> Interval:
-        """The interquartile mean."""
+        """The interquartile mean as an interval."""
         return Interval(self.iqm, self.low, self.high)
 
 
@@ -113,7 +113,7 @@ def compare(
         groups.append([index for index, cell in enumerate(shown) if cell.algorithm == algorithm])
     final = [all(shown[index].done for index in group) for group in groups]
     pairs = [
-        (first, second)  # the later one minus the earlier: plain HER comes first in most studies
+        (first, second)  # the later algorithm minus the earlier: plain HER comes first in most studies
         for second, first in combinations(range(len(keys)), 2)
         if keys[first][0] == keys[second][0] and final[first] and final[second]
     ]
@@ -143,14 +143,14 @@ def compare(
 
 
 def _complete(cells: Sequence[Combination], shown: Sequence[Combination]) -> list[str]:
-    """The algorithms that are at their end on all tasks, if there are several."""
+    """Returns the algorithms whose runs are finished on all tasks, if there are several."""
     tasks = {cell.task for cell in cells}
     counts = Counter(cell.algorithm for cell in shown if cell.done)
     return [name for name, count in counts.items() if count == len(tasks) > 1]
 
 
 def judge(cells: Sequence[Combination], orders: Sequence[Order], found: Sequence[Difference]) -> list[Judged]:
-    """Whether orders hold: on each task of a study, and the ones of success on all tasks together.
+    """Judges whether expected orders hold, on each task of a study and, for success, on all tasks together.
 
     An order holds if the 95 % interval of the difference lies on its side of 0. That is less than asking
     for intervals of the two algorithms that lie apart, which is said, too.
@@ -189,7 +189,7 @@ def _judge(cells: Sequence[Combination], order: Order, task: str, found: Sequenc
 
 
 def _verdict(gap: Interval, *, rising: bool, apart: bool) -> Verdict:
-    """Verdict on an order by the interval of a difference."""
+    """Returns the verdict on an order, from the interval of a difference."""
     if math.isnan(gap.low):
         return Verdict.OPEN
     above, below = gap.low > 0, gap.high < 0

@@ -1,4 +1,4 @@
-"""Measures and numbers as a reader of a report wants them."""
+"""Formats measures and numbers for readers of a report."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIGNS = {  # verdict to a sign for it, and a class of the page
 
 
 def show(value: float | None, measure: str) -> str:
-    """A number of a measure as a reader wants it; a dash for none.
+    """Formats a number of a measure; a dash if there is none.
 
     Example:
         >>> show(0.614, "success"), show(1.0, "kl"), show(12345.6, "rows_real_positive"), show(None, "kl")
@@ -41,12 +41,12 @@ def show(value: float | None, measure: str) -> str:
 
 
 def show_interval(row: Final, measure: str) -> str:
-    """An interquartile mean with its interval."""
+    """Formats an interquartile mean with its interval."""
     return show(row.iqm, measure) + show_range(row.low, row.high, measure)
 
 
 def show_range(low: float, high: float, measure: str) -> str:
-    """Two ends in brackets, behind a number; nothing where they are not known.
+    """Formats the ends of an interval in brackets; empty if they are not known.
 
     Example:
         >>> show_range(0.27, 0.45, "success")
@@ -58,7 +58,7 @@ def show_range(low: float, high: float, measure: str) -> str:
 
 
 def show_gap(row: Difference | Judged) -> str:
-    """A difference with its interval; of success in points.
+    """Formats a difference with its interval; differences of success are in percentage points.
 
     Example:
         >>> show_gap(Difference("success", "hand_v0", "her_ibs", "her", 0.0932, 0.01, 0.2, False))

@@ -1,4 +1,4 @@
-"""A page about a study, and the tables and pictures that it is made of."""
+"""Writes a page about a study with its tables and pictures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _AT_THE_END = ("success", "reached", "distance", "kl", "q_bias")  # shown with i
 
 
 def write_report(study: Study, folder: Path, out: Path) -> Path:
-    """Writes a page about what there is of a study; trains nothing.
+    """Writes a page about the results of a study so far, without training anything.
 
     Args:
         study: study that is meant.
@@ -107,13 +107,13 @@ def _duration(seconds: float) -> str:
 
 
 def _success_now(cell: Combination) -> str:
-    """The success of its last evaluation, the median of its runs."""
+    """Formats the median success of the runs in the last evaluation of a combination."""
     last = [row["success"] for row in cell.rows if row["epoch"] == cell.epoch]
     return show(statistics.median(last), "success")
 
 
 def _averaged(cells: Sequence[Combination]) -> str:
-    """The evaluations whose mean is shown: the last ones, as far as there are as many."""
+    """Describes the evaluations whose mean is shown: the last ones, or fewer if a run has fewer."""
     counts = [min(LAST, len({row["epoch"] for row in cell.rows})) for cell in cells if not cell.missing]
     least, most = min(counts), max(counts)
     if most == 1:
@@ -122,7 +122,7 @@ def _averaged(cells: Sequence[Combination]) -> str:
 
 
 def _shares(rows: Sequence[Final]) -> dict[tuple[str, str], tuple[float, float | None]]:
-    """Share of HER's divergence that each algorithm leaves on the same task: here, and as published."""
+    """Computes each algorithm's divergence as a fraction of HER's on its task: measured and published."""
     her = {row.task: row for row in rows if row.algorithm == "her" and row.iqm > 0}
     shares = {}
     for row in rows:
@@ -134,7 +134,7 @@ def _shares(rows: Sequence[Final]) -> dict[tuple[str, str], tuple[float, float |
 
 
 def _by_order(judged: Sequence[Judged]) -> dict[tuple[str, str], dict[str, Judged]]:
-    """Measure and order to task to what became of it."""
+    """Arranges verdicts by measure and order, then by task."""
     table: dict[tuple[str, str], dict[str, Judged]] = {}
     for row in judged:
         table.setdefault((row.measure, row.order), {})[row.task] = row
@@ -172,7 +172,7 @@ def _about(cell: Combination) -> dict[str, Any]:
 
 
 def _points(cell: Combination) -> list[dict[str, Any]]:
-    """Rows of the page's curves."""
+    """Returns the rows of the page's table of curves."""
     names = ("frames", "percentile_33", "median", "percentile_67")
     return [
         {"task": cell.task, "algorithm": cell.algorithm, "measure": measure}

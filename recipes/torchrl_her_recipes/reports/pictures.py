@@ -1,4 +1,4 @@
-"""The pictures of a report, drawn into files, with words for those who cannot see them."""
+"""Draws the pictures of a report into files, with alternative texts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Picture:
 
     Attributes:
         file: that is embedded.
-        alt: what it shows, in words.
+        alt: alternative text.
     """
 
     file: Path
@@ -36,7 +36,7 @@ class Picture:
 
     @property
     def uri(self) -> str:
-        """The whole picture as an address."""
+        """The whole picture as a data URI."""
         data = base64.b64encode(self.file.read_bytes()).decode()
         return f"data:{_MIME[self.file.suffix]};base64,{data}"
 
@@ -44,7 +44,7 @@ class Picture:
 def draw_pictures(
     cells: Sequence[Combination], finals: Sequence[Final], figures: Path
 ) -> dict[str, list[Picture]]:
-    """All pictures: the panels of each figure, one for each task; the heat maps of a task are a figure."""
+    """Draws all pictures: figures with a panel for each task, and a figure of heat maps for each task."""
     pictures: dict[str, list[Picture]] = {}
     palette = colors(list(dict.fromkeys(cell.algorithm for cell in cells)))
     for task in dict.fromkeys(cell.task for cell in cells):
@@ -91,7 +91,7 @@ def _final(
 
 
 def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Picture]:
-    """A heat map of each algorithm's virtual goals, and one of where they should be."""
+    """Draws a heat map of each algorithm's virtual goals, and one of their target."""
     if task not in TASKS:
         return []  # there is no screen to draw them on
     maps = {cell.algorithm: cell.goals for cell in cells if cell.goals is not None}
@@ -111,5 +111,5 @@ def _map(task: str, label: str, share: np.ndarray, env: ThrowingEnv, limit: floa
 
 
 def _stem(figures: Path, *words: str) -> Path:
-    """The name of a picture, of letters that every file system takes."""
+    """Returns the name of a picture, in characters that every file system allows."""
     return figures / re.sub(r"[^\w.=-]+", "_", "_".join(words))

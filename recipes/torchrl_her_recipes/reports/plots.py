@@ -1,4 +1,4 @@
-"""Pictures of a study, a panel each, so that a page can set them side by side or below each other."""
+"""Plots of a study, one panel in each picture, so that a page can arrange them."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _panel(title: str, *, height: float = _HEIGHT) -> tuple[Figure, Axes]:
 
 
 def _save(figure: Figure, stem: Path) -> None:
-    """Writes a picture twice: to be scaled, and for what cannot."""
+    """Writes a picture as .svg, and as .png for programs that cannot show that."""
     figure.savefig(f"{stem}.svg", metadata={"Date": None})
     figure.set_layout_engine("none")  # it is laid out already, which takes longer than drawing it
     figure.savefig(f"{stem}.png", dpi=120)

@@ -13,7 +13,7 @@ from torchrl_her_recipes.config.study import Study, curve_label
 from torchrl_her_recipes.runs.goal_map import GoalMap
 from torchrl_her_recipes.studies.seed_batches import Batches
 
-LAST = 3  # evaluations whose mean is what a run reached in the end
+LAST = 3  # number of last evaluations whose mean is a run's result
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,15 +25,15 @@ class Combination:
     Attributes:
         label: its name, which is that of its folder.
         task: the task that was learned.
-        algorithm: what sets it apart from the others on the same task.
+        algorithm: name that distinguishes it from the others on the same task.
         options: the options that the study varies, and their values here.
         rows: its table of metrics, one row for each epoch and run.
         done: whether the runs in its table have reached their last epoch.
         epochs: the last epoch of its runs.
-        planned: how many runs the study has of it.
+        planned: number of its runs in the study.
         seconds: how long its runs took, one core each; NaN if that is not known.
         differs: options that are not the study's, in words.
-        goals: where its virtual goals lie; None if nothing counted them.
+        goals: histogram of its virtual goals; None if they were not counted.
     """
 
     label: str
@@ -50,12 +50,12 @@ class Combination:
 
     @property
     def missing(self) -> bool:
-        """Whether there is nothing to show of it."""
+        """Whether there are no results."""
         return not self.rows
 
     @property
     def epoch(self) -> int:
-        """The last one that was evaluated."""
+        """Last epoch that was evaluated."""
         return int(self.rows[-1]["epoch"]) if self.rows else 0
 
     @property
@@ -65,12 +65,12 @@ class Combination:
 
     @property
     def runs(self) -> int:
-        """How many runs are in the table."""
+        """Number of runs in the table."""
         return len({row["run"] for row in self.rows})
 
     @property
     def state(self) -> str:
-        """How far it is, in words."""
+        """Progress of the combination, in words."""
         if self.missing:
             return "missing"
         if not self.done:
@@ -79,16 +79,16 @@ class Combination:
 
     @property
     def whole(self) -> bool:
-        """Whether it is at its end with all of the study's runs."""
+        """Whether all of the study's runs are finished."""
         return self.done and self.runs >= self.planned
 
     def has(self, name: str) -> bool:
-        """Whether its table has a metric."""
+        """Returns whether the table has a metric."""
         return bool(self.rows) and all(name in row for row in self.rows)
 
 
 def read_combinations(study: Study, folder: Path) -> list[Combination]:
-    """All combinations of a study, with what a folder holds of them."""
+    """Reads all combinations of a study, with their results in a folder."""
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; `torchrl-her study {study.name}` makes its runs")
     cells = [
@@ -110,7 +110,7 @@ def _read(label: str, planned: Recipe, options: Mapping[str, Any], batches: Batc
 
 
 def read_single(label: str, batches: Batches) -> Combination:
-    """A run of no study; what differs are the options that are not the usual ones."""
+    """Reads a single run as a combination, described by its options that differ from the defaults."""
     recipes = [home.recipe() for home in batches.homes]
     made = recipes[0].replace(num_runs=sum(own.run.num_runs for own in recipes))
     differs = [f"{name}={value}" for name, value, _ in _differences(made, Recipe())]
@@ -118,7 +118,7 @@ def read_single(label: str, batches: Batches) -> Combination:
 
 
 def _differences(made: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
-    """The options of a recipe that are not those of another one, and their values in both."""
+    """Returns the options in which two recipes differ, and their values in both."""
     ours, theirs = dict(_flat(made.to_dict())), dict(_flat(usual.to_dict()))
     changed = {*dict(_flat(made.changed())), *dict(_flat(usual.changed()))}
     differ = [name for name, value in ours.items() if name in changed and value != theirs.get(name)]
@@ -152,7 +152,7 @@ def _combination(
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Mappings within mappings as one, with names such as ``group.option``."""
+    """Flattens nested mappings to one with names such as ``group.option``."""
     for name, value in values.items():
         if isinstance(value, Mapping) and value:
             yield from _flat(value, f"{prefix}{name}.")

@@ -1,4 +1,4 @@
-"""A page about single runs, or about a folder of them; some may not be at their end."""
+"""Writes a page about single runs or a folder of runs, finished or not."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LARGEST = 20_000_000  # bytes of a film
 
 
 def read_runs(folders: Sequence[Path]) -> Results:
-    """Reads some runs; those that differ only in their seeds are one algorithm on the page.
+    """Reads some runs; those that differ only in their seeds form one algorithm on the page.
 
     Args:
         folders: folders of runs, or of batches of seeds (``seeds_*``), or with such folders in them.
@@ -39,7 +39,7 @@ def read_runs(folders: Sequence[Path]) -> Results:
 
 
 def write_runs_report(folders: Sequence[Path], out: Path) -> Path:
-    """Writes a page about single runs, of which some may not be at their end; trains nothing.
+    """Writes a page about single runs, finished or not, without training anything.
 
     Args:
         folders: folders of runs, or of folders with runs in them.

@@ -1,4 +1,4 @@
-"""The numbers of a study as files to keep: one table of all its runs, and what is to be known about them."""
+"""Stores the numbers of a study in a few files: one table of all its runs, and facts about them."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from torchrl_her_recipes.runs.goal_map import GoalMap
 
 _ABOUT, _RUNS, _GOALS = "about.yaml", "runs.csv", "goals.npz"
 _DAMAGE = (AttributeError, EOFError, LookupError, OSError, TypeError, ValueError, csv.Error, zlib.error)
-_LARGE = 1_000_000  # bytes, from which on a table is compressed
-_KEYS = ("seed", "epoch", "frames")  # of a row, beside its combination
+_LARGE = 1_000_000  # size in bytes above which a table is compressed
+_KEYS = ("seed", "epoch", "frames")  # columns that identify a row within its combination
 _KEPT = ("task", "algorithm", "options", "done", "epochs", "planned", "seconds", "differs")
 
 
@@ -43,7 +43,7 @@ class Results:
         name: name of the study.
         summary: one-line description for users.
         cells: its combinations.
-        kind: what they are: of a ``"study"``, or single ``"runs"``.
+        kind: origin of the results: a ``"study"`` or single ``"runs"``.
         expect, published: as in :class:`~torchrl_her_recipes.Study`.
         film: the newest film of its policies, if there is one.
     """
@@ -58,7 +58,7 @@ class Results:
 
 
 def is_results(folder: Path) -> bool:
-    """Whether a folder holds the files of :func:`write_results`, and not the folders of runs."""
+    """Returns whether a folder holds the files of :func:`write_results`, and not the folders of runs."""
     return (folder / _ABOUT).is_file()
 
 
@@ -101,7 +101,7 @@ def write_results(
     Args:
         study: study that is meant.
         folder: with a folder of each of its combinations; some may be missing or not at their end.
-        out: where the files go.
+        out: folder for the files.
         command: the command, or several, that made the runs; by default ``torchrl-her study NAME``.
 
     Returns:
@@ -136,7 +136,9 @@ def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Pat
     text = yaml.safe_dump(
         {**_plain(about), "combinations": states}, sort_keys=False, allow_unicode=True, width=110
     )
-    (out / _ABOUT).write_text(text, encoding="utf-8")  # the last: with it the folder is one of results
+    (out / _ABOUT).write_text(
+        text, encoding="utf-8"
+    )  # written last: a folder with this file counts as results
     return out
 
 
@@ -182,19 +184,21 @@ def _write_table(cells: Sequence[Combination], out: Path) -> None:
                 writer.writerow([*own, *(_number(row.get(name)) for name in (*_KEYS, *metrics))])
     packed.unlink(missing_ok=True)
     if plain.stat().st_size > _LARGE:
-        packed.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))  # the same bytes every time
+        packed.write_bytes(
+            gzip.compress(plain.read_bytes(), mtime=0)
+        )  # without a time stamp: the same bytes every time
         plain.unlink()
 
 
 def _number(value: float | None) -> str:
-    """Six significant digits; whole numbers have all of theirs."""
+    """Formats a number with six significant digits; whole numbers with all of them."""
     if value is None:
         return ""
     return str(int(value)) if float(value).is_integer() else f"{value:.6g}"
 
 
 def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
-    """Label to its rows in the order of epochs and runs."""
+    """Reads the table of runs: rows by label, in the order of epochs and runs."""
     path, packed = folder / _RUNS, folder / f"{_RUNS}.gz"
     if not path.is_file() and not packed.is_file():
         raise ValueError(f"{folder} has no {_RUNS}")
@@ -208,7 +212,7 @@ def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
         names = lines.fieldnames or []
         if not {"label", *_KEYS} <= set(names):
             raise ValueError(f"its columns are {', '.join(names)}")
-        numbers = names.index("seed")  # what comes before them says which combination
+        numbers = names.index("seed")  # the columns before these identify the combination
         for line in lines:
             row = {name: number(line[name]) for name in names[numbers:] if line[name] != ""}
             tables.setdefault(line["label"], []).append(row)
@@ -218,7 +222,7 @@ def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
 
 
 def _count(rows: list[dict[str, float]]) -> list[dict[str, float]]:
-    """Runs are counted in the order of their seeds, as when the folders of runs are read."""
+    """Numbers runs in the order of their seeds, as when the folders of runs are read."""
     places = {seed: run for run, seed in enumerate(sorted({row["seed"] for row in rows}))}
     return sorted(
         ({"run": places[row["seed"]], **row} for row in rows), key=lambda row: (row["epoch"], row["run"])
@@ -249,7 +253,7 @@ def _read_goals(path: Path) -> dict[str, GoalMap]:
 
 
 def _origin(folders: Sequence[Path]) -> dict[str, Any]:
-    """The day of the last evaluation, and the versions that all runs had."""
+    """Returns the day of the last evaluation, and the versions of packages in all runs."""
     homes = [home for folder in folders for home in (folder, *sorted(folder.glob("seeds_*")))]
     versions: dict[str, set[str]] = {}
     for path in (home / "run.json" for home in homes):
@@ -265,7 +269,7 @@ def _origin(folders: Sequence[Path]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Values that YAML has words for."""
+    """Converts values to types that YAML can store."""
     if isinstance(value, Mapping):
         return {str(name): _plain(own) for name, own in value.items()}
     if isinstance(value, list | tuple):

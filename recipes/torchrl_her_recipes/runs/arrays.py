@@ -23,6 +23,6 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             if odd := [name for name, array in arrays.items() if array.dtype.kind not in "biuf"]:
                 raise ValueError(f"{odd[0][:80]!r} holds no numbers")
             return arrays
-        except Exception as error:  # of any type: zlib's, zipfile's, those of Python's parser
+        except Exception as error:  # errors of any type: zlib's, zipfile's, those of Python's parser
             said = str(error) if type(error) is ValueError else f"it holds no arrays ({type(error).__name__})"
             raise ValueError(f"{path} is damaged: {said}") from error

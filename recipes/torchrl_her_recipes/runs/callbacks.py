@@ -1,4 +1,4 @@
-"""Callbacks: code of your own that a run calls on its way, and that may stop it."""
+"""Callbacks: user code that a run calls during training, and that may stop it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torchrl_her_recipes.runs.folder import RunFolder
 
 @dataclass(frozen=True)
 class RunView:
-    """What a callback sees of a run, always as it is now.
+    """Live view of a run for callbacks.
 
     Attributes:
-        components: what the run consists of.
+        components: components of the run.
         trainer: the training loop, with its counters ``frames``, ``updates`` and ``epochs``.
         rows: the table of metrics so far, with a row for each epoch and run.
-        folder: where the run writes its files, or None.
+        folder: folder of the run, or None.
     """
 
     components: Components
@@ -30,7 +30,7 @@ class RunView:
 
 
 class Callback:
-    """Is called by a run on its way. Override the methods that you need; here they do nothing.
+    """Base class of callbacks. Override the methods that you need; here they do nothing.
 
     ``on_batch`` and ``on_epoch`` may return True to stop the run in good order: its checkpoint, pictures and
     policy are written as at its end, and :func:`~torchrl_her_recipes.resume` can go on from there. All
@@ -47,7 +47,7 @@ class Callback:
     """
 
     def on_start(self, run: RunView) -> None:
-        """Called before the first batch, also when a run goes on."""
+        """Called before the first batch, also when a run resumes."""
 
     def on_batch(self, run: RunView) -> bool | None:
         """Called after each collected batch and its gradient steps; returns whether to stop."""
@@ -62,7 +62,7 @@ class Callback:
         return None
 
     def on_end(self, run: RunView) -> None:
-        """Called when everything was written, also after Ctrl-C or a stop."""
+        """Called after everything was written, also after Ctrl-C or a stop."""
 
 
 class EarlyStopping(Callback):
@@ -104,11 +104,11 @@ class EarlyStopping(Callback):
         self.metric, self.at_least, self.at_most, self.epochs = metric, at_least, at_most, epochs
 
     def on_epoch(self, run: RunView) -> bool:
-        """Whether the metric has been good enough for as many evaluations as it should."""
+        """Returns whether the metric has been good enough in the required number of evaluations."""
         return self.reached(run.rows)
 
     def reached(self, rows: Sequence[dict[str, float]]) -> bool:
-        """Whether the last evaluations of a table are all good enough. NaN is not.
+        """Returns whether the last evaluations of a table are all good enough; NaN is not.
 
         Args:
             rows: the table, with a row for each epoch and run.
@@ -133,4 +133,4 @@ class EarlyStopping(Callback):
 
 
 class Stopped(Exception):
-    """A callback asked in the middle of an epoch to stop the run."""
+    """Raised when a callback stops the run in the middle of an epoch."""

@@ -7,7 +7,7 @@ from torchrl_her_recipes.config.recipe import Recipe
 
 _SELDOM = 0.5  # of the episodes
 _UNLIKE = 100  # times as large
-_SLOW = 5e-3  # seconds of an environment's step, about those of a gradient step
+_SLOW = 5e-3  # seconds: slower environments take longer for a step than a gradient step does
 _MOSTLY = 0.5
 _ROUNDED = 0.005
 
@@ -63,7 +63,7 @@ def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> li
 
 
 def _percent(share: float) -> str:
-    """A share that is above 0 is never 0%."""
+    """Formats a fraction as a percentage; one above 0 is never shown as 0%."""
     return "less than 1%" if 0 < share < _ROUNDED else f"{share:.0%}"
 
 

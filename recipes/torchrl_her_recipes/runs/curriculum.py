@@ -1,4 +1,4 @@
-"""Runs in a curriculum: how well they do in their layer, and when the next one begins."""
+"""Runs in a curriculum: measures their success in their layer, and moves them to the next one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchrl_her_recipes.components.envs import judging
 
 
 def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDictBase:
-    """Greedy episodes of each run, run after run, with starts and goals of their own in each epoch."""
+    """Plays greedy episodes, run after run, with new starts and goals in each epoch."""
     task, recipe = goal_env(env), components.recipe
     runs, episodes = recipe.run.num_runs, recipe.evaluation.episodes
     task.set_seeds(eval_seeds(recipe.seeds, epoch))
@@ -37,7 +37,7 @@ def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDic
 def layer_success(
     components: Components, state: CurriculumState, rollout: TensorDictBase, epoch: int
 ) -> Tensor:
-    """Success [R, n] at the goals of the runs' layers; that of ``rollout`` where it is the full task."""
+    """Returns success [R, n] at the goals of the runs' layers; in the last layer that of ``rollout``."""
     runs, last = components.recipe.run.num_runs, len(state.curriculum) - 1
     full = success(rollout, **judging(components.eval_env)).float().view(runs, -1)
     below = state.progress.layer < last

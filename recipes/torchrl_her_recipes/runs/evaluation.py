@@ -1,4 +1,4 @@
-"""What is measured of runs at the end of an epoch."""
+"""Measurements of runs at the end of an epoch."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchrl_her_recipes.runs.notices import saturation
 
 @torch.no_grad()
 def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor]:
-    """What greedy episodes of each run show of the policy and the critics, [R] each.
+    """Computes metrics of policy and critics from greedy episodes of each run, [R] each.
 
     ``q`` is the value of the first action as the loss's own critics see it (see
     :func:`~torchrl_her.objectives.critic_value`), and ``q_bias`` is that minus the return of the policy that
@@ -29,7 +29,7 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     """
     recipe, judged_by = components.recipe, judging(components.eval_env)
     there = success(rollout, **judged_by)
-    # An episode that is cut off at its goal is taken to stay there.
+    # An episode that is truncated at its goal is assumed to stay there.
     missed, achieved = components.rewards
     tail = torch.where(there, achieved, missed).to(rollout["next", "reward"].dtype)
     returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=tail)
@@ -51,7 +51,7 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
 
 
 def written(components: Components, run: int) -> dict[str, float]:
-    """What the writer of one run has counted."""
+    """Returns the counts of one run's writer, as metrics."""
     writer = components.buffer.writer
     counts = {f"rows_{name}": value for name, value in asdict(writer.totals_of(run)).items()}
     weights = writer.goal_weights[run] if writer.goal_weights else None
@@ -61,7 +61,7 @@ def written(components: Components, run: int) -> dict[str, float]:
     elif isinstance(weights, InstructiveWeights):
         divergence = weights.divergence
     if divergence is not None:
-        # q* is that of the full task
+        # q* belongs to the full task
         full = components.curriculum is None or components.curriculum.at_the_top(run)
         counts["kl"] = divergence if full else math.nan
     return counts

@@ -1,4 +1,4 @@
-"""The film of a run's policy that is made at its end."""
+"""Makes a video of a run's policy at the end of the run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FILMED = 6  # environments
 def film_policy(
     recipe: Recipe, env: EnvBase, player: TensorDictModuleBase, out: Path, *, run: int, epoch: int
 ) -> None:
-    """Films greedy episodes of one of the runs, if its environment gives pictures.
+    """Makes a video of greedy episodes of one of the runs, if its environment can be rendered.
 
     Environments that only give pictures if they are made for it are made anew. Drawing them may need what a
     machine lacks, such as a display: then there is a warning instead of a film.
@@ -40,7 +40,7 @@ def film_policy(
             with closing(drawn):
                 if goal_env(drawn).can_render:
                     _film(player, drawn, out, run * shown, shown)
-        except Exception as error:  # whatever a renderer raises: the run itself is done
+        except Exception as error:  # a renderer may raise any error; the run itself is done
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"no {out.name}: the environment could not be drawn: {reason}", stacklevel=2)
 

@@ -1,4 +1,4 @@
-"""The folder that a run leaves behind: configuration, metrics, checkpoint, pictures."""
+"""The folder of a run: configuration, metrics, checkpoint, pictures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict", "gymnasium", "pymu
 
 
 class RunFolder:
-    """Paths and the table of one run.
+    """Paths and the metrics table of one run.
 
     Args:
         path: path of the folder; :meth:`create` makes it.
@@ -58,7 +58,7 @@ class RunFolder:
 
     @classmethod
     def of(cls, source: str | Path) -> RunFolder | None:
-        """The folder of a run that somebody means; None if that is no folder, and no policy's file in one.
+        """Finds the folder of a run from itself or from a policy's file in it; None for other paths.
 
         Args:
             source: the folder, or the file of one of its policies.
@@ -78,7 +78,7 @@ class RunFolder:
         The end of a process ends this, however it comes. The same process may do so more than once.
 
         Args:
-            wait: seconds for another process to end: one that nobody looks after any more saves what it has.
+            wait: seconds for another process to end: one whose parent is gone first saves its run.
 
         Raises:
             ValueError: another process is at work in it.
@@ -104,7 +104,7 @@ class RunFolder:
         """
         if self.config.exists():
             raise ValueError(
-                f"{self.path} holds a run already; go on with it by --resume, or choose another folder"
+                f"{self.path} holds a run already; continue it with --resume, or choose another folder"
             )
         self.path.mkdir(parents=True, exist_ok=True)
 
@@ -121,12 +121,12 @@ class RunFolder:
         remember(self.config, recipe.task.name)
 
     def describe_best(self, epoch: int, success: float) -> None:
-        """Adds to what :meth:`describe` wrote which evaluation the best policy is of."""
+        """Adds the evaluation of the best policy to the file that :meth:`describe` wrote."""
         about = read_json(self.about) | {"best": {"epoch": epoch, "success": success}}
         write_text(self.about, json.dumps(about, indent=2) + "\n")
 
     def recipe(self) -> Recipe:
-        """The recipe of the run; if this user has trained it, the module that its task names may be imported.
+        """Reads the recipe. If this user has trained the run, the module that its task names is permitted.
 
         Raises:
             ValueError: this is no folder of a run, its configuration cannot be read, or a link in it leads
@@ -145,20 +145,18 @@ class RunFolder:
         return recipe
 
     def _check_links(self) -> None:
-        """Raises a ValueError if something would be written through a link to a place elsewhere."""
+        """Raises a ValueError if a link in the folder would lead writes elsewhere."""
         home = self.path.resolve()
         for path in self.path.rglob("*"):
             top, *below = path.relative_to(self.path).parts
             if top == "wandb" and below and not below[0].startswith("run_id"):
-                continue  # wandb's own links to logs, which it replaces and never writes through
+                continue  # wandb's links to logs, which it replaces and never writes through
             if path.is_symlink() and not path.resolve().is_relative_to(home):
-                raise ValueError(
-                    f"{path} is a link that leads out of the run's folder: put there what it is of"
-                )
+                raise ValueError(f"{path} is a link that leads out of the run's folder: replace it by a copy")
 
     @property
     def is_done(self) -> bool:
-        """Whether the run has reached its last epoch and left all behind; its policy comes last."""
+        """Whether the run has reached its last epoch and written all files; its policy comes last."""
         rows = self.rows() if self.config.exists() and self.policy.exists() else []
         return bool(rows) and rows[-1]["epoch"] >= self.recipe().run.epochs
 
@@ -173,14 +171,14 @@ class RunFolder:
 
     @property
     def _parts(self) -> list[Path]:
-        """The files that are there only while others are written."""
+        """Returns temporary files, which exist only while others are written."""
         whole = (self.config, self.about, self.metrics, self.checkpoint, self.policy, self.best)
         pictures = (self.curves, self.goals, self.goal_map, self.video)
         return [part_of(path) for path in (*whole, *pictures)]
 
     @property
     def checkpoints(self) -> list[Path]:
-        """The checkpoints that there are, the newest first."""
+        """Existing checkpoints, the newest first."""
         newest = [self.checkpoint] if self.checkpoint.exists() else []
         return newest + self.older_checkpoints
 
@@ -190,7 +188,7 @@ class RunFolder:
         return sorted(self.path.glob(f"{self.checkpoint.stem}.[0-9]*{self.checkpoint.suffix}"))
 
     def rows(self) -> list[dict[str, float]]:
-        """The table so far.
+        """Reads the metrics table so far.
 
         Raises:
             ValueError: it is damaged.
@@ -202,7 +200,7 @@ class RunFolder:
 
 
 def remember(config: Path, task: str) -> None:
-    """Notes that this user has trained the run of a ``config.yaml``; only needed if its task names a module.
+    """Records that this user has trained the run of a ``config.yaml``, if its task names a module.
 
     Nothing is noted where the user's state directory cannot be written.
     """
@@ -218,7 +216,7 @@ def remember(config: Path, task: str) -> None:
 
 
 def is_own(config: Path) -> bool:
-    """Whether this user has trained the run of a ``config.yaml``, at this place and with this content."""
+    """Returns whether this user has trained the run of a ``config.yaml``, with this path and content."""
     return _known().get(str(config.resolve())) == _digest(config)
 
 
@@ -228,7 +226,7 @@ def _state_file() -> Path:
 
 
 def _known() -> dict[str, str]:
-    """Digests by path."""
+    """Reads the recorded digests by path."""
     try:
         found = json.loads(_state_file().read_text())
     except (OSError, ValueError):

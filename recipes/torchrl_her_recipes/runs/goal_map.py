@@ -1,4 +1,4 @@
-"""Where a run's virtual goals lie, beside where they should: q and q* over a grid, as a file."""
+"""Map of a run's virtual goals and their target, q and q* over a grid, as a file."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class GoalMap:
 
     @property
     def share(self) -> np.ndarray:
-        """q [n, n], the mean of the runs."""
+        """Returns q [n, n], the mean of the runs."""
         totals = self.counts.sum(tuple(range(1, self.counts.ndim)), keepdims=True)
         return (self.counts / np.maximum(totals, 1)).mean(0)
 
     def save(self, path: Path) -> None:
-        """Writes it as a file of numpy arrays."""
+        """Writes the map as a file of numpy arrays."""
         with written(path) as part:
             np.savez_compressed(part, counts=self.counts, target=self.target)
 
@@ -52,7 +52,7 @@ class GoalMap:
 
     @classmethod
     def of(cls, path: Path, counts: np.ndarray | None, target: np.ndarray | None) -> GoalMap:
-        """One of arrays that a file holds.
+        """Makes a map from the arrays of a file, checked.
 
         Raises:
             ValueError: there are none, or they are not those of a map; the message names the file.
@@ -66,7 +66,7 @@ class GoalMap:
 
 
 def goal_map(buffer: TensorDictReplayBuffer, target: torch.Tensor | None) -> GoalMap | None:
-    """The map of the runs' virtual goals and their q* [cells]; None where nothing counts virtual goals."""
+    """Returns the map of the runs' virtual goals and their q* [cells]; None if goals are not counted."""
     counted = [own for own in buffer.writer.goal_weights if isinstance(own, GoalHistogram)]
     if not counted or target is None:
         return None

@@ -1,4 +1,4 @@
-"""Ctrl-C, or a request to end, that lets the work at hand finish."""
+"""Handles Ctrl-C, or another request to end, so that work in progress can finish."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from types import FrameType
 
 _TOGETHER = 1.0  # seconds
-_OTHERS = ("SIGTERM", "SIGHUP")  # `kill` or a scheduler of jobs, a closed terminal: not everywhere
+_OTHERS = ("SIGTERM", "SIGHUP")  # sent by `kill`, job schedulers and closed terminals; not on all systems
 
 
 class Interrupted(Exception):
-    """Somebody pressed Ctrl-C, or asked for an end, and this is a good moment to stop."""
+    """Raised at a good moment to stop, after Ctrl-C or another request to end."""
 
 
 @contextmanager
@@ -26,7 +26,7 @@ def soft_interrupt() -> Iterator[Callable[[], None]]:
 
     Example:
         >>> with soft_interrupt() as check:
-        ...     check()  # raises Interrupted if somebody pressed Ctrl-C
+        ...     check()  # raises Interrupted after Ctrl-C
     """
     pressed: list[float] = []  # when
 
@@ -35,7 +35,7 @@ def soft_interrupt() -> Iterator[Callable[[], None]]:
             raise Interrupted
 
     if threading.current_thread() is not threading.main_thread():
-        yield check  # signals are the main thread's business
+        yield check  # only the main thread can handle signals
         return
 
     def handle(_number: int, _frame: FrameType | None) -> None:

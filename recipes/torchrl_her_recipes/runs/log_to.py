@@ -1,4 +1,4 @@
-"""Tells loggers of TorchRL what comes of a run: its options, the rows of its table, its pictures."""
+"""Passes a run's options, the rows of its table and its pictures to loggers of TorchRL."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torchrl_her_recipes.config.values import load_name
 from torchrl_her_recipes.runs.callbacks import Callback, RunView
 from torchrl_her_recipes.runs.show import show_file
 
-_OF_A_ROW = ("run", "seed")  # they say whose row it is, and are no metrics
+_OF_A_ROW = ("run", "seed")  # columns that identify a row, and are no metrics
 
 
 class LogTo(Callback):
-    """Tells one of TorchRL's loggers what comes of a run.
+    """Logs a run to one of TorchRL's loggers.
 
     It is told the options at the start, each row of the table of metrics after its evaluation, at the step
     that is its number of frames, and shown the pictures and the film at the end. Metrics are named
@@ -49,17 +49,17 @@ class LogTo(Callback):
         self._told = after
 
     def on_start(self, run: RunView) -> None:
-        """Tells the options, and the rows that there are."""
+        """Logs the options, and all rows so far."""
         self._told = self.after
         self.logger.log_hparams(flat(run.components.recipe.to_dict()))
         self._tell(run.rows)
 
     def on_epoch(self, run: RunView) -> None:
-        """Tells the new rows."""
+        """Logs the new rows."""
         self._tell(run.rows)
 
     def on_end(self, run: RunView) -> None:
-        """Shows what pictures there are."""
+        """Logs the run's pictures."""
         if run.folder is not None:
             for path in (run.folder.curves, run.folder.goals, run.folder.video):
                 if path.exists():
@@ -77,13 +77,13 @@ class LogTo(Callback):
             }
             self.logger.log_metrics(metrics, step=frames)
             self._told = frames
-        self.logger.flush()  # what is behind a checkpoint must be there when the run goes on from it
+        self.logger.flush()  # rows before a checkpoint must be there when the run resumes from it
 
 
 class LogByName(Callback):
-    """What ``log=NAME`` does: opens a logger in the run's folder, goes on in it, and closes it.
+    """Callback of ``log=NAME``: opens or resumes a logger in the run's folder, and closes it.
 
-    A logger that fails on the way does not end the run: it is opened anew after the next epoch, and told what
+    A logger that fails does not end the run: it is opened again after the next epoch, and gets the rows that
     it has missed.
     """
 
@@ -96,12 +96,12 @@ class LogByName(Callback):
         self._kept = run.trainer.frames
         try:
             self._open(run)
-        except Exception as error:  # whatever a service raises
+        except Exception as error:  # a service may raise any error
             self.close()
             raise ValueError(f"log={self.name} cannot begin: {_reason(error)}") from error
 
     def on_epoch(self, run: RunView) -> None:
-        """Tells the new rows."""
+        """Logs the new rows."""
 
         def tell() -> None:
             if self._teller is None:
@@ -112,7 +112,7 @@ class LogByName(Callback):
         self._kept = run.trainer.frames if self._tried(tell, run) else self._kept
 
     def on_end(self, run: RunView) -> None:
-        """Shows the pictures, and closes the logger."""
+        """Logs the pictures, and closes the logger."""
 
         def show() -> None:
             if self._teller is None:
@@ -125,7 +125,7 @@ class LogByName(Callback):
         self._tried(show, run)
 
     def close(self) -> None:
-        """Closes what is open, also after an error."""
+        """Closes the logger if it is open, also after an error."""
         teller, self._teller = self._teller, None
         if teller is not None:
             try:
@@ -143,7 +143,7 @@ class LogByName(Callback):
             what()
         except Exception as error:  # a full disk, a network that is down
             after = f"after {run.trainer.frames:,} frames"
-            warnings.warn(f"log={self.name} fails {after}, the run goes on: {_reason(error)}", stacklevel=2)
+            warnings.warn(f"log={self.name} fails {after}, the run continues: {_reason(error)}", stacklevel=2)
             self.close()
             return False
         return True
@@ -154,7 +154,7 @@ def _reason(error: Exception) -> str:
 
 
 def flat(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, bool | int | float | str]:
-    """Options by their long names; what is neither a number nor text is written as JSON.
+    """Flattens options to their long names; values that are neither numbers nor text become JSON.
 
     Example:
         >>> flat({"run": {"seed": 3, "log": ("wandb",)}, "task": {"name": "hand_v0", "options": None}})

@@ -1,4 +1,4 @@
-"""Says what goes wrong in a run while it does, once for each run, and which options help."""
+"""Notices about problems of a run, once for each run, with options that help."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_her_recipes.config.recipe import Recipe
 
 Row = dict[str, float]  # of the table of metrics: one epoch of one run
-Rule = Callable[[Sequence[Row], Recipe], str | None]  # what is wrong with a run, given its rows
+Rule = Callable[[Sequence[Row], Recipe], str | None]  # a rule: returns a problem of a run, given its rows
 
 _AT_BOUND = 0.99  # of the way from the middle of the range to its end
 _NEARLY_ALL = 0.95  # of the entries of all actions, or of virtual rows
@@ -22,7 +22,7 @@ _BEYOND = 0.25  # of the range of returns
 
 
 def saturation(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """The share of an action's entries that are at their bounds.
+    """Computes the fraction of an action's entries that are at their bounds.
 
     Args:
         action: [..., a].
@@ -44,7 +44,7 @@ def saturation(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) -> list[str]:
-    """One line for each trouble that the newest epoch shows for the first time.
+    """Returns a line for each problem that appears in the newest epoch for the first time.
 
     Args:
         rows: the table of metrics so far, one row for each epoch and run.
@@ -73,7 +73,7 @@ def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) ->
 
 
 def _success(row: Row) -> float:
-    return row.get("layer_success", row["success"])  # in a curriculum, at what is learned now
+    return row.get("layer_success", row["success"])  # in a curriculum, at the goals of the present layer
 
 
 def _nothing_achieved(rows: Sequence[Row], recipe: Recipe) -> str | None:
@@ -124,7 +124,7 @@ def _saturated(rows: Sequence[Row], recipe: Recipe) -> str | None:
 
 
 def _beyond(bounds: tuple[float, float]) -> Rule:
-    """A rule for values that no return can have."""
+    """Makes a rule for values of critics that no return can have."""
 
     def rule(rows: Sequence[Row], recipe: Recipe) -> str | None:
         gamma = float(recipe.learner.gamma)
@@ -176,5 +176,5 @@ def _differ(runs: Sequence[Sequence[Row]]) -> bool:
 
 
 def _means(values: Sequence[float]) -> list[float]:
-    """The mean of every few values in a row."""
+    """Computes the mean of every few values in a row."""
     return [sum(values[end - _STREAK : end]) / _STREAK for end in range(_STREAK, len(values) + 1)]

@@ -1,4 +1,4 @@
-"""Pictures of a run: its curves, and where its virtual goals lie."""
+"""Plots of a run: its curves, and heat maps of its virtual goals."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def plot_comparison(
     Args:
         panels: title of each panel to the curves in it, label to table of metrics.
         path: path of the picture.
-        metrics: what is drawn, one panel each; those of several titles have a row each.
+        metrics: metrics to draw, one panel each; those of several titles have a row each.
     """
     columns = [(title, curves, name) for name in metrics for title, curves in panels.items()]
     rows = len(metrics) if len(panels) > 1 else 1
@@ -103,7 +103,7 @@ def plot_comparison(
 
 
 def colors(labels: Sequence[str]) -> dict[str, str]:
-    """A color for each label: algorithms have their own, others take turns at those that are left.
+    """Returns a color for each label: a fixed one for algorithms, the remaining ones in turn for others.
 
     Example:
         >>> colors(["her", "window=20"])
@@ -115,7 +115,7 @@ def colors(labels: Sequence[str]) -> dict[str, str]:
 
 
 def draw_curves(axes: Axes, curves: Mapping[str, Rows], name: str, palette: Mapping[str, str]) -> None:
-    """One metric of several algorithms over environment steps, on given axes."""
+    """Draws a metric of several algorithms over environment steps, on given axes."""
     for label, rows in curves.items():
         draw_curve(axes, rows, name, color=palette[label], label=label)
     label, limits = AXES[name]
@@ -127,13 +127,13 @@ def draw_curves(axes: Axes, curves: Mapping[str, Rows], name: str, palette: Mapp
 
 
 def count_frames(axes: Axes) -> None:
-    """Environment steps along the x axis, with room between their numbers."""
+    """Labels the x axis with environment steps, with room between the numbers."""
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
 def layer_changes(rows: Rows) -> list[float]:
-    """After how many frames runs went on to another layer of their curriculum: one entry each."""
+    """Returns the numbers of frames after which runs moved to another layer of their curriculum."""
     last: dict[float, dict[str, float]] = {}
     changes = []
     for row in rows:
@@ -152,7 +152,7 @@ def draw_curve(
     color: str = "#2b6cb0",
     label: str | None = None,
 ) -> None:
-    """One metric over environment steps, on given axes: median, 33rd to 67th percentile, and single runs."""
+    """Draws a metric over environment steps, on given axes: median, 33rd to 67th percentile, single runs."""
     frames, low, middle, high = band(rows, name)
     each = by_frames(rows, name)[1]
     if 1 < each.shape[1] <= _MOST_LINES:
@@ -162,14 +162,14 @@ def draw_curve(
 
 
 def band(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Frames, and the 33rd, 50th and 67th percentile of one metric there, [n] each."""
+    """Returns frames, and the 33rd, 50th and 67th percentile of a metric there, [n] each."""
     frames, values = by_frames(rows, name)
     low, middle, high = np.percentile(values, [33, 50, 67], axis=1)
     return frames, low, middle, high
 
 
 def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """One metric as (frames [n], values [n, R])."""
+    """Returns a metric as (frames [n], values [n, R])."""
     if missing := [row for row in rows if name not in row]:
         raise ValueError(f"these runs did not measure {name}; they have {', '.join(missing[0])}")
     groups: dict[float, list[float]] = {}
@@ -179,7 +179,7 @@ def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plot_goals(goals: GoalMap, env: GoalEnv, path: Path, *, title: str = "") -> None:
-    """Draws where virtual goals lie beside the target q*, in the same colors."""
+    """Draws a heat map of virtual goals beside that of the target q*, in the same colors."""
     figure = Figure(figsize=(9.6, 4.6), layout="constrained")
     figure.suptitle(title)
     limit = max(float(goals.target.max()), 1e-9)
@@ -194,7 +194,7 @@ def plot_goals(goals: GoalMap, env: GoalEnv, path: Path, *, title: str = "") -> 
 
 
 def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> None:
-    """A heat map [n, n] over a picture of the environment, on given axes; its colors end at ``limit``.
+    """Draws a heat map [n, n] over a picture of the environment, on given axes; colors end at ``limit``.
 
     The environment says in which box goals can lie, where the edges of its picture are, and which regions
     are worth drawing. Without a picture the heat map is on white.
@@ -212,9 +212,7 @@ def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> 
         axes.imshow(env.render(0, size=_SCREEN).numpy(), extent=_extent(frame))
     (left, bottom), (right, top) = box
     heat = share.T
-    alpha = (
-        np.clip(heat / limit, 0.0, 1.0) ** 0.5
-    )  # what is hardly ever written leaves the picture to be seen
+    alpha = np.clip(heat / limit, 0.0, 1.0) ** 0.5  # cells with few goals leave the picture visible
     axes.imshow(heat, origin="lower", cmap="magma", vmin=0.0, vmax=limit, alpha=alpha, extent=_extent(box))
     for name, ((x, y), (x_end, y_end)) in env.regions().items():
         color = _REGIONS.get(name, "#718096")
@@ -225,6 +223,6 @@ def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> 
 
 
 def _extent(box: Box) -> tuple[float, float, float, float]:
-    """A box as matplotlib takes it."""
+    """Converts a box to the form of matplotlib."""
     (left, bottom), (right, top) = box
     return left, right, bottom, top

@@ -17,7 +17,7 @@ from torchrl_her_recipes.config.policy_header import METADATA_KEY, read_header
 
 
 def write_policy(path: Path, weights: Mapping[str, Tensor], description: Mapping[str, Any]) -> None:
-    """Writes weights and what describes them, whole or not at all.
+    """Writes weights and their description, whole or not at all.
 
     Args:
         path: The file.

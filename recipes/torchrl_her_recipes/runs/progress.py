@@ -1,4 +1,4 @@
-"""How a run shows how far it is: a bar on a terminal, lines where its output goes elsewhere."""
+"""Shows the progress of a run: a bar on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl_her.trainers.trainer import Trainer
 
 
 class Progress:
-    """Shows how far a run is, on the standard error stream.
+    """Shows the progress of a run on the standard error stream.
 
     On a terminal it is a bar; where that goes into a file or to another program, a line for each epoch.
     """
@@ -28,12 +28,12 @@ class Progress:
         )
 
     def batch(self) -> None:
-        """Says that a batch was learned from."""
+        """Updates the display after a batch and its gradient steps."""
         self.bar.set_description_str(f"{self.trainer.updates} updates", refresh=False)
         self.bar.update(self.trainer.frames - self.bar.n)
 
     def epoch(self, rows: Sequence[dict[str, float]]) -> None:
-        """Says how the evaluation of an epoch went."""
+        """Shows the results of an epoch's evaluation."""
         success = statistics.median(row["success"] for row in rows)
         self.bar.set_postfix(success=f"{success:.2f}")
         if self.lines:

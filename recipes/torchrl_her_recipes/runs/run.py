@@ -1,4 +1,4 @@
-"""One run from beginning to end: train, evaluate, record, checkpoint, and go on from there."""
+"""Runs from beginning to end: training, evaluation, recording, checkpoints, resuming."""
 
 from __future__ import annotations
 
@@ -78,11 +78,11 @@ def run(
     callbacks: Sequence[Callback] = (),
     progress: bool = True,
 ) -> RunResult:
-    """Trains for as many epochs as the recipe says.
+    """Trains for the recipe's number of epochs.
 
     Args:
         components: from :func:`~torchrl_her_recipes.build`; you may have replaced some of them.
-        folder: where the run writes its files; None writes nothing.
+        folder: folder for the run's files; None writes nothing.
         callbacks: called on the way; they may stop the run.
         progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
 
@@ -105,7 +105,7 @@ def run(
             check_installed(components.recipe.run.log)
             own.home.create()
             stack.enter_context(own.home.at_work())
-            own.save(own.home, goals=False)  # before config.yaml: a folder that has one can be resumed
+            own.save(own.home, goals=False)  # before config.yaml is written: a folder with one can be resumed
             own.home.describe(components.recipe)
         return own.train(callbacks, progress=progress)
 
@@ -117,11 +117,11 @@ def run_score(
     callbacks: Sequence[Callback] = (),
     progress: bool = False,
 ) -> float:
-    """Trains, and returns the score of the result: what any program that searches can maximize.
+    """Trains, and returns the score of the result, which any program for searches can maximize.
 
     Args:
         recipe: its ``num_runs`` runs, side by side, are the seeds that the score is the median of.
-        folder: where the run writes its files; None writes nothing.
+        folder: folder for the run's files; None writes nothing.
         callbacks: called on the way; they may stop the run.
         progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
 
@@ -131,7 +131,7 @@ def run_score(
     """
     result = run(build(recipe), folder, callbacks=callbacks, progress=progress)
     if result.interrupted:
-        raise KeyboardInterrupt  # a search that goes on would take an unfinished run for a bad one
+        raise KeyboardInterrupt  # otherwise, a search would take an unfinished run for a bad one
     return score(result.rows)
 
 
@@ -167,16 +167,16 @@ def resume(
             options and components are given, or the components differ from those of the run.
     """
     home = RunFolder(folder)
-    home.recipe()  # before a lock is left in a folder that is none of a run
+    home.recipe()  # raises before a lock is left in a folder that is not a run's
     if options and components is not None:
-        raise ValueError("give resume() options, or components that were made with them, not both")
+        raise ValueError("give resume() either options or components that were made with them, not both")
     with home.at_work():
         recipe = home.recipe()
         try:
             state = load_newest_checkpoint(home.checkpoint, keep=recipe.run.keep_checkpoints)
         except FileNotFoundError:
             raise ValueError(
-                f"the run in {home.path} cannot go on: {home.checkpoint.name} is missing"
+                f"the run in {home.path} cannot be resumed: {home.checkpoint.name} is missing"
             ) from None
         with naming(home.checkpoint, "is not of this run"):
             done, has_buffer = int(state["trainer"]["epochs"]), bool(state["buffer"])
@@ -184,8 +184,8 @@ def resume(
         check_installed(wanted.run.log)
         if not has_buffer and (wanted.run.epochs > done or wanted.run.keep_buffer):
             raise ValueError(
-                f"the run in {home.path} cannot go on after its {done} epochs: its checkpoint has no replay "
-                "buffer; only runs that are trained with keep_buffer=true keep it when they have finished"
+                f"the run in {home.path} cannot be extended beyond {done} epochs: its checkpoint has no "
+                "replay buffer; only runs trained with keep_buffer=true keep it when they have finished"
             )
         if options and wanted.run.epochs < done:
             raise ValueError(
@@ -198,16 +198,18 @@ def resume(
                 load_run_state(own.parts, state)
             if options:
                 home.describe(own.recipe)
-            home.policy.unlink(missing_ok=True)  # of an earlier stop: it comes last, when the run has ended
+            home.policy.unlink(missing_ok=True)  # a policy of an earlier stop: it marks finished runs
             if own.best.state is None:
-                home.best.unlink(missing_ok=True)  # newer than the checkpoint, as the last rows may be
+                home.best.unlink(
+                    missing_ok=True
+                )  # it may be newer than the checkpoint, as the last rows may be
             own.save_best(home)
             own.rows, own.has_buffer = home.rows()[: done * own.recipe.run.num_runs], has_buffer
             return own.train(callbacks, progress=progress)
 
 
 class _Run:
-    """One run, or several side by side, with its folder."""
+    """A run, or several side by side, with its folder."""
 
     def __init__(self, components: Components, home: RunFolder | None) -> None:
         self.components, self.recipe, self.home = components, components.recipe, home
@@ -218,7 +220,7 @@ class _Run:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the last epoch is done."""
+        """Whether the last epoch is finished."""
         return self.trainer.epochs >= self.recipe.run.epochs
 
     def train(self, callbacks: Sequence[Callback], *, progress: bool) -> RunResult:
@@ -231,14 +233,14 @@ class _Run:
         torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
         shown = Progress(trainer, epochs=recipe.run.epochs, frames=recipe.total_frames, show=progress)
         interrupted = stopped = saved = False
-        with soft_interrupt() as check, ExitStack() as opened:  # also while things are saved at the end
+        with soft_interrupt() as check, ExitStack() as opened:  # covers saving at the end
             for logger in loggers:
                 opened.callback(logger.close)
 
             def on_batch(_trainer: Trainer) -> None:
                 shown.batch()
                 check()
-                wanted = [own.on_batch(view) for own in hooks]  # of all of them, also after a True
+                wanted = [own.on_batch(view) for own in hooks]  # calls all of them, also after a True
                 if any(wanted):
                     raise Stopped
 
@@ -279,7 +281,7 @@ class _Run:
         )
 
     def epoch(self, on_batch: Callable[[Trainer], None], shown: Progress) -> None:
-        """One epoch and its evaluation, as new rows of the table: one for each run."""
+        """Runs an epoch and its evaluation; returns new rows of the table, one for each run."""
         components, trainer, state = self.components, self.trainer, self.components.curriculum
         began = time.perf_counter()
         seed_epoch(components.env, self.recipe, trainer)
@@ -311,7 +313,7 @@ class _Run:
         self.rows += rows
 
     def save(self, home: RunFolder, *, goals: bool = True) -> bool:
-        """Writes a checkpoint; returns whether it could. That of the last epoch is without the replay buffer.
+        """Writes a checkpoint; returns whether that succeeded. The last one has no replay buffer.
 
         Before it the histogram of virtual goals, which later needs the buffer, unless ``goals`` is False.
         """
@@ -325,7 +327,7 @@ class _Run:
         return False
 
     def save_best(self, home: RunFolder) -> None:
-        """Writes the best policy if there is a new one."""
+        """Writes the best policy if it has changed."""
         if self.best.state is not None and self.best.is_new:
             with self._despite_a_full_disk("best policy"):
                 described = {name: self.best.state[name] for name in ("epoch", "success")}
@@ -334,7 +336,7 @@ class _Run:
                 self.best.is_new = False
 
     def save_goals(self, home: RunFolder) -> GoalMap | None:
-        """Writes the histogram of virtual goals; returns it, or what is left of a buffer that is gone."""
+        """Writes the histogram of virtual goals and returns it; without a buffer, reads the old one."""
         if not self.has_buffer:
             return GoalMap.load(home.goal_map) if home.goal_map.is_file() else None
         goals = goal_map(self.components.buffer, self.components.goal_target)
@@ -344,15 +346,15 @@ class _Run:
 
     @contextmanager
     def _despite_a_full_disk(self, what: str) -> Iterator[None]:
-        """Turns a failure to write a file into a warning: the run goes on, and the next epoch tries again."""
+        """Turns a failure to write a file into a warning; the next epoch tries again."""
         try:
             yield
         except OSError as error:
-            said = f"no {what} after {self.trainer.frames:,} frames, the run goes on: {error}"
+            said = f"no {what} after {self.trainer.frames:,} frames, the run continues: {error}"
             warnings.warn(said, stacklevel=4)
 
     def finish(self, home: RunFolder) -> None:
-        """Draws the pictures and then writes the policy, whose file tells that the run has ended.
+        """Draws the pictures and then writes the policy, whose file marks the run as finished.
 
         Raises:
             OSError: a file cannot be written; the message says which are missing.

@@ -1,4 +1,4 @@
-"""How good runs are: their last evaluation, the score that searches maximize, the best policy."""
+"""Scores of runs: their last evaluation, the score that searches maximize, the best policy."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ LAST = 5  # evaluations
 
 
 def last_success(rows: list[dict[str, float]]) -> list[float]:
-    """Success of each run in the last evaluation."""
+    """Returns the success of each run in the last evaluation."""
     return [row["success"] for row in rows if row["epoch"] == rows[-1]["epoch"]]
 
 
 def median_run(rows: list[dict[str, float]]) -> int:
-    """The index of the run with the median success in the last evaluation."""
+    """Returns the index of the run with the median success in the last evaluation."""
     values = last_success(rows)
     return sorted(range(len(values)), key=values.__getitem__)[len(values) // 2]
 
 
 def score(rows: Sequence[dict[str, float]], *, last: int = LAST) -> float:
-    """The median over the runs of their mean success in the last evaluations: what searches maximize.
+    """Computes the score for searches: the median of the runs' mean success in the last evaluations.
 
     Args:
         rows: the table of metrics, with a row for each epoch and run.
-        last: how many evaluations; all, as long as there are fewer.
+        last: number of evaluations; all of them if there are fewer.
 
     Returns:
         From 0 to 1; 0 if there was no evaluation.
@@ -53,7 +53,7 @@ def score(rows: Sequence[dict[str, float]], *, last: int = LAST) -> float:
 
 
 class BestPolicy:
-    """The policy of the evaluation with the best success so far; of several as good ones, the last.
+    """The policy of the evaluation with the best success so far; the latest of several equal ones.
 
     Of several runs side by side the median counts, and the policies of all of them are kept.
 
@@ -80,7 +80,7 @@ class BestPolicy:
         return self.state
 
     def load_state_dict(self, state: dict[str, Any] | None) -> None:
-        """Takes what :meth:`state_dict` gave."""
+        """Restores the state that :meth:`state_dict` returned."""
         self.state, self.is_new = state, state is not None
 
     def see(self, rows: Sequence[dict[str, float]], actor: TensorDictModuleBase) -> None:

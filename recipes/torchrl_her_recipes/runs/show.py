@@ -1,4 +1,4 @@
-"""Shows pictures and films to loggers, each in its own way."""
+"""Passes pictures and videos to loggers, in the form of each."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from torchrl.record.loggers.common import Logger
 
 @singledispatch
 def show_file(logger: Logger, name: str, path: Path, step: int) -> None:
-    """Shows a picture (``.png``) or a film (``.gif``) to a logger; one that cannot show it leaves it out.
+    """Passes a picture (``.png``) or a video (``.gif``) to a logger; does nothing for loggers without them.
 
     A logger of your own kind is shown films by its ``log_video``. To show it pictures as well, register a
     function for its class: ``@show_file.register``.
 
     Args:
         logger: who is to show it.
-        name: what it is called there.
+        name: name in the logger.
         path: path of the file.
-        step: when it was made, in frames.
+        step: number of frames at which it was made.
     """
     if path.suffix == ".gif":
         logger.log_video(name, read_film(path), step=step)
@@ -32,7 +32,7 @@ def show_file(logger: Logger, name: str, path: Path, step: int) -> None:
 
 @show_file.register
 def _(logger: CSVLogger, name: str, path: Path, step: int) -> None:
-    """Tables show nothing."""
+    """Does nothing: tables have no pictures."""
 
 
 @show_file.register
@@ -60,7 +60,7 @@ def _(logger: MLFlowLogger, _name: str, path: Path, _step: int) -> None:
 
 
 def read_film(path: Path) -> torch.Tensor:
-    """The frames of a GIF as TorchRL's loggers take them, [1, T, 3, H, W] of uint8."""
+    """Reads the frames of a GIF for TorchRL's loggers, [1, T, 3, H, W] of uint8."""
     with Image.open(path) as film:
         frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
     return torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2).unsqueeze(0)

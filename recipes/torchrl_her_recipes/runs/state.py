@@ -1,4 +1,4 @@
-"""All that a run is, as tensors and plain data, so that it can go on from there bit for bit."""
+"""The whole state of a run as tensors and plain data, from which it resumes bit for bit."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from torchrl_her_recipes.components.devices import place_of
 from torchrl_her_recipes.config.recipe import Recipe
 
 _NETWORKS = ("loss", "optimizer", "target", "exploration", "norm", "average", "guide")
-_ROWS = ("buffer", "demonstrations")  # nearly all of a checkpoint
+_ROWS = ("buffer", "demonstrations")  # the largest part of a checkpoint
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a run whose state is read and put back by functions."""
+    """A part of a run, with functions that read and restore its state."""
 
     state_dict: Callable[[], Any]
     load_state_dict: Callable[[Any], object]
 
 
 def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
-    """All parts of a run that have a state, by name, in the order in which they are loaded."""
+    """Returns all parts of a run that have a state, by name, in the order in which they are loaded."""
     buffer, collector, state = components.buffer, components.collector, components.curriculum
     guide, generators, device = components.guide, components.generators, place_of(components.loss)
     worlds = _worlds(components.env, components.recipe.collection.processes)
@@ -77,7 +77,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             lambda: [own.get_state() for own in generators],
             lambda states: [own.set_state(state) for own, state in zip(generators, states, strict=True)],
         ),
-        # For losses that draw, as SAC's.
+        # For losses that draw random numbers, as SAC's.
         "torch_generator": Part(torch.get_rng_state, torch.set_rng_state),
         "cuda_generator": None
         if device.type != "cuda" or not torch.cuda.is_initialized()
@@ -85,7 +85,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             partial(torch.cuda.get_rng_state, device), partial(torch.cuda.set_rng_state, device=device)
         ),
         "progress": None if state is None else Part(state.progress.state_dict, load_progress),
-        "demonstrations": components.demonstrations,  # they are those of the layers, from the progress
+        "demonstrations": components.demonstrations,  # rewards of layers follow from the progress
         "collector": Part(
             partial(collector_state_dict, collector), partial(load_collector_state_dict, collector)
         ),
@@ -98,7 +98,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
 
 
 def run_state(parts: dict[str, Any], *, buffer: bool = True) -> dict[str, Any]:
-    """The states of parts, as tensors and plain data. Rows are the buffer's own: save it at once.
+    """Returns the states of parts as tensors and plain data. Rows are views of the buffer: save them at once.
 
     Args:
         parts: parts from :func:`parts_of`.
@@ -110,7 +110,7 @@ def run_state(parts: dict[str, Any], *, buffer: bool = True) -> dict[str, Any]:
 
 
 def load_run_state(parts: dict[str, Any], state: dict[str, Any]) -> None:
-    """Puts freshly built parts where :func:`run_state` was taken; their buffer stays empty without one.
+    """Restores a state from :func:`run_state` in newly built parts; a buffer without state stays empty.
 
     Raises:
         ValueError: the state is of other parts, or these are of other types or have other settings.
@@ -133,13 +133,13 @@ def seed_epoch(env: EnvBase, recipe: Recipe, trainer: Trainer) -> None:
 
 
 def _worlds(env: EnvBase, processes: int) -> BatchedEnv | None:
-    """The environment below all transforms, if it is one of ours and collects here."""
+    """Returns the environment below all transforms if this process collects and its state can be saved."""
     worlds = goal_env(env)
     return worlds if processes == 0 and isinstance(worlds, BatchedEnv) else None
 
 
 def _made_of(components: Components) -> dict[str, str]:
-    """What must be the same for a run to go on."""
+    """Returns the properties of components that must be equal for a run to resume."""
     writer = components.buffer.writer
     hindsight: list[object] = []
     if isinstance(writer, HERWriter):

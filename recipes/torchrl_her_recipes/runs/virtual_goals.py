@@ -1,4 +1,4 @@
-"""How well virtual goals are achieved, and what critics think of them: greedy episodes that ask for them."""
+"""Evaluates success and values of critics at virtual goals, in greedy episodes that have them as goals."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.runs.curriculum import play_greedily
 from torchrl_her_recipes.runs.evaluation import measure
 
-_TRIES = 8  # rows that are looked at for each goal, since some are real
+_TRIES = 8  # rows that are drawn for each goal, since some are real
 _NAMES = ("success", "q", "q_bias")
 
 
 def at_virtual_goals(components: Components, epoch: int) -> dict[str, Tensor]:
-    """What greedy episodes of each run show, [R] each, if they are to ask for virtual goals.
+    """Measures greedy episodes of each run that have virtual goals, [R] each.
 
     Returns:
         ``virtual_success``, ``virtual_q`` and ``virtual_q_bias``, which are to virtual goals what ``success``
@@ -31,13 +31,13 @@ def at_virtual_goals(components: Components, epoch: int) -> dict[str, Tensor]:
         return {}
     found = torch.tensor(ask_for_virtual_goals(components, env, epoch))
     played = play_greedily(components, env, epoch)
-    # The environment's own word is about its own goals.
+    # The environment's own flag is about its own goals.
     shown = measure(components, played.exclude(("next", "is_success")))
     return {f"virtual_{name}": shown[name].masked_fill(~found, torch.nan) for name in _NAMES if name in shown}
 
 
 def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> list[bool]:
-    """Lets the next episodes ask for virtual goals, drawn for each run from all that the buffer holds of it.
+    """Sets virtual goals for the next episodes, drawn for each run from its rows in the buffer.
 
     Returns:
         For each run, whether it has virtual goals of the full task. If not, its episodes ask for the
@@ -63,7 +63,7 @@ def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> l
 def _virtual_goals(
     buffer: TensorDictReplayBuffer, state: CurriculumState | None, run: int, number: int, seed: int
 ) -> Tensor:
-    """Virtual goals [n, g] of the full task that a run's rows have, about so many; none if there are none."""
+    """Draws up to ``number`` virtual goals [n, g] of the full task from a run's rows."""
     begin, end = bounds_of_run(buffer, run)
     if begin == end or (state is not None and not state.at_the_top(run)):
         return torch.empty(0, 1)
@@ -76,7 +76,7 @@ def _virtual_goals(
 
 
 def _asking(env: EnvBase) -> BehaviorGoals:
-    """The transform of an environment that proposes goals."""
+    """Finds the transform of an environment that proposes goals."""
     transform = env.transform
     parts = transform if isinstance(transform, Compose) else [transform]
     return next(own for own in parts if isinstance(own, BehaviorGoals))

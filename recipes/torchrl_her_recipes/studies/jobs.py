@@ -1,4 +1,4 @@
-"""Jobs of a study: one is a batched run and the folder that it leaves behind, wherever it is worked on."""
+"""Jobs of a study: a job is a batched run with its folder, on this machine or another."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Job:
 
     Args:
         label: names it within the study.
-        recipe: what to run.
-        folder: where to.
-        around: what surrounds the run where it is done, as ``module:name`` of a context manager that gives
+        recipe: recipe of the run.
+        folder: folder of the run.
+        around: context manager around the run in its process, as ``module:name``, that gives
             the run's callbacks; empty if nothing does.
-        options: what it is called with, plain values by name.
+        options: arguments of the context manager, plain values by name.
     """
 
     label: str
@@ -41,7 +41,7 @@ class Job:
     options: dict[str, Any] = field(default_factory=dict)
 
     def to_plain(self) -> dict[str, Any]:
-        """The job as plain values for another process, with the modules that it must import first.
+        """Converts the job to plain values for another process, with the modules that it must import first.
 
         They register the tasks and learners that the recipe may name.
         """
@@ -51,20 +51,20 @@ class Job:
 
     @classmethod
     def from_plain(cls, values: dict[str, Any]) -> Job:
-        """The job that :meth:`to_plain` was asked of; its modules are imported.
+        """Makes a job from the values of :meth:`to_plain`, and imports its modules.
 
         Raises:
             ValueError: a module cannot be imported here, or the recipe names something that is not known.
         """
         import_modules(values["modules"])
         recipe = Recipe.from_dict(values["recipe"])
-        permit_task(recipe.task.name)  # it was checked where the study began
+        permit_task(recipe.task.name)  # checked where the study was started
         around = {name: values[name] for name in ("around", "options")}
         return cls(label=values["label"], recipe=recipe, folder=Path(values["folder"]), **around)
 
 
 class Progress(NamedTuple):
-    """How far a run is: epochs, and the seconds that they took."""
+    """Progress of a run: epochs, and the seconds that they took."""
 
     epochs: int = 0
     seconds: float = 0.0
@@ -92,7 +92,7 @@ def can_resume(folder: Path) -> bool:
 
 
 def read_progress(folder: Path) -> Progress:
-    """How far the table of a run's folder goes. Cheap: only its last line is looked at.
+    """Reads the progress of a run from the last line of its table, which is cheap.
 
     Example:
         >>> read_progress(Path("nowhere"))
@@ -100,16 +100,16 @@ def read_progress(folder: Path) -> Progress:
     """
     try:
         lines = read_text(RunFolder(folder).metrics, largest=LARGEST_TABLE).splitlines()
-    except (OSError, ValueError):  # there is none yet, or it is damaged
+    except (OSError, ValueError):  # the table is missing or damaged
         return Progress()
-    with suppress(IndexError, ValueError, KeyError):  # of a table that lost its end when the power went
+    with suppress(IndexError, ValueError, KeyError):  # the table lost its end in a power failure
         last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
         return Progress(int(last["epoch"]), float(last["seconds"]))
     return Progress()
 
 
 def kept_progress(job: Job) -> Progress:
-    """How far a job is that nobody is at work on: what was done behind its last checkpoint may be lost.
+    """Returns the progress of a job that is not running, up to its last checkpoint.
 
     One that was killed between its last epoch and its pictures is an epoch short of its end.
     """
@@ -121,7 +121,7 @@ def kept_progress(job: Job) -> Progress:
 
 
 def run_job(job: Job) -> Outcome:
-    """Does a job, or resumes it from its checkpoint. Ctrl-C ends it at the next good moment.
+    """Runs a job, or resumes it from its checkpoint. Ctrl-C ends it at the next good moment.
 
     Whatever goes wrong is an outcome; the whole story of it is left in ``error.txt``.
     """
@@ -134,7 +134,7 @@ def run_job(job: Job) -> Outcome:
     except KeyboardInterrupt:
         return Outcome(interrupted=True)
     except Exception as error:
-        with suppress(OSError):  # there may be no folder, or no room
+        with suppress(OSError):  # the folder may be missing, or the disk full
             story.write_text(traceback.format_exc())
         return Outcome(error=" ".join(f"{type(error).__name__}: {error}".split()))
 
@@ -144,13 +144,13 @@ def _train(job: Job) -> RunResult:
         if can_resume(job.folder):
             return resume(job.folder, callbacks=callbacks, progress=False)
         home = RunFolder(job.folder)
-        for left in (home.config, home.metrics):  # by a run that ended before its first checkpoint
+        for left in (home.config, home.metrics):  # the run was stopped before its first checkpoint
             left.unlink(missing_ok=True)
         return run(build(job.recipe), job.folder, callbacks=callbacks, progress=False)
 
 
 def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:
-    """The files of a run's folder, to be sent to another machine.
+    """Reads the files of a run's folder, to be sent to another machine.
 
     Args:
         folder: folder of the run; there may be none yet.
@@ -173,7 +173,7 @@ def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:
 
 
 def unpack(files: dict[str, bytes], folder: Path) -> None:
-    """Makes a folder of what :func:`pack` gave, in place of the one that may be there.
+    """Writes the files from :func:`pack` into a folder, and replaces an existing one.
 
     It appears as a whole: written beside it, and then renamed.
     """

@@ -11,7 +11,7 @@ from torchrl_her_recipes.studies.seed_batches import Batches
 
 
 def plot_virtual_goals(folder: Path, out: Path) -> None:
-    """Draws a heat map of virtual goals beside the target q*.
+    """Draws a heat map of a run's virtual goals beside the target q*.
 
     Args:
         folder: folder of a run, or of the batches of a study's combination.

@@ -1,4 +1,4 @@
-"""Jobs of a study that are left, and how long they will take by the time of its epochs so far."""
+"""Unfinished jobs of a study, and an estimate of their time from the epochs so far."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.studies.jobs import Job, kept_progress
 
-# What a gradient step costs besides its products of matrices, in rows times weights of such products.
+# Cost of a gradient step besides its matrix products, in rows times weights of such products.
 _OVERHEAD = 1e7
 
 
 def relative_cost(recipe: Recipe, epochs: int) -> float:
-    """Cost of some epochs of a batched run, without a unit: gradient steps, weighted by their size.
+    """Estimates the relative cost of some epochs of a batched run: gradient steps, weighted by their size.
 
     Example:
         >>> from torchrl_her_recipes import load_preset, make_recipe
@@ -29,7 +29,7 @@ def relative_cost(recipe: Recipe, epochs: int) -> float:
 
 
 def wall_clock(seconds: Iterable[float], at_once: int) -> float:
-    """How long it takes until all are done, each begun when a place is free.
+    """Computes the time until all jobs are done, each of which starts when a worker is free.
 
     Example:
         >>> wall_clock([3.0, 2.0, 2.0], at_once=2)
@@ -42,7 +42,7 @@ def wall_clock(seconds: Iterable[float], at_once: int) -> float:
 
 
 def duration(seconds: float) -> str:
-    """For people.
+    """Formats a number of seconds for readers.
 
     Example:
         >>> duration(42), duration(8 * 60), duration(5000)
@@ -55,7 +55,7 @@ def duration(seconds: float) -> str:
 
 
 class Plan:
-    """The jobs of a study, and how far each of them is.
+    """The jobs of a study, and the progress of each.
 
     Args:
         jobs: in the order of the table.
@@ -75,12 +75,12 @@ class Plan:
         self.progress = {job.label: kept_progress(job) for job in self.jobs}
 
     def is_done(self, job: Job) -> bool:
-        """Whether a job has reached its last epoch."""
+        """Returns whether a job has reached its last epoch."""
         return self._epochs_to_go(job) == 0
 
     @property
     def to_go(self) -> list[Job]:
-        """Jobs that are not done yet, the longest first: no core waits for long at the end."""
+        """Unfinished jobs, the longest first, so that no core waits for long at the end."""
         return sorted((job for job in self.jobs if not self.is_done(job)), key=self._cost_to_go, reverse=True)
 
     @property
@@ -89,14 +89,14 @@ class Plan:
         return sum(job.recipe.total_frames * job.recipe.run.num_runs for job in self.jobs)
 
     def steps_to_go(self, jobs: Iterable[Job]) -> int:
-        """Environment steps that are left of some jobs."""
+        """Returns the environment steps that some jobs still have to do."""
         return sum(
             self._epochs_to_go(job) * job.recipe.collection.epoch_frames * job.recipe.run.num_runs
             for job in jobs
         )
 
     def wall_clock(self, jobs: Iterable[Job], at_once: int) -> float:
-        """About how many seconds it is until some jobs are done; NaN until an epoch of the study is done."""
+        """Estimates the seconds until some jobs are done; NaN until an epoch of the study is done."""
         costs = {job.label: relative_cost(job.recipe, self.progress[job.label].epochs) for job in self.jobs}
         if not any(costs.values()):
             return math.nan
@@ -104,7 +104,7 @@ class Plan:
         return pace * wall_clock(map(self._cost_to_go, jobs), at_once)
 
     def table(self, at_once: int) -> list[str]:
-        """A line for each job, with its state and what it still takes; and one for all, so many at once."""
+        """Formats a line for each job, with its state and remaining time, and one for all jobs."""
         width = max(len(job.label) for job in self.jobs)
         lines = [f"  {job.label:<{width}}  {self._state(job)}" for job in self.jobs]
         if to_go := self.to_go:
@@ -112,7 +112,7 @@ class Plan:
         return lines
 
     def about(self, jobs: Iterable[Job], at_once: int, text: str) -> str:
-        """A text with the time until some jobs are done in place of ``{}``; empty if it is not known yet."""
+        """Inserts the time until some jobs are done in place of ``{}``; empty if it is not known yet."""
         seconds = self.wall_clock(jobs, at_once)
         return "" if math.isnan(seconds) else text.format(f"about {duration(seconds)}")
 
@@ -131,7 +131,7 @@ class Plan:
 
 
 def _begun(job: Job) -> Recipe:
-    """The recipe in a job's folder; that of the job if there is none yet, or a power failure has torn it."""
+    """Returns the recipe in a job's folder, or that of the job if the file is missing or damaged."""
     try:
         return RunFolder(job.folder).recipe()
     except ValueError:

@@ -69,7 +69,7 @@ class Puck(EnvBase):
         drawn = torch.zeros(len(begins), 4)
         for block, generator in enumerate(self._generators):
             rows = slice(block * count, (block + 1) * count)
-            if begins[rows].any():  # so that no block depends on the others
+            if begins[rows].any():  # no block depends on the others
                 drawn[rows].uniform_(-1.0, 1.0, generator=generator)
         self.place = torch.where(begins, drawn[:, :2], self.place)
         self.goal = torch.where(begins, drawn[:, 2:], self.goal)

@@ -1,4 +1,4 @@
-"""Does the jobs of a plan, as many at once as there are places, and shows how far all of them are."""
+"""Runs the jobs of a plan, as many at once as workers allow, and shows their progress."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from torchrl_her_recipes.studies.workers_local import Workers
 _TICK = 1.0  # seconds
 _BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [{elapsed}{postfix}]"
 _STOPPING = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [saving what there is]"
-_PART = 0.05  # of all steps: where there is no terminal, as much is worth a line
+_PART = 0.05  # fraction of all steps after which a line is printed, if there is no terminal
 
 
 def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str, Outcome]:
-    """Does all jobs of a plan that are not done yet.
+    """Runs all unfinished jobs of a plan.
 
     One that fails holds no other back. The first Ctrl-C lets all of them save what they have; a later
     one ends them at once.
@@ -75,7 +75,7 @@ class _Overview:
         self._next = self._share() + _PART
 
     def show(self, left: Sequence[Job]) -> None:
-        """Brings plan and bar up to date."""
+        """Updates plan and bar."""
         working = self.workers.progress()
         self.plan.progress.update(working)
         self.bar.n = self.plan.steps - self.plan.steps_to_go(self.plan.jobs)
@@ -88,12 +88,12 @@ class _Overview:
             self._say(f"{share:.0%} of all steps: {state}")
 
     def ended(self, job: Job, outcome: Outcome) -> None:
-        """Says that a job has ended, and how."""
+        """Reports that a job has ended, and its outcome."""
         how = "failed" if outcome.error else "interrupted" if outcome.interrupted else "done"
         self._say(f"{job.label}: {how}")
 
     def stopping(self) -> None:
-        """Says that all were told to stop."""
+        """Reports that all jobs are stopping."""
         self.bar.bar_format = _STOPPING
         self._say("saving what there is")
 

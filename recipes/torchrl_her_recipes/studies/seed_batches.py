@@ -1,4 +1,4 @@
-"""The runs of one combination of a study: its seeds, in batches that are run side by side."""
+"""Batches of seeds of one combination of a study; the seeds of a batch are trained side by side."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ROWS = 1_280  # of a batch's gradient step: more runs side by side are no faste
 
 
 class Batches:
-    """Folders of one combination: ``seeds_*`` in it, or the folder itself if it is that of a run.
+    """Folders of one combination: its ``seeds_*``, or the folder itself if it is a single run's.
 
     What is read are the batches that have come to their end; as long as none has, those that are under
     way, up to the last epoch that all of them have reached.
@@ -46,17 +46,17 @@ class Batches:
 
     @cached_property
     def shown(self) -> list[RunFolder]:
-        """Returns the folders that are read."""
+        """Folders that are read: the finished ones, or else those with results."""
         return self._done or [home for home in self.homes if home.rows()]
 
     @property
     def is_done(self) -> bool:
-        """Whether those that are read have come to their end."""
+        """Whether the runs in the folders that are read are finished."""
         return bool(self._done)
 
     @property
     def recipe(self) -> Recipe | None:
-        """Joins the recipes of all seeds; None if there is nothing to read.
+        """The recipe of all seeds together; None if there is nothing to read.
 
         Raises:
             ValueError: a configuration cannot be read.
@@ -66,11 +66,11 @@ class Batches:
 
     @property
     def seconds(self) -> float:
-        """How long the runs took, one core for each batch, without their pictures."""
+        """Seconds that the runs took, with one core for each batch, without their pictures."""
         return sum(read_progress(home.path).seconds for home in self.shown)
 
     def rows(self) -> list[dict[str, float]]:
-        """The tables of the runs as one: a row an epoch and run, in this order; runs are counted anew."""
+        """Joins the tables of the runs: rows by epoch and run; runs are renumbered."""
         tables = [home.rows() for home in self.shown]
         if not tables:
             return []
@@ -85,13 +85,13 @@ class Batches:
         return sorted(rows, key=lambda row: (row["epoch"], row["run"]))
 
     def goal_map(self) -> GoalMap | None:
-        """Where the virtual goals of the runs lie; None where no run has written its map."""
+        """Reads the map of the runs' virtual goals; None if no run has written one."""
         maps = [GoalMap.load(home.goal_map) for home in self.shown if home.goal_map.is_file()]
         return GoalMap(np.concatenate([own.counts for own in maps]), maps[0].target) if maps else None
 
 
 def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
-    """The jobs of one combination: the batches that there are, and those of the seeds that are missing."""
+    """Plans the jobs of one combination: existing batches, and batches of missing seeds."""
     home = folder / label
     if (home / "config.yaml").exists():
         raise ValueError(f"{home} is the folder of a single run; choose another folder for the study")
@@ -114,7 +114,7 @@ def _name(seeds: Sequence[int]) -> str:
 
 
 def _seeds_of(path: Path) -> list[int]:
-    """The seeds of a batch, by the name of its folder."""
+    """Returns the seeds of a batch, from the name of its folder."""
     match = re.fullmatch(r"seeds_(\d+)(?:-(\d+))?", path.name)
     if match is None:
         raise ValueError(f"{path} is not the name of a batch, which is for instance seeds_0-4")
@@ -122,11 +122,11 @@ def _seeds_of(path: Path) -> list[int]:
 
 
 def share_out(seeds: Sequence[int], *, most: int) -> list[list[int]]:
-    """Neighboring seeds in batches, as few and as equal as can be.
+    """Divides neighboring seeds into batches, as few and as equal as possible.
 
     Args:
         seeds: in rising order, not all of them neighbours.
-        most: seeds of a batch.
+        most: maximum number of seeds in a batch.
 
     Example:
         >>> share_out([0, 1, 2, 3, 4, 5, 9], most=5)

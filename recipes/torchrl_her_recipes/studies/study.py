@@ -1,4 +1,4 @@
-"""Runs a study, or single runs: all that is not done yet, on all cores or a cluster."""
+"""Runs a study or single runs, as far as unfinished, on all cores or a cluster."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from torchrl_her_recipes.studies.schedule import run_jobs
 from torchrl_her_recipes.studies.seed_batches import Batches, plan_batches
 from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
 
-_NOTE = "sweep.json"  # the single runs that a folder is for
+_NOTE = "sweep.json"  # file that lists the single runs of a folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,10 +46,10 @@ class StudyResult:
 
 
 def plan_study(study: Study | Mapping[str, Recipe], folder: Path) -> Plan:
-    """Jobs of a study, and about how long they take.
+    """Plans the jobs of a study, and estimates their time.
 
     Args:
-        study: what to run; or recipes of single runs, by the names of their folders.
+        study: study to run; or recipes of single runs, by the names of their folders.
         folder: a folder of each combination or single run goes into it, or is there already. Seeds that a
             combination lacks are added to those that it has.
 
@@ -71,18 +71,18 @@ def run_study(
     workers: Workers | None = None,
     progress: bool = True,
 ) -> StudyResult:
-    """Runs what is not done yet, several at once, and draws the figure of a study.
+    """Runs the unfinished jobs of a study, several at once, and draws its figure.
 
     Runs that were interrupted go on from their checkpoints.
 
     Args:
-        study: what to run; or recipes of single runs, by the names of their folders.
+        study: study to run; or recipes of single runs, by the names of their folders.
         folder: a folder of each combination or single run goes into it.
         workers: who does it; by default a process for each core. They are closed in the end.
         progress: whether to show a progress bar over all of it.
 
     Raises:
-        ValueError: the folder has a run of other options under the same name, somebody is at work in it, or
+        ValueError: the folder has a run of other options under the same name, another process is using it, or
             a task names a module that must not be imported.
         KeyboardInterrupt: by a second Ctrl-C.
     """
@@ -111,7 +111,7 @@ def run_study(
 
 
 def unfinished_sweep(runs: Mapping[str, Recipe], folders: Path) -> Path | None:
-    """The newest folder of just these single runs that has some to go; None if there is none.
+    """Finds the newest folder of exactly these single runs that is unfinished; None if there is none.
 
     Args:
         runs: recipes, by the names of their folders.
@@ -132,7 +132,7 @@ def _note(runs: Mapping[str, Recipe]) -> str:
 
 
 def draw_study(study: Study, folder: Path) -> Path:
-    """Metrics over environment steps: a panel for each task, a curve for each combination of the rest."""
+    """Draws metrics over environment steps: a panel for each task, a curve for each other combination."""
     path = folder / f"{study.name}.png"
     panels: dict[str, dict[str, list[dict[str, float]]]] = {}
     for label, recipe in study.cells():

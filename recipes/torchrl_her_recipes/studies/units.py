@@ -1,4 +1,4 @@
-"""A task whose lengths are in another unit, to see whether an agent depends on units."""
+"""A task whose lengths are in another unit, to test whether an agent depends on units."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class InUnits(GoalEnv):
         return self.task.batched
 
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """The reward of the task: goals [..., g] to [..., 1]."""
+        """Computes the reward of the task: maps goals [..., g] to [..., 1]."""
         return self.task.compute_reward(achieved_goal / self.factor, desired_goal / self.factor)
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Whether an episode of the task ends: goals [..., g] to [..., 1]."""
+        """Returns whether an episode of the task ends: maps goals [..., g] to [..., 1]."""
         return self.task.compute_terminated(achieved_goal / self.factor, desired_goal / self.factor)
 
     def set_seeds(self, seeds: Any) -> None:

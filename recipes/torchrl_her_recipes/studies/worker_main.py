@@ -1,7 +1,7 @@
-"""A worker process: does the jobs that come in on its input, one after the other, until that ends.
+"""Worker process: runs the jobs from its standard input, one after the other, until the input ends.
 
 The end of its input is also how it is told to stop in the middle of a job, so it does so as well if
-whoever started it is gone: what it has is saved, and nothing goes on unseen.
+the process that started it is gone: it saves its run and ends.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ def main() -> None:
     logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
     try:
         with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as answers:
-            os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # nothing that is printed gets among them
+            os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keeps other output out of them
             _serve(answers)
     except BrokenPipeError:
-        pass  # nobody is there to hear
+        pass  # the other process is gone
 
 
 def _serve(answers: BinaryIO) -> None:
@@ -37,7 +37,7 @@ def _serve(answers: BinaryIO) -> None:
     working = False
 
     def stop(_number: int, _frame: FrameType | None) -> None:
-        # Between jobs there is nothing to stop, and raised in the garbage collection or at exit it would only
+        # Between jobs there is nothing to stop, and raising in the garbage collection or at exit would only
         # keep semaphores from being given back.
         if working:
             raise KeyboardInterrupt
@@ -49,7 +49,7 @@ def _serve(answers: BinaryIO) -> None:
             working = True
             outcome = _run(values)
             working = False
-        except KeyboardInterrupt:  # before the job began, or just after it ended
+        except KeyboardInterrupt:  # a stop before the job began, or just after it ended
             working = False
             outcome = Outcome(interrupted=True)
         pickle.dump(outcome, answers)
@@ -60,7 +60,7 @@ def _serve(answers: BinaryIO) -> None:
 def _run(values: dict[str, Any]) -> Outcome:
     try:
         job = Job.from_plain(values)
-    except Exception as error:  # whatever a user's module raises
+    except Exception as error:  # a user's module may raise any error
         return Outcome(error=" ".join(f"{type(error).__name__}: {error}".split()))
     return run_job(job)
 
@@ -70,7 +70,7 @@ def _listen(jobs: SimpleQueue[dict[str, Any] | None]) -> None:
         while True:
             jobs.put(pickle.load(sys.stdin.buffer))
     except (EOFError, pickle.UnpicklingError):
-        os.kill(os.getpid(), signal.SIGINT)  # a run knows how to stop at a good moment
+        os.kill(os.getpid(), signal.SIGINT)  # a run stops at a good moment by itself
         jobs.put(None)
 
 

@@ -1,4 +1,4 @@
-"""Workers for the jobs of a study, chosen by the options of the user."""
+"""Makes the workers for the jobs of a study, by the user's options."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
 
 
 def make_workers(*, jobs: int | None = None, ray: str | None = None, gpus_per_job: float = 0.0) -> Workers:
-    """Worker processes on this machine, or the nodes of a Ray cluster.
+    """Makes worker processes on this machine, or uses the nodes of a Ray cluster.
 
     Args:
-        jobs: how many at once on this machine; one for each core if None.
+        jobs: number of jobs at once on this machine; None for one on each core.
         ray: address of a cluster, ``auto`` or ``HOST:PORT``; None for this machine.
         gpus_per_job: the share of a GPU that each job gets on a cluster.
 

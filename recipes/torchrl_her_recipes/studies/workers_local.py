@@ -21,23 +21,23 @@ class Workers(Protocol):
 
     @property
     def at_once(self) -> int:
-        """How many jobs they do at the same time."""
+        """Number of jobs that run at the same time."""
 
     def run(self, job: Job) -> Outcome:
-        """Waits for a place, does the job there, and returns when it has ended.
+        """Waits for a free worker, runs the job there, and returns when it has ended.
 
         Called from threads. Jobs must not overlap within a process: TorchRL's exploration type, and torch's
         random numbers, are those of all its threads.
         """
 
     def progress(self) -> dict[str, Progress]:
-        """How far the jobs are that are being done, by label."""
+        """Returns the progress of running jobs, by label."""
 
     def stop(self) -> None:
-        """Tells all to save what they have and to stop; returns at once."""
+        """Makes all jobs save their state and stop; returns at once."""
 
     def close(self) -> None:
-        """Ends what is still going on, the hard way, and gives everything back."""
+        """Kills running jobs and releases all resources."""
 
 
 class LocalWorkers:
@@ -46,7 +46,7 @@ class LocalWorkers:
     They are in sessions of their own: Ctrl-C reaches them by :meth:`stop` only, never in a bad moment.
 
     Args:
-        at_once: how many; by default one for each core.
+        at_once: number of processes; by default one for each core.
     """
 
     def __init__(self, at_once: int | None = None) -> None:
@@ -65,7 +65,7 @@ class LocalWorkers:
             if self._stopped:
                 return Outcome(interrupted=True)
             worker = worker or _Worker()
-            self._busy[job.label] = job, worker  # from here on, stop() tells it
+            self._busy[job.label] = job, worker  # from here on, stop() reaches it
             if self._stopped:
                 worker.stop()
             outcome = worker.run(job)
@@ -99,7 +99,7 @@ class LocalWorkers:
 
 
 def _cores() -> int:
-    """How many cores this process may use: fewer than there are, under taskset or a scheduler of jobs."""
+    """Returns the number of cores that this process may use, which taskset or job schedulers limit."""
     if sys.platform == "linux":
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -127,14 +127,14 @@ class _Worker:
             return Outcome(error=self.end(), died=True)
 
     def stop(self) -> None:
-        with suppress(BrokenPipeError):  # it has ended already
+        with suppress(BrokenPipeError):  # the process has ended already
             self._jobs.close()
 
     def kill(self) -> None:
         self._process.kill()
 
     def end(self) -> str:
-        """Waits for its end, and says how it came."""
+        """Waits for the end of the process, and returns its cause."""
         self.stop()
         code = self._process.wait()
         self._answers.close()

@@ -31,7 +31,7 @@ from torchrl_her_recipes.studies.jobs import (
     unpack,
 )
 
-_RETRIES = 3  # of a job whose node died
+_RETRIES = 3  # retries of a job whose node died
 _REPORT = 0.5  # seconds between two looks at how far a run is
 
 
@@ -64,12 +64,12 @@ class RayWorkers:
 
     @property
     def at_once(self) -> int:
-        """How many jobs the cluster has cores and GPUs for just now."""
+        """Number of jobs for which the cluster has cores and GPUs at present."""
         cores = int(resource("CPU"))
         return min(cores, self._places_on_gpus()) if self._gpus else cores
 
     def _places_on_gpus(self) -> int:
-        """How many jobs have their share of a GPU at once."""
+        """Returns the number of jobs that fit on the GPUs at once."""
         if self._gpus > 1:
             return sum(int(own // self._gpus) for own in gpus())
         return sum(int(own) * int(1 / self._gpus) for own in gpus())
@@ -79,7 +79,7 @@ class RayWorkers:
             ray.shutdown()
 
     def run(self, job: Job) -> Outcome:
-        """Has a job done where there is a core free, and fetches its files."""
+        """Runs a job on a node with a free core, and fetches its files."""
         needs = _work.options(num_cpus=job.recipe.run.threads, num_gpus=self._gpus)
         task = needs.remote(job.to_plain(), _begun(job), self._board)
         self._tasks[job.label] = task  # from here on, stop() cancels it
@@ -98,43 +98,43 @@ class RayWorkers:
     def progress(self) -> dict[str, Progress]:
         try:
             board = ray.get(self._board.read.remote())
-        except RayError:  # this machine's node is gone, which run() gets to hear, too
+        except RayError:  # this machine's node is gone, and run() raises, too
             board = {}
         return {label: board[label] for label in list(self._tasks) if label in board}
 
     def stop(self) -> None:
         self._stopped = True
         for task in list(self._tasks.values()):
-            ray.cancel(task)  # which is a Ctrl-C to those that have begun
+            ray.cancel(task)  # acts as Ctrl-C on jobs that have begun
 
     def close(self) -> None:
-        """Ends what is still going on, the hard way, and leaves the cluster."""
+        """Kills running jobs and leaves the cluster."""
         self._stopped = True
         while self._tasks:
             for task in list(self._tasks.values()):
                 ray.cancel(task, force=True)
-            time.sleep(0.1)  # until run() has heard of it
+            time.sleep(0.1)  # until run() has returned
         self._leave()
 
 
 class Board:
-    """Where the nodes write how far their jobs are."""
+    """Ray actor to which nodes report the progress of their jobs."""
 
     def __init__(self) -> None:
         self._progress: dict[str, Progress] = {}
 
     def write(self, label: str, progress: Progress) -> None:
-        """Takes down how far a job is."""
+        """Stores the progress of a job."""
         self._progress[label] = progress
 
     def read(self) -> dict[str, Progress]:
-        """All there is, by label."""
+        """Returns all reported progress, by label."""
         return self._progress
 
 
 @ray.remote(max_retries=_RETRIES)
 def _work(values: dict[str, Any], files: dict[str, bytes], board: Any) -> tuple[Outcome, dict[str, bytes]]:
-    """Does a job on a node, from the files of an earlier attempt if there are any."""
+    """Runs a job on a node, from the files of an earlier attempt if there are any."""
     job = Job.from_plain(values)
     with TemporaryDirectory(prefix="torchrl-her-") as place:
         own = replace(job, folder=Path(place) / job.label)
@@ -147,7 +147,7 @@ def _work(values: dict[str, Any], files: dict[str, bytes], board: Any) -> tuple[
 
 @contextmanager
 def _reporting(job: Job, board: Any) -> Iterator[None]:
-    """Keeps the board up to date."""
+    """Reports the progress of a job to the board, in the ``with`` block."""
     ended = threading.Event()
 
     def report() -> None:

@@ -28,7 +28,7 @@ DEFAULT = "default"
 
 
 def folder_of(trial: FrozenTrial | Trial) -> str:
-    """Name of the folder of a trial's run: that of the trial it repeats, if it repeats one."""
+    """Returns the name of a trial's folder, or that of the trial that it repeats."""
     return str(trial.user_attrs.get("folder", f"trial_{trial.number:04}"))
 
 
@@ -60,7 +60,7 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
 
 
 def importances(study: Study) -> dict[str, float]:
-    """Importance of each option for the score (PED-ANOVA), as fractions; empty for too few trials."""
+    """Computes each option's importance for the score (PED-ANOVA), as fractions; empty for too few trials."""
     done = _in_space(study)
     if len(done.trials) < _FEWEST or len({own.value for own in done.trials}) < 2:
         return {}
@@ -68,7 +68,7 @@ def importances(study: Study) -> dict[str, float]:
 
 
 def _in_space(study: Study) -> Study:
-    """Returns a study of the complete trials with a value of each option, which the first one may lack."""
+    """Returns a study of the complete trials that have all options; the first trial may lack some."""
     done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     most = max((len(own.params) for own in done), default=0)
     inside = create_study(direction="maximize")
@@ -81,7 +81,7 @@ def write_pictures(study: Study, folder: Path) -> None:
     if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
         return
     with warnings.catch_warnings(), rc_context():  # Optuna chooses a style for the whole process
-        warnings.simplefilter("ignore")  # that they are experimental, and limits of axes
+        warnings.simplefilter("ignore")  # suppresses: figures are experimental, limits of axes
         drawn = {
             "history": figures.plot_optimization_history(study, target_name="score"),
             "options": figures.plot_slice(study, target_name="score"),
@@ -93,7 +93,7 @@ def write_pictures(study: Study, folder: Path) -> None:
 
 
 def search_summary(study: Study) -> list[str]:
-    """The best trials and the importance of each option, in lines for people."""
+    """Describes the best trials and the importance of each option, in lines of text."""
     done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     ranked = sorted(done, key=lambda own: (-(own.value or 0.0), own.number))[:_SHOWN]
     lines = [

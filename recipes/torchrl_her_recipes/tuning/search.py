@@ -36,8 +36,8 @@ from torchrl_her_recipes.tuning.results import DEFAULT, folder_of, write_picture
 
 _NAME, _SETTINGS, _DATABASE = "search", "search.yaml", "search.db"
 _TICK = 1.0  # seconds
-_ATTEMPTS = 3  # at a trial whose process dies
-_FAILURES = 5  # without any success: something other than the options is wrong
+_ATTEMPTS = 3  # attempts at a trial whose process dies
+_FAILURES = 5  # failures before any success: something other than the options is wrong
 _ATTEMPT, _REPEATED, _PRUNED, _ERROR = "attempt", "repeated", "pruned", "error"
 
 
@@ -48,7 +48,7 @@ class SearchResult:
     Attributes:
         study: Optuna's study. Trials with the attribute ``repeated`` were cut short and run again.
         folder: with the best trial as a preset, a table and pictures.
-        interrupted: whether somebody stopped the search. The same call goes on with it.
+        interrupted: whether the user stopped the search. The same call resumes it.
     """
 
     study: Study
@@ -57,7 +57,7 @@ class SearchResult:
 
     @property
     def trials(self) -> list[FrozenTrial]:
-        """All trials but those that were cut short."""
+        """All trials except interrupted ones."""
         return _counted(self.study)
 
     @property
@@ -68,7 +68,7 @@ class SearchResult:
 
     @property
     def failed(self) -> dict[int, str]:
-        """Why trials failed, by their numbers."""
+        """Reasons for which trials failed, by number."""
         failed = (trial for trial in self.trials if trial.state == TrialState.FAIL)
         return {trial.number: trial.user_attrs.get(_ERROR, "") for trial in failed}
 
@@ -133,7 +133,7 @@ def tune(
 
 
 def _describe(search: Search, path: Path) -> None:
-    """Writes the settings of a search, or compares them with those that are there."""
+    """Writes the settings of a search, or compares them with those in its folder."""
     text = yaml.safe_dump(search.to_plain(), sort_keys=False)
     if not path.exists():
         write_text(path, text)
@@ -148,7 +148,7 @@ def _describe(search: Search, path: Path) -> None:
 
 
 def _begin(search: Search, database: Path) -> Study:
-    """Optuna's study; the first trial is the recipe as it is, and trials that were cut short come again."""
+    """Opens Optuna's study: the first trial is the unchanged recipe, and interrupted trials are repeated."""
     study = optuna.create_study(
         storage=_storage(database),
         study_name=_NAME,
@@ -170,7 +170,7 @@ def _begin(search: Search, database: Path) -> Study:
 def _storage(database: Path) -> RDBStorage:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
 
-    def connect() -> sqlite3.Connection:  # letters of the path may mean something else in an address
+    def connect() -> sqlite3.Connection:  # characters of the path may have a meaning in a URL
         return sqlite3.connect(database, timeout=60, check_same_thread=False)
 
     return RDBStorage("sqlite:///search.db", engine_kwargs={"creator": connect})
@@ -201,13 +201,13 @@ def _make_pruner(name: str, epochs: int) -> optuna.pruners.BasePruner:
 
 
 def _counted(study: Study) -> list[FrozenTrial]:
-    """The trials that have begun, but for those that were cut short and are repeated."""
+    """Returns the trials that have begun, except interrupted ones that are repeated."""
     trials = study.get_trials(deepcopy=False)
     return [own for own in trials if own.state != TrialState.WAITING and _REPEATED not in own.user_attrs]
 
 
 def _repeat(study: Study, trial: FrozenTrial | Trial, *, attempt: int = 0) -> None:
-    """Ends a trial that was cut short; another one with its values resumes its run."""
+    """Ends an interrupted trial; another trial with its values resumes its run."""
     kept = {name: value for name, value in trial.user_attrs.items() if name == DEFAULT}
     Trial(study, trial._trial_id).set_user_attr(_REPEATED, True)
     study.tell(trial.number, state=TrialState.FAIL)
@@ -215,7 +215,7 @@ def _repeat(study: Study, trial: FrozenTrial | Trial, *, attempt: int = 0) -> No
 
 
 class _TrialRuns:
-    """The trials of a search, several at once."""
+    """Runs the trials of a search, several at once."""
 
     def __init__(
         self, search: Search, home: Path, study: Study, workers: Workers, say: Callable[[str], None]
@@ -260,11 +260,13 @@ class _TrialRuns:
         space, ranges = self.search.space, self.search.space.distributions()
         waiting = self.study.get_trials(deepcopy=False, states=(TrialState.WAITING,))
         if waiting and (default := waiting[0].user_attrs.get(DEFAULT)) is not None:
-            ranges = {name: ranges[name] for name in space.inside(default)}  # its other values lie outside
+            ranges = {
+                name: ranges[name] for name in space.inside(default)
+            }  # values of the first trial that lie outside of the space
         trial = self.study.ask(ranges)
         try:
             recipe = space.recipe(self.search.recipe, trial.params)
-        except ValueError as error:  # values that do not go together
+        except ValueError as error:  # invalid combination of values
             self._tell(trial, TrialState.FAIL, error=str(error))
             return
         name = folder_of(trial)
@@ -285,7 +287,7 @@ class _TrialRuns:
             self._end(trial, outcome)
 
     def _end(self, trial: Trial, outcome: Outcome) -> None:
-        """Tells Optuna what came of a trial, and renews the table."""
+        """Passes the result of a trial to Optuna, and writes the table again."""
         attempt = trial.user_attrs.get(_ATTEMPT, 0)
         if outcome.interrupted:
             _repeat(self.study, trial, attempt=attempt)
@@ -302,7 +304,7 @@ class _TrialRuns:
         else:
             self._tell(trial, TrialState.COMPLETE, value=score(run.rows()))
             return
-        for path in run.checkpoints:  # large, and nothing goes on from them
+        for path in run.checkpoints:  # large, and no longer needed
             path.unlink(missing_ok=True)
 
     def _tell(self, trial: Trial, state: TrialState, *, value: float | None = None, error: str = "") -> None:
@@ -327,7 +329,7 @@ class _Reporter(Callback):
         self.trial = Trial(study, study.get_trials(deepcopy=False)[number]._trial_id)
 
     def on_epoch(self, run: RunView) -> bool:
-        """Returns whether the trial is pruned; never at its last epoch, nor the recipe as it is."""
+        """Returns whether the trial is pruned; never at its last epoch, nor for the unchanged recipe."""
         epoch = run.trainer.epochs
         self.trial.report(score(run.rows), epoch)
         may_end = epoch < run.components.recipe.run.epochs and DEFAULT not in self.trial.user_attrs
@@ -339,7 +341,7 @@ class _Reporter(Callback):
 
 @contextmanager
 def reporting(*, database: str, number: int, pruner: str, epochs: int) -> Iterator[list[Callback]]:
-    """Surrounds the run of a trial in its worker process, and gives the run's callbacks.
+    """Context of a trial's run in its worker process; yields the run's callbacks.
 
     Args:
         database: Path of the search's database.

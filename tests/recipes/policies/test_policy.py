@@ -150,7 +150,7 @@ def test_what_export_wrote_is_played(
             "run/checkpoint.pt",
             "does not end with .safetensors and cannot be loaded: `torchrl-her export RUN`",
         ),
-        ("moved.safetensors", "is no exported policy: `torchrl-her export RUN` writes one"),
+        ("moved.safetensors", "is not an exported policy: `torchrl-her export RUN` writes one"),
         ("notes.safetensors", "cannot be read: its header must have at most 4,194,304 bytes, got"),
     ):
         assert main(["play", name]) == 2
@@ -270,7 +270,7 @@ def test_files_that_somebody_made_give_one_line(
     write_policy(Path("bad.safetensors"), weights, description)
     assert main(["play", "bad.safetensors"]) == 2
     said = capsys.readouterr().err
-    assert said.startswith("torchrl-her: bad.safetensors is no exported policy: ")
+    assert said.startswith("torchrl-her: bad.safetensors is not an exported policy: ")
     assert message in said
     assert said.count("\n") == 1
 

@@ -164,7 +164,7 @@ def _flaky(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("flaky")
 def test_a_logger_that_fails_is_opened_anew_and_told_what_it_missed(tmp_path: Path) -> None:
     recipe = small(epochs=3, epoch_frames=480, log="flaky")
-    said = "^log=flaky fails after 960 frames, the run goes on: OSError: no network$"
+    said = "^log=flaky fails after 960 frames, the run continues: OSError: no network$"
     with pytest.warns(UserWarning, match=said):
         result = run(build(recipe), tmp_path, progress=False)
     assert len(result.rows) == 3

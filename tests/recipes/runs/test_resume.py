@@ -227,7 +227,7 @@ def test_epochs_extend_a_finished_run_and_an_interrupted_one(
     [
         (
             ["seed=3"],
-            "keep_buffer, pictures, log only; seed=3 would change what it has trained: start a new run",
+            "keep_buffer, pictures, log only; seed=3 would change its training so far: start a new run",
         ),
         (
             ["epochs=4", "learner.gamma=0.9"],
@@ -235,7 +235,7 @@ def test_epochs_extend_a_finished_run_and_an_interrupted_one(
         ),
         (
             ["preset=demo"],
-            "keep_buffer, pictures, log only; preset=demo would change what it has trained",
+            "keep_buffer, pictures, log only; preset=demo would change its training so far",
         ),
         (["epoch=4"], "no option 'epoch'; did you mean epochs?"),
         (["epochs=4", "run.epochs=5"], "epochs=4 and run.epochs=5 set the same option"),
@@ -277,13 +277,13 @@ def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(
     assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is None
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     said = (
-        f"torchrl-her: the run in {tmp_path} cannot go on after its 2 epochs: its checkpoint has no replay "
-        "buffer; only runs that are trained with keep_buffer=true keep it when they have finished\n"
+        f"torchrl-her: the run in {tmp_path} cannot be extended beyond 2 epochs: its checkpoint has no "
+        "replay buffer; only runs trained with keep_buffer=true keep it when they have finished\n"
     )
     for arguments in (["epochs=3"], ["epochs=3", "keep_buffer=true"], ["keep_buffer=true"]):
         assert cli.main(["train", "--resume", str(tmp_path), *arguments]) == 2
         assert capsys.readouterr().err == said
-    with pytest.raises(ValueError, match="cannot go on after its 2 epochs"):
+    with pytest.raises(ValueError, match="cannot be extended beyond 2 epochs"):
         resume(tmp_path, components=build(recipe.replace(epochs=3)))
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
@@ -334,7 +334,7 @@ def test_without_a_checkpoint_a_run_cannot_go_on(tmp_path: Path, capsys: pytest.
     run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
     (tmp_path / "checkpoint.pt").unlink()
     assert cli.main(["train", "--resume", str(tmp_path), "epochs=3"]) == 2
-    said = f"torchrl-her: the run in {tmp_path} cannot go on: checkpoint.pt is missing\n"
+    said = f"torchrl-her: the run in {tmp_path} cannot be resumed: checkpoint.pt is missing\n"
     assert capsys.readouterr().err == said
 
 
@@ -419,7 +419,7 @@ def test_a_run_before_its_first_epoch_can_be_resumed(tmp_path: Path) -> None:
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no disk that is always full")
 def test_a_full_disk_does_not_end_a_run(tmp_path: Path) -> None:
     (tmp_path / "checkpoint.part.pt").symlink_to("/dev/full")
-    said = "no checkpoint after 0 frames, the run goes on: .*No space left on device"
+    said = "no checkpoint after 0 frames, the run continues: .*No space left on device"
     with pytest.warns(UserWarning, match=said):
         run(build(small(epochs=2)), tmp_path, progress=False)
     assert load_checkpoint(tmp_path / "checkpoint.pt")["trainer"]["epochs"] == 2
@@ -427,7 +427,7 @@ def test_a_full_disk_does_not_end_a_run(tmp_path: Path) -> None:
 
 def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "metrics.part.csv").symlink_to("/dev/full")
-    with pytest.warns(UserWarning, match=r"no table after 800 frames, the run goes on: .*No space left"):
+    with pytest.warns(UserWarning, match=r"no table after 800 frames, the run continues: .*No space left"):
         result = run(build(small(epochs=2, epoch_frames=800)), tmp_path, progress=False)
     assert len(result.rows) == len(RunFolder(tmp_path).rows()) == 2
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()

@@ -173,7 +173,7 @@ def test_the_best_policy_is_played_loaded_and_exported(
 def test_without_a_best_policy_one_line_says_so(
     two: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(ValueError, match="best goes with the folder of a run, and hand_v1 is none"):
+    with pytest.raises(ValueError, match="best needs the folder of a run, got hand_v1"):
         play("hand_v1", out=tmp_path / "film.gif", best=True)
     (two / "best.safetensors").unlink()
     for command in ("play", "export"):

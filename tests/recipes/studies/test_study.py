@@ -319,7 +319,7 @@ def children(pid: int) -> list[int]:
         (["ibs", "--frames", "-5"], "Invalid value for '--frames': -5 is not in the range x>=1"),
         (
             ["recipes: {}"],
-            "a study has no recipes; it has preset, summary, recipe, vary, cases, for_task, figure",
+            "unknown recipes; a study has preset, summary, recipe, vary, cases, for_task, figure",
         ),
         ([""], "mine.yaml cannot be read: it must hold names and values, got None"),
         (["vary: {algo: ["], "mine.yaml cannot be read: line 1: while parsing"),

@@ -1,1 +1,1 @@
-"""The loggers that ``log=`` names: each opens one of TorchRL's so that a resumed run goes on in it."""
+"""The loggers for ``log=NAME``: each opens one of TorchRL's so that a resumed run continues in it."""

@@ -1,4 +1,4 @@
-"""``log=tensorboard``: TorchRL's ``TensorboardLogger``, which can go on after a kill."""
+"""``log=tensorboard``: TorchRL's ``TensorboardLogger``, which can resume after a kill."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torchrl.record.loggers import TensorboardLogger
 from torchrl_her_recipes.runs.callbacks import RunView
 
 _NAME = "tensorboard"
-_PATIENCE = 3  # seconds that a clock may have been set back
+_PATIENCE = 3  # seconds: tolerance for a clock that was set back
 
 
 class TensorboardEvents(TensorboardLogger):
-    """Writes events of TensorBoard; those that are there already are dropped from some step on.
+    """Writes events of TensorBoard, after dropping earlier events from some step on.
 
     Args:
         exp_name: name of the folder.
-        log_dir: where it is.
+        log_dir: path of its parent folder.
 
     Keyword Args:
         purge_step: the first step that does not count any more; None keeps all.
@@ -35,13 +35,13 @@ class TensorboardEvents(TensorboardLogger):
         return SummaryWriter(f"{self.log_dir}/{self.exp_name}", purge_step=self._purge_step)
 
     def log_hparams(self, cfg: dict[str, Any]) -> None:
-        """Writes options into the same events; TorchRL's own makes another folder at each start."""
+        """Writes options into the same events; TorchRL's method would make another folder at each start."""
         for summary in hparams(cfg, {}):
             self.experiment.file_writer.add_summary(summary)
 
 
 def open_tensorboard(run: RunView, frames: int) -> tuple[TensorboardEvents, int]:
-    """A logger into ``tensorboard/`` of the run's folder; what was written behind ``frames`` is dropped."""
+    """Opens a logger into ``tensorboard/`` of the run's folder; events behind ``frames`` are dropped."""
     assert run.folder is not None
     home = run.folder.path
     before = list((home / _NAME).glob("events.*"))
@@ -51,7 +51,7 @@ def open_tensorboard(run: RunView, frames: int) -> tuple[TensorboardEvents, int]
 
 
 def _wait_for_the_next_second(files: list[Path]) -> None:
-    """Files are read in the order of their names, which begin with the time in seconds: ours must be last."""
+    """Waits until a new file sorts last: files are read by name, and names begin with the time in seconds."""
     newest = max(int(path.name.split(".")[3]) for path in files)
     while newest >= int(time.time()) > newest - _PATIENCE:
         time.sleep(0.05)

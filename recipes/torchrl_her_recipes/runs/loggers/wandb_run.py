@@ -1,4 +1,4 @@
-"""``log=wandb``: TorchRL's ``WandbLogger`` (extra ``wandb``), in a run of Weights & Biases that can go on."""
+"""``log=wandb``: TorchRL's ``WandbLogger`` (extra ``wandb``), in a resumable run of Weights & Biases."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PROJECT = "torchrl-her"
 
 
 class WandbRun(WandbLogger):
-    """Counts frames as the steps of the whole run; TorchRL's own has a counter for each group of metrics."""
+    """Logger that counts frames as steps; TorchRL's has a counter for each group of metrics."""
 
     def log_metrics(
         self, metrics: Mapping[str, Any], step: int | None = None, **_options: Any
@@ -29,14 +29,14 @@ class WandbRun(WandbLogger):
 
 
 def open_wandb(run: RunView, _frames: int) -> tuple[WandbRun, int]:
-    """A logger into the project ``WANDB_PROJECT`` or ``torchrl-her``; a run that goes on has the same id.
+    """Opens a logger into the project ``WANDB_PROJECT`` or ``torchrl-her``; a resumed run keeps its id.
 
-    A run that is offline (``WANDB_MODE=offline``) is told the whole table anew, and replaces what was there.
-    The service takes nothing back: it keeps what it knows, and is told what comes behind.
+    A run that is offline (``WANDB_MODE=offline``) logs the whole table again, and replaces earlier files.
+    The service cannot delete rows: it keeps those that it has, and gets only later ones.
     """
     assert run.folder is not None
     home = run.folder.path
-    settings = wandb.Settings(console="off", silent=True)  # the output is ours
+    settings = wandb.Settings(console="off", silent=True)  # the console belongs to this program
     own_id = remembered(home / "wandb" / "run_id.txt")
     project = os.environ.get("WANDB_PROJECT", _PROJECT)
     try:
@@ -45,9 +45,9 @@ def open_wandb(run: RunView, _frames: int) -> tuple[WandbRun, int]:
             save_dir=str(home),
             id=own_id,
             project=project,
-            log_env_packages=False,  # run.json has them
+            log_env_packages=False,  # run.json has the versions
             settings=settings,
-            reinit="create_new",  # beside others in this process
+            reinit="create_new",  # other runs may be open in this process
         )
     except wandb.errors.UsageError as error:
         raise ValueError(f"{error} Without an account, set WANDB_MODE=offline.") from error
@@ -59,14 +59,14 @@ def open_wandb(run: RunView, _frames: int) -> tuple[WandbRun, int]:
 
 
 def _remove_others(home: Path, current: Path) -> None:
-    """Removes what was logged offline before: the one that has begun says all of it again."""
+    """Removes earlier offline logs: the current one repeats their contents."""
     for folder in home.glob("offline-run-*"):
         if folder.resolve() != current.resolve():
             shutil.rmtree(folder, ignore_errors=True)
 
 
 def remembered(path: Path) -> str:
-    """The id of a run that a file holds; a new one, which is written there, if there is none."""
+    """Reads the id of a run from a file; makes and writes a new one if there is none."""
     if path.is_file() and (own := path.read_text().strip()):
         return own
     own = uuid.uuid4().hex[:12]
