@@ -56,14 +56,14 @@ class Options:
     epochs: int = 30
     epoch_frames: int = 10_240
     num_envs: int = 64
-    steps_per_batch: int = 10  # of each environment
+    steps_per_batch: int = 10  # steps of each environment
     frames_per_update: int = 5
     warmup_frames: int = 3_200
-    episodes: int = 100  # of an evaluation
+    episodes: int = 100  # episodes of an evaluation
     # Hindsight
     k: int = 4  # virtual goals of a transition
     capacity: int = 1_000_000  # real and virtual transitions
-    priority_alpha: float = 0.3  # of the squared temporal-difference error: 0.6 in Schaul et al.
+    priority_alpha: float = 0.3  # exponent of the squared TD error: equals 0.6 in Schaul et al.
     priority_beta: float = 0.4
     # Curriculum
     window: int = 20  # greedy episodes whose mean success ends a stage
@@ -76,7 +76,7 @@ class Options:
     tau: float = 0.02
     action_penalty: float = 0.3  # keeps tanh from its ends, where its gradient vanishes
     max_grad_norm: float = 3.0
-    average_decay: float = 0.9995  # of the weights that are evaluated
+    average_decay: float = 0.9995  # decay of the average of weights that is evaluated
     # Exploration: a share epsilon of the actions has noise, a fifth of it is uniform
     epsilon_decay: float = 0.9  # each epoch
     epsilon_end: float = 0.05

@@ -110,7 +110,7 @@ def choose_goals(
     index = _propose(candidates, k, weight, draws)
     valid = torch.ones_like(index, dtype=torch.bool)
     useless = weight is not None and not bool((weight > 0).all())
-    begin = line * width  # of the lines in the flat table
+    begin = line * width  # start of each line in the flat table
 
     def test(which: Index, index: Tensor) -> Tensor:
         """Returns which of c proposed goals the filter rejects, for m transitions: [m, c] of bool."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl_her.goals.grid import Numbers
 
 _CHUNK = 1 << 20  # distances held at once: 8 MiB of float64
-_LEAST_SCALE = 0.01  # of the widest dimension
+_LEAST_SCALE = 0.01  # as a fraction of the scale of the widest dimension
 _FARTHEST = 1e140  # coordinates, in sigmas, beyond which squares of float64 would overflow
 
 

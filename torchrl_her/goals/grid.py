@@ -18,7 +18,7 @@ from torchrl_her.checks import check_finite
 
 _MAX_CELLS = 1 << 24  # a table of float64 is then 128 MiB, and five are kept
 _CHUNK = 1 << 21  # kernel values held at once when summing over samples
-_THIN = 1e-4  # of sigma: differences over thinner boxes would lose digits
+_THIN = 1e-4  # in units of sigma: differences over thinner boxes would lose digits
 
 Numbers = float | Sequence[float] | Tensor
 

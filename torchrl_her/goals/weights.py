@@ -157,5 +157,5 @@ def spread_evenly(count: int, most: int, device: torch.device | None = None) -> 
     n = min(count, most)
     part = torch.arange(n, device=device)
     begin, end = part * count // max(n, 1), (part + 1) * count // max(n, 1)
-    share = (part.double() * _GOLDEN).frac()  # of neighbors as different as can be, and even over many parts
+    share = (part.double() * _GOLDEN).frac()  # differs most between neighbors, even over many parts
     return begin + ((end - begin) * share).long()

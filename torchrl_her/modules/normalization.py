@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchrl_her.checks import check_whole
 from torchrl_her.modules.networks import by_run
 
-_RELATIVE_STD = 1e-4  # of the mean: smaller deviations are hardly more than what float32 rounds
+_RELATIVE_STD = 1e-4  # relative to the mean: smaller deviations are hardly above float32's rounding
 
 
 class Moments(NamedTuple):

@@ -83,7 +83,7 @@ class _Ahead(NamedTuple):
 class _Chosen(NamedTuple):
     """The changes that a batch needs."""
 
-    shape: torch.Size  # of the batch
+    shape: torch.Size  # shape of the batch
     rows: Tensor  # [V], places in the flat batch
     goals: Tensor  # [V, g]
     ends: Tensor | None  # [B, 1], where a sampler of slices ends them

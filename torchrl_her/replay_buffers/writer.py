@@ -55,7 +55,7 @@ class _Draft(NamedTuple):
     runs: list[int]
     real: WrittenRows
     virtual: WrittenRows | None
-    numbers: dict[str, list[int]]  # as they are counted
+    numbers: dict[str, list[int]]  # arguments of RunCounts.add
     weighted: bool  # whether weights are updated with the virtual goals
     ids: int  # number of trajectory ids that they take
 
@@ -174,7 +174,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         [9.0, 9.0, 9.0]
     """
 
-    _cursor: int  # where the plain writer writes next; untyped there
+    _cursor: int  # next row of the plain writer, which does not declare its type
 
     def __init__(
         self,
@@ -197,9 +197,11 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         super().__init__(reward_fn, options, weights=own[0] if own and runs == 1 else None, **changes)
         if refill > 1 and self.options.per == "episode":
             raise ValueError(f"refill={refill} is for per='transition': the filter looks at each of them")
-        self._weights = own  # of several runs
+        self._weights = own  # weights of several runs
         self.runs = runs
-        self._own_rewards: dict[int, RewardFunction] = {}  # of runs that differ from ``reward_fn``
+        self._own_rewards: dict[
+            int, RewardFunction
+        ] = {}  # reward functions of runs that do not use ``reward_fn``
         self._counts, self._rings = RunCounts(runs), Rings(runs)
         self._held = Batch.none(runs)  # transitions of open episodes
         self._recent = self._no_goals(runs)

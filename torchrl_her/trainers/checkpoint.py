@@ -35,7 +35,7 @@ from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_
 
 _MAGIC = b"torchrl-her checkpoint 1\n"
 _PIECE = 1 << 26  # bytes between two syncs to disk
-_BODY = len(_MAGIC) + hashlib.sha256().digest_size  # where it begins
+_BODY = len(_MAGIC) + hashlib.sha256().digest_size  # start of torch's file
 
 
 _PLAIN = (bool, int, float, str, type(None), torch.Size, torch.dtype)

@@ -32,7 +32,7 @@ _OUR_OPTIONS = (
 EPISODES = 8  # states whose goals the environment's functions are tried with
 _TRIED_STEPS = 100
 _LIMIT_STEPS = 1_000  # that are played to see where an environment truncates an episode itself
-_LIMIT = 100  # of episodes that it does not truncate
+_LIMIT = 100  # length at which other episodes are truncated
 _HALVINGS = 30
 _COARSE = 0.05  # steps of float32, relative to the standard deviation of a goal
 

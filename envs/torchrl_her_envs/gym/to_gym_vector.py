@@ -83,7 +83,7 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
         self._size = size
-        self._over = np.zeros(num_envs, np.bool_)  # whose episode is over
+        self._over = np.zeros(num_envs, np.bool_)  # environments whose episodes are over
         self._seeded = False
 
     def reset(

@@ -25,7 +25,7 @@ from torchrl_her_envs.throwing.rules import Arrays, Bodies, Numbers, take_step
 from torchrl_her_envs.throwing.state import WorldState
 from torchrl_her_envs.throwing.tasks import Task, WorldConfig
 
-# What moves, in the order of ``WorldState`` and ``Bodies``.
+# Names of the moving entries, in the order of ``WorldState`` and ``Bodies``.
 _BODIES = ("joints", "joint_velocity", "grip", "grip_velocity", "ball", "ball_velocity")
 _FEW = 3  # number of worlds up to which plain numbers are faster than arrays
 _HELD_FROM_THE_START = {"held": 1.0, "away": 0.0, "mixed": 0.5}

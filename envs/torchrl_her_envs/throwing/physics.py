@@ -20,14 +20,14 @@ from torchrl_her_envs.throwing.tasks import WorldConfig
 
 _FIELDS = pymunk.batch.BodyFields.POSITION | pymunk.batch.BodyFields.VELOCITY
 _BORDER = 0.5  # meters: half the thickness of the screen's sides, which lie outside of it
-_CELL = 1.0  # meters, of the spatial hash; with larger cells more balls are compared with each other
-_CELLS = 100  # of the spatial hash
+_CELL = 1.0  # meters: side of a cell of the spatial hash; larger cells compare more balls with each other
+_CELLS = 100  # number of cells of the spatial hash
 _SLOP = 1e-3  # meters that a ball may sink into a surface; Chipmunk's default, 0.1, is meant for pixels
-_SKIN = _SLOP / 2  # surfaces stand out by this: a ball put against one touches it, whatever the rounding
-_ITERATIONS = 4  # of the solver: a ball touches at most a side and a corner at once
-_MOST = 64  # balls in the space at once: each is compared with all that are near it
+_SKIN = _SLOP / 2  # meters added to surfaces, so that a ball put against one touches it despite rounding
+_ITERATIONS = 4  # iterations of the solver: a ball touches at most a side and a corner at once
+_MOST = 64  # balls in the space at once: each is compared with all nearby ones
 _APART = 4.0  # meters between the edges of parked balls, and of the first and the screen's right side
-_PATIENCE = 64  # steps after which balls that none of them needed are removed
+_PATIENCE = 64  # steps after which unused balls are removed
 _FEW = 12  # number of balls up to which plain numbers are faster than arrays
 
 

@@ -22,7 +22,7 @@ from torchrl_her_recipes.config.spaces import load_space, space_for, space_names
 if TYPE_CHECKING:
     from torchrl_her_recipes.tuning.search import SearchResult
 
-_SEEDS = 3  # of a trial
+_SEEDS = 3  # seeds of a trial
 
 
 @click.command(short_help="search for good options with Optuna, on all cores")

@@ -16,7 +16,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 KEYS = ("observation", "desired_goal")
 
 _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict")
-_WIDEST = 1 << 16  # of an entry or an action; more is a damaged file
+_WIDEST = 1 << 16  # width of an entry or an action above which a file counts as damaged
 _FLOATS = ("float32", "float64")
 _WHOLE = ("bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 

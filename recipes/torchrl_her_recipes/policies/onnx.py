@@ -28,7 +28,7 @@ from torchrl_her_recipes.policies.info import KEYS, PolicyInfo
 from torchrl_her_recipes.policies.network import TensorPolicy
 
 SUFFIX = ".onnx"
-TOLERANCE = 1e-5  # of actions, relative to the greatest one where that is above 1
+TOLERANCE = 1e-5  # difference of actions, relative to the greatest one if that is above 1
 
 _OPSET = 18  # the lowest that torch's exporter writes without converting; runtimes have it since 2023
 
@@ -141,12 +141,10 @@ def _silent() -> Iterator[None]:
     """Suppresses notices of torch's exporter that do not concern the policy."""
     log = logging.getLogger("torch.onnx")
     level = log.level
-    log.setLevel(logging.ERROR)  # suppresses: torchvision is not installed
+    log.setLevel(logging.ERROR)  # suppresses a notice that torchvision is missing
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # suppresses: both inputs have the same batch, deprecated calls of its own
+            warnings.simplefilter("ignore")  # about equal batch sizes, and deprecated calls in the exporter
             yield
     finally:
         log.setLevel(level)

@@ -17,7 +17,7 @@ from torchrl_her_recipes.runs.film import FPS
 
 _RATES = (1, 2, 4, 8, FPS, 25, 50, 100, 200)  # steps a second
 _LOOKS = 30  # times a second that keys are looked for, at least
-_MOST_NUMBERS = 3  # of a goal that are written out
+_MOST_NUMBERS = 3  # coordinates of a goal up to which they are shown
 _KEYS = "space: pause    n: one step    r: next goals    + -: speed    q: quit"
 
 

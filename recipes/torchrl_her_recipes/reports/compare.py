@@ -176,7 +176,7 @@ def _judge(cells: Sequence[Combination], order: Order, task: str, found: Sequenc
             order.more,
             order.less,
         }:
-            # as the order is written: a < b is about a minus b
+            # in the order of writing: a < b is about a minus b
             written = order.text.split()[0]
             ends = (gap.difference, gap.low, gap.high)
             if gap.first != written:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torchrl_her_recipes.components.first_look import Facts, resolved
 from torchrl_her_recipes.config.recipe import Recipe
 
-_SELDOM = 0.5  # of the episodes
+_SELDOM = 0.5  # fraction of the episodes
 _UNLIKE = 100  # times as large
 _SLOW = 5e-3  # seconds: slower environments take longer for a step than a gradient step does
 _MOSTLY = 0.5

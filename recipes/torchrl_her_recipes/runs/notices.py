@@ -9,16 +9,16 @@ from torch import Tensor
 
 from torchrl_her_recipes.config.recipe import Recipe
 
-Row = dict[str, float]  # of the table of metrics: one epoch of one run
+Row = dict[str, float]  # row of the table of metrics: one epoch of one run
 Rule = Callable[[Sequence[Row], Recipe], str | None]  # a rule: returns a problem of a run, given its rows
 
-_AT_BOUND = 0.99  # of the way from the middle of the range to its end
-_NEARLY_ALL = 0.95  # of the entries of all actions, or of virtual rows
+_AT_BOUND = 0.99  # fraction of the way from the middle of the range to its end
+_NEARLY_ALL = 0.95  # fraction of the entries of all actions, or of virtual rows
 _STREAK = 3  # epochs in a row
 _LONG = 5
 _LITTLE = 0.5  # success from which on full speed may well be the right policy
-_FEW = 0.02  # of the transitions
-_BEYOND = 0.25  # of the range of returns
+_FEW = 0.02  # fraction of the transitions
+_BEYOND = 0.25  # fraction of the range of returns
 
 
 def saturation(action: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from torchrl_her_recipes.runs.goal_map import GoalMap
 
 Rows = Sequence[dict[str, float]]
 
-COLORS = {  # of algorithms, the same in every picture
+COLORS = {  # colors of algorithms, the same in every picture
     "no_hindsight": "#1a202c",
     "her": "#dd6b20",
     "her_ibs": "#38a169",
@@ -33,7 +33,7 @@ COLORS = {  # of algorithms, the same in every picture
     "unfiltered_cher_ibs": "#975a16",
 }
 _ORDER = ("her", "filtered_her", "filtered_her_ibs", "her_ibs", "unfiltered_cher", "her_ibs_sequential")
-_COLORS = tuple(dict.fromkeys([*(COLORS[name] for name in _ORDER), *COLORS.values()]))  # of all others
+_COLORS = tuple(dict.fromkeys([*(COLORS[name] for name in _ORDER), *COLORS.values()]))  # colors of all others
 _REGIONS = {"goals": "#63b3ed", "reach": "#fc8181"}
 _MOST_LINES = 15  # runs that are drawn one by one
 _MOST_COLUMNS = 6  # panels beside each other

@@ -15,7 +15,7 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap
 from torchrl_her_recipes.studies.jobs import Job, read_progress
 
-_ROWS = 1_280  # of a batch's gradient step: more runs side by side are no faster, and fill no second core
+_ROWS = 1_280  # rows of a batch's gradient step above which more runs side by side are no faster
 
 
 class Batches:

@@ -22,7 +22,7 @@ class Field(NamedTuple):
 
     key: NestedKey
     dtype: torch.dtype
-    shape: torch.Size  # of one row's entry
+    shape: torch.Size  # shape of the entry in a row
     begin: int  # bytes from the beginning of the row
     end: int
 
@@ -66,7 +66,7 @@ class PackedStorage(LazyTensorStorage):
         self._packed: Tensor | None = None  # [max_size, bytes / 8] of int64
         self._views: TensorDictBase | None = None  # the same memory, entry by entry
         self._fields: tuple[Field, ...] = ()
-        self._number = 0  # of keys of the views, those of nested tensordicts among them
+        self._number = 0  # number of keys of the views, those of nested tensordicts included
 
     @property
     def packed(self) -> Tensor | None:

@@ -151,7 +151,7 @@ def _descend(sums: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
 
     The running sums of the children are [..., c]. A child of value 0 is never taken, unless all are 0.
     """
-    total = sums[..., -1:]  # which rounding may have made less than the mass
+    total = sums[..., -1:]  # rounding may have made it less than the mass
     within = torch.minimum(mass.to(sums.dtype), torch.nextafter(total, torch.zeros_like(total)))
     child = (sums <= within).sum(-1, keepdim=True).clamp_max_(sums.shape[-1] - 1)
     before = sums.gather(-1, (child - 1).clamp_min_(0)).masked_fill_(child == 0, 0.0)

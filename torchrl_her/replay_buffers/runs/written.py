@@ -106,7 +106,7 @@ def virtual_rows(chunk: Chunk, source: Tensor, goals: Tensor, *, first_id: int) 
     return WrittenRows(root, last, changes, reward.flatten(), counts).like(chunk.rows)
 
 
-_Parts = tuple[Tensor, Tensor, dict[NestedKey, Tensor], Tensor]  # of WrittenRows
+_Parts = tuple[Tensor, Tensor, dict[NestedKey, Tensor], Tensor]  # fields of WrittenRows
 
 
 def _virtual_transitions(chunk: Chunk, source: Tensor, goals: Tensor, _first_id: int) -> _Parts:

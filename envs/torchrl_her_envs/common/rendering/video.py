@@ -19,7 +19,7 @@ try:
 except ImportError:  # only MP4 needs it
     imageio = None
 
-_COLORS = 255  # of a GIF: one place is left, with which unchanged pixels are made transparent
+_COLORS = 255  # colors of a GIF; one place is left for transparent pixels, which are unchanged
 _SAMPLES = 12  # frames that a GIF's colors are chosen from
 
 

@@ -14,7 +14,7 @@ from torchrl_her_envs.throwing.experts.clearance import clears_ceiling, is_free
 from torchrl_her_envs.throwing.experts.inverse_kinematics import nearest_turn, turn
 from torchrl_her_envs.throwing.tasks import WorldConfig
 
-_SPEEDS = 9  # of each joint, from full speed one way to full speed the other way
+_SPEEDS = 9  # number of speeds of each joint, from full speed one way to full speed the other way
 _LONGEST_SWING = 16  # steps, in which a joint turns by up to 147 degrees
 _READY = (math.radians(120.0), 0.0)  # stretched up and back: from around here all goals can be thrown at
 

@@ -22,7 +22,7 @@ def clears_ceiling(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tenso
         >>> clears_ceiling(start, velocity, WorldConfig())  # they rise by 0.8 m and by 1.25 m, of 0.92 m
         tensor([ True, False])
     """
-    loss = world.gravity * world.time_step / world.substeps  # of upward speed, in each substep
+    loss = world.gravity * world.time_step / world.substeps  # loss of upward speed in each substep
     rising = (velocity[..., 1] / loss + 0.5).clamp(min=0.0)
     return fly(start, velocity, rising, world)[..., 1] < (1.0 - world.ball_radius) * world.size
 

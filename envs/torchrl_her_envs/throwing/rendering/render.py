@@ -16,8 +16,8 @@ from torchrl_her_envs.throwing.rendering.canvas import MARGIN, Canvas, Point
 from torchrl_her_envs.throwing.state import WorldState
 from torchrl_her_envs.throwing.tasks import Task, WorldConfig
 
-_LINE = 0.004  # of the screen: thickness of the edges of regions
-_TEXT = 0.045  # of the screen: height of a caption
+_LINE = 0.004  # thickness of the edges of regions, as a fraction of the screen
+_TEXT = 0.045  # height of a caption, as a fraction of the screen
 
 
 class Scene(Protocol):

@@ -9,7 +9,7 @@ from torchrl_her_envs.throwing.rendering import palette
 from torchrl_her_envs.throwing.rendering.canvas import Canvas, Point
 from torchrl_her_envs.throwing.rendering.textures import basketball, black_hole
 
-_LINE = 0.005  # of the screen: thickness of outlines
+_LINE = 0.005  # thickness of outlines, as a fraction of the screen like all lengths here
 _FINGER = 0.0175  # thickness of a finger
 _PALM = 0.035  # radius of the palm, a little more than the ball's
 _SPREAD = ((128.0, 0.070), (104.0, 0.080), (80.0, 0.080), (56.0, 0.070))  # open fingers: degrees and length

@@ -13,9 +13,11 @@ from torchrl_her_envs.throwing.rendering.palette import Color
 
 Array = NDArray[np.float64]
 
-_TILT = np.radians((24.0, -20.0, 14.0))  # of the basketball about x, y and z: seams cross off its center
-_SEAM_WIDTH = 0.07  # of the radius, to each side
-_HORIZON = 0.5  # of the black hole's radius: within it nothing shines
+_TILT = np.radians(
+    (24.0, -20.0, 14.0)
+)  # rotation of the basketball about x, y and z, so that seams cross off its center
+_SEAM_WIDTH = 0.07  # to each side, as a fraction of the radius
+_HORIZON = 0.5  # dark part of the black hole, as a fraction of its radius
 _RIM = 0.06  # ... and the width of the line in which the glow ends
 _SWIRL = 2.2  # how far the arms of the glow are wound up, in radians for each factor of e in radius
 
