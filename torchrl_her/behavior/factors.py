@@ -50,7 +50,7 @@ class GoalFactor:
     The base class finds all goals alike.
 
     Attributes:
-        samples: how many of the achieved goals ``GoalCandidates.known`` is to have.
+        samples: number of achieved goals that it needs in ``GoalCandidates.known``.
 
     Example:
         >>> class NotTooFar(GoalFactor):
@@ -124,7 +124,7 @@ class InverseDensity(GoalFactor):
     Keyword Args:
         samples: achieved goals that the density is estimated from.
         sigma: width of the kernel, in standard deviations.
-        k: which neighbor.
+        k: number of the neighbor whose distance counts.
 
     Raises:
         ValueError: an option is not positive.
@@ -252,7 +252,7 @@ class DiscoverScore(GoalFactor):
     Keyword Args:
         runs: R.
         beta: how much the critics' disagreement counts.
-        alpha: where it begins.
+        alpha: first value of alpha.
         step: how far it moves in ``memory`` episodes whose success is off the target by 1.
         target: the success that is aimed at.
         temperature: in the unit of values; the lower, the more the best goal is preferred.

@@ -281,7 +281,7 @@ class CurriculumProgress:
         window: number of samples that are averaged; with fewer a run stays in its layer.
         success_threshold: the mean at which a layer ends.
         patience: number of evaluations (calls of :meth:`record`) after which a layer ends although the mean
-            is lower; None if it goes on.
+            is lower; None for no limit.
 
     Attributes:
         layers: R numbers, the layer of each run, from 0.

@@ -12,7 +12,7 @@ from torchrl_her.replay_buffers.writer import HERWriter
 
 
 def set_layer_goals(writer: Writer, layer: CurriculumLayer, *, run: int = 0) -> None:
-    """Lets a writer relabel a run with a layer's reward, and use its IBS weights only if the layer says so.
+    """Lets a writer relabel a run with a layer's reward, and use its IBS weights only if the layer is set so.
 
     Args:
         writer: writer of one run or several.

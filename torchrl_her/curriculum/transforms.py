@@ -136,7 +136,7 @@ class StateToObs(_LayerTransform):
     goal is nearer than the layer's threshold, -1 elsewhere), and ``done``, which is
     ``terminated | truncated``. ``truncated`` stays as it was, so the environment must set it at its time
     limit even if its own goal is achieved. Where the environment terminates an episode by itself, the
-    layer's episode goes on if the environment can be stepped further. If it cannot
+    layer's episode continues if the environment can be stepped further. If it cannot
     (``continues_after_termination=False``, as with gymnasium's environments), the layer's episode ends
     there, too: it is ``truncated`` unless the layer's goal was achieved in that step, so that the critic goes
     on to estimate what would have come. The end says nothing about the layer's goal.
@@ -346,7 +346,7 @@ class LayerOutcomes(Transform):
     (:class:`~torchrl_her.behavior.BehaviorGoals`) do not count: they say little of the layer's own goals.
 
     Args:
-        progress: is told.
+        progress: progress that counts the outcomes.
 
     Keyword Args:
         reward_fn, achieved_reward: tell which goals are achieved in the last layer, where achieving a goal

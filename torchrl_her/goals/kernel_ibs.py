@@ -38,9 +38,9 @@ class KernelInstructiveness(InstructiveWeights):
         decay: factor of the covariance in each step, in (0, 1]; 1 never shrinks it.
         floor: the least weight of a goal, as a share of the largest q* of a real goal.
         subtract: False for the weights q* alone, without q and floor (the sequential architecture).
-        scale: what goals are divided by first, a number or g of them, where their numbers have different
+        scale: divisor of goals, a number or g of them, where their numbers have different
             units.
-        samples: how many real goals, and how many virtual ones, the densities are computed from at most. The
+        samples: maximum number of real goals, and of virtual ones, from which densities are computed. The
             virtual ones are a part that is spread evenly over all that were written.
         log_target: maps goals [m, g] and a sigma to the logarithm of the density q* [m], in place of the
             kernel density of ``goals``.

@@ -17,7 +17,7 @@ class GoalWeights:
     The base class gives all goals the same weight and has no state.
 
     Attributes:
-        alike: True promises that all weights are equal, so that nobody has to look them up.
+        alike: True promises that all weights are equal, so that they need not be computed.
 
     Example:
         >>> class PreferRight(GoalWeights):

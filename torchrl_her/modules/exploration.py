@@ -87,11 +87,11 @@ class Exploration(TensorDictModuleBase):
 
     Keyword Args:
         start: epsilon before the first :meth:`step`.
-        decay: what each step multiplies it by.
+        decay: factor of epsilon in each step.
         end: the least epsilon.
         generators: sources of the random numbers, one for each of R independent runs, whose actions are R
             equal blocks of the batch in this order. None for one run and torch's own generator.
-        action_key: where the action is read and written.
+        action_key: key of the action, which is read and written.
 
     Attributes:
         epsilon: [R], the present share of exploring actions of each run.

@@ -27,9 +27,10 @@ class NormalizeBatch(Transform):
         norm: the statistics, shared with the policy (:class:`~torchrl_her.modules.NormalizedPolicy`).
 
     Keyword Args:
-        counted_k: None if somebody else counts what is written, as ``HERWriter(on_write=norm.update)`` does.
-            In a buffer with a plain writer and a :class:`~torchrl_her.HERSampleUnit`, the k of that unit:
-            then all that is written counts here, and each achieved goal under ``next`` as k desired goals.
+        counted_k: None if written transitions are counted elsewhere, as ``HERWriter(on_write=norm.update)``
+            does. In a buffer with a plain writer and a :class:`~torchrl_her.HERSampleUnit`, the k of that
+            unit: then all that is written counts here, and each achieved goal under ``next`` as k desired
+            goals.
         achieved_goal_key, desired_goal_key: goals, for ``counted_k``.
 
     Raises:

@@ -94,7 +94,7 @@ def index_episodes(
         The index. An episode that was partly overwritten consists of the rows that are left.
 
     Example:
-        >>> # Slots 0 and 1 were written last: trajectory 3 began in slot 4, and goes on in them
+        >>> # Slots 0 and 1 were written last: trajectory 3 began in slot 4, and continues in them
         >>> index = index_episodes(torch.zeros(5).bool(), torch.tensor([3, 3, 1, 1, 3]), oldest=2)
         >>> first, end = index.episode(index.place(torch.tensor([0, 2])))
         >>> [index.row(torch.arange(*bounds)).tolist() for bounds in zip(first, end)]

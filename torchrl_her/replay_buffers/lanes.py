@@ -1,7 +1,7 @@
 """Lanes: the environment or the trajectory that each transition of a batch belongs to.
 
 Batches come from one collector or from several, with or without ids. Transitions of one lane are in the order
-of time, one episode after the other, and a lane goes on from batch to batch.
+of time, one episode after the other, and a lane continues from batch to batch.
 """
 
 from __future__ import annotations

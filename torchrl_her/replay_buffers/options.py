@@ -34,9 +34,9 @@ class HindsightOptions:
 
     Args:
         k: virtual transitions for each real one (on average, when relabeling while sampling); 0 makes none.
-        strategy: which achieved goals of its episode a transition may take: ``"future"`` (those achieved by
-            its action or later), ``"final"`` (the last one), ``"episode"`` (any), another name given to
-            :func:`~torchrl_her.register_strategy`, or a function as described there.
+        strategy: rule for the achieved goals of its episode that a transition may take: ``"future"`` (those
+            achieved by its action or later), ``"final"`` (the last one), ``"episode"`` (any), another name
+            given to :func:`~torchrl_her.register_strategy`, or a function as described there.
         goal_sources: number of virtual goals by source, in place of ``k`` and ``strategy``, which are short
             for a single source: ``k=4, strategy="future"`` is ``{"future": 4}``. Besides strategies there are
             two sources that look beyond the own episode: ``"actual"``, goals that were really wanted in
@@ -61,7 +61,7 @@ class HindsightOptions:
             terminate. Where episodes go on at their goals, such transitions teach to stay there. Then only
             goals are left out that were achieved at the start of the episode as well, because nothing has
             moved yet.
-        redraw: where the filter refuses a goal that was drawn, draw another one among those that it keeps;
+        redraw: True draws another goal, among those that the filter keeps, for one that it refuses;
             False: the goal makes no virtual transition, so there are fewer where it refuses many.
         achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved. A
             transition that terminated with a lower reward failed, as by a fall: it terminates for virtual

@@ -102,7 +102,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
 
     Candidates are the transitions of the same episode that are still stored. If an episode's beginning was
     overwritten, they are the remaining ones; if an episode is still open, those up to the newest one, which
-    is also the goal of ``"final"`` then. Flat transitions of several environments are told apart by
+    is also the goal of ``"final"`` then. Flat transitions of several environments are distinguished by
     trajectory ids. Under samplers of slices, all transitions of a slice get the same goal: one that its last
     transition may take and, with the filter, that was not achieved before. A priority belongs to the real
     transition, whatever goal it had when the priority was computed.
@@ -121,7 +121,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         options: how transitions are relabeled; None for the defaults.
 
     Keyword Args:
-        weights: prefers some goals to others, and is told which ones were given; None for all alike. It is
+        weights: weights of goals, updated with those that were given; None if all goals are equal. It is
             not told when the buffer is emptied, so call its ``clear`` then. It is not part of the buffer's
             state but has a ``state_dict`` of its own.
         generator: source of the random numbers; None for the buffer's (``buffer.set_rng``).

@@ -94,7 +94,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     [R * N, T], R equal blocks in the order of the runs, and the storage is R equal blocks of rows, each of
     them a ring of its own. What is written for a run does not depend on the other runs.
 
-    Episodes that nobody collected, such as demonstrations, are written with :meth:`extend_run`.
+    Episodes from elsewhere, such as demonstrations, are written with :meth:`extend_run`.
 
     The writer works in any TorchRL replay buffer with a one-dimensional storage, under any sampler that does
     not consume its transitions (those of slices need ``per="episode"``); the capacity counts real and virtual

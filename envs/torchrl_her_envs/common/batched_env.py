@@ -23,7 +23,7 @@ _COUNTERS = ("step", "episode")  # entries of the state that are counters and no
 class BatchedEnv(GoalEnv):
     """N environments whose state is a dataclass of tensors with N rows, and a random key for each of them.
 
-    Subclasses say how episodes start (:meth:`_start_episodes`), what an action does (:meth:`_advance`),
+    Subclasses define how episodes start (:meth:`_start_episodes`), what an action does (:meth:`_advance`),
     what the agent sees (:meth:`_show`) and when a goal is achieved (:meth:`compute_terminated`). All
     random numbers come from the keys (see ``common.seeding``), so environment k
     with a given seed does the same in every batch. The reward is 0 where the goal is achieved and -1

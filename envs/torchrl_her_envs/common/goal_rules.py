@@ -62,9 +62,9 @@ class GoalEnds:
         tells_success: whether the infos of steps have ``is_success``.
 
     Attributes:
-        rule: which of the environment's own function (``"own"``), its ``is_success`` (``"success"``) or the
-            reward of a goal (``"reward"``) ends episodes; ``"never"`` if goals end none; ``"watch"`` while
-            the environment's own ends count and no rule is set.
+        rule: rule that ends episodes: the environment's own function (``"own"``), its ``is_success``
+            (``"success"``) or the reward of a goal (``"reward"``); ``"never"`` if goals end none; ``"watch"``
+            while the environment's own ends count and no rule is set.
         steps: number of steps so far.
         ended, went_on: steps at achieved goals in which the environment itself ended the episode, or went on.
 

@@ -35,7 +35,7 @@ def record_episodes(
         size: longer side of the picture of one environment in pixels.
         columns: pictures in a row; None for a grid that is at least as wide as high.
         trail: whether to draw where the balls were, in throwing tasks.
-        hold: how many times the last frame is repeated: 25 are one second at 25 frames a second.
+        hold: number of repetitions of the last frame: 25 are one second at 25 frames a second.
         caption: a line of text in each picture.
 
     Returns:

@@ -58,7 +58,7 @@ class ThrowingEnv(BatchedEnv):
         dtype: type of observations, goals, actions and rewards, or its name; the physics is in float64.
 
     Attributes:
-        task: what is to be done.
+        task: the task, see :data:`~torchrl_her_envs.TASKS`.
         world: the constants of the physics.
         effector: the hand or the arm.
         threshold: how near to the goal is achieved, in shown coordinates.

@@ -26,7 +26,7 @@ class LearnerConfig(Choice):
     """The learner and its networks. Its maker is a ``LearnerBuilder``.
 
     Attributes:
-        actions: which actions it can choose among.
+        actions: kinds of actions that it supports.
         stacks: whether several runs can be trained side by side in one program.
         priority_power: its loss gives this power of the absolute TD error as a priority.
         has_epsilon: whether a share epsilon of the actions explores.

@@ -27,8 +27,8 @@ class Search:
             seeds of each trial, and its ``seed`` is also that of the sampler.
         space: the options that are varied.
         sampler: ``tpe``, ``random`` or ``cmaes``.
-        pruner: which trials are ended early: ``median``, those below the median of the others at the same
-            epoch; ``halving``, all but the best third at a ninth and at a third of the epochs; ``none``.
+        pruner: rule by which trials are ended early: ``median``, those below the median of the others at the
+            same epoch; ``halving``, all but the best third at a ninth and at a third of the epochs; ``none``.
 
     Raises:
         ValueError: an unknown sampler or pruner, or a space that the recipe does not take.

@@ -34,7 +34,7 @@ def load_network(info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor]
 
     Args:
         info: says the widths.
-        recipe: says what the network is like; of a single run.
+        recipe: recipe of a single run, which defines the network.
         weights: ``state_dict()`` of its actor, with its normalization if there is one.
 
     Raises:

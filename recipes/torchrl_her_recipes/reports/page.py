@@ -35,7 +35,7 @@ def write_report(study: Study, folder: Path, out: Path) -> Path:
         study: study that is meant.
         folder: with a folder of each of its combinations, of which some may be missing or not at their end;
             or with the files that :func:`~torchrl_her_recipes.write_results` made of them.
-        out: where the page goes, its tables, and its pictures into `figures`.
+        out: folder for the page and its tables; pictures go into its `figures`.
 
     Returns:
         The page.

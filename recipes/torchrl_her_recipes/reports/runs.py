@@ -43,7 +43,7 @@ def write_runs_report(folders: Sequence[Path], out: Path) -> Path:
 
     Args:
         folders: folders of runs, or of folders with runs in them.
-        out: where the page goes, its tables, and its pictures into `figures`.
+        out: folder for the page and its tables; pictures go into its `figures`.
 
     Returns:
         The page.

@@ -20,11 +20,11 @@ _OF_A_ROW = ("run", "seed")  # columns that identify a row, and are no metrics
 class LogTo(Callback):
     """Logs a run to one of TorchRL's loggers.
 
-    It is told the options at the start, each row of the table of metrics after its evaluation, at the step
+    It gets the options at the start, each row of the table of metrics after its evaluation, at the step
     that is its number of frames, and shown the pictures and the film at the end. Metrics are named
     ``success/run_0``, for each run. It is not closed: it is yours.
 
-    When a run goes on, the logger is first told all rows so far, as it may be a new one.
+    When a run resumes, the logger first gets all rows so far, as it may be a new one.
 
     Args:
         logger: any of TorchRL's, or one of your own.

@@ -115,7 +115,7 @@ def unfinished_sweep(runs: Mapping[str, Recipe], folders: Path) -> Path | None:
 
     Args:
         runs: recipes, by the names of their folders.
-        folders: where folders of :func:`run_study` are looked for.
+        folders: folder in which to search for folders of :func:`run_study`.
 
     Example:
         >>> unfinished_sweep({}, Path("nowhere"))

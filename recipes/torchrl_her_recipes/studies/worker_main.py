@@ -1,6 +1,6 @@
 """Worker process: runs the jobs from its standard input, one after the other, until the input ends.
 
-The end of its input is also how it is told to stop in the middle of a job, so it does so as well if
+The end of its input also stops it in the middle of a job, so it stops as well if
 the process that started it is gone: it saves its run and ends.
 """
 

@@ -13,7 +13,7 @@ from torchrl_her.replay_buffers.runs.storage import Move
 class Rings:
     """Cursors of R ring buffers, one for each run. When a ring is full, its oldest rows are overwritten.
 
-    How many rows a block can hold is told with each call, because it is known only once there is a storage.
+    The capacity of a block is passed with each call, because it is known only once there is a storage.
 
     Args:
         runs: R.

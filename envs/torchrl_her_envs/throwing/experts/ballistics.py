@@ -82,7 +82,7 @@ def quickest(steps: Tensor, works: Tensor) -> tuple[Tensor, ...]:
     """Selects for each row the throw that takes the fewest steps among those that hit.
 
     Args:
-        steps: [B, ...], of as many further dimensions as throws are told apart by.
+        steps: [B, ...], with any dimensions that distinguish the throws of a row.
         works: [B, ...] of bool.
 
     Returns:
