@@ -167,8 +167,8 @@ def check_extending(values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         if name.removeprefix("run.") not in EXTENDING:
             raise ValueError(
-                f"a resumed run takes {', '.join(EXTENDING)} only; {name}={value} would change what it "
-                "has trained: start a new run"
+                f"a resumed run takes {', '.join(EXTENDING)} only; {name}={value} would change its "
+                "training so far: start a new run"
             )
 
 

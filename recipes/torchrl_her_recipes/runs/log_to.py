@@ -21,8 +21,8 @@ class LogTo(Callback):
     """Logs a run to one of TorchRL's loggers.
 
     It gets the options at the start, each row of the table of metrics after its evaluation, at the step
-    that is its number of frames, and shown the pictures and the film at the end. Metrics are named
-    ``success/run_0``, for each run. It is not closed: it is yours.
+    that is its number of frames, and the pictures and the video at the end. Metrics are named
+    ``success/run_0``, for each run. The caller closes it.
 
     When a run resumes, the logger first gets all rows so far, as it may be a new one.
 
