@@ -57,8 +57,8 @@ def load_library(source: str, *, headers: Sequence[str] = (), real: str = "float
 
     It is compiled for this processor the first time, which takes some seconds, and kept in the user's cache:
     the folder that ``TORCHRL_HER_CACHE`` names, or ``torchrl_her`` in that of ``XDG_CACHE_HOME``. The
-    compiler is ``CXX`` from the environment, or else g++, clang++, c++ or the package ``ziglang``. Without
-    one, the library is the one that the wheel carries for such processors.
+    compiler is ``CXX`` from the environment, or else g++, clang++ or c++. Without one, the library is the
+    one that the wheel carries for such processors, or else it is compiled by the package ``ziglang``.
 
     Args:
         source: the file's name.
@@ -69,15 +69,20 @@ def load_library(source: str, *, headers: Sequence[str] = (), real: str = "float
         CannotCompile: there is no compiler, or it failed, or the library cannot be loaded; the message says
             which. No wheel's library can be loaded instead.
     """
-    try:
-        return _load_compiled(source, headers, real)
-    # A compiler that cannot run, no home, a full disk, a folder that must not be written.
-    except (OSError, RuntimeError) as error:
-        if library := _load_shipped(source, real):
-            return library
-        if isinstance(error, CannotCompile):
-            raise
-        raise CannotCompile(f"{source} cannot be compiled or loaded: {error}") from error
+    errors: list[Exception] = []
+    for load in (
+        lambda: _load_compiled(find_compiler(), source, headers, real),
+        lambda: _load_shipped(source, real),
+        lambda: _load_compiled(find_ziglang(), source, headers, real),
+    ):
+        try:
+            return load()
+        # A compiler that cannot run, no home, a full disk, a folder that must not be written.
+        except (OSError, RuntimeError) as error:
+            errors.append(error)
+    if isinstance(errors[0], CannotCompile):
+        raise errors[0]
+    raise CannotCompile(f"{source} cannot be compiled or loaded: {errors[0]}") from errors[0]
 
 
 def compile_library(
@@ -118,15 +123,15 @@ def levels(flags: Collection[str]) -> list[str]:
     return [level for level, needed in LEVELS.items() if needed.issubset(flags)]
 
 
-def _load_shipped(source: str, real: str) -> ctypes.CDLL | None:
+def _load_shipped(source: str, real: str) -> ctypes.CDLL:
     for level in levels(_processor_flags().split()):
         with contextlib.suppress(OSError):  # no wheel of this kind, or the system's libraries are older
             return ctypes.CDLL(str(_SHIPPED / level / shipped_name(source, real)))
-    return None
+    raise CannotCompile(f"no library of a wheel does the work of {source}")
 
 
-def _load_compiled(source: str, headers: Sequence[str], real: str) -> ctypes.CDLL:
-    compiler, folder = find_compiler(), Path(__file__).parent
+def _load_compiled(compiler: Sequence[str], source: str, headers: Sequence[str], real: str) -> ctypes.CDLL:
+    folder = Path(__file__).parent
     text = "".join((folder / name).read_text(encoding="utf-8") for name in (source, *headers))
     made_of = (text, real, *compiler, _version(compiler), str(_FLAGS), str(_EXTRAS), _processor())
     name = hashlib.sha256("\n".join(made_of).encode()).hexdigest()[:20]
@@ -165,10 +170,19 @@ def find_compiler() -> list[str]:
     for name, *options in [wanted] if wanted else [["g++"], ["clang++"], ["c++"]]:
         if path := shutil.which(name):
             return [path, *options]
-    if not wanted and importlib.util.find_spec("ziglang"):
-        return [sys.executable, "-m", "ziglang", "c++"]
     named = f" {wanted[0]}" if wanted else " (g++ or clang++; `pip install ziglang` brings one)"
     raise CannotCompile(f"there is no C++ compiler{named}")
+
+
+def find_ziglang() -> list[str]:
+    """The compiler of the package ``ziglang``, which takes a minute the first time.
+
+    Raises:
+        CannotCompile: it is not installed, or ``CXX`` asks for another one.
+    """
+    if os.environ.get("CXX") or not importlib.util.find_spec("ziglang"):
+        raise CannotCompile("the package ziglang is not installed, or CXX asks for another compiler")
+    return [sys.executable, "-m", "ziglang", "c++"]
 
 
 def _version(compiler: Sequence[str]) -> str:

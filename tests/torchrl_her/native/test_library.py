@@ -11,7 +11,13 @@ import pytest
 import torch
 
 from torchrl_her.native import CannotCompile, library, load_library, load_steps
-from torchrl_her.native.library import _EXTRAS, compile_library, find_compiler, levels, shipped_name
+from torchrl_her.native.library import (
+    _EXTRAS,
+    compile_library,
+    find_ziglang,
+    levels,
+    shipped_name,
+)
 
 V3 = "sse2 avx avx2 bmi1 bmi2 f16c fma movbe abm"
 V4 = f"{V3} avx512f avx512bw avx512cd avx512dq avx512vl"
@@ -73,7 +79,17 @@ def test_a_compiler_from_pip_is_found_where_there_is_no_other(monkeypatch: pytes
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setenv("PATH", "")
     monkeypatch.setattr(importlib.util, "find_spec", {"ziglang": object()}.get)
-    assert find_compiler() == [sys.executable, "-m", "ziglang", "c++"]
+    assert find_ziglang() == [sys.executable, "-m", "ziglang", "c++"]
+    tried: list[list[str]] = []
+    monkeypatch.setattr(library, "_load_compiled", lambda compiler, *_: tried.append(compiler) or "loaded")
+    assert load_library("steps.cpp") == "loaded"
+    assert tried == [find_ziglang()]
+    monkeypatch.setattr(library, "_load_shipped", lambda *_: "shipped")  # at once, and no slower
+    assert load_library("steps.cpp") == "shipped"
+    assert len(tried) == 1
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(CannotCompile, match="CXX asks for another"):
+        find_ziglang()
 
 
 @pytest.mark.parametrize(
