@@ -6,13 +6,15 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from torchrl_her_envs.common.goal_env import Names
 from torchrl_her_envs.gym.renamed import RenamedKeys
+
+if TYPE_CHECKING:  # each process of an environment imports this file, and TorchRL would take it seconds
+    from torchrl_her_envs.common.goal_env import Names
 
 
 def make_quietly(

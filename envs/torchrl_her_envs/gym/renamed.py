@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 from gymnasium import spaces
 
-from torchrl_her_envs.common.goal_env import Names
+if TYPE_CHECKING:
+    from torchrl_her_envs.common.goal_env import Names
 
 
 class RenamedKeys(gymnasium.ObservationWrapper):

@@ -3,32 +3,17 @@
 from __future__ import annotations
 
 import os
-import sys
-from typing import Any
 
-import gymnasium
 import pytest
 
 from torchrl_her_envs import make_gym_env
-
-from .walk import Walk
-
-
-class Loud(Walk):
-    def __init__(self, **options: Any) -> None:
-        os.write(1, b"argv[0]=--background\n")  # as compiled code does
-        sys.stdout.write("the user's own line\n")
-        super().__init__(**options)
-
-
-gymnasium.register("tests/Loud-v0", Loud, max_episode_steps=6)
 
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_lines_of_simulators_are_left_out_and_those_of_python_are_not(
     parallel: bool, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    make_gym_env("tests.envs.gym.test_quiet:tests/Loud-v0", num_envs=2, parallel=parallel).close()
+    make_gym_env("tests.envs.gym.loud:tests/Loud-v0", num_envs=2, parallel=parallel).close()
     os.write(1, b"afterwards\n")
     printed = capfd.readouterr().out.splitlines()
     assert set(printed) == {"the user's own line", "afterwards"}

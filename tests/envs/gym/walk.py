@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from torchrl_her_envs import GymGoalEnv, make_gym_env
+import torchrl_her_envs  # loads TorchRL when it is first used, and so not in the processes of environments
 
 WALK = "tests/Walk-v0"  # episodes of 6 steps
 LAST = 4  # places 0 to 4
@@ -88,5 +88,5 @@ gymnasium.register(WALK, Walk, max_episode_steps=6)
 gymnasium.register("tests/Endless-v0", Walk)
 
 
-def walk(num_envs: int = 1, **options: Any) -> GymGoalEnv:
-    return make_gym_env(WALK, num_envs=num_envs, **options)
+def walk(num_envs: int = 1, **options: Any) -> torchrl_her_envs.GymGoalEnv:
+    return torchrl_her_envs.make_gym_env(WALK, num_envs=num_envs, **options)
