@@ -9,6 +9,7 @@ differences, with 95 % by stratified bootstrap.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -41,8 +42,9 @@ Finding = tuple[str, str]  # numbers of this project, verdict
 
 @cache
 def results(study: str) -> Results:
-    """Stored results of a study."""
-    return read_results(RESULTS / study)
+    """Stored results of a study, without the combinations that are not finished."""
+    stored = read_results(RESULTS / study)
+    return replace(stored, cells=[one for one in stored.cells if one.done])
 
 
 @cache
@@ -54,6 +56,11 @@ def compared(study: str, measure: str) -> tuple[list[Final], list[Difference]]:
 def cell(study: str, task: str, algorithm: str) -> Combination:
     """One combination of a study."""
     return next(one for one in results(study).cells if (one.task, one.algorithm) == (task, algorithm))
+
+
+def of_study(study: str, tasks: Sequence[str]) -> list[str]:
+    """Those tasks that a study has finished runs of."""
+    return [task for task in tasks if any(one.task == task for one in results(study).cells)]
 
 
 def gap(first: Sequence[float], second: Sequence[float]) -> Interval:
@@ -97,6 +104,8 @@ def orders(study: str, *, measure: str, expected: Sequence[str]) -> Finding:
     rows, lines = judged(study, measure, expected), []
     for text in expected:
         found = [row for row in rows if row.order == text]
+        if not found:  # an algorithm that the study does not have
+            continue
         shown = [_bold(show_gap(row), row.verdict is not Verdict.UNDECIDED) for row in found]
         tasks = [f"{_name(row.task)} {number}" for row, number in zip(found, shown, strict=True)]
         lines.append(f"`{text}`: {', '.join(tasks)}")
@@ -116,7 +125,7 @@ def levels(
     """What each algorithm reached, beside the thesis's numbers; orders or bounds give the verdict."""
     found = {(row.task, row.algorithm): row for row in compared(study, measure)[0]}
     lines, ends = [], []
-    for task in tasks:
+    for task in of_study(study, tasks):
         rows = [found[task, name] for name in algorithms]
         ends += [(least <= row.low and row.high <= most, row.high < least or row.low > most) for row in rows]
         shown = [f"`{row.algorithm}` {show_interval(row, measure)}{_published(row)}" for row in rows]
@@ -143,7 +152,7 @@ def _points(one: Interval) -> str:
 
 def over_training(study: str, *, tasks: Sequence[str], first: str, second: str) -> Finding:
     """Mean success of all evaluations, one algorithm minus another."""
-    gaps = []
+    gaps, tasks = [], of_study(study, tasks)
     for task in tasks:
         rows = [cell(study, task, name).rows for name in (first, second)]
         gaps.append(gap(*(at_the_end(one, "success", evaluations=len(one)) for one in rows)))
@@ -156,7 +165,7 @@ def over_training(study: str, *, tasks: Sequence[str], first: str, second: str) 
 def widths(study: str, *, tasks: Sequence[str], wide: str, narrow: str) -> Finding:
     """Points of success from the 33rd to the 67th percentile of runs, of two algorithms."""
     draw, lines, ends = np.random.default_rng(0), [], []
-    for task in tasks:
+    for task in of_study(study, tasks):
         runs = [np.array(values_of(cell(study, task, name), "success")) for name in (wide, narrow)]
         before, after = (_width(drawn) for drawn in runs)
         drawn = [_width(draw.choice(one, (REPETITIONS, len(one)))) for one in runs]
