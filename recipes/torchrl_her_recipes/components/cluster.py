@@ -64,7 +64,7 @@ def gpus() -> list[float]:
 
 
 def one_line(error: Any) -> str:
-    """What went wrong, without where."""
+    """Type and message of an error, without its traceback, in one line."""
     if isinstance(error, RayTaskError):
         return f"{type(error.cause).__name__}: {error.cause}"
     return next(iter(str(error).splitlines()), type(error).__name__)

@@ -69,7 +69,7 @@ class SyncWorkers(MultiSyncCollector):
         super().__init__(*args, cat_results="stack", **options)
 
     def begin(self, beginnings: Sequence[Beginning]) -> None:
-        """Drops what they are collecting, and begins new episodes in all of them."""
+        """Drops the batches under way, and begins new episodes in all processes."""
         if self._batch is not None:
             self._batch.result()
             self._batch = None
@@ -111,7 +111,7 @@ class AsyncWorkers(MultiAsyncCollector):
         self.map_fn("begin", [(own,) for own in beginnings])
 
     def ahead(self, weights: TensorDictBase) -> None:
-        """They always do."""
+        """Does nothing: the processes always collect ahead."""
 
     def take(self, weights: TensorDictBase) -> TensorDictBase:
         self.update_policy_weights_(weights)
@@ -298,7 +298,7 @@ def _start_on_cluster(
 
 
 def _get(get: Callable[..., Any], processes: Sequence[BaseProcess]) -> Any:
-    """What a queue gives that some processes write to.
+    """Waits for the next item of a queue that processes write to, as long as all of them are alive.
 
     Raises:
         RuntimeError: one of them has ended.

@@ -1,4 +1,4 @@
-"""What runs in a process that collects: its environments, its collector, and how episodes begin anew."""
+"""The environments and the collector of a process, and how its episodes begin anew."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def derive_seed(*numbers: int) -> int:
 
 
 class WorkerCollector(Collector):
-    """The collector in a process. Its random numbers begin anew with each reset: runs can go on there."""
+    """Collector of a process; its random numbers begin anew with each reset, so that runs can be resumed."""
 
     def begin(self, beginning: Beginning) -> None:
         """Begins new episodes everywhere."""
@@ -133,7 +133,7 @@ class NodeCollector(WorkerCollector):
             self._error = f"{type(error).__name__}: {error}"
 
     def register_scheme_receiver(self, *args: Any, **options: Any) -> None:
-        """Nothing: weights come with each order."""
+        """Does nothing: weights come with each call of :meth:`collect`."""
 
     def collect(self, weights: TensorDictBase, beginning: Beginning | None = None) -> TensorDictBase | str:
         """The next batch that a policy with these weights plays; of new episodes, if told how they begin."""

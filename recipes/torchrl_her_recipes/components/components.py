@@ -34,7 +34,7 @@ from torchrl_her_recipes.config.recipe import Recipe
 
 @dataclass(kw_only=True)
 class Components(Agent):
-    """What a run, or R independent runs side by side, consist of. Swap what you like, then run it.
+    """All parts of a run, or of R independent runs side by side. Replace any of them, then run it.
 
     A loss of your own needs its own optimizer and target updater; an environment of your own, its
     own collector.

@@ -39,7 +39,7 @@ class CurriculumState:
 
     @property
     def curriculum(self) -> Curriculum:
-        """Its layers."""
+        """The layers that the runs go through."""
         return self.progress.curriculum
 
     def at_the_top(self, run: int) -> bool:

@@ -41,7 +41,7 @@ class RunDemonstrations:
     starts: DemonstrationStarts | None = None
 
     def shown(self, run: int) -> Demonstrations:
-        """As a run sees them at the moment."""
+        """The demonstrations in the layer that a run is in, with the task's rewards."""
         rule = task_reward(self.env)
         if self.state is None:
             return with_reward(self.recorded, rule)

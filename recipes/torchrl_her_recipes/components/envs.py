@@ -18,7 +18,7 @@ from torchrl_her_recipes.components.failures import Failures
 from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
 
-_AT_ONCE = 20  # environments of gymnasium's in an evaluation: each is a simulation of 10 MB and more
+_AT_ONCE = 20  # most of gymnasium's environments in an evaluation, since each takes 10 MB and more
 
 
 def evaluation_envs(recipe: Recipe) -> int:

@@ -1,4 +1,4 @@
-"""What ends of episodes without their goals are worth, as by a fall or a crash."""
+"""The worth of failures, which end an episode without its goal, as a fall or a crash does."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ class LearnerBuilder(ABC):
         return self.networks(runs)[0]
 
     def greedy(self, actor: TensorDictModule) -> nn.Module:
-        """What an exported policy plays: (observation, goal), as tensors, to the greedy action.
+        """The network of an exported policy: (observation, goal), as tensors, to the greedy action.
 
         Args:
             actor: of a single run, from :meth:`player`; its weights are shared.

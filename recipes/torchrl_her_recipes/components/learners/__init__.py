@@ -1,1 +1,1 @@
-"""One builder for each learner. They are found by the names in :mod:`torchrl_her_recipes.config.learners`."""
+"""Builders of learners, found by their names in :mod:`torchrl_her_recipes.config.learners`."""

@@ -27,7 +27,7 @@ class DQNBuilder(LearnerBuilder):
             in_keys=self.in_keys,
             **self.options.critic_shape,
         )
-        return actor.to(self.dtype), [critic]  # which has the same weights
+        return actor.to(self.dtype), [critic]  # the critic shares the actor's weights
 
     def greedy(self, actor: TensorDictModule) -> nn.Module:
         return BestAction(next(each for each in actor.modules() if isinstance(each, QNet)))

@@ -63,7 +63,7 @@ class SACBuilder(DDPGBuilder):
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """The same, but asked for where there are no bounds it is an error, since it is off by default."""
+        """Bounds of rewards, as for other learners; asked for where there are none, clamping is an error."""
         if self.options.clamp_targets and not all(map(math.isfinite, self.shape.rewards)):
             raise ValueError(
                 f"clamp_targets=true has no effect on {self.shape.task}, whose rewards have no bounds: "
