@@ -42,9 +42,10 @@ Finding = tuple[str, str]  # numbers of this project, verdict
 
 @cache
 def results(study: str) -> Results:
-    """Stored results of a study, without the combinations that are not finished."""
+    """Stored results of a study, without tasks that it has not finished."""
     stored = read_results(RESULTS / study)
-    return replace(stored, cells=[one for one in stored.cells if one.done])
+    unfinished = {one.task for one in stored.cells if not one.done}
+    return replace(stored, cells=[one for one in stored.cells if one.task not in unfinished])
 
 
 @cache
