@@ -231,7 +231,7 @@ def test_epochs_extend_a_finished_run_and_an_interrupted_one(
         ),
         (
             ["epochs=4", "learner.gamma=0.9"],
-            "keep_checkpoints, keep_buffer, pictures, log only; learner.gamma=0.9 would change what",
+            "keep_checkpoints, keep_buffer, pictures, log only; learner.gamma=0.9 would change its training",
         ),
         (
             ["preset=demo"],
@@ -339,7 +339,9 @@ def test_without_a_checkpoint_a_run_cannot_go_on(tmp_path: Path, capsys: pytest.
 
 
 def test_options_and_components_are_not_given_together(ended: Path) -> None:
-    with pytest.raises(ValueError, match="give resume.. options, or components that were made with them"):
+    with pytest.raises(
+        ValueError, match="give resume.. either options or components that were made with them"
+    ):
         resume(ended, components=build(small()), options={"epochs": 3})
 
 

@@ -1094,7 +1094,7 @@ def test_padded_trajectories_are_refused() -> None:
     batch = flat([[5]])
     batch["collector", "mask"] = torch.ones(5, dtype=torch.bool)
     buffer.extend(batch)
-    with pytest.raises(ValueError, match="HERSampleUnit takes batches as they are collected, not split"):
+    with pytest.raises(ValueError, match="HERSampleUnit needs batches that are not split and padded"):
         buffer.sample()
 
 
