@@ -20,11 +20,8 @@ from torchrl_her.replay_buffers.n_steps import STEPS_KEY
 _FORKED: list[bool] = []
 os.register_at_fork(after_in_child=lambda: _FORKED.append(True))
 
-_DRAWS = {
-    Algorithm.TD3: 1,
-    Algorithm.SAC: 2,
-    Algorithm.TQC: 2,
-}  # random numbers of a step: first of next actions, then of present ones
+# random numbers of a step: first of next actions, then of present ones
+_DRAWS = {Algorithm.TD3: 1, Algorithm.SAC: 2, Algorithm.TQC: 2}
 
 
 class FusedCall:

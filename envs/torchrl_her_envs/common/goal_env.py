@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_her_envs.common.rendering.pictures import captioned
 
+E = TypeVar("E", bound=EnvBase)
 Box = tuple[list[float], list[float]]  # the least and the greatest coordinates
 Names = str | Sequence[str]  # of an entry that an environment shows, or of several
 INFO = "info"  # the entry of transitions that holds what rewards read besides goals
@@ -225,11 +226,21 @@ def goal_env(env: EnvBase) -> GoalEnv:
         >>> goal_env(TransformedEnv(make_env("hand_v1"), StepCounter())).max_steps
         50
     """
+    # mypy: an abstract class is as good as others for isinstance.
+    return first_below(env, GoalEnv, "an environment with goals")  # type: ignore[type-abstract]
+
+
+def first_below(env: object, kind: type[E], what: str) -> E:
+    """The environment, or the first one below its transforms, that is of a class.
+
+    Raises:
+        TypeError: there is none; the message says that ``what`` was expected.
+    """
     inner: object = env
-    while not isinstance(inner, GoalEnv):
+    while not isinstance(inner, kind):
         inner = getattr(inner, "base_env", None)
         if inner is None:
-            raise TypeError(f"expected an environment with goals, got {type(env).__name__}")
+            raise TypeError(f"expected {what}, got {type(env).__name__}")
     return inner
 
 

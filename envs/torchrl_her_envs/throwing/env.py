@@ -14,7 +14,7 @@ from torchrl.data import Bounded, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_her_envs.common.batched_env import BatchedEnv
-from torchrl_her_envs.common.goal_env import Box
+from torchrl_her_envs.common.goal_env import Box, first_below
 from torchrl_her_envs.common.seeding import as_seeds
 from torchrl_her_envs.throwing.arrays import within
 from torchrl_her_envs.throwing.core import ThrowingCore
@@ -298,12 +298,7 @@ def base_env(env: EnvBase) -> ThrowingEnv:
         >>> base_env(TransformedEnv(make_env("hand_v1"), StepCounter())).task.name
         'hand_v1'
     """
-    inner: object = env
-    while not isinstance(inner, ThrowingEnv):
-        inner = getattr(inner, "base_env", None)
-        if inner is None:
-            raise TypeError(f"expected a ThrowingEnv, transformed or not, got {type(env).__name__}")
-    return inner
+    return first_below(env, ThrowingEnv, "a ThrowingEnv, transformed or not")
 
 
 def _as_dtype(dtype: torch.dtype | str) -> torch.dtype:

@@ -24,11 +24,8 @@ class Hand:
     """
 
     num_joints = 2
-    shown: tuple[str, ...] = (
-        "grip",
-        "grip_velocity",
-        "closed",
-    )  # joints and grip are the same: observed once
+    # Joints and grip are the same, and observed once.
+    shown: tuple[str, ...] = ("grip", "grip_velocity", "closed")
     observation_size = 5
     grip_index = (0, 1)
 

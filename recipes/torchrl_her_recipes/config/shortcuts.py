@@ -34,10 +34,8 @@ GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
 KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)}
 # groups that had options before, and the groups that have them now
 FORMER = {"ibs": ("weights", "behavior"), "novelty": ("weights",), "curriculum": ("order",)}
-
-LONG_ONLY = (
-    "demonstrations",
-)  # its options are always named with the group: ``file`` alone would be unclear
+# groups whose options are always named with them: ``file`` alone would be unclear
+LONG_ONLY = ("demonstrations",)
 
 
 # options that tasks of gymnasium and of users take in any case

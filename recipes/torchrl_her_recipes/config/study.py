@@ -169,9 +169,8 @@ class Study:
             if label in before:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
             for_task = self.for_task.get(_task_of(own.get("task")), {})
-            asked = merge(
-                self.cases.get(case, {}), own
-            )  # unlike options of the whole study, these are never dropped silently
+            # Unlike options of the whole study, these are never dropped silently.
+            asked = merge(self.cases.get(case, {}), own)
             try:
                 recipe = compose(merge(self.recipe, for_task), asked)
             except ValueError as error:

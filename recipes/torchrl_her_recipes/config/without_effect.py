@@ -32,11 +32,8 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     learner, sources = groups.learner, groups.hindsight.sources
     takes, with_task = get_task_spec(groups.task.name).options, f"with task={groups.task.name}"
     yield "threshold" not in takes, with_task, ["task.threshold"]
-    yield (
-        "termination" not in takes,
-        with_task,
-        ["task.failure"],
-    )  # episodes of such tasks end at their goals in any case
+    # Episodes of such tasks end at their goals in any case.
+    yield "termination" not in takes, with_task, ["task.failure"]
     yield "dtype" not in takes, with_task, ["run.dtype"]
 
     given = algorithm.virtual and groups.hindsight.goal_sources not in (None, AUTO)

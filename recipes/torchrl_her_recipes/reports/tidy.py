@@ -136,9 +136,8 @@ def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Pat
     text = yaml.safe_dump(
         {**_plain(about), "combinations": states}, sort_keys=False, allow_unicode=True, width=110
     )
-    (out / _ABOUT).write_text(
-        text, encoding="utf-8"
-    )  # written last: a folder with this file counts as results
+    # Written last: a folder with this file counts as results.
+    (out / _ABOUT).write_text(text, encoding="utf-8")
     return out
 
 
@@ -184,9 +183,8 @@ def _write_table(cells: Sequence[Combination], out: Path) -> None:
                 writer.writerow([*own, *(_number(row.get(name)) for name in (*_KEYS, *metrics))])
     packed.unlink(missing_ok=True)
     if plain.stat().st_size > _LARGE:
-        packed.write_bytes(
-            gzip.compress(plain.read_bytes(), mtime=0)
-        )  # without a time stamp: the same bytes every time
+        # Without a time stamp: the same bytes every time.
+        packed.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
         plain.unlink()
 
 

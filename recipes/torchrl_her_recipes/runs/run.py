@@ -200,9 +200,8 @@ def resume(
                 home.describe(own.recipe)
             home.policy.unlink(missing_ok=True)  # a policy of an earlier stop: it marks finished runs
             if own.best.state is None:
-                home.best.unlink(
-                    missing_ok=True
-                )  # it may be newer than the checkpoint, as the last rows may be
+                # It may be newer than the checkpoint, as the last rows may be.
+                home.best.unlink(missing_ok=True)
             own.save_best(home)
             own.rows, own.has_buffer = home.rows()[: done * own.recipe.run.num_runs], has_buffer
             return own.train(callbacks, progress=progress)

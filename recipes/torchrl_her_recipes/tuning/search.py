@@ -260,9 +260,8 @@ class _TrialRuns:
         space, ranges = self.search.space, self.search.space.distributions()
         waiting = self.study.get_trials(deepcopy=False, states=(TrialState.WAITING,))
         if waiting and (default := waiting[0].user_attrs.get(DEFAULT)) is not None:
-            ranges = {
-                name: ranges[name] for name in space.inside(default)
-            }  # values of the first trial that lie outside of the space
+            # Other values of the first trial lie outside of the space.
+            ranges = {name: ranges[name] for name in space.inside(default)}
         trial = self.study.ask(ranges)
         try:
             recipe = space.recipe(self.search.recipe, trial.params)

@@ -14,11 +14,8 @@ from torchrl_her_envs.common.rendering.colors import INK, MARGIN, Color
 
 _BORDER = 1 / 60  # width of a border, as a fraction of a picture's height
 _TEXT = 0.045  # height of a caption, as a fraction of a picture's height
-_LINE, _LEAST_LINE, _MOST_LINE = (
-    0.055,
-    11,
-    18,
-)  # height of a line of text: fraction of the width, limits in pixels
+# height of a line of text: fraction of the width, limits in pixels
+_LINE, _LEAST_LINE, _MOST_LINE = 0.055, 11, 18
 
 
 def as_picture(drawn: Any, name: str, *, size: int | None = None) -> Tensor:

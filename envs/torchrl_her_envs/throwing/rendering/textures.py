@@ -13,9 +13,8 @@ from torchrl_her_envs.throwing.rendering.palette import Color
 
 Array = NDArray[np.float64]
 
-_TILT = np.radians(
-    (24.0, -20.0, 14.0)
-)  # rotation of the basketball about x, y and z, so that seams cross off its center
+# rotation of the basketball about x, y and z, so that seams cross off its center
+_TILT = np.radians((24.0, -20.0, 14.0))
 _SEAM_WIDTH = 0.07  # to each side, as a fraction of the radius
 _HORIZON = 0.5  # dark part of the black hole, as a fraction of its radius
 _RIM = 0.06  # ... and the width of the line in which the glow ends
