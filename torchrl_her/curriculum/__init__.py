@@ -6,6 +6,7 @@ from torchrl_her.curriculum.normalization import count_inputs, restart_inputs
 from torchrl_her.curriculum.orders import EpisodeLayers, TeacherStudent
 from torchrl_her.curriculum.switch import enter_layer, set_layer_goals
 from torchrl_her.curriculum.transforms import LayerOutcomes, StateToObs, ZeroPad
+from torchrl_her.curriculum.view import LayerView
 
 __all__ = [
     "Curriculum",
@@ -14,6 +15,7 @@ __all__ = [
     "EpisodeLayers",
     "GuidedExploration",
     "LayerOutcomes",
+    "LayerView",
     "StateToObs",
     "TeacherStudent",
     "ZeroPad",

@@ -219,6 +219,22 @@ class Curriculum:
             extended[..., self.state_width :] = extended.new_tensor(self.appended)
         return extended
 
+    def show(self, state: Tensor, layer: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns the observation, the achieved and the desired goal of states as a layer shows them.
+
+        Args:
+            state: [..., state_width].
+            layer: index of the layer, from 0.
+
+        Returns:
+            [..., observation_width], zeros behind the layer's own entries, and [..., g] twice.
+        """
+        entries = self.extend(state).index_select(-1, self.state_index[layer].to(state.device))
+        observation, achieved, desired = entries.split(
+            [self.observation_width, self.goal_width, self.goal_width], -1
+        )
+        return observation, achieved, desired
+
     def _check(self, layer: CurriculumLayer, last: CurriculumLayer) -> None:
         for key in _LISTS:
             highest = max(getattr(layer, key), default=0)

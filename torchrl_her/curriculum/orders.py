@@ -13,7 +13,7 @@ from torchrl_her.replay_buffers.runs.streams import Generators, check_generators
 
 
 class EpisodeLayers(CurriculumProgress):
-    """Draws the layer of each episode when it begins, all with equal probabilities: they are trained at once.
+    """Draws the layer of each episode when it begins, so that all layers are trained at once.
 
     Runs are always in the last layer, which is the full task; it is their episodes that are in layers.
     :class:`~torchrl_her.StateToObs` draws them, and writes each row's layer, so that one buffer holds rows
@@ -27,9 +27,11 @@ class EpisodeLayers(CurriculumProgress):
     Keyword Args:
         runs: R.
         generators: generators, one for each run; None for torch's own, with one run only.
+        task_share: share of the episodes that are played in the last layer, the full task; the others are
+            drawn evenly from the layers below. None for all layers alike.
 
     Raises:
-        ValueError: ``runs`` is below 1, or several runs have no generators.
+        ValueError: ``runs`` is below 1, several runs have no generators, or the share is outside of [0, 1].
 
     Example:
         >>> from torchrl_her import CurriculumLayer
@@ -54,15 +56,22 @@ class EpisodeLayers(CurriculumProgress):
         *,
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
+        task_share: float | None = None,
     ) -> None:
         super().__init__(curriculum, runs=runs)
-        self.layers = (len(curriculum) - 1,) * runs
+        below = len(curriculum) - 1
+        share = 1 / (below + 1) if task_share is None else task_share
+        if not 0 <= share <= 1:
+            raise ValueError(f"task_share must be in [0, 1], got {task_share}")
+        self.layers = (below,) * runs
         self.generators: Generators = check_generators(runs, generators) or [None]
+        each = [(1 - share) / below] * below if below else []
+        self._shares = torch.tensor([[*each, share if below else 1.0]] * runs, dtype=torch.float64)
 
     @property
     def shares(self) -> Tensor:
         """Returns the probability of each layer for the next episode of each run, [R, L] of float64."""
-        return torch.full((self.runs, len(self.curriculum)), 1 / len(self.curriculum), dtype=torch.float64)
+        return self._shares
 
     def mean_layer(self, run: int) -> float:
         return float(self.shares[self._check_run(run)] @ torch.arange(len(self.curriculum)).double())

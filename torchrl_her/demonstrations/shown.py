@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchrl_her.curriculum.layers import Curriculum
-from torchrl_her.curriculum.transforms import take_columns
 from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
 
@@ -77,9 +76,7 @@ def in_layer(
     Raises:
         ValueError: observation and goal are not as wide as the curriculum's state.
     """
-    rows, goal = demonstrations.rows.copy(), curriculum.goal_width
-    index = curriculum.state_index[[layer]]
-    widths = [curriculum.observation_width, goal, goal]
+    rows = demonstrations.rows.copy()
     after = rows["next"].copy()
     for own in (rows, after):
         state = torch.cat((own["observation"], own["desired_goal"]), -1)
@@ -88,7 +85,7 @@ def in_layer(
                 f"the curriculum needs states of width {curriculum.state_width}, demonstrations of "
                 f"{demonstrations.task} have {state.shape[-1]}"
             )
-        shown = take_columns(curriculum.extend(state), index).split(widths, -1)
+        shown = curriculum.show(state, layer)
         own.update(dict(zip(("observation", "achieved_goal", "desired_goal"), shown, strict=True)))
     if layer < len(curriculum) - 1:
         after["terminated"] = torch.zeros_like(after["terminated"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from tensordict import NestedKey, TensorDictBase
@@ -18,23 +18,27 @@ class LayerRule(NamedTuple):
     Attributes:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
         weighted: whether the weights of goals apply, and are updated with the goals that were written.
+        view: shows transitions [n] of any layer as this one would have
+            (:class:`~torchrl_her.curriculum.LayerView`): those of all episodes are then written for this
+            layer. None for episodes that were played in it alone.
     """
 
     reward_fn: RewardFunction
     weighted: bool = True
+    view: Callable[[TensorDictBase], TensorDictBase] | None = None
 
 
 def split_layers(
-    rows: TensorDictBase, episodes: Episodes, run: Tensor | None, key: NestedKey, layers: int
-) -> Iterator[tuple[int, Episodes, Tensor | None]]:
-    """Yields the episodes of each layer, in the order in which they came.
+    rows: TensorDictBase, episodes: Episodes, run: Tensor | None, key: NestedKey, layers: Sequence[LayerRule]
+) -> Iterator[tuple[int, TensorDictBase, Episodes, Tensor | None]]:
+    """Yields the transitions as each layer shows them, and its episodes, in the order in which they came.
 
     Args:
         rows: [n], transitions.
         episodes: positions among them.
         run: [E] int64, the run of each episode; None if there is only one.
         key: key of the layer [n, 1].
-        layers: number of layers.
+        layers: rules of the layers.
 
     Raises:
         KeyError: rows do not carry their layer.
@@ -47,13 +51,15 @@ def split_layers(
         raise KeyError(f"episodes of several layers need the entry {key!r}, got {list(rows.keys())}")
     own = layer.reshape(-1)[episodes.rows[:, 0]]
     least, most = int(own.min()), int(own.max())
-    if least < 0 or most >= layers:
-        raise ValueError(f"{key!r} must be in [0, {layers - 1}], got {least if least < 0 else most}")
-    for number in range(layers):
+    if least < 0 or most >= len(layers):
+        raise ValueError(f"{key!r} must be in [0, {len(layers) - 1}], got {least if least < 0 else most}")
+    for number, rule in enumerate(layers):
         which = own == number
-        if bool(which.any()):
+        if rule.view is not None:
+            yield number, rule.view(rows), episodes, run
+        elif bool(which.any()):
             part = Episodes(episodes.rows[which], episodes.lengths[which])
-            yield number, part, None if run is None else run[which]
+            yield number, rows, part, None if run is None else run[which]
 
 
 def check_layers(layers: Sequence[LayerRule] | None) -> list[LayerRule]:

@@ -52,6 +52,7 @@ OnWrite = Callable[[TensorDictBase, list[int], list[int]], Callable[[], None] | 
 class _Draft(NamedTuple):
     """Real and virtual transitions of some episodes before they are written."""
 
+    rows: TensorDictBase  # those that were collected, as the layer shows them
     runs: list[int]
     real: WrittenRows
     virtual: WrittenRows | None
@@ -111,7 +112,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         runs: R.
         generators: R sources of random numbers; None for the buffer's, with one run only.
         layers: for episodes that carry the layer of a curriculum in which they were played, one rule for each
-            layer; they take the place of ``reward_fn``. None if episodes have no layers.
+            layer; they take the place of ``reward_fn``. A rule may have all episodes written for its layer,
+            whatever layer they were played in. None if episodes have no layers.
         refill: where the filter leaves transitions without goals, the others get more goals of their episode,
             so that there are about as many in all: up to this many times as many; 1: no more. It goes by the
             share of transitions that got goals so far, of each run.
@@ -454,15 +456,15 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         entries = max(1, min(_ROWS, self.capacity) // most), _ROWS // most
         own = None if run is None else run[episodes.rows[:, :1]].flatten()
         recent, settings, drafts, first_id = list(self._recent), self._settings(), [], self._episodes
-        for layer, part, run_of in self._by_layer(rows, episodes, own):
-            lately = recent[layer].after(rows, part, run_of, self._keys, sizes=self.options.remembered)
+        for layer, shown, part, run_of in self._by_layer(rows, episodes, own):
+            lately = recent[layer].after(shown, part, run_of, self._keys, sizes=self.options.remembered)
             recent[layer] = lately
             for piece in split_runs(part, run_of, settings, each=entries[0], together=entries[1]):
                 rule = self._rule(layer, piece.runs[0])
-                chunk = Chunk(rows, run, piece, rule.reward_fn, self.options, self._keys)
+                chunk = Chunk(shown, run, piece, rule.reward_fn, self.options, self._keys)
                 drafts.append(self._draft(chunk, lately, weighted=rule.weighted, first_id=first_id))
                 first_id += drafts[-1].ids
-        self._commit(rows, drafts, places)
+        self._commit(drafts, places)
         self._episodes = first_id
         return places.rows(self._rings.cursors, self.capacity)[held:], left, recent
 
@@ -472,11 +474,11 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     def _by_layer(
         self, rows: TensorDictBase, episodes: Episodes, run: Tensor | None
-    ) -> Iterable[tuple[int, Episodes, Tensor | None]]:
-        """Yields the episodes of each layer; all of them if episodes have no layers."""
+    ) -> Iterable[tuple[int, TensorDictBase, Episodes, Tensor | None]]:
+        """Yields transitions and episodes of each layer; all of them if episodes have no layers."""
         if not self.layers:
-            return [(0, episodes, run)]
-        return split_layers(rows, episodes, run, self._keys.layer, len(self.layers))
+            return [(0, rows, episodes, run)]
+        return split_layers(rows, episodes, run, self._keys.layer, self.layers)
 
     def _rule(self, layer: int, run: int) -> LayerRule:
         """Returns the rule for relabeling episodes of a layer, or of a run without layers."""
@@ -512,9 +514,9 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             virtual = virtual_rows(chunk, drawn.source, drawn.goals, first_id=first_id)
             numbers |= {"virtual": virtual.counts, **virtual_positives(chunk, virtual)}
         ids = copies + len(chunk.episodes.lengths) if self.options.per == "episode" else 0
-        return _Draft(runs, real, virtual, numbers, weighted=weighted, ids=ids)
+        return _Draft(chunk.rows, runs, real, virtual, numbers, weighted=weighted, ids=ids)
 
-    def _commit(self, rows: TensorDictBase, drafts: list[_Draft], places: Places) -> None:
+    def _commit(self, drafts: list[_Draft], places: Places) -> None:
         """Stores and counts real and virtual transitions, and notes where the real ones went.
 
         If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out.
@@ -524,7 +526,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
         def join(draft: _Draft) -> TensorDictBase:
             virtual_key = self.options.virtual_key
-            return join_rows(rows, draft.virtual, draft.real, exclude=exclude, virtual_key=virtual_key)
+            return join_rows(draft.rows, draft.virtual, draft.real, exclude=exclude, virtual_key=virtual_key)
 
         shown: list[TensorDictBase] = []
         undo: list[Callable[[], None] | None] = []

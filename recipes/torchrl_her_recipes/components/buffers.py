@@ -15,6 +15,7 @@ from torchrl.envs import DeviceCastTransform, EnvBase
 from torchrl_her.curriculum.normalization import count_inputs
 from torchrl_her.curriculum.switch import set_layer_goals
 from torchrl_her.curriculum.transforms import ZeroPad
+from torchrl_her.curriculum.view import LayerView
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch
@@ -96,7 +97,7 @@ def make_buffer(
             exclude=_NOT_STORED,
             runs=runs,
             generators=generators,
-            layers=_rules(state, rule),
+            layers=_rules(state, rule, every=getattr(recipe.order, "every_layer", False)),
             on_write=counted,
         ),
         sampler=_make_sampler(recipe.replay, recipe.learner.priority_power, generators, size, devices.replay),
@@ -114,11 +115,19 @@ def make_buffer(
     return buffer
 
 
-def _rules(state: CurriculumState | None, task: RewardFunction) -> list[LayerRule] | None:
-    """How the episodes of each layer are relabeled, where they have layers of their own."""
+def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) -> list[LayerRule] | None:
+    """How the episodes of each layer are relabeled, where they have layers of their own.
+
+    Args:
+        every: whether they are written for all layers.
+    """
     if state is None or not state.progress.by_episode:
         return None
-    return [LayerRule(layer.reward_fn or task, layer.instructive) for layer in state.curriculum.layers]
+    rules = [LayerRule(layer.reward_fn or task, layer.instructive) for layer in state.curriculum.layers]
+    if not every:
+        return rules
+    views = [LayerView(state.curriculum, number, rule.reward_fn) for number, rule in enumerate(rules)]
+    return [rule._replace(view=view) for rule, view in zip(rules, views, strict=True)]
 
 
 def _goals(options: HindsightConfig) -> dict[str, Any]:

@@ -138,9 +138,9 @@ def make_threshold(options: Threshold, curriculum: Curriculum, *, runs: int, **_
     )
 
 
-def make_all_at_once(_options: AllAtOnce, curriculum: Curriculum, **runs: Any) -> EpisodeLayers:
-    """Draws each episode's layer, all layers alike."""
-    return EpisodeLayers(curriculum, **runs)
+def make_all_at_once(options: AllAtOnce, curriculum: Curriculum, **runs: Any) -> EpisodeLayers:
+    """Draws each episode's layer, with the same probabilities all the time."""
+    return EpisodeLayers(curriculum, **runs, task_share=options.task_share)
 
 
 def make_teacher(options: Teacher, curriculum: Curriculum, **runs: Any) -> TeacherStudent:

@@ -39,18 +39,32 @@ class Threshold(Order):
     layer_epsilon: float = option(1.0, "epsilon of exploration when a layer begins", at_least=0, at_most=1)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _ByEpisode(Order):
+    every_layer: bool = option(
+        False, "whether a transition is stored for every layer, not for that of its episode alone"
+    )
+
+
 @ORDER.register
 @dataclass(frozen=True, kw_only=True)
-class AllAtOnce(Order):
+class AllAtOnce(_ByEpisode):
     """Each episode is played in any of the layers."""
 
     name = "all_at_once"
     maker = f"{_MAKERS}:make_all_at_once"
 
+    task_share: float | None = option(
+        None,
+        "share of the episodes that are played in the last layer; all layers alike if None",
+        at_least=0,
+        at_most=1,
+    )
+
 
 @ORDER.register
 @dataclass(frozen=True, kw_only=True)
-class Teacher(Order):
+class Teacher(_ByEpisode):
     """Episodes prefer layers whose success changes (Matiisen et al., 2017)."""
 
     name = "teacher_student"

@@ -28,6 +28,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "discover": {**PLAIN, "behavior": "discover", "learner": "td3"},
     "all at once": {**LAYERS, "order": "all_at_once"},
     "teacher": {**LAYERS, "order": "teacher_student", "behavior": "mega", "behavior.goal_memory": 5_000},
+    "every layer": {**LAYERS, "order": "all_at_once", "every_layer": True, "task_share": 1.0},
 }
 
 
@@ -158,6 +159,17 @@ def test_one_buffer_holds_rows_of_all_layers() -> None:
     # The first layer sees the hand alone: its goal is not observed, nor is the ball's speed.
     assert (rows["observation"][first][:, 5:] == 0).all()
     assert (rows["observation"][~first][:, 5:7] != 0).any()
+
+
+def test_the_full_task_alone_is_played_and_trains_every_layer() -> None:
+    components = trained(recipe("every layer"))
+    rows = rows_of_run(components.buffer, 0)
+    rows = rows[~rows["virtual"].squeeze(-1)]
+    reach, throw = (rows[rows["layer"].squeeze(-1) == layer] for layer in (0, 1))
+    assert torch.equal(reach["action"], throw["action"])
+    assert torch.equal(reach["observation"][:, :5], throw["observation"][:, :5])
+    assert (reach["observation"][:, 5:] == 0).all()
+    assert torch.equal(reach["desired_goal"], throw["observation"][:, 5:7])  # the hand is to be at the ball
 
 
 def test_a_teacher_knows_both_layers() -> None:

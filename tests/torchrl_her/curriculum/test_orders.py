@@ -13,7 +13,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_her import Curriculum, GoalReward, GoalWeights, HERWriter, StateToObs, ZeroPad
-from torchrl_her.curriculum import EpisodeLayers, LayerOutcomes, TeacherStudent, count_inputs
+from torchrl_her.curriculum import EpisodeLayers, LayerOutcomes, LayerView, TeacherStudent, count_inputs
 from torchrl_her.modules import RunningNorm
 from torchrl_her.replay_buffers import LayerRule, RunsSampler
 
@@ -55,6 +55,14 @@ def test_all_layers_are_drawn_alike() -> None:
     layers = EpisodeLayers(THREE, generators=[torch.Generator().manual_seed(0)])
     counts = layers.draw([3_000]).bincount()
     torch.testing.assert_close(counts / 3_000, torch.full((3,), 1 / 3), atol=0.03, rtol=0.0)
+
+
+def test_a_share_of_the_episodes_is_of_the_full_task() -> None:
+    assert EpisodeLayers(THREE, task_share=0.5).shares.tolist() == [[0.25, 0.25, 0.5]]
+    layers = EpisodeLayers(THREE, task_share=1.0)
+    assert layers.draw([100]).tolist() == [2] * 100
+    with pytest.raises(ValueError, match=r"task_share must be in \[0, 1\], got 1.5"):
+        EpisodeLayers(THREE, task_share=1.5)
 
 
 def test_a_run_draws_as_it_would_alone() -> None:
@@ -193,7 +201,77 @@ def test_thresholds_are_those_of_the_rows_layers() -> None:
     assert step["next", "terminated"].flatten().tolist() == [False, True, False]
 
 
+# The view of another layer
+
+RULES = [*(own.reward_fn for own in THREE.layers[:-1]), lambda achieved, desired: always_seven(achieved)]
+
+
+def always_seven(achieved: Tensor) -> tuple[Tensor, Tensor]:
+    """The reward of the environment itself, with no end."""
+    return torch.full_like(achieved, 7.0), torch.zeros_like(achieved, dtype=torch.bool)
+
+
+@pytest.mark.parametrize("played", range(3))
+@pytest.mark.parametrize("wanted", range(3))
+@pytest.mark.parametrize("action", [0.0, 10.0])  # with 10 the goal of the first layer is achieved
+def test_a_view_shows_what_the_layer_would_have_shown(played: int, wanted: int, action: float) -> None:
+    def step(layer: int) -> TensorDictBase:
+        env = shown(Fixed(*[layer] * 4), 2)
+        return act(env, env.reset(), action, 0.0)[0]
+
+    rows, own, view = step(played), step(wanted), LayerView(THREE, wanted, RULES[wanted])  # type: ignore[arg-type]
+    before = rows.clone()
+    seen = view(rows)
+    for key in ("observation", "achieved_goal", "desired_goal", "layer", "reward", "terminated"):
+        assert torch.equal(seen["next", key], own["next", key]), key
+        if key in own:
+            assert torch.equal(seen[key], own[key]), key
+    # Where the episode ended in its own layer, it does not go on in any other.
+    assert torch.equal(seen["next", "done"], rows["next", "done"] | own["next", "done"])
+    cut = rows["next", "done"] & ~own["next", "done"]
+    assert torch.equal(seen["next", "truncated"], cut)
+    assert (rows == before).all()
+
+
+def test_a_view_keeps_what_was_played_in_its_layer() -> None:
+    env = shown(Fixed(2, 2), 1)
+    begun = env.reset().set("desired_goal", torch.tensor([[55.0]]))  # proposed in place of the state's
+    rows = act(env, begun, 30.0)[0]  # the environment terminates the full task, which no rule would
+    seen = LayerView(THREE, 2, RULES[2])(rows)  # type: ignore[arg-type]
+    assert seen["desired_goal"].item() == 55.0
+    assert seen["next", "terminated"].item()
+    assert not seen["next", "truncated"].item()
+    with pytest.raises(ValueError, match=r"layer must be in \[0, 2\], got 3"):
+        LayerView(THREE, 3, strict)
+
+
 # What is written and sampled
+
+
+def test_transitions_are_written_for_every_layer() -> None:
+    rules = [
+        LayerRule(rule, view=LayerView(THREE, layer, rule))  # type: ignore[arg-type]
+        for layer, rule in enumerate(RULES)
+    ]
+    writer = HERWriter(strict, k=1, strategy="final", layers=rules, exclude=["state", "input"])
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), writer=writer, batch_size=4)
+    env, steps = shown(Fixed(0, 2, 0, 2), 2, horizon=2), []
+    rows = env.reset()
+    for _ in range(2):
+        step, rows = act(env, rows, 1.0, 2.0)
+        steps.append(step)
+    index = buffer.extend(torch.stack(steps, -1))
+    stored = buffer[:]
+    real = stored[~stored["virtual"].squeeze(-1)]
+    assert real["layer"].flatten().tolist() == [0] * 4 + [1] * 4 + [2] * 4
+    assert stored["layer"].flatten().bincount().tolist() == [8] * 3
+    first = real[real["layer"].squeeze(-1) == 1]
+    assert first["achieved_goal"].flatten().tolist() == [20.0, 20.0, 1020.0, 1020.0]
+    assert first["desired_goal"].flatten().tolist() == [30.0, 30.0, 1030.0, 1030.0]
+    # A transition is where the writer says: its last copy, that of the last layer.
+    assert stored["layer"][index].flatten().tolist() == [2] * 4
+    assert stored["observation"][index][..., 0].tolist() == [[10.0, 11.0], [1010.0, 1012.0]]
+    assert writer.counts.real == 12
 
 
 class OnlyLast(GoalWeights):
