@@ -30,7 +30,7 @@ def test_short_names_choose_an_order_and_its_options() -> None:
     assert make_recipe(algo="cher", window=5, layer_epsilon=0.3).order == Threshold(
         window=5, layer_epsilon=0.3
     )
-    assert make_recipe(algo="cher", order="all_at_once").to_dict()["order"] == {"name": "all_at_once"}
+    assert make_recipe(algo="cher", order="all_at_once", task_share=1).order == AllAtOnce(task_share=1.0)
     recipe = make_recipe(algo="cher", order={"name": "teacher_student", "even_share": 0.5})
     assert recipe.order == Teacher(even_share=0.5)
     assert Recipe.from_dict(recipe.to_dict()) == recipe
