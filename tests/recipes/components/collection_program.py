@@ -1,16 +1,11 @@
-"""A program that collects in processes. Whatever happens there, all of them end with it.
-
-Processes are forked, which takes a second instead of the ten of TorchRL's own way.
-"""
+"""Collecting in processes, which are forked instead of spawned, in a process of its own."""
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
-import subprocess
-import sys
 import tempfile
+from collections.abc import Sequence
 from copy import deepcopy
 from multiprocessing import active_children
 from pathlib import Path
@@ -22,6 +17,7 @@ from torch import multiprocessing
 from torchrl_her_recipes import Components, Recipe, RunResult, build, resume, run
 from torchrl_her_recipes.components.collection import ProcessCollector
 
+from ...forks import call_in_session
 from ..small import small, stop_after
 from .tagged_task import TASK, block_of
 
@@ -44,7 +40,7 @@ _TAGGED: dict[str, Any] = {
 _TABLE = ("seconds",)  # columns that differ
 
 
-def main(out: str, *names: str) -> None:
+def main(out: Path, names: Sequence[str]) -> None:
     torch.set_num_threads(1)
     multiprocessing.set_start_method("fork", force=True)
     torch.save({name: JOBS[name]() for name in names}, out)
@@ -249,18 +245,8 @@ JOBS = {
 
 
 def results_of(*names: str) -> dict[str, Any]:
-    """What the program found out in some of its jobs."""
+    """What some of the jobs find out, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "results.pt"
-        command = [sys.executable, "-m", __name__, str(out), *names]
-        with subprocess.Popen(command, cwd=Path(__file__).parents[3], start_new_session=True) as program:
-            try:
-                program.wait(SECONDS)
-            finally:
-                with contextlib.suppress(ProcessLookupError):  # all of them ended by themselves
-                    os.killpg(program.pid, signal.SIGKILL)
+        call_in_session(main, out, names, seconds=SECONDS)
         return torch.load(out, weights_only=False)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import re
+import runpy
 import signal
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -18,9 +20,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_her import load_checkpoint
-from torchrl_her_recipes import build
+from torchrl_her_recipes import build, cli
 from torchrl_her_recipes.components.collection import ProcessCollector
 
+from ...forks import fork
 from ..small import overrides, small
 from .collection_program import RUNS, SECONDS, results_of
 from .tagged_task import LENGTH, wanted
@@ -189,23 +192,29 @@ def test_nothing_stays_behind(together: dict[str, Any]) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc tells which processes there are")
 def test_ctrl_c_ends_all_processes(tmp_path: Path) -> None:
-    """Started as users start it, and with the signal for all of them, as a terminal sends it."""
+    """The signal is for all of them, as a terminal sends it; they are spawned, as for users."""
     folder = tmp_path / "run"
-    options = overrides(processes=2, epochs=1_000, folder=str(folder))
-    command = [sys.executable, "-m", "torchrl_her_recipes", "train", *options]
-    with subprocess.Popen(command, cwd=tmp_path, start_new_session=True) as program:
-        try:
-            _wait_for(lambda: (folder / "metrics.csv").exists())
-            children = Path(f"/proc/{program.pid}/task/{program.pid}/children").read_text().split()
-            assert len(children) >= 2
-            os.killpg(program.pid, signal.SIGINT)
-            assert program.wait(SECONDS) == 130
-        finally:
-            program.kill()
+    program = fork(_train, tmp_path, overrides(processes=2, epochs=1_000, folder=str(folder)))
+    try:
+        _wait_for(lambda: (folder / "metrics.csv").exists())
+        children = Path(f"/proc/{program.pid}/task/{program.pid}/children").read_text().split()
+        assert len(children) >= 2
+        os.killpg(program.pid or 0, signal.SIGINT)
+        program.join(SECONDS)
+        assert program.exitcode == 130
+    finally:
+        program.kill()
     # The last one is Python's tracker of resources.
     _wait_for(lambda: not any(map(_runs, children)), seconds=20.0)
     saved = load_checkpoint(folder / "checkpoint.pt")
     assert saved["trainer"]["frames"] > 0
+
+
+def _train(folder: Path, options: list[str]) -> None:
+    multiprocessing.set_start_method("spawn", force=True)
+    os.chdir(folder)
+    os.setsid()
+    sys.exit(cli.main(["train", *options]))
 
 
 def _runs(process: str) -> bool:
@@ -239,8 +248,6 @@ def test_a_script_that_its_processes_would_run_again_is_refused(tmp_path: Path) 
         "from torchrl_her_recipes import build, make_recipe, run\n"
         f"run(build(make_recipe(task='hand_v0', {sizes})), progress=False)\n"
     )
-    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=SECONDS)
-    assert ended.returncode == 1
-    said = ended.stderr.splitlines()[-1]
-    assert said.startswith("RuntimeError: processes=2 starts processes that import ")
-    assert said.endswith("put what trains there under `if __name__ == '__main__':`")
+    message = f"processes=2 starts processes that import {script}: put what trains there under `if __name__"
+    with pytest.raises(RuntimeError, match=re.escape(message)):
+        runpy.run_path(str(script), run_name="__main__")

@@ -18,8 +18,8 @@ from torchrl_her_recipes import LogTo, build, resume, run
 from torchrl_her_recipes.runs.callbacks import RunView
 from torchrl_her_recipes.runs.folder import RunFolder
 
+from ...forks import fork
 from ..small import small
-from .killed import server
 from .test_log_to import SHORT, STEPS, DiesAt
 
 wandb = pytest.importorskip("wandb", reason="needs the extra wandb")
@@ -80,8 +80,7 @@ def wandb_history(folder: Path) -> dict[int, dict[str, Any]]:
 
 @pytest.mark.long
 def test_after_a_kill_and_a_resumption_each_step_is_there_once(tmp_path: Path) -> None:
-    process = server().Process(target=_die, args=(tmp_path,))
-    process.start()
+    process = fork(_die, tmp_path)
     process.join(180)
     assert process.exitcode == -signal.SIGKILL
     wandb_id = (tmp_path / "wandb" / "run_id.txt").read_text()

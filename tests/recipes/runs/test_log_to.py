@@ -21,8 +21,8 @@ from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.runs import log_to
 from torchrl_her_recipes.runs.show import read_film
 
+from ...forks import fork
 from ..small import small
-from .killed import server
 
 SHORT: dict[str, Any] = {"epoch_frames": 480, "epochs": 5, "checkpoint_interval": 2}
 STEPS = [480, 960, 1_440, 1_920, 2_400]
@@ -45,8 +45,7 @@ def _die(log: list[str], folder: Path, epochs: int) -> None:
 
 def killed_run(folder: Path, log: list[str], *, after: int = 3) -> None:
     """Leaves a run behind that was killed after three epochs, one more than its last checkpoint has."""
-    process = server().Process(target=_die, args=(log, folder, after))
-    process.start()
+    process = fork(_die, log, folder, after)
     process.join(120)
     assert process.exitcode == -signal.SIGKILL
 

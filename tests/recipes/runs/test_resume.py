@@ -31,8 +31,9 @@ from torchrl_her_recipes import (
 from torchrl_her_recipes.runs import state as run_state
 from torchrl_her_recipes.runs.folder import RunFolder
 
+from ...forks import server
 from ..small import assert_same, assert_same_runs, small
-from .killed import is_killed, server
+from .killed import is_killed
 
 KILLS = 20
 # Everything there is to save: a curriculum whose layer changes on the way, q, priorities, held-back episodes.

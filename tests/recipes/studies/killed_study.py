@@ -21,7 +21,7 @@ from torchrl_her_recipes.studies import worker_main, workers_local
 from torchrl_her_recipes.studies.study import StudyResult, run_study
 from torchrl_her_recipes.studies.workers_local import LocalWorkers
 
-from ..runs.killed import server
+from ...forks import fork
 
 Whom = Literal["parent", "worker", "both"]
 WHOM: tuple[Whom, ...] = ("parent", "worker", "both")
@@ -37,8 +37,7 @@ class Attempt:
 
     def __init__(self, study: Study, folder: Path) -> None:
         self._reader, writer = Pipe(duplex=False)
-        self._process = server().Process(target=_run, args=(study, folder, writer))
-        self._process.start()
+        self._process = fork(_run, study, folder, writer)
         writer.close()
         self.folder = folder
         self.workers: list[int] = []

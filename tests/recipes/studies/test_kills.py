@@ -17,7 +17,7 @@ from filelock import FileLock
 from torchrl_her import load_checkpoint
 from torchrl_her_recipes.config.study import Study
 
-from ..runs.killed import server
+from ...forks import server
 from ..small import SMALL, assert_same_runs
 from .killed_study import WHOM, Attempt
 

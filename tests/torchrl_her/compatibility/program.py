@@ -1,15 +1,9 @@
-"""A process for what starts worker processes: whatever happens there, all of them end with it.
-
-Workers are forked, which takes a second instead of the ten of TorchRL's own way.
-"""
+"""A process for what starts worker processes: whatever happens there, all of them end with it."""
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -21,6 +15,7 @@ from typing import Any
 import torch
 from torch import multiprocessing
 
+from ...forks import call_in_session
 from .buffers import try_ray, try_remote
 from .collect import SOURCES
 from .fill import share
@@ -47,15 +42,7 @@ def run_jobs(jobs: Sequence[tuple[Any, ...]], *, start: str = "fork") -> list[tu
         wrote to the standard error.
     """
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", __name__, folder, start, json.dumps(jobs)]
-        with subprocess.Popen(
-            command, cwd=Path(__file__).parents[3], stdout=subprocess.DEVNULL, start_new_session=True
-        ) as program:
-            try:
-                program.wait()
-            finally:
-                with contextlib.suppress(ProcessLookupError):  # all of them ended by themselves
-                    os.killpg(program.pid, signal.SIGKILL)
+        call_in_session(_main, folder, start, jobs, seconds=_SECONDS * len(jobs))
         return [_outcome(Path(folder), number) for number in range(len(jobs))]
 
 
@@ -65,11 +52,11 @@ def _outcome(folder: Path, number: int) -> tuple[Any, str]:
     return result, (folder / f"{number}.txt").read_text()
 
 
-def main(folder: str, start: str, jobs: str) -> None:
-    """The program: each job in a process that is forked from this one, which has no threads."""
+def _main(folder: str, start: str, jobs: Sequence[tuple[Any, ...]]) -> None:
+    """Does each job in a process that is forked from this one, which has no threads."""
     torch.set_num_threads(1)
     multiprocessing.set_start_method(start, force=True)  # TorchRL sets another one when it is imported
-    for number, job in enumerate(json.loads(jobs)):
+    for number, job in enumerate(jobs):
         if (process := os.fork()) == 0:
             _do(f"{folder}/{number}", *job)
         deadline = time.monotonic() + _SECONDS
@@ -92,7 +79,3 @@ def _do(out: str, name: str, *arguments: Any) -> None:
                 worker.kill()
                 worker.join()
             os._exit(0)  # threads of queues would wait for workers that are gone
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
