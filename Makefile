@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # to have it, each process that a test starts would compile all of torch, which takes six seconds.
 PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal --durations=15
 
-.PHONY: demo shell test test-full test-versions lint bench bench-gpu wheel docs clean
+.PHONY: demo shell test test-full test-versions lint bench bench-gpu wheel check-dist release docs clean
 .SILENT:
 
 demo: $(VENV)/.ready  ## learn to pick up a ball and throw it, in a minute; ends with a curve and a GIF
@@ -41,8 +41,15 @@ bench-gpu: $(VENV)/.ready  ## what a GPU gives, in less than ten minutes: runs/b
 	mkdir -p runs
 	$(BIN)/python benchmarks/gpu.py --out runs/bench_gpu.md
 
-wheel: $(VENV)/.ready  ## source distribution and, for Linux on x86-64, a wheel with compiled C++ code: dist/
-	HATCH_BUILD_HOOK_ENABLE_CUSTOM=1 $(BIN)/uv build
+wheel: $(BIN)/uv  ## source distribution and a wheel with C++ code compiled for this kind of machine: dist/
+	rm -rf dist
+	HATCH_BUILD_HOOK_ENABLE_CUSTOM=1 $(BIN)/uv build --python $(BIN)/python
+
+check-dist: $(BIN)/uv  ## metadata of what is in dist/, by twine
+	$(BIN)/uv tool run twine check --strict dist/*
+
+release: $(VENV)/.ready-test  ## builds what is published, checks it and tries it in new environments; uploads nothing
+	$(BIN)/python .ci/release.py $(TAG)
 
 docs: $(VENV)/.ready-docs  ## the documentation as a site, with the studies' pages: build/docs/index.html
 	$(BIN)/python -m sphinx -W --keep-going docs build/docs
@@ -54,11 +61,14 @@ $(VENV)/.ready: EXTRAS :=
 $(VENV)/.ready-test: EXTRAS := [test,lint,video]
 $(VENV)/.ready-bench: EXTRAS := [bench]
 $(VENV)/.ready-docs: EXTRAS := [docs,report]
-$(VENV)/.ready $(VENV)/.ready-test $(VENV)/.ready-bench $(VENV)/.ready-docs: pyproject.toml
+$(BIN)/uv:  # installs torch in seconds
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; set PYTHON=") if sys.version_info < (3, 11) else None'
-	echo "Installing into $(VENV): about 6 GB, most of it for CUDA; UV_TORCH_BACKEND=cpu takes far less"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet uv  # installs torch in seconds; pip is the way out where it cannot
+	$(BIN)/python -m pip install --quiet uv
+
+# pip is the way out where uv cannot.
+$(VENV)/.ready $(VENV)/.ready-test $(VENV)/.ready-bench $(VENV)/.ready-docs: pyproject.toml | $(BIN)/uv
+	echo "Installing into $(VENV): about 6 GB, most of it for CUDA; UV_TORCH_BACKEND=cpu takes far less"
 	VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/uv pip install --editable '.$(EXTRAS)' \
 		|| $(BIN)/python -m pip install --quiet --editable '.$(EXTRAS)'
 	touch $@

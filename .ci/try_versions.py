@@ -15,6 +15,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 RANGED = ("torch", "tensordict", "torchrl")
 TESTS = [  # what another TorchRL breaks first, and what another Python does
     "tests/torchrl_her/test_torchrl_private.py",
@@ -41,18 +42,17 @@ folder.mkdir()
 """
 
 
+class CannotInstall(RuntimeError):
+    """The outcome of a try whose environment could not be made."""
+
+
 def main(tests: list[str]) -> int:
     """Tries everything; returns 1 if something failed."""
-    if not UV.exists():
-        print(f"there is no {UV}; `pip install uv` puts it there", file=sys.stderr)
-        return 2
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    ranges = [text for text in project["dependencies"] if re.match(rf"({'|'.join(RANGED)})[<>=]", text)]
-    pythons = re.findall(r":: (3\.\d+)", "\n".join(project["classifiers"]))
+    pythons = re.findall(r":: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
     tries = [(pythons[0], "lowest"), (pythons[0], "mixed"), *((python, "newest") for python in pythons)]
     outcomes = []
     for python, which in tries:
-        outcome = attempt(python, ranges, which, tests or TESTS)
+        outcome = attempt(python, which, tests or TESTS)
         print(f"-- Python {python}, {which} versions: {outcome}", flush=True)
         outcomes.append((python, which, outcome))
     print("\nPython  versions  outcome")
@@ -61,46 +61,54 @@ def main(tests: list[str]) -> int:
     return int(any(outcome.startswith("FAILED") for _, _, outcome in outcomes))
 
 
-def attempt(python: str, ranges: list[str], which: str, tests: list[str]) -> str:
-    """Makes one environment and runs the tests in it.
-
-    Args:
-        python: a version of Python, such as 3.12.
-        ranges: the requirements of which releases are installed.
-        which: ``"lowest"``, ``"newest"``, or ``"mixed"``: the newest torch beside the oldest TorchRL.
-        tests: files or folders.
-
-    Returns:
-        What came of it, in words.
-    """
-    oldest, newest = _minors(ranges)
+def attempt(python: str, which: str, tests: list[str]) -> str:
+    """Makes one environment, runs the tests in it, and returns the outcome in words; see :func:`install`."""
     with tempfile.TemporaryDirectory() as folder:
-        interpreter = Path(folder) / "bin" / "python"
-        if uv("venv", "--quiet", "--clear", "--python", python, folder):
-            return "skipped: this Python is not here, and uv cannot install it"
-        install = ["pip", "install", "--quiet", "--python", str(interpreter)]
-        wanted = (
-            ["--resolution", "lowest-direct", *ranges]
-            if which == "lowest"
-            else [*ranges, f"torchrl=={oldest}.*"]
-        )
-        if uv(*install, *wanted) or uv(*install, "--editable", f"{ROOT}[test]"):
-            return "FAILED: cannot be installed"
-        if which == "newest" and uv(*install, "--upgrade", *ranges, f"torchrl=={newest}.*"):
-            print(f"-- TorchRL {newest} is not released; its nightly build is tried", flush=True)
-            uv("pip", "uninstall", "--quiet", "--python", str(interpreter), "torchrl")
-            nightly = ["--no-deps", "torchrl-nightly", f"tensordict=={newest}.*"]
-            if (
-                uv(*install, *nightly)
-                or subprocess.run([interpreter, "-c", ALIAS, newest], check=False).returncode
-            ):
-                return "FAILED: cannot be installed"
+        try:
+            interpreter, versions = install(folder, python, which, "--editable", f"{ROOT}[test]")
+        except CannotInstall as error:
+            return str(error)
         one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
-        shown = subprocess.run([interpreter, "-c", SHOW], capture_output=True, text=True, check=False)
-        print(f"\n-- {shown.stdout.strip() or shown.stderr}", flush=True)
         command = [interpreter, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests]
         failed = subprocess.run(command, cwd=ROOT, env=one_thread, check=False).returncode
-    return f"{'FAILED' if failed else 'passed'}: {shown.stdout.strip()}"
+    return f"{'FAILED' if failed else 'passed'}: {versions}"
+
+
+def install(folder: str, python: str, which: str, *project: str) -> tuple[Path, str]:
+    """Makes a virtual environment that has the project.
+
+    Args:
+        folder: the environment's folder.
+        python: a version of Python, such as 3.12.
+        which: ``"lowest"``, ``"newest"``, or ``"mixed"``: the newest torch beside the oldest TorchRL.
+        project: what pip is told to install: a checkout or a file.
+
+    Returns:
+        The interpreter, and the versions of Python and of the packages in ``RANGED``.
+
+    Raises:
+        CannotInstall: this Python or the packages are not to be had.
+    """
+    interpreter = Path(folder) / "bin" / "python"
+    if uv("venv", "--quiet", "--clear", "--python", python, folder):
+        raise CannotInstall("skipped: this Python is not here, and uv cannot install it")
+    ranges = [text for text in PROJECT["dependencies"] if re.match(rf"({'|'.join(RANGED)})[<>=]", text)]
+    oldest, newest = _minors(ranges)
+    pip = ["pip", "install", "--quiet", "--python", str(interpreter)]
+    wanted = ["--resolution", "lowest-direct"] if which == "lowest" else [f"torchrl=={oldest}.*"]
+    failed = uv(*pip, *ranges, *wanted) or uv(*pip, *project)
+    if which == "newest" and not failed and uv(*pip, "--upgrade", *ranges, f"torchrl=={newest}.*"):
+        print(f"-- TorchRL {newest} is not released; its nightly build is tried", flush=True)
+        uv("pip", "uninstall", "--quiet", "--python", str(interpreter), "torchrl")
+        failed = (
+            uv(*pip, "--no-deps", "torchrl-nightly", f"tensordict=={newest}.*")
+            or subprocess.run([interpreter, "-c", ALIAS, newest], check=False).returncode
+        )
+    if failed:
+        raise CannotInstall("FAILED: cannot be installed")
+    shown = subprocess.run([interpreter, "-c", SHOW], capture_output=True, text=True, check=False)
+    print(f"\n-- {shown.stdout.strip() or shown.stderr}", flush=True)
+    return interpreter, shown.stdout.strip()
 
 
 def _minors(ranges: list[str]) -> tuple[str, str]:
@@ -112,6 +120,8 @@ def _minors(ranges: list[str]) -> tuple[str, str]:
 
 def uv(*arguments: str) -> int:
     """Runs uv, which also finds the Pythons of pyenv; returns its exit code."""
+    if not UV.exists():
+        sys.exit(f"there is no {UV}; `pip install uv` puts it there")
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
     folders = [os.environ["PATH"], *(str(path) for path in sorted(pyenv.glob("versions/*/bin")))]
     path = {**os.environ, "PATH": os.pathsep.join(folders)}

@@ -5,14 +5,11 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-import tomllib
 import zipfile
-from importlib import metadata
 from pathlib import Path
 
 import hatchling.build
 import pytest
-import yaml
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {
@@ -65,13 +62,6 @@ def test_the_wheel_holds_three_packages_and_no_module_called_envs_or_recipes(
         [sys.executable, "-S", "-I", "-c", check], check=True, cwd=ROOT, capture_output=True, text=True
     )
     assert done.stdout.split() == list(PACKAGES)
-
-
-def test_the_version_is_said_once() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert metadata.version("torchrl-her") == project["version"]
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
-    assert citation["version"] == project["version"]
 
 
 def test_the_readme_s_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

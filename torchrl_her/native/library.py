@@ -39,10 +39,15 @@ _EXTRAS = (
     (),
 )
 _V3 = frozenset(("abm", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"))
-# Levels of x86-64 that wheels carry libraries for, the fastest first, and what /proc/cpuinfo lists for each.
+_ARM: dict[str, frozenset[str]] = {"armv8-a": frozenset()}  # any processor of this kind
+# Levels that wheels carry libraries for, the fastest first, and what /proc/cpuinfo lists for each.
 LEVELS = {
-    "x86-64-v4": _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
-    "x86-64-v3": _V3,
+    "x86_64": {
+        "x86-64-v4": _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
+        "x86-64-v3": _V3,
+    },
+    "aarch64": _ARM,
+    "arm64": _ARM,  # its name on macOS
 }
 _SHIPPED = Path(__file__).parent  # in a wheel it has a folder for each level
 _LOGGER = logging.getLogger("torchrl_her")
@@ -110,21 +115,24 @@ def shipped_name(source: str, real: str) -> str:
     return f"{Path(source).stem}-{real}.so"
 
 
-def levels(flags: Collection[str]) -> list[str]:
-    """Returns the levels of x86-64 whose libraries a processor can run, the fastest first.
+def levels(machine: str, flags: Collection[str]) -> list[str]:
+    """Returns the levels whose libraries a processor can run, the fastest first.
 
     Args:
+        machine: kind of processor, as ``platform.machine()`` names it.
         flags: names of its instruction sets, as in ``/proc/cpuinfo``.
 
     Example:
-        >>> levels("fma avx2 bmi1 bmi2 f16c movbe abm avx512f".split())
+        >>> levels("x86_64", "fma avx2 bmi1 bmi2 f16c movbe abm avx512f".split())
         ['x86-64-v3']
+        >>> levels("arm64", [])
+        ['armv8-a']
     """
-    return [level for level, needed in LEVELS.items() if needed.issubset(flags)]
+    return [level for level, needed in LEVELS.get(machine, {}).items() if needed.issubset(flags)]
 
 
 def _load_shipped(source: str, real: str) -> ctypes.CDLL:
-    for level in levels(_processor_flags().split()):
+    for level in levels(platform.machine(), _processor_flags().split()):
         with contextlib.suppress(OSError):  # no wheel of this kind, or the system's libraries are older
             return ctypes.CDLL(str(_SHIPPED / level / shipped_name(source, real)))
     raise CannotCompile(f"no library of a wheel does the work of {source}")

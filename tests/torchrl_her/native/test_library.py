@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import platform
 import shutil
 import sys
 from pathlib import Path
@@ -42,13 +43,14 @@ def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @pytest.fixture
 def tiny(tmp_path: Path) -> Path:
-    """A source whose function gives 1, and its libraries in a wheel: 3 for x86-64-v3, damaged for v4."""
+    """A source whose function gives 1, and a wheel's libraries: 3 for x86-64-v3, 8 on ARM, damaged for v4."""
     source = tmp_path / "tiny.cpp"
-    source.write_text(TINY.replace("ANSWER", "3"), encoding="utf-8")
-    for level in library.LEVELS:
-        (tmp_path / "shipped" / level).mkdir(parents=True)
     name = shipped_name("tiny.cpp", "float")
-    compile_library(["g++"], source, tmp_path / "shipped" / "x86-64-v3" / name, real="float", extras=())
+    for level, answer in (("x86-64-v3", "3"), ("armv8-a", "8")):
+        (tmp_path / "shipped" / level).mkdir(parents=True)
+        source.write_text(TINY.replace("ANSWER", answer), encoding="utf-8")
+        compile_library(["g++"], source, tmp_path / "shipped" / level / name, real="float", extras=())
+    (tmp_path / "shipped" / "x86-64-v4").mkdir()
     (tmp_path / "shipped" / "x86-64-v4" / name).write_text("damaged", encoding="utf-8")
     source.write_text(TINY.replace("ANSWER", "1"), encoding="utf-8")
     return source
@@ -93,20 +95,24 @@ def test_a_compiler_from_pip_is_found_where_there_is_no_other(monkeypatch: pytes
 
 
 @pytest.mark.parametrize(
-    ("flags", "expected"),
+    ("machine", "flags", "expected"),
     [
-        ("sse2 avx", []),
-        (V3.replace("fma", "fma4"), []),
-        (V3, ["x86-64-v3"]),
-        (f"{V3} avx512f avx512cd avx512er avx512pf", ["x86-64-v3"]),  # a Xeon Phi
-        (V4, ["x86-64-v4", "x86-64-v3"]),
-        (f"{V4} avx512_bf16 amx_tile", ["x86-64-v4", "x86-64-v3"]),
+        ("x86_64", "sse2 avx", []),
+        ("x86_64", V3.replace("fma", "fma4"), []),
+        ("x86_64", V3, ["x86-64-v3"]),
+        ("x86_64", f"{V3} avx512f avx512cd avx512er avx512pf", ["x86-64-v3"]),  # a Xeon Phi
+        ("x86_64", V4, ["x86-64-v4", "x86-64-v3"]),
+        ("x86_64", f"{V4} avx512_bf16 amx_tile", ["x86-64-v4", "x86-64-v3"]),
+        ("x86_64", "", []),  # macOS lists nothing
+        ("aarch64", "fp asimd", ["armv8-a"]),
+        ("arm64", "", ["armv8-a"]),
+        ("riscv64", V4, []),
     ],
 )
 def test_a_processor_runs_the_levels_all_of_whose_instructions_it_has(
-    flags: str, expected: list[str]
+    machine: str, flags: str, expected: list[str]
 ) -> None:
-    assert levels(flags.split()) == expected
+    assert levels(machine, flags.split()) == expected
 
 
 @needs_compiler
@@ -127,13 +133,17 @@ def test_what_compiles_but_does_not_load_is_compiled_with_other_options(
 
 
 @needs_compiler
-@pytest.mark.parametrize("flags", [V3, V4])  # of the latter, the library is damaged
+@pytest.mark.parametrize(
+    ("machine", "flags", "answer"),
+    [("x86_64", V3, 3), ("x86_64", V4, 3), ("aarch64", "fp asimd", 8), ("arm64", "", 8)],  # v4 is damaged
+)
 def test_without_a_compiler_the_wheels_library_is_loaded(
-    monkeypatch: pytest.MonkeyPatch, tiny: Path, flags: str
+    monkeypatch: pytest.MonkeyPatch, tiny: Path, machine: str, flags: str, answer: int
 ) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setattr(platform, "machine", lambda: machine)
     monkeypatch.setattr(library, "_processor_flags", lambda: f"flags : {flags}")
-    assert load_library(str(tiny)).answer() == 3
+    assert load_library(str(tiny)).answer() == answer
 
 
 @needs_compiler
@@ -141,6 +151,7 @@ def test_a_wheels_library_is_not_loaded_on_a_processor_that_cannot_run_it(
     monkeypatch: pytest.MonkeyPatch, tiny: Path
 ) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     monkeypatch.setattr(library, "_processor_flags", lambda: "flags : sse2 avx")
     with pytest.raises(CannotCompile, match="there is no C\\+\\+ compiler no-such-compiler"):
         load_library(str(tiny))
