@@ -60,7 +60,8 @@ clean:
 $(VENV)/.ready: EXTRAS :=
 $(VENV)/.ready-test: EXTRAS := [test,lint,video]
 $(VENV)/.ready-bench: EXTRAS := [bench]
-$(VENV)/.ready-docs: EXTRAS := [docs,report]
+# The reference imports searches, too.
+$(VENV)/.ready-docs: EXTRAS := [docs,report,tune]
 $(BIN)/uv:  # installs torch in seconds
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; set PYTHON=") if sys.version_info < (3, 11) else None'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
