@@ -34,6 +34,8 @@ PAGES = {
     "../CHANGELOG.md": "changelog.md",
     "../results/README.md": "numbers.md",  # so it is called in pages of this folder
     "results/README.md": "numbers.md",  # and in RESULTS.md
+    "RESULTS.md": "results.md",  # in CHANGELOG.md
+    "recipes/one_file_cher.py": "../recipes/one_file_cher.py",  # in RESULTS.md, for downloading
     "../benchmarks/PROFILE.md": "profile.md",
 }
 # The numbers of studies: a link to such a folder is, on the site, one to the page that is made of them.
@@ -63,9 +65,11 @@ nitpick_ignore_regex = [
     ("py:class", r"torchrl_her_recipes\.tuning\.search\.SearchResult"),
     ("py:class", r"torchrl_her\.replay_buffers\.runs\.storage\.Field"),
     ("py:class", r"torchrl_her\.native\.job\.Structures"),
+    ("py:class", r"torchrl_her\.objectives\.targets\._BuffersToo"),
+    ("py:class", r"torchrl_her_envs\.common\.goal_rules\.GoalEnds"),
     ("py:class", r"torchrl_her_envs\.throwing\.arrays\.Array"),
     ("py:class", r"torchrl_her_envs\.throwing\.rendering\.render\.Scene"),
-    ("py:class", r"torchrl_her_recipes\.components\.curricula\.CurriculumState"),
+    ("py:class", r"torchrl_her_recipes\.components\.(curricula\.CurriculumState|learner\.AgentShape)"),
     ("py:class", r"torchrl_her_recipes\.reports\.tidy\.Results"),
     ("py:class", r"torchrl_her_recipes\.components\.demonstrations\.RunDemonstrations"),
     ("py:class", r"torchrl_her_recipes\.studies\.(workers_local\.Workers|study\.StudyResult|plan\.Plan)"),

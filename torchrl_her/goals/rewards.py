@@ -266,7 +266,7 @@ def missed(
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
-        achieved: goals [..., g], with the info that the function reads (:func:`outcomes`).
+        achieved: goals [..., g], with the info that the function reads (``outcomes``).
         desired_goal: [..., g], broadcast against them.
         achieved_reward: the reward of an achieved goal.
 
@@ -285,7 +285,7 @@ def ends_at_goals(reward_fn: RewardFunction, goals: Outcome) -> bool:
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
-        goals: [n, g], at least one; with the info that the function reads (:func:`outcomes`).
+        goals: [n, g], at least one; with the info that the function reads (``outcomes``).
 
     Example:
         >>> stay = EnvReward(lambda a, d: -(a - d).abs(), lambda a, d: a != a)

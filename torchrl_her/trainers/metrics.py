@@ -63,7 +63,7 @@ def success(
 def reached(
     rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
 ) -> Tensor:
-    """Returns whether the goal is achieved at some step of the episode; arguments as for :func:`success`."""
+    """Returns whether the goal is achieved at some step; arguments as for :func:`torchrl_her.success`."""
     inside = first_episode(rollout.get(("next", "done")).squeeze(-1))
     return (inside & is_achieved(rollout["next"], reward_fn, achieved_reward=achieved_reward)).any(-1)
 

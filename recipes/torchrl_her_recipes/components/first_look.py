@@ -55,7 +55,7 @@ class Facts:
         constant: entries of the observation that never changed.
         goal_inside: entries of the observation that are the desired goal.
         own_layers: whether the task has a curriculum of its own.
-        layers: of a curriculum, as :func:`propose_layers` gives them; empty if none is proposed, as where
+        layers: of a curriculum, as ``propose_layers`` gives them; empty if none is proposed, as where
             rewards depend on more than goals.
         ends: what ends an episode at its goal, and what the environment was seen to do there; None if the
             environment itself says so for all goals.

@@ -32,7 +32,7 @@ def option(
 
     Args:
         default: the value that works for most tasks; None where the task or the learner has its own, and
-            :data:`AUTO` where it follows from the environment before training begins.
+            ``AUTO`` where it follows from the environment before training begins.
         help: a few words, shown by ``torchrl-her train -h``.
         at_least, above, at_most, below: the range of a number.
         choices: the values that are allowed.

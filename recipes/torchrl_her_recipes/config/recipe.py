@@ -28,7 +28,7 @@ class Recipe:
     """Every choice of a training run, as groups of options with plain values.
 
     Options that are ``auto`` get their values from the task's environment when the run is built, see
-    :func:`~torchrl_her_recipes.config.resolve.resolve`.
+    ``torchrl_her_recipes.config.resolve``.
 
     :func:`make_recipe` makes one from the short names of options. Lengths are environment steps ("frames").
 

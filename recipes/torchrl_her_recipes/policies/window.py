@@ -49,7 +49,7 @@ def play(
             None.
         best: Whether to take the best policy of the first source, if that is a folder.
         view: ``goals``, ``seed``, ``size`` and ``named`` of
-            :class:`~torchrl_her_recipes.policies.viewer.View`.
+            ``torchrl_her_recipes.policies.viewer.View``.
 
     Returns:
         Goals that each policy achieved, and all that it had.
