@@ -20,6 +20,9 @@ from torchrl_her_recipes.config.behavior import BEHAVIOR
 from torchrl_her_recipes.config.learners import LEARNERS
 from torchrl_her_recipes.config.order import ORDER
 from torchrl_her_recipes.config.weights import WEIGHTS
+from torchrl_her_recipes.studies import workers
+
+from ..recipes.studies.here import Here
 
 PAGE = (Path(__file__).parents[2] / "docs" / "extending.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL))
@@ -75,7 +78,8 @@ def test_the_page_has_seven_examples_and_names_them_all() -> None:
 @pytest.mark.long
 @pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("section", SECTIONS)
-def test_an_example_runs(section: str, tmp_path: Path) -> None:
+def test_an_example_runs(section: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "LocalWorkers", lambda _jobs: Here())
     files, (use,) = blocks(section)
     for name, text in files.items():
         (tmp_path / name).write_text(text)
