@@ -7,7 +7,8 @@ import signal
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
-from multiprocessing import get_context
+from multiprocessing import Pipe, get_context
+from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,17 @@ def fork(target: Callable[..., Any], *args: Any) -> ForkServerProcess:
     return _started(server(), target, *args)
 
 
+def result_of(function: Callable[..., Any], *args: Any) -> Any:
+    """What a function returns in a new process."""
+    reader, writer = Pipe(duplex=False)
+    process = fork(_send_result, writer, function, args)
+    writer.close()
+    with reader:
+        result = reader.recv()
+    process.join()
+    return result
+
+
 def call_in_session(target: Callable[..., Any], *args: Any, seconds: float) -> None:
     """Calls a function in a new session, and kills all processes that are left there when it returns.
 
@@ -63,6 +75,10 @@ def _started(context: ForkServerContext, target: Callable[..., Any], *args: Any)
 
 def _nothing() -> None:
     """Runs when all is imported."""
+
+
+def _send_result(writer: Connection, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    writer.send(function(*args))
 
 
 def _lead_session(target: Callable[..., Any], args: tuple[Any, ...]) -> None:

@@ -41,6 +41,8 @@ from torchrl_her import (
 from torchrl_her.curriculum.transforms import take_columns
 from torchrl_her_envs import make_env
 
+from ...forks import server
+
 
 class TinyEnv(EnvBase):
     """Worlds of four numbers [a, b, c, d]; an action is added to a.
@@ -465,9 +467,12 @@ def test_around_a_serial_env() -> None:
 
 @pytest.fixture(scope="module")
 def parallel_env() -> Iterator[ParallelEnv]:
-    """Two workers, each with transforms inside in the first layer. Starting them takes seconds."""
+    """Two workers, each with transforms inside in the first layer."""
+    server()  # so that they need not import torch
     make = partial(make_env, "hand_v1", num_envs=2)
-    env = ParallelEnv(2, EnvCreator(lambda: TransformedEnv(make(), both(at(make_hand(), 0)))))
+    env = ParallelEnv(
+        2, EnvCreator(lambda: TransformedEnv(make(), both(at(make_hand(), 0)))), mp_start_method="forkserver"
+    )
     yield env
     env.close()
 

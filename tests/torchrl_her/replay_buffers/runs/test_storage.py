@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +17,8 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her.replay_buffers.runs import PackedStorage
 from torchrl_her.replay_buffers.runs.storage import Move, layout, unpack, write_slices
+
+from ....forks import result_of
 
 TYPES = [torch.bool, torch.uint8, torch.int16, torch.float32, torch.float64, torch.int64, torch.bfloat16]
 
@@ -223,28 +224,19 @@ def test_the_capacity_is_allocated_once(monkeypatch: pytest.MonkeyPatch) -> None
     assert made.count((1_000,)) == 1
 
 
-FILL_A_LITTLE = """
-import os
-from pathlib import Path
-import torch
-from tensordict import TensorDict
-from torchrl_her.replay_buffers.runs import PackedStorage
-
-def used():
+def used() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
 
-storage, before = PackedStorage(4_000_000), used()
-storage.set(slice(0, 1_000), TensorDict({"x": torch.ones(1_000, 12)}, [1_000]))
-print(storage.packed.nbytes, used() - before)
-"""
+
+def fill_a_little() -> tuple[int, int]:
+    storage, before = PackedStorage(4_000_000), used()
+    storage.set(slice(0, 1_000), TensorDict({"x": torch.ones(1_000, 12)}, [1_000]))
+    return storage.packed.nbytes, used() - before
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux for the memory in use")
 def test_memory_is_taken_when_rows_come() -> None:
     # in a process of its own: one that has freed as much before may get that memory again, in use
-    printed = subprocess.run(
-        [sys.executable, "-c", FILL_A_LITTLE], capture_output=True, text=True, check=True
-    )
-    reserved, taken = map(int, printed.stdout.split())
+    reserved, taken = result_of(fill_a_little)
     assert reserved > 100e6
     assert taken < 50e6
