@@ -49,6 +49,8 @@ class EpisodeLayers(CurriculumProgress):
     """
 
     by_episode = True
+    # Whether layers depend on how episodes have ended: all of them must then be played in one process.
+    adapts = False
 
     def __init__(
         self,
@@ -150,6 +152,8 @@ class TeacherStudent(EpisodeLayers):
         >>> [round(share, 2) for share in teacher.shares[0].tolist()]  # only the first one has made progress
         [0.81, 0.19]
     """
+
+    adapts = True
 
     def __init__(
         self,

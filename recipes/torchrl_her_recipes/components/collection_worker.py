@@ -17,13 +17,15 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.layers import CurriculumProgress
+from torchrl_her.curriculum.orders import EpisodeLayers
 from torchrl_her.curriculum.transforms import StateToObs
 from torchrl_her.modules.exploration import Exploration
 from torchrl_her.modules.stochastic_actor import StochasticActor
 from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her_envs.common.goal_env import goal_env
-from torchrl_her_recipes.components.curricula import in_layers, is_guided, make_curriculum
+from torchrl_her_recipes.components.curricula import in_layers, is_guided, make_progress
 from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.groups import CollectionConfig
 from torchrl_her_recipes.config.imports import import_modules, permit_task
 from torchrl_her_recipes.config.recipe import Recipe
@@ -44,13 +46,8 @@ def make_worker_env(recipe: Recipe, modules: Sequence[str] = ()) -> EnvBase:
     permit_task(recipe.task.name)
     import_modules(modules)
     env = make_task_envs(recipe, share_of_envs(recipe.collection), recipe.seeds)
-    curriculum = make_curriculum(recipe, env)
-    if curriculum is not None:
-        env = in_layers(
-            env,
-            CurriculumProgress(curriculum, runs=recipe.run.num_runs),
-            begins=is_guided(recipe.curriculum, curriculum),
-        )
+    if (progress := make_progress(recipe, env)) is not None:
+        env = in_layers(env, progress, begins=is_guided(recipe.curriculum, progress.curriculum))
     # Only ids tell there which environment a row belongs to: batches come one by one, or a node is replaced.
     if not recipe.collection.sync or recipe.collection.ray is not None:
         env = env if isinstance(env, TransformedEnv) else TransformedEnv(env)
@@ -111,9 +108,13 @@ class WorkerCollector(Collector):
         np.random.seed(first % (1 << 32))
         random.seed(first)
         for module in drawing_modules(self.policy):
-            module.generators = [torch.Generator().manual_seed(seed) for seed in beginning.seeds]
+            module.generators = _generators(beginning.seeds)
         if beginning.progress is not None:
-            _progress_of(self.env).load_state_dict(beginning.progress)
+            progress = _progress_of(self.env)
+            progress.load_state_dict(beginning.progress)
+            if isinstance(progress, EpisodeLayers):  # each process draws other ones
+                seeds = [derive_seed(seed, Stream.LAYERS) for seed in beginning.seeds]
+                progress.generators = _generators(seeds)
         self.reset()
 
 
@@ -146,6 +147,10 @@ class NodeCollector(WorkerCollector):
             return self.next()
         except Exception as error:
             return f"{type(error).__name__}: {error}"
+
+
+def _generators(seeds: Sequence[int]) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in seeds]
 
 
 def _progress_of(env: TransformedEnv) -> CurriculumProgress:

@@ -103,15 +103,13 @@ def make_curriculum_state(recipe: Recipe, env: EnvBase, seeds: Sequence[int]) ->
     """Returns the curriculum of the recipe's runs at its beginning; None if it has no curriculum.
 
     Raises:
-        ValueError: Episodes have layers, and processes collect, each of which would have to know how the
-            episodes of the others ended; or the weights cannot tell layers apart.
+        ValueError: Processes collect, each of which would have to know how the episodes of the others ended;
+            or the weights cannot tell layers apart.
     """
-    curriculum, order = make_curriculum(recipe, env), recipe.order
-    if curriculum is None:
+    progress, order = make_progress(recipe, env), recipe.order
+    if progress is None:
         return None
-    generators = generators_of(recipe.seeds, Stream.LAYERS)
-    progress = load_name(order.maker)(order, curriculum, runs=recipe.run.num_runs, generators=generators)
-    if not progress.by_episode:
+    if not isinstance(progress, EpisodeLayers):
         layer_env = in_layers(make_task_envs(recipe, evaluation_envs(recipe), seeds), progress)
         return CurriculumState(progress, layer_env)
     if not isinstance(recipe.weights, Equal):
@@ -119,12 +117,23 @@ def make_curriculum_state(recipe: Recipe, env: EnvBase, seeds: Sequence[int]) ->
             f"weights={recipe.weights.name} must not be used with order={order.name}: they would take the "
             "goals of all layers for one kind; choose order=threshold"
         )
-    if recipe.collection.processes > 0:
+    if progress.adapts and recipe.collection.processes > 0:
         raise ValueError(
-            f"order={order.name} draws layers where the environments are: it needs processes=0, "
+            f"order={order.name} draws layers by how all episodes have ended: it needs processes=0, "
             f"got processes={recipe.collection.processes}"
         )
     return CurriculumState(progress, None)
+
+
+def make_progress(recipe: Recipe, env: EnvBase) -> CurriculumProgress | None:
+    """Returns the layers of the recipe's runs at their beginning; None if it has no curriculum."""
+    if (curriculum := make_curriculum(recipe, env)) is None:
+        return None
+    generators, order = generators_of(recipe.seeds, Stream.LAYERS), recipe.order
+    progress: CurriculumProgress = load_name(order.maker)(
+        order, curriculum, runs=recipe.run.num_runs, generators=generators
+    )
+    return progress
 
 
 def make_threshold(options: Threshold, curriculum: Curriculum, *, runs: int, **_: Any) -> CurriculumProgress:

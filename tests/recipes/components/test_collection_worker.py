@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
@@ -13,18 +15,19 @@ from torchrl_her_recipes.components.collection_worker import Beginning, WorkerCo
 from ..small import small
 
 
-def collect(env_seeds: list[int], seeds: list[int]) -> TensorDictBase:
-    recipe = small(processes=2, num_runs=2)
-    policy = build(recipe).policy
+def collect(env_seeds: list[int], seeds: list[int], **options: Any) -> TensorDictBase:
+    recipe = small(processes=2, num_runs=2, **options)
+    components = build(recipe)
     collector = WorkerCollector(
         make_worker_env(recipe),
-        policy,
-        frames_per_batch=80,
+        components.policy,
+        frames_per_batch=320,
         total_frames=-1,
         auto_register_policy_transforms=False,
     )
     collector.next()
-    collector.begin(Beginning(env_seeds, seeds))
+    state = components.curriculum
+    collector.begin(Beginning(env_seeds, seeds, None if state is None else state.progress.state_dict()))
     return collector.next().clone()
 
 
@@ -49,3 +52,14 @@ def test_seeds_repeat_what_follows_and_runs_have_their_own() -> None:
     for changed, key in ((other_env, "desired_goal"), (other_draws, "action")):
         assert torch.equal(first[key][:4], changed[key][:4])
         assert not torch.equal(first[key][4:], changed[key][4:])
+
+
+def test_each_process_draws_the_layers_of_its_episodes() -> None:
+    at_once = {"task": "hand_v1", "algo": "cher", "order": "all_at_once", "num_envs": 64}
+    one, same, other = (collect([5, 6], seeds, **at_once)["layer"] for seeds in ([7, 8], [7, 8], [7, 9]))
+    assert torch.equal(one, same)
+    assert torch.equal(one[:32], other[:32])
+    assert not torch.equal(one[32:], other[32:])
+    whole = collect([5, 6], [7, 8], **at_once, every_layer=True, task_share=1.0)
+    assert (whole["layer"] == 1).all()
+    assert "state" in whole  # of which every layer is shown where transitions are stored

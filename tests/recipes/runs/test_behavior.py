@@ -273,7 +273,7 @@ def test_the_options_of_ibs_arrive_at_proposals_alone() -> None:
     assert components.buffer.writer.weights.grid.shape == (20, 20)
 
 
-@pytest.mark.parametrize("options", [{"behavior": "mega"}, {"algo": "cher", "order": "all_at_once"}])
+@pytest.mark.parametrize("options", [{"behavior": "mega"}, {"algo": "cher", "order": "teacher_student"}])
 def test_processes_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="it needs processes=0, got processes=2"):
         build(small(**{"algo": "her", "task": "hand_v1", **options, "processes": 2}))
