@@ -15,7 +15,8 @@ from torchrl_her_recipes.config.without_effect import without_effect
 TERMINATION = "termination"  # option of a task: the rule that ends an episode at its goal
 _WARMUP = 1_000  # environment steps, at least
 _EPISODES = 100  # in an epoch, where environments are stepped one by one
-_LAYER_EPOCHS = 10  # epochs after which a layer that was not asked for ends, learned or not
+_AT_ONCE = {"order": "all_at_once", "every_layer": True, "task_share": 1.0}  # of a curriculum that was found
+_LAYER_EPOCHS = 10  # after which the first one ends, learned or not, where goals are weighted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,8 +105,8 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
     for group, name in auto_options(recipe):
         values = {f"{group}.{name}": _VALUES[name](recipe, facts)}
         if name == "algo" and facts.layers:
-            values |= {"layers": facts.layers, "layer_epochs": _LAYER_EPOCHS}
-            values |= {"guided_share": 0.5, "guided_per": "step"}
-            values |= {"layer_epsilon": 0.5} if recipe.learner.has_epsilon else {}
+            values |= {"layers": facts.layers, "guided_share": 0.5, "guided_per": "step"}
+            # Weights of goals know one layer at a time.
+            values |= _AT_ONCE if recipe.weights.name == "none" else {"layer_epochs": _LAYER_EPOCHS}
         recipe = recipe.replace(**values)
     return recipe

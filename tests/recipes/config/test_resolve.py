@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from torchrl_her_recipes import build, load_preset, make_recipe, run
-from torchrl_her_recipes.config.order import Threshold
+from torchrl_her_recipes.config.order import AllAtOnce, Threshold
 from torchrl_her_recipes.config.resolve import EnvFacts, auto_options, resolve
 from torchrl_her_recipes.config.shipped import preset_names
 
@@ -37,9 +37,9 @@ def test_a_curriculum_comes_with_its_options() -> None:
     recipe = resolve(make_recipe(), EnvFacts(max_steps=50, layers=layers))
     assert (recipe.hindsight.algo, recipe.curriculum.layers) == ("cher", layers)
     assert (recipe.curriculum.guided_share, recipe.curriculum.guided_per) == (0.5, "step")
-    assert recipe.order == Threshold(layer_epochs=10, layer_epsilon=0.5)
-    without_epsilon = resolve(make_recipe(learner="sac"), EnvFacts(max_steps=50, layers=layers))
-    assert without_epsilon.order == Threshold(layer_epochs=10)
+    assert recipe.order == AllAtOnce(every_layer=True, task_share=1.0)
+    weighted = resolve(make_recipe(weights="rare"), EnvFacts(max_steps=50, layers=layers))
+    assert weighted.order == Threshold(layer_epochs=10)
     assert resolve(make_recipe(), EnvFacts(max_steps=50)).hindsight.algo == "filtered_her"
     assert make_recipe(curriculum=layers).hindsight.algo == "cher"
 

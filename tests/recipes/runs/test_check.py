@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl_her_recipes import Facts, advice, build, look_at, make_recipe
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.first_look import resolved
+from torchrl_her_recipes.config.order import AllAtOnce
 
 GOALS = ("observation", "achieved_goal", "desired_goal")
 HERE = "tests.recipes.runs.test_check"
@@ -116,7 +117,7 @@ def test_a_block_that_lies_still_gets_a_curriculum() -> None:
     assert components.curriculum is not None
     assert components.recipe.hindsight.algo == "cher"
     assert components.recipe.curriculum.layers == look_at(recipe.replace(seed=0)).layers
-    assert components.recipe.changed()["order"] == {"layer_epochs": 10, "layer_epsilon": 0.5}
+    assert components.recipe.order == AllAtOnce(every_layer=True, task_share=1.0)
     assert resolved(components.recipe) == components.recipe
     components.close()
 
