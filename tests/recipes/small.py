@@ -15,7 +15,7 @@ from torchrl_her_recipes.runs.interrupt import Interrupted
 
 SMALL: dict[str, Any] = {
     "epochs": 2,
-    "epoch_frames": 1_600,
+    "epoch_frames": 800,
     "num_envs": 8,
     "frames_per_update": 20,
     "hidden": 64,

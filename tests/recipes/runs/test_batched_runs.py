@@ -43,7 +43,7 @@ def runs(request: pytest.FixtureRequest) -> tuple[Components, list[Components]]:
     options: dict[str, Any] = {
         "algo": request.param,
         "dtype": "float64",
-        "frames_per_update": 16.0,
+        "frames_per_update": 8.0,
         "seed": 5,
     }
     return (

@@ -151,13 +151,13 @@ def test_ctrl_c_at_any_batch_changes_nothing(options: dict[str, Any], tmp_path: 
 
 
 def test_ctrl_c_saves_what_there_is(tmp_path: Path) -> None:
-    components = press_ctrl_c(build(small(epochs=3, pictures=True)), 50)  # in the middle of the third epoch
+    components = press_ctrl_c(build(small(epochs=3, pictures=True)), 25)  # in the middle of the third epoch
     result = run(components, tmp_path / "run", progress=False)
     assert result.interrupted
-    assert [row["frames"] for row in result.rows] == [1_600, 3_200]
+    assert [row["frames"] for row in result.rows] == [800, 1_600]
     saved = load_checkpoint(tmp_path / "run" / "checkpoint.pt")
-    assert saved["trainer"]["frames"] == 51 * 80
-    assert saved["trainer"]["measured"]["loss_value"].shape == (44, 1)
+    assert saved["trainer"]["frames"] == 26 * 80
+    assert saved["trainer"]["measured"]["loss_value"].shape == (24, 1)
     assert (tmp_path / "run" / "curves.png").exists()
 
 
@@ -166,12 +166,12 @@ def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
 ) -> None:
     monkeypatch.setattr(run_state, "_worlds", lambda _env, _processes: None)
     recipe = small(epochs=2)
-    run(press_ctrl_c(build(recipe), 25), tmp_path / "run", progress=False)
+    run(press_ctrl_c(build(recipe), 12), tmp_path / "run", progress=False)
     held = load_checkpoint(tmp_path / "run" / "checkpoint.pt")["buffer"]["writer"]["held"]
     components = build(recipe)
     result = resume(tmp_path / "run", components=components, progress=False)
-    assert [row["frames"] for row in result.rows] == [1_600, 3_200]
-    assert result.rows[-1]["rows_real"] + components.buffer.writer.held_back == 3_200
+    assert [row["frames"] for row in result.rows] == [800, 1_600]
+    assert result.rows[-1]["rows_real"] + components.buffer.writer.held_back == 1_600
     assert held["collector"]["traj_ids"].max() < components.collector._carrier["collector", "traj_ids"].min()
 
 

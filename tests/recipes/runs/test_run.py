@@ -36,8 +36,8 @@ def test_configuration_versions_and_seed(finished: Path) -> None:
 
 def test_pandas_reads_the_metrics_at_once(finished: Path) -> None:
     table = pd.read_csv(finished / "metrics.csv")
-    assert table["frames"].tolist() == [1_600, 3_200]
-    assert table["updates"].tolist() == [80, 160]
+    assert table["frames"].tolist() == [800, 1_600]
+    assert table["updates"].tolist() == [40, 80]
     assert table["epsilon"].tolist() == pytest.approx([0.9, 0.81])
     assert {"success", "distance", "return", "q", "q_bias", "loss_actor", "loss_value"} <= set(table.columns)
     assert (table["rows_virtual"] > 0).all()
@@ -47,7 +47,7 @@ def test_pandas_reads_the_metrics_at_once(finished: Path) -> None:
 def test_tensorboard_reads_the_events(finished: Path) -> None:
     events = EventAccumulator(str(finished / "tensorboard"))
     events.Reload()
-    assert [event.step for event in events.Scalars("success/run_0")] == [1_600, 3_200]
+    assert [event.step for event in events.Scalars("success/run_0")] == [800, 1_600]
 
 
 def test_pictures_open(finished: Path) -> None:

@@ -145,7 +145,7 @@ def _stop_after(*, frames: int, told: str) -> Iterator[list[Callback]]:
 
 def test_what_surrounds_a_run_travels_with_its_job_and_gives_it_callbacks(job: Job) -> None:
     told = job.folder.with_name("told")
-    own = replace(job, around=f"{__name__}:_stop_after", options={"frames": 1_600, "told": str(told)})
+    own = replace(job, around=f"{__name__}:_stop_after", options={"frames": 800, "told": str(told)})
     assert Job.from_plain(own.to_plain()) == own
     assert run_job(own) == Outcome()
     assert read_progress(job.folder).epochs == 1  # of two

@@ -14,7 +14,8 @@ from ..small import small
 
 
 def jobs(folder: Path) -> list[Job]:
-    recipes = {"short": small(epochs=10), "long": small(epochs=10, num_runs=4)}
+    short = small(epochs=10, epoch_frames=1_600)
+    recipes = {"short": short, "long": short.replace(num_runs=4)}
     return [Job(label=label, recipe=recipe, folder=folder / label) for label, recipe in recipes.items()]
 
 

@@ -87,8 +87,8 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     command = ["study", str(path), f"folder={folder}", "--jobs", "1"]
     assert main([*command, "--plan"]) == 0
     said = capsys.readouterr().out
-    assert "2 batched runs to go, 6,400 environment steps in all" in said
-    assert "her/seeds_0           to do                      3,200 steps to go\n" in said
+    assert "2 batched runs to go, 3,200 environment steps in all" in said
+    assert "her/seeds_0           to do                      1,600 steps to go\n" in said
     assert not folder.exists()
 
     folder.mkdir()
@@ -103,7 +103,7 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     monkeypatch.setattr(torchrl_her_recipes, "make_workers", lambda **_options: Here())
     assert main(command) == 0
     said = capsys.readouterr().out
-    assert "1 batched runs to go, 3,200 environment steps in all" in said
+    assert "1 batched runs to go, 1,600 environment steps in all" in said
     assert re.search(r"^her: success \d+%$", said, re.MULTILINE)
     with Image.open(folder / "mine.png") as picture:
         assert min(picture.size) > 200
@@ -123,7 +123,7 @@ def test_a_whole_study_ends_without_a_word(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     said = [line for line in re.split(r"[\r\n]+", done.stderr) if line.strip()]
-    assert [line for line in said if not re.fullmatch(r" *\d+%\|.*/3\.20k steps \[.*\]", line)] == []
+    assert [line for line in said if not re.fullmatch(r" *\d+%\|.*/1\.60k steps \[.*\]", line)] == []
 
 
 def test_mappings_are_called_by_the_entries_that_differ() -> None:
