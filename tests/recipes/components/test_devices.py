@@ -30,7 +30,7 @@ CURRICULUM = {
     "window": 4,
     "success_threshold": 0.01,
 }
-SHORT = {"epoch_frames": 640, "warmup_frames": 160}
+SHORT = {"epoch_frames": 320, "warmup_frames": 80}
 
 
 @pytest.fixture
