@@ -37,7 +37,6 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "floor": str(HERE / "studies" / "floor.yaml"),
     "thesis_v1": str(HERE / "studies" / "thesis_v1.yaml"),
     "curriculum": "curriculum",
-    "curriculum_before": "curriculum",
     "climb": str(HERE / "studies" / "climb.yaml"),
     "cher": str(HERE / "studies" / "cher.yaml"),
     "draws": str(HERE / "studies" / "draws.yaml"),
@@ -73,7 +72,6 @@ THESIS = {  # metrics of the thesis's figures beside success
     "bias_before": ("q_bias",),
     "filter_bias": ("distance", "q"),
     "curriculum": ("distance", *POSITIVE),
-    "curriculum_before": ("distance", *POSITIVE),
 }
 
 Rows = list[dict[str, float]]

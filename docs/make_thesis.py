@@ -9,7 +9,6 @@ differences, with 95 % by stratified bootstrap.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -42,10 +41,8 @@ Finding = tuple[str, str]  # numbers of this project, verdict
 
 @cache
 def results(study: str) -> Results:
-    """Stored results of a study, without tasks that it has not finished."""
-    stored = read_results(RESULTS / study)
-    unfinished = {one.task for one in stored.cells if not one.done}
-    return replace(stored, cells=[one for one in stored.cells if one.task not in unfinished])
+    """Stored results of a study."""
+    return read_results(RESULTS / study)
 
 
 @cache
