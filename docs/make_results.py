@@ -170,14 +170,13 @@ def draw_study(cells: Sequence[Combination], metrics: Sequence[str], path: Path)
 
 
 def draw_staying(path: Path) -> None:
-    """Draws success at the last step on FetchPush, of the default agent and of the preset."""
-    shown = {"default agent": "default agent", "preset fetch_push": "preset=fetch_push"}
-    curves: dict[str, Rows] = {label: [] for label in shown.values()}
+    """Draws success at the last step on FetchPush, of the default agent as it is and as it was."""
+    curves: dict[str, Rows] = {"default agent": [], "default agent, one stage after the other": []}
     with open(RESULTS / "staying" / "runs.csv") as file:
         for row in csv.DictReader(file):
-            if row["case"] in shown:
+            if row["case"] in curves:
                 own = {name: float(row[name]) for name in ("seed", "epoch", "frames", "success")}
-                curves[shown[row["case"]]].append({"run": own["seed"], **own})
+                curves[row["case"]].append({"run": own["seed"], **own})
     plot_comparison({"FetchPush, at the last step": curves}, path)
 
 

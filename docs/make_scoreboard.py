@@ -75,12 +75,12 @@ def boards() -> dict[str, list[Curves]]:
     return {
         "FetchPush": [
             ours("default agent", "default agent"),
-            ours("preset fetch_push", "`preset=fetch_push`"),
+            ours("default agent, one stage after the other", "the same, one stage after the other"),
             theirs("RHER", "FetchPush", "Relay-HER"),
             theirs("DDPG+HER", "FetchPush", "DDPG and HER, by Relay-HER's authors"),
         ],
         "FetchPickAndPlace": [
-            ours("default agent on FetchPickAndPlace", "default agent, seeds 0 to 2"),
+            ours("default agent on FetchPickAndPlace", "one stage after the other, seeds 0 to 2"),
             theirs("RHER", "FetchPickAndPlace", "Relay-HER"),
             theirs("DDPG+HER", "FetchPickAndPlace", "DDPG and HER, by Relay-HER's authors"),
         ],
