@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
@@ -65,9 +64,3 @@ class Kind(dict[str, type[C]]):
     def summaries(self) -> dict[str, str]:
         """Returns the first line of each choice's docstring."""
         return {name: str(choice.__doc__).split("\n")[0].rstrip(".") for name, choice in self.items()}
-
-    def stored(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns values of a file without options of other choices that are at their defaults."""
-        choice = self.find(values["name"])
-        defaults = {option: [getattr(other, option, self) for other in self.values()] for option in values}
-        return {k: v for k, v in values.items() if hasattr(choice, k) or v not in defaults[k]}

@@ -15,7 +15,7 @@ from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, LearnerConfig
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.order import ORDER, Order
-from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, Nested, chosen, over, place, renewed
+from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, Nested, chosen, over, place
 from torchrl_her_recipes.config.weights import WEIGHTS, Weights
 from torchrl_her_recipes.config.without_effect import without_effect
 
@@ -145,13 +145,7 @@ class Recipe:
         Raises:
             ValueError: a group or an option that does not exist, or a value that cannot work.
         """
-        placed, former = renewed(values)
-        for group, kind in KINDS.items():
-            name = chosen(group, placed, former)
-            known = {own.name for own in fields(kind.find(name))}
-            kept = {key: value for key, value in former.get(group, {}).items() if key in known}
-            placed[group] = kind.stored({**kept, **placed.get(group, {}), "name": name})
-        return Recipe(**_groups(placed))
+        return Recipe(**_groups(place(values)))
 
 
 def check_extending(values: Mapping[str, Any]) -> None:

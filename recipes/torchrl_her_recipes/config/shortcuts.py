@@ -82,15 +82,6 @@ def renamed(name: str) -> list[str]:
     return [home if own == home else f"{home}.{own}" for home in homes if own in (home, *names[home])]
 
 
-def renewed(values: Mapping[str, Any]) -> tuple[Nested, Nested]:
-    """Sorts values of a file into groups; returns those with former names separately."""
-    groups = [name for name in FORMER if isinstance(values.get(name), Mapping)]
-    every = {name: value for name, value in values.items() if name not in groups}
-    every |= {f"{group}.{own}": value for group in groups for own, value in values[group].items()}
-    former = {now: value for name, value in every.items() for now in renamed(name)}
-    return place({name: value for name, value in every.items() if not renamed(name)}), place(former)
-
-
 def locate(name: str, *values: Nested) -> tuple[str, str]:
     """Finds the group and the name of an option.
 

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import pytest
 
-from torchrl_her_recipes import BEHAVIOR, Proposed, Recipe, build, load_policy, make_recipe, option
+from torchrl_her_recipes import BEHAVIOR, Proposed, Recipe, build, make_recipe, option
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config.behavior import Behavior, Mega, Real
 from torchrl_her_recipes.config.choices import Kind
-from torchrl_her_recipes.config.shipped import policy_path
 from torchrl_her_recipes.config.shortcuts import KINDS
 
 from ..small import small
@@ -33,14 +32,6 @@ def test_another_choice_takes_those_options_of_a_base_that_it_has() -> None:
     base = {"behavior": {**MEGA, "real_share": 0.25}}
     assert make_recipe(base, behavior="ibs").changed() == {"behavior": {"name": "ibs", "real_share": 0.25}}
     assert make_recipe(base, behavior="real") == Recipe()
-
-
-def test_files_may_have_defaults_of_other_choices() -> None:
-    stored = {"name": "real", "real_share": 0.5, "candidates": 100, "goal_memory": 50_000, "cutoff": -3.0}
-    assert Recipe.from_dict({"behavior": stored}) == Recipe()
-    assert load_policy(policy_path("hand_v1")).recipe.behavior == Real()
-    with pytest.raises(ValueError, match="behavior=real has no option cutoff; behavior=mega has it"):
-        Recipe.from_dict({"behavior": {**stored, "cutoff": -4.0}})
 
 
 def test_a_name_is_taken_once() -> None:

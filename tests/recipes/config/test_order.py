@@ -10,20 +10,11 @@ import torch
 
 from torchrl_her import CurriculumProgress
 from torchrl_her.curriculum import TeacherStudent
-from torchrl_her_recipes import ORDER, Order, Recipe, build, load_policy, make_recipe, option
+from torchrl_her_recipes import ORDER, Order, Recipe, build, make_recipe, option
 from torchrl_her_recipes.config.order import AllAtOnce, Teacher, Threshold
-from torchrl_her_recipes.config.shipped import policy_path
 from torchrl_her_recipes.runs.curriculum import move_on
 
 from ..small import small
-
-BEFORE = {
-    "order": "threshold",
-    "window": 20,
-    "success_threshold": 0.9,
-    "layer_epochs": 0,
-    "layer_epsilon": 1.0,
-}
 
 
 def test_short_names_choose_an_order_and_its_options() -> None:
@@ -55,23 +46,6 @@ def test_short_names_choose_an_order_and_its_options() -> None:
 def test_what_cannot_be_is_refused_by_name(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_recipe(**{"algo": "cher", **options})
-
-
-def test_files_may_have_the_options_where_they_were_before() -> None:
-    for changes, order in (
-        ({}, Threshold()),
-        ({"window": 5, "layer_epochs": 10}, Threshold(window=5, layer_epochs=10)),
-        ({"order": "all_at_once"}, AllAtOnce()),
-        ({"order": "teacher_student"}, Teacher()),
-    ):
-        curriculum = {"guided_share": 0.5, **BEFORE, **changes}
-        recipe = Recipe.from_dict({"hindsight": {"algo": "cher"}, "curriculum": curriculum})
-        assert recipe.order == order
-        assert recipe.changed()["curriculum"] == {"guided_share": 0.5}
-    assert Recipe.from_dict({"curriculum": BEFORE}) == Recipe()
-    assert load_policy(policy_path("hand_v1")).recipe.order == Threshold()
-    with pytest.raises(ValueError, match=r"no option 'curriculum.widow'"):
-        Recipe.from_dict({"curriculum": {**BEFORE, "widow": 5}})
 
 
 def test_the_options_of_a_teacher_arrive() -> None:

@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 
-from torchrl_her_recipes import ALGORITHMS, Algorithm, Recipe, load_policy, make_recipe
+from torchrl_her_recipes import ALGORITHMS, Algorithm, Recipe, make_recipe
 from torchrl_her_recipes.config.groups import HindsightConfig
-from torchrl_her_recipes.config.shipped import policy_path
 from torchrl_her_recipes.config.weights import IBS, RND, Equal, Rare, SequentialIBS
 
 
@@ -79,17 +78,6 @@ def test_options_of_other_weights_are_dropped_from_a_base() -> None:
     assert make_recipe(base, algo="her_ibs").weights == IBS(floor_is_relative=False, cells=8)
     assert make_recipe(base, algo="her").weights == Equal(cells=8)
     assert make_recipe(base, weights="rnd").weights == RND(sharpness=2.0)
-
-
-def test_files_may_have_the_groups_that_weights_had_before() -> None:
-    ibs = {"sigma": 0.3, "cells": 8, "floor": 0.002, "estimator": "auto"}
-    stored = {"ibs": ibs, "novelty": {"sharpness": None, "memory": 50}}
-    for algo, weights in (("her", Equal(cells=8)), ("her_ibs", IBS(sigma=0.3, cells=8))):
-        recipe = Recipe.from_dict({**stored, "hindsight": {"algo": algo}, "behavior": {"name": "ibs"}})
-        assert recipe.weights == weights
-        assert recipe.changed()["behavior"] == {"name": "ibs", "sigma": 0.3, "cells": 8}
-    assert Recipe.from_dict({**stored, "hindsight": {"algo": "cher_rare"}}).weights == Rare(memory=50)
-    assert load_policy(policy_path("hand_v1")).recipe.weights == IBS()
 
 
 def test_an_algorithm_of_ones_own_names_its_weights(monkeypatch: pytest.MonkeyPatch) -> None:
