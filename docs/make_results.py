@@ -12,7 +12,6 @@ pages of the studies are made by ``make docs``.
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -169,17 +168,6 @@ def draw_study(cells: Sequence[Combination], metrics: Sequence[str], path: Path)
     plot_comparison(panels, path, metrics=metrics)
 
 
-def draw_staying(path: Path) -> None:
-    """Draws success at the last step on FetchPush, of the default agent as it is and as it was."""
-    curves: dict[str, Rows] = {"default agent": [], "default agent, one stage after the other": []}
-    with open(RESULTS / "staying" / "runs.csv") as file:
-        for row in csv.DictReader(file):
-            if row["case"] in curves:
-                own = {name: float(row[name]) for name in ("seed", "epoch", "frames", "success")}
-                curves[row["case"]].append({"run": own["seed"], **own})
-    plot_comparison({"FetchPush, at the last step": curves}, path)
-
-
 def draw_the_ends(cells: Sequence[Combination], measure: str, label: str, path: Path) -> None:
     """A line for each combination: median and 33rd to 67th percentile of its runs at the end."""
     ends = [at_the_end(cell.rows, measure, evaluations=1) for cell in cells]
@@ -247,7 +235,6 @@ def main() -> None:
     options = parser.parse_args()
     if options.runs is not None:
         export(options.runs)
-    draw_staying(options.images / "staying.png")
     for name in STUDIES:
         if is_results(RESULTS / name):
             every = read_results(RESULTS / name).cells

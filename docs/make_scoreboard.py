@@ -1,6 +1,8 @@
 """Makes the tables and the figure of docs/scoreboard.md from the numbers in results/ and scoreboard.yaml.
 
 python docs/make_scoreboard.py    # replaces the tables; the rest of the page stays as it is
+
+It also draws the figure of FetchPush by the default agent, evaluation by evaluation.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ import yaml
 from torchrl_her_recipes.runs.plots import plot_comparison
 
 HERE = Path(__file__).parent
-PAGE, RESULTS, FIGURE = HERE / "scoreboard.md", HERE.parent / "results", HERE / "images" / "scoreboard.png"
+PAGE, RESULTS = HERE / "scoreboard.md", HERE.parent / "results"
+FIGURE, STAYING = HERE / "images" / "scoreboard.png", HERE / "images" / "staying.png"
 BEGIN, END = "<!-- The {}: python docs/make_scoreboard.py -->\n\n", "\n<!-- End of the {}. -->\n"
 LEVELS = (0.9, 0.95)
 
@@ -146,3 +149,8 @@ if __name__ == "__main__":
         },
         FIGURE,
     )
+    cases = [
+        read_curves("staying", {"case": case}, case, window=1, episodes=100)
+        for case in ("default agent", "default agent, one stage after the other")
+    ]
+    plot_comparison({"FetchPush, at the last step": {own.method: own.rows for own in cases}}, STAYING)
