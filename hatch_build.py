@@ -51,9 +51,8 @@ class CompiledSteps(BuildHookInterface):
             made.mkdir(parents=True, exist_ok=True)
             for source, real in SOURCES:
                 path = made / library.shipped_name(source, real)
-                extras = options(system, level)
                 library.compile_library(
-                    library.find_compiler(), folder / source, path, real=real, extras=extras
+                    library.find_compiler(), folder / source, path, real=real, extras=options(system, level)
                 )
                 build_data["force_include"][str(path)] = f"{NATIVE}/{level}/{path.name}"
                 libraries.append(path.read_bytes())

@@ -56,11 +56,6 @@ def cell(study: str, task: str, algorithm: str) -> Combination:
     return next(one for one in results(study).cells if (one.task, one.algorithm) == (task, algorithm))
 
 
-def of_study(study: str, tasks: Sequence[str]) -> list[str]:
-    """Those tasks that a study has finished runs of."""
-    return [task for task in tasks if any(one.task == task for one in results(study).cells)]
-
-
 def gap(first: Sequence[float], second: Sequence[float]) -> Interval:
     """Interquartile mean of the first runs minus that of the second."""
     return bootstrap([first, second], [[0], [1]], [(0, 1)])[1][0]
@@ -102,8 +97,6 @@ def orders(study: str, *, measure: str, expected: Sequence[str]) -> Finding:
     rows, lines = judged(study, measure, expected), []
     for text in expected:
         found = [row for row in rows if row.order == text]
-        if not found:  # an algorithm that the study does not have
-            continue
         shown = [_bold(show_gap(row), row.verdict is not Verdict.UNDECIDED) for row in found]
         tasks = [f"{_name(row.task)} {number}" for row, number in zip(found, shown, strict=True)]
         lines.append(f"`{text}`: {', '.join(tasks)}")
@@ -123,7 +116,7 @@ def levels(
     """What each algorithm reached, beside the thesis's numbers; orders or bounds give the verdict."""
     found = {(row.task, row.algorithm): row for row in compared(study, measure)[0]}
     lines, ends = [], []
-    for task in of_study(study, tasks):
+    for task in tasks:
         rows = [found[task, name] for name in algorithms]
         ends += [(least <= row.low and row.high <= most, row.high < least or row.low > most) for row in rows]
         shown = [f"`{row.algorithm}` {show_interval(row, measure)}{_published(row)}" for row in rows]
@@ -150,7 +143,7 @@ def _points(one: Interval) -> str:
 
 def over_training(study: str, *, tasks: Sequence[str], first: str, second: str) -> Finding:
     """Mean success of all evaluations, one algorithm minus another."""
-    gaps, tasks = [], of_study(study, tasks)
+    gaps = []
     for task in tasks:
         rows = [cell(study, task, name).rows for name in (first, second)]
         gaps.append(gap(*(at_the_end(one, "success", evaluations=len(one)) for one in rows)))
@@ -163,7 +156,7 @@ def over_training(study: str, *, tasks: Sequence[str], first: str, second: str) 
 def widths(study: str, *, tasks: Sequence[str], wide: str, narrow: str) -> Finding:
     """Points of success from the 33rd to the 67th percentile of runs, of two algorithms."""
     draw, lines, ends = np.random.default_rng(0), [], []
-    for task in of_study(study, tasks):
+    for task in tasks:
         runs = [np.array(values_of(cell(study, task, name), "success")) for name in (wide, narrow)]
         before, after = (_width(drawn) for drawn in runs)
         drawn = [_width(draw.choice(one, (REPETITIONS, len(one)))) for one in runs]

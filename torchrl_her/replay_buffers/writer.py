@@ -201,9 +201,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             raise ValueError(f"refill={refill} is for per='transition': the filter looks at each of them")
         self._weights = own  # weights of several runs
         self.runs = runs
-        self._own_rewards: dict[
-            int, RewardFunction
-        ] = {}  # reward functions of runs that do not use ``reward_fn``
+        # reward functions of runs that do not use ``reward_fn``
+        self._own_rewards: dict[int, RewardFunction] = {}
         self._counts, self._rings = RunCounts(runs), Rings(runs)
         self._held = Batch.none(runs)  # transitions of open episodes
         self._recent = self._no_goals(runs)

@@ -24,6 +24,7 @@ from torchrl_her.modules.stochastic_actor import StochasticActor
 from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import in_layers, is_guided, make_progress
+from torchrl_her_recipes.components.devices import CPU, make_generators
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.groups import CollectionConfig
@@ -108,13 +109,13 @@ class WorkerCollector(Collector):
         np.random.seed(first % (1 << 32))
         random.seed(first)
         for module in drawing_modules(self.policy):
-            module.generators = _generators(beginning.seeds)
+            module.generators = make_generators(beginning.seeds, CPU)
         if beginning.progress is not None:
             progress = _progress_of(self.env)
             progress.load_state_dict(beginning.progress)
             if isinstance(progress, EpisodeLayers):  # each process draws other ones
                 seeds = [derive_seed(seed, Stream.LAYERS) for seed in beginning.seeds]
-                progress.generators = _generators(seeds)
+                progress.generators = make_generators(seeds, CPU)
         self.reset()
 
 
@@ -147,10 +148,6 @@ class NodeCollector(WorkerCollector):
             return self.next()
         except Exception as error:
             return f"{type(error).__name__}: {error}"
-
-
-def _generators(seeds: Sequence[int]) -> list[torch.Generator]:
-    return [torch.Generator().manual_seed(seed) for seed in seeds]
 
 
 def _progress_of(env: TransformedEnv) -> CurriculumProgress:

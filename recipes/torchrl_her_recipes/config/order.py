@@ -17,7 +17,8 @@ class Order(Choice):
     The maker takes the options and the :class:`~torchrl_her.Curriculum`, and by keyword ``runs`` and
     ``generators`` (of random numbers, one for each run). It returns the
     :class:`~torchrl_her.CurriculumProgress` of the runs, or :class:`~torchrl_her.curriculum.EpisodeLayers` if
-    each episode has a layer of its own. A run that begins a layer explores with the epsilon of the option
+    each episode has a layer of its own; with a true option ``every_layer``, transitions are then stored for
+    every layer. A run that begins a layer explores with the epsilon of the option
     ``layer_epsilon``, or with 1 if the order has no such option.
     """
 

@@ -15,8 +15,8 @@ from torchrl_her_recipes.config.without_effect import without_effect
 TERMINATION = "termination"  # option of a task: the rule that ends an episode at its goal
 _WARMUP = 1_000  # environment steps, at least
 _EPISODES = 100  # in an epoch, where environments are stepped one by one
-_AT_ONCE = {"order": "all_at_once", "every_layer": True, "task_share": 1.0}  # of a curriculum that was found
-_LAYER_EPOCHS = 10  # after which the first one ends, learned or not, where goals are weighted
+_AT_ONCE = {"order": "all_at_once", "every_layer": True, "task_share": 1.0}  # order of a found curriculum
+_LAYER_EPOCHS = 10  # epochs after which its first layer ends, learned or not, where goals are weighted
 
 
 @dataclass(frozen=True, kw_only=True)

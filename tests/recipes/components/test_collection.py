@@ -248,6 +248,7 @@ def test_a_script_that_its_processes_would_run_again_is_refused(tmp_path: Path) 
         "from torchrl_her_recipes import build, make_recipe, run\n"
         f"run(build(make_recipe(task='hand_v0', {sizes})), progress=False)\n"
     )
-    message = f"processes=2 starts processes that import {script}: put what trains there under `if __name__"
-    with pytest.raises(RuntimeError, match=re.escape(message)):
+    advice = "put what trains there under `if __name__ == '__main__':`"
+    message = f"processes=2 starts processes that import {script}: {advice}"
+    with pytest.raises(RuntimeError, match=f"^{re.escape(message)}$"):
         runpy.run_path(str(script), run_name="__main__")
