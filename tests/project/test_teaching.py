@@ -15,11 +15,10 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from torchrl_her_envs.throwing.tasks import TASKS
 from torchrl_her_recipes import make_recipe
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.policy_header import read_header
-from torchrl_her_recipes.config.shipped import policy_names, policy_path
+from torchrl_her_recipes.config.shipped import policy_files
 
 DOCS = Path(__file__).parents[2] / "docs"
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
@@ -45,9 +44,9 @@ def test_the_page_on_the_command_line_is_what_the_program_says() -> None:
 def test_the_gallery_shows_every_task_with_what_its_policy_achieves() -> None:
     text = (DOCS / "gallery.md").read_text()
     shown = re.findall(r"!\[(\w+)\]\(images/gallery/(\w+)\.gif\)", text)
-    assert sorted(shown) == sorted((name, name) for name in TASKS)
-    for name in policy_names():
-        facts = read_header(policy_path(name))["info"]
+    assert sorted(shown) == [(name, name) for name in policy_files()]
+    for name, path in policy_files().items():
+        facts = read_header(path)["info"]
         cells = next(row for row in re.findall(r"(\| !\[.*\n\|.*\n)", text) if f"[{name}]" in row)
         pictures, achieved = (line.strip("| ").split(" | ") for line in cells.splitlines())
         mine = achieved[next(index for index, one in enumerate(pictures) if f"[{name}]" in one)]
@@ -58,7 +57,7 @@ def test_the_gallery_shows_every_task_with_what_its_policy_achieves() -> None:
 
 def test_the_films_are_small_and_move() -> None:
     films = sorted((DOCS / "images" / "gallery").glob("*.gif"))
-    assert [film.stem for film in films] == sorted(TASKS)
+    assert [film.stem for film in films] == list(policy_files())
     assert all(film.stat().st_size < 250_000 for film in films)
     for film in films:
         with Image.open(film) as image:

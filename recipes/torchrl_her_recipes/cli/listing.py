@@ -7,7 +7,7 @@ import click
 from torchrl_her_envs.registry import GYM, get_task_spec, task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.policy_header import read_header
-from torchrl_her_recipes.config.shipped import policy_names, policy_path, preset_names, preset_summary
+from torchrl_her_recipes.config.shipped import policy_files, preset_names, preset_summary
 from torchrl_her_recipes.config.shortcuts import KINDS
 from torchrl_her_recipes.config.spaces import space_names, space_summary
 from torchrl_her_recipes.config.study import load_study, study_names
@@ -24,8 +24,9 @@ def listing() -> int:
         **{f"choices of {group}": kind.summaries() for group, kind in KINDS.items()},
         "studies": {name: load_study(name).summary for name in study_names()},
         "trained policies": {
-            name: f"{read_header(policy_path(name))['info']['success']:.0%} success"
-            for name in policy_names()
+            name: f"{info['success']:.0%} success on {info['task']}"
+            for name, path in policy_files().items()
+            if (info := read_header(path)["info"])
         },
         "spaces": {name: space_summary(name) for name in space_names()},
         "presets": {name: preset_summary(name) for name in preset_names()},

@@ -11,7 +11,7 @@ from click.shell_completion import CompletionItem
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `play`
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.options import what_there_is
-from torchrl_her_recipes.config.shipped import policy_names
+from torchrl_her_recipes.config.shipped import policy_files, policy_path
 
 _SUFFIXES = (".gif", ".mp4")
 _RUN = click.Path(path_type=Path)
@@ -21,7 +21,7 @@ _best = click.option(
 
 
 def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    names = [CompletionItem(name) for name in policy_names() if name.startswith(incomplete)]
+    names = [CompletionItem(name) for name in policy_files() if name.startswith(incomplete)]
     return [*names, CompletionItem(incomplete, type="file")]
 
 
@@ -82,8 +82,8 @@ def play(
 
 
 def _check_source(source: str) -> None:
-    if not Path(source).exists() and source not in policy_names():
-        known = what_there_is(source, policy_names(), "trained policies")
+    if not Path(source).exists() and policy_path(source) is None:
+        known = what_there_is(source, policy_files(), "trained policies")
         raise ValueError(
             f"{source} is neither the folder of a run, nor the file of an exported policy, nor one of the "
             f"trained policies{known}"
@@ -97,7 +97,8 @@ def _film_of(source: Path, *, compared: bool) -> Path:
         return source / name
     if source == recipes.RunFolder(source.parent).policy and source.is_file():
         return source.with_name(name)  # policy.gif is the video that the run itself made at its end
-    return source.with_name(f"{source.stem if source.is_file() else source.name}{'_compare' * compared}.gif")
+    stem = source.stem if source.is_file() else file_name(str(source))
+    return source.with_name(f"{stem}{'_compare' * compared}.gif")
 
 
 @click.command(short_help="write a run's policy to a small file, for load_policy or as ONNX")
@@ -149,12 +150,12 @@ def _file_of(source: str, task: str | None, suffix: str) -> Path:
     home = recipes.RunFolder.of(path)
     if home is not None:
         return home.path / f"{file_name(task or home.recipe().task.name)}{suffix}"
-    if source not in policy_names() and not path.is_file():
+    if policy_path(source) is None and not path.is_file():
         raise ValueError(
             f"{source} is no folder of a run: it has no config.yaml; nor is it the file of an exported policy"
-            f"{what_there_is(source, policy_names(), 'trained policies')}"
+            f"{what_there_is(source, policy_files(), 'trained policies')}"
         )
-    file = path.with_suffix(suffix) if path.is_file() else Path(f"{source}{suffix}")
+    file = path.with_suffix(suffix) if path.is_file() else Path(f"{file_name(source)}{suffix}")
     if file == path:
         raise ValueError(f"{source} would be replaced by itself: give --out or --format onnx")
     return file

@@ -18,8 +18,8 @@ def read_header(path: Path) -> dict[str, Any]:
     """Returns the description in the header of a policy's file, without reading its weights.
 
     Example:
-        >>> from torchrl_her_recipes.config.shipped import policy_path
-        >>> header = read_header(policy_path("hand_v1"))
+        >>> from torchrl_her_recipes.config import shipped
+        >>> header = read_header(shipped.policy_files()["hand_v1"])
         >>> header["info"]["task"], header["recipe"]["learner"]["gamma"]
         ('hand_v1', 0.98)
     """

@@ -7,7 +7,7 @@ from typing import Any
 
 from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.plain_files import naming, read_mapping, shown
-from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
+from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX, read_header
 from torchrl_her_recipes.config.shortcuts import merge, place
 
 CONF = Path(__file__).parent.parent / "conf"
@@ -59,11 +59,18 @@ def _path(name: str) -> Path:
     return path
 
 
-def policy_names() -> list[str]:
-    """Returns the tasks whose policies come with the package."""
-    return sorted(path.stem for path in _TRAINED.glob(f"*{POLICY_SUFFIX}"))
+def policy_files() -> dict[str, Path]:
+    """Returns the files of the policies that come with the package, by their names."""
+    return {path.stem: path for path in sorted(_TRAINED.glob(f"*{POLICY_SUFFIX}"))}
 
 
-def policy_path(task: str) -> Path:
-    """Returns the file of the policy that comes with the package for a task."""
-    return _TRAINED / f"{task}{POLICY_SUFFIX}"
+def policy_path(name: str) -> Path | None:
+    """Returns the file of the packaged policy of this name or of this task; None if there is none.
+
+    Example:
+        >>> policy_path("gym:FetchPush-v4").name
+        'fetch_push.safetensors'
+    """
+    files = policy_files()
+    plays = (path for path in files.values() if read_header(path)["info"]["task"] == name)
+    return files.get(name) or next(plays, None)

@@ -27,7 +27,7 @@ from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.shipped import policy_names, policy_path
+from torchrl_her_recipes.config.shipped import policy_files, policy_path
 from torchrl_her_recipes.policies.info import KEYS, PolicyInfo, describe_env, present_versions
 from torchrl_her_recipes.policies.model_card import card_path, check_free, write_model_card
 from torchrl_her_recipes.policies.network import load_network
@@ -85,7 +85,7 @@ class Policy(TensorDictModuleBase):
         is made.
 
         Args:
-            source: Name of a task whose policy comes with the package, a ``.safetensors`` file that
+            source: Name of a policy that comes with the package, or of its task, a ``.safetensors`` file that
                 :meth:`save` wrote, the folder of a run, or the file of a policy in it.
             run: Index of the run, of several side by side in a folder; the run with the median success if
                 None.
@@ -313,11 +313,11 @@ def _check_out(path: Path, *, card: bool) -> None:
 
 def _path_of(source: str | Path) -> Path:
     """Returns the path of a policy's file, or of one that comes with the package."""
-    path = policy_path(str(source)) if str(source) in policy_names() else Path(source)
+    path = policy_path(str(source)) or Path(source)
     if not path.is_file():
         if path.suffix or len(path.parts) > 1:
             raise ValueError(f"there is no file {path}")
-        raise ValueError(f"there is no policy {str(source)!r}; there are {', '.join(policy_names())}")
+        raise ValueError(f"there is no policy {str(source)!r}; there are {', '.join(policy_files())}")
     if path.suffix != POLICY_SUFFIX:
         why = "is for onnxruntime" if path.suffix == SUFFIX else f"does not end with {POLICY_SUFFIX}"
         raise ValueError(
