@@ -29,6 +29,7 @@ class Push(EnvBase):
     Args:
         show_goal: whether the observation contains the desired goal.
         moves: whether the block can be moved.
+        arm: how far before the hand the block is pushed.
         cost: of each step, which compute_reward does not know.
         wall: whether episodes terminate where the hand goes below -0.5.
     """
@@ -41,11 +42,12 @@ class Push(EnvBase):
         *,
         show_goal: bool = False,
         moves: bool = True,
+        arm: float = 0.0,
         cost: float = 0.0,
         wall: bool = False,
     ) -> None:
         super().__init__(batch_size=[num_envs])
-        self.show_goal, self.moves, self.cost, self.wall = show_goal, moves, cost, wall
+        self.show_goal, self.moves, self.arm, self.cost, self.wall = show_goal, moves, arm, cost, wall
         widths = {"observation": 3 + show_goal, "achieved_goal": 1, "desired_goal": 1}
         seen = {key: Unbounded(shape=(num_envs, width)) for key, width in widths.items()}
         self.observation_spec = Composite(seen, shape=self.batch_size)
@@ -67,7 +69,7 @@ class Push(EnvBase):
         hand, block, goal = self.places
         hand = hand + 0.3 * tensordict["action"]
         if self.moves:
-            block = torch.maximum(block, hand)
+            block = torch.maximum(block, hand + self.arm)
         self.places = torch.stack((hand, block, goal))
         reward = self.compute_reward(block, goal) - self.cost
         ends = (reward == 0) | (hand < -0.5 if self.wall else torch.zeros_like(reward, dtype=torch.bool))
@@ -104,7 +106,8 @@ def test_a_block_that_lies_still_is_told_and_layers_are_proposed() -> None:
     reach, task = facts.layers
     assert [reach[key] for key in GOALS] == [[0, 2], [2], [1]]
     assert [task[key] for key in GOALS] == [[0, 2, 1], [1], "desired_goal"]
-    assert reach["threshold"] < 0.3
+    assert reach["threshold"] == 0.05  # half of the task's, since the hand comes to the block itself
+    assert look(arm=0.08).layers[0]["threshold"] == 0.08  # no nearer than it can come
     assert "threshold" not in task  # the environment's own
     assert "algo=cher curriculum=layers.yaml" in said(facts, algo="filtered_her")
     assert "entries 2 to 2 of the observation" in said(facts, algo="filtered_her")
