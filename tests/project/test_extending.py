@@ -16,10 +16,10 @@ from torchrl_her_envs import registry
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config import imports
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
-from torchrl_her_recipes.config.behavior import BEHAVIOR
-from torchrl_her_recipes.config.learners import LEARNERS
-from torchrl_her_recipes.config.order import ORDER
-from torchrl_her_recipes.config.weights import WEIGHTS
+from torchrl_her_recipes.config.choices.behavior import BEHAVIOR
+from torchrl_her_recipes.config.choices.learners import LEARNERS
+from torchrl_her_recipes.config.choices.order import ORDER
+from torchrl_her_recipes.config.choices.weights import WEIGHTS
 from torchrl_her_recipes.studies import workers
 
 from ..recipes.studies.here import Here

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from torchrl_her_recipes.config.learners import LEARNERS
+from torchrl_her_recipes.config.choices.learners import LEARNERS
 from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.config.shortcuts import locate
 

@@ -22,8 +22,8 @@ from torchrl_her_recipes.components.curricula import CurriculumState, is_guided
 from torchrl_her_recipes.components.devices import CPU, place_of
 from torchrl_her_recipes.components.learner import Agent, AgentShape, LearnerBuilder, Networks
 from torchrl_her_recipes.components.normalization import acting, make_norm
+from torchrl_her_recipes.config.choices.learners import BY_ACTIONS, LEARNERS, Actions, LearnerConfig
 from torchrl_her_recipes.config.groups import CurriculumConfig, RunConfig
-from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, Actions, LearnerConfig
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name

@@ -1,4 +1,4 @@
-"""The goals that training proposes before an episode: makers of the choices in :mod:`..config.behavior`."""
+"""Makers of the goals that training proposes before an episode, for :mod:`..config.choices.behavior`."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from torchrl_her_recipes.components.goal_space import goal_space
 from torchrl_her_recipes.components.learner import Agent
 from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.components.weights import make_instructive
-from torchrl_her_recipes.config.behavior import IBS, Discover, Mega, Proposed, UniformAchieved
-from torchrl_her_recipes.config.learners import LearnerConfig
+from torchrl_her_recipes.config.choices.behavior import IBS, Discover, Mega, Proposed, UniformAchieved
+from torchrl_her_recipes.config.choices.learners import LearnerConfig
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
 

@@ -16,11 +16,11 @@ from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
 from torchrl_her_recipes.components.envs import evaluation_envs, judging, make_task_envs
 from torchrl_her_recipes.components.streams import Stream, generators_of
+from torchrl_her_recipes.config.choices.order import AllAtOnce, Teacher, Threshold
+from torchrl_her_recipes.config.choices.weights import Equal
 from torchrl_her_recipes.config.groups import CurriculumConfig
-from torchrl_her_recipes.config.order import AllAtOnce, Teacher, Threshold
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
-from torchrl_her_recipes.config.weights import Equal
 
 _STATE = ["observation", "desired_goal"]  # what the state is made of, in this order
 

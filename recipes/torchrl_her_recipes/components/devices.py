@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
+from torchrl_her_recipes.config.choices.learners import LearnerConfig
 from torchrl_her_recipes.config.groups import ReplayConfig
-from torchrl_her_recipes.config.learners import LearnerConfig
 
 CPU = torch.device("cpu")
 _WORTH_IT = 1e9  # multiplications of a gradient step of all runs, from which on a GPU is worth its calls

@@ -16,9 +16,9 @@ from torchrl_her.goals.grid import GoalGrid, box_target, sampled_target
 from torchrl_her_envs.common.goal_env import Box, goal_env
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.components.streams import Stream
+from torchrl_her_recipes.config.choices.weights import Equal, SequentialIBS
 from torchrl_her_recipes.config.groups import Group
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.weights import Equal, SequentialIBS
 
 _SAMPLES = 10_000  # goals, if they do not fill a box
 _RESETS = 1_000  # episodes whose goals are collected, if the environment has no distribution of goals

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizedPolicy
-from torchrl_her_recipes.config.learners import LearnerConfig
+from torchrl_her_recipes.config.choices.learners import LearnerConfig
 
 
 def make_norm(options: LearnerConfig, widths: Mapping[str, int], *, runs: int) -> RunningNorm | None:

@@ -10,13 +10,13 @@ from typing import Any
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config import groups
 from torchrl_her_recipes.config.algorithms import get_algorithm
-from torchrl_her_recipes.config.behavior import BEHAVIOR, Behavior
+from torchrl_her_recipes.config.choices.behavior import BEHAVIOR, Behavior
+from torchrl_her_recipes.config.choices.learners import BY_ACTIONS, LEARNERS, LearnerConfig
+from torchrl_her_recipes.config.choices.order import ORDER, Order
+from torchrl_her_recipes.config.choices.weights import WEIGHTS, Weights
 from torchrl_her_recipes.config.imports import permit_task
-from torchrl_her_recipes.config.learners import BY_ACTIONS, LEARNERS, LearnerConfig
 from torchrl_her_recipes.config.options import AUTO
-from torchrl_her_recipes.config.order import ORDER, Order
 from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, Nested, chosen, over, place
-from torchrl_her_recipes.config.weights import WEIGHTS, Weights
 from torchrl_her_recipes.config.without_effect import without_effect
 
 # Options that may change when a run resumes, since they do not affect training so far.

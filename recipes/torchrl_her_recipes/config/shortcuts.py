@@ -8,12 +8,12 @@ from typing import Any
 
 from torchrl_her_recipes.config import groups
 from torchrl_her_recipes.config.algorithms import get_algorithm
-from torchrl_her_recipes.config.behavior import BEHAVIOR
-from torchrl_her_recipes.config.choices import Kind
-from torchrl_her_recipes.config.learners import LEARNERS
+from torchrl_her_recipes.config.choices.behavior import BEHAVIOR
+from torchrl_her_recipes.config.choices.kind import Kind
+from torchrl_her_recipes.config.choices.learners import LEARNERS
+from torchrl_her_recipes.config.choices.order import ORDER
+from torchrl_her_recipes.config.choices.weights import WEIGHTS
 from torchrl_her_recipes.config.options import nearest, what_there_is
-from torchrl_her_recipes.config.order import ORDER
-from torchrl_her_recipes.config.weights import WEIGHTS
 
 Nested = dict[str, dict[str, Any]]
 

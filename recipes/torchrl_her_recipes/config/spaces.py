@@ -9,7 +9,7 @@ from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 from torchrl_her_envs.registry import get_task_spec
-from torchrl_her_recipes.config.learners import BY_ACTIONS
+from torchrl_her_recipes.config.choices.learners import BY_ACTIONS
 from torchrl_her_recipes.config.options import AUTO, what_there_is
 from torchrl_her_recipes.config.plain_files import read_yaml, shown
 from torchrl_her_recipes.config.recipe import Recipe, compose, drop_other_goal_sources

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl_her_recipes import Recipe, build, load_preset, make_recipe, run
 from torchrl_her_recipes.components.agents import find_learner, make_agent, make_player, shape_of
 from torchrl_her_recipes.components.envs import make_task_envs
-from torchrl_her_recipes.config.learners import LearnerConfig, SACConfig
+from torchrl_her_recipes.config.choices.learners import LearnerConfig, SACConfig
 
 from ..small import SMALL, small
 

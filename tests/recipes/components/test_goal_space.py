@@ -16,7 +16,7 @@ from torchrl_her_envs import TASKS, make_env
 from torchrl_her_recipes import build, run
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.goal_space import GoalSpace, goal_space
-from torchrl_her_recipes.config.weights import Equal
+from torchrl_her_recipes.config.choices.weights import Equal
 from torchrl_her_recipes.runs.goal_map import GoalMap
 
 from ..small import small

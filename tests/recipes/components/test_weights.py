@@ -17,7 +17,7 @@ from torchrl_her_envs import make_env
 from torchrl_her_recipes import build, resume, run
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.goal_space import KernelSpace, goal_space
-from torchrl_her_recipes.config.weights import IBS
+from torchrl_her_recipes.config.choices.weights import IBS
 
 from ..small import assert_same, small, stop_after
 

@@ -8,8 +8,8 @@ import pytest
 
 from torchrl_her_recipes import BEHAVIOR, Proposed, Recipe, build, make_recipe, option
 from torchrl_her_recipes.cli import main
-from torchrl_her_recipes.config.behavior import Behavior, Mega, Real
-from torchrl_her_recipes.config.choices import Kind
+from torchrl_her_recipes.config.choices.behavior import Behavior, Mega, Real
+from torchrl_her_recipes.config.choices.kind import Kind
 from torchrl_her_recipes.config.shortcuts import KINDS
 
 from ..small import small

@@ -20,7 +20,7 @@ from ..small import overrides, small
 MODULE = '''
 from dataclasses import dataclass
 from torchrl_her_recipes import LEARNERS, option
-from torchrl_her_recipes.config.learners import TD3Config
+from torchrl_her_recipes.config.choices.learners import TD3Config
 
 @LEARNERS.register
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from torchrl_her_recipes import LEARNERS, LearnerBuilder, Recipe, make_recipe
-from torchrl_her_recipes.config.learners import SACConfig
+from torchrl_her_recipes.config.choices.learners import SACConfig
 from torchrl_her_recipes.config.values import load_name
 
 

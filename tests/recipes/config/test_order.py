@@ -11,7 +11,7 @@ import torch
 from torchrl_her import CurriculumProgress
 from torchrl_her.curriculum import TeacherStudent
 from torchrl_her_recipes import ORDER, Order, Recipe, build, make_recipe, option
-from torchrl_her_recipes.config.order import AllAtOnce, Teacher, Threshold
+from torchrl_her_recipes.config.choices.order import AllAtOnce, Teacher, Threshold
 from torchrl_her_recipes.runs.curriculum import move_on
 
 from ..small import small

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from torchrl_her_recipes import build, load_preset, make_recipe, run
-from torchrl_her_recipes.config.order import AllAtOnce, Threshold
+from torchrl_her_recipes.config.choices.order import AllAtOnce, Threshold
 from torchrl_her_recipes.config.resolve import EnvFacts, auto_options, resolve
 from torchrl_her_recipes.config.shipped import preset_names
 

@@ -7,8 +7,8 @@ from dataclasses import fields
 import pytest
 
 from torchrl_her_recipes import make_recipe
+from torchrl_her_recipes.config.choices.weights import IBS
 from torchrl_her_recipes.config.shortcuts import LONG_ONLY, locate, merge, option_names, place
-from torchrl_her_recipes.config.weights import IBS
 
 
 def test_every_option_is_found_by_its_long_name() -> None:

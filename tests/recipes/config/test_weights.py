@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from torchrl_her_recipes import ALGORITHMS, Algorithm, Recipe, make_recipe
+from torchrl_her_recipes.config.choices.weights import IBS, RND, Equal, Rare, SequentialIBS
 from torchrl_her_recipes.config.groups import HindsightConfig
-from torchrl_her_recipes.config.weights import IBS, RND, Equal, Rare, SequentialIBS
 
 
 def test_an_algorithm_has_its_weights() -> None:

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl_her_recipes import Facts, advice, build, look_at, make_recipe
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.first_look import resolved
-from torchrl_her_recipes.config.order import AllAtOnce
+from torchrl_her_recipes.config.choices.order import AllAtOnce
 
 GOALS = ("observation", "achieved_goal", "desired_goal")
 HERE = "tests.recipes.runs.test_check"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from torchrl_her_recipes.config.choices import Choice, Kind
+from torchrl_her_recipes.config.choices.kind import Choice, Kind
 from torchrl_her_recipes.config.options import Needs, option
 
 _MAKERS = "torchrl_her_recipes.components.weights"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from operator import not_
 from typing import Any, ClassVar, Literal
 
-from torchrl_her_recipes.config.choices import Choice, Kind
+from torchrl_her_recipes.config.choices.kind import Choice, Kind
 from torchrl_her_recipes.config.options import AUTO, Needs, option
 
 Actions = Literal["continuous", "discrete"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_her_recipes.config.choices import Choice, Kind
+from torchrl_her_recipes.config.choices.kind import Choice, Kind
 from torchrl_her_recipes.config.options import option
 
 _MAKERS = "torchrl_her_recipes.components.curricula"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_her_recipes.config.choices import Choice, Kind
+from torchrl_her_recipes.config.choices.kind import Choice, Kind
+from torchrl_her_recipes.config.choices.weights import IBS as IBSWeights
 from torchrl_her_recipes.config.options import option
-from torchrl_her_recipes.config.weights import IBS as IBSWeights
 
 _MAKERS = "torchrl_her_recipes.components.behavior"
 

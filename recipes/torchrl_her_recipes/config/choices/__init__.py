@@ -1,0 +1,1 @@
+"""Sections of a recipe that are one of several classes, each with options of its own."""
