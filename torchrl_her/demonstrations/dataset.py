@@ -50,8 +50,8 @@ class Demonstrations:
         >>> from torchrl_her_envs import make_controller, make_env
         >>> env = make_env("hand_v0", num_envs=3, seed=0)
         >>> episodes = env.rollout(50, make_controller(env), break_when_any_done=False)
-        >>> own = Demonstrations.from_rollout(episodes, task="hand_v0", first=True)
-        >>> len(own), own.achieved.tolist(), len(own.rows) == int(own.lengths.sum())
+        >>> demos = Demonstrations.from_rollout(episodes, task="hand_v0", first=True)
+        >>> len(demos), demos.achieved.tolist(), len(demos.rows) == int(demos.lengths.sum())
         (3, [True, True, True], True)
     """
 
@@ -72,13 +72,13 @@ class Demonstrations:
         n = int(self.lengths.sum())
         if self.rows.batch_size != (n,):
             raise ValueError(f"rows must be [{n}], the sum of all lengths, got {list(self.rows.batch_size)}")
-        check_finite({f"{key!r} of demonstrations": own for key, own in self.rows.items(True, True)})
+        check_finite({f"{key!r} of demonstrations": entry for key, entry in self.rows.items(True, True)})
         ends = self.lengths.cumsum(0) - 1
         if self.rows["next", "done"].flatten().nonzero().flatten().tolist() != ends.tolist():
             raise ValueError("the last transition of each demonstration must be done, and no other one")
-        for name, own in (self.states or {}).items():
-            if own.shape[:1] != (n,):
-                raise ValueError(f"states must have {n} rows, got {list(own.shape)} of {name!r}")
+        for name, entry in (self.states or {}).items():
+            if entry.shape[:1] != (n,):
+                raise ValueError(f"states must have {n} rows, got {list(entry.shape)} of {name!r}")
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -103,9 +103,9 @@ class Demonstrations:
     def digest(self) -> str:
         """Short checksum of all transitions and states, which distinguishes files."""
         sha, entries = hashlib.sha256(), dict(self.rows.items(True, True))
-        for name, own in {**entries, **(self.states or {}), "lengths": self.lengths}.items():
+        for name, entry in {**entries, **(self.states or {}), "lengths": self.lengths}.items():
             sha.update(str(name).encode())
-            sha.update(own.contiguous().flatten().view(torch.uint8).numpy().tobytes())
+            sha.update(entry.contiguous().flatten().view(torch.uint8).numpy().tobytes())
         return sha.hexdigest()[:16]
 
     def select(self, episodes: Tensor | Sequence[int]) -> Demonstrations:
@@ -129,7 +129,7 @@ class Demonstrations:
         Keyword Args:
             rows: [n], of which they are taken; those that there are if None.
         """
-        states = None if self.states is None else {name: own[index] for name, own in self.states.items()}
+        states = None if self.states is None else {name: entry[index] for name, entry in self.states.items()}
         taken = (self.rows if rows is None else rows)[index]
         return replace(self, rows=taken, lengths=lengths, states=states)
 
@@ -176,12 +176,12 @@ class Demonstrations:
             )
         ends = rows["next", "done"].flatten().nonzero().flatten()
         lengths = torch.diff(ends, prepend=ends.new_tensor([-1]))
-        flat = None if states is None else {name: own.flatten(0, 1) for name, own in states.items()}
-        own = cls(rows, lengths, states=flat, **facts)
+        flat = None if states is None else {name: entry.flatten(0, 1) for name, entry in states.items()}
+        demonstrations = cls(rows, lengths, states=flat, **facts)
         if not first:
-            return own
-        env = own.begins // rollout.shape[1]
-        return own.select((torch.diff(env, prepend=env.new_tensor([-1])) > 0).nonzero().flatten())
+            return demonstrations
+        env = demonstrations.begins // rollout.shape[1]
+        return demonstrations.select((torch.diff(env, prepend=env.new_tensor([-1])) > 0).nonzero().flatten())
 
     @classmethod
     def join(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
@@ -189,10 +189,12 @@ class Demonstrations:
         states = None
         if parts[0].states is not None:
             states = {
-                name: torch.cat([(own.states or {})[name] for own in parts]) for name in parts[0].states
+                name: torch.cat([(part.states or {})[name] for part in parts]) for name in parts[0].states
             }
-        rows: TensorDictBase = torch.cat([own.rows for own in parts])
-        return replace(parts[0], rows=rows, lengths=torch.cat([own.lengths for own in parts]), states=states)
+        rows: TensorDictBase = torch.cat([part.rows for part in parts])
+        return replace(
+            parts[0], rows=rows, lengths=torch.cat([part.lengths for part in parts]), states=states
+        )
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Writes a file of tensors and plain data, with a checksum.

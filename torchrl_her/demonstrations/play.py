@@ -41,8 +41,8 @@ def demonstrate(
     Example:
         >>> from torchrl_her_envs import make_controller, make_env
         >>> env = make_env("hand_v0", num_envs=3, seed=0)
-        >>> own = demonstrate(env, make_controller(env), max_steps=50, task="hand_v0")
-        >>> len(own), sorted(own.states)[:3]
+        >>> demos = demonstrate(env, make_controller(env), max_steps=50, task="hand_v0")
+        >>> len(demos), sorted(demos.states)[:3]
         (3, ['ball', 'ball_velocity', 'closed'])
     """
     with_states: Any = env
@@ -57,7 +57,7 @@ def demonstrate(
 
     rollout = evaluate(env, act, max_steps=max_steps)
     names = [name for name in (states[0] if states else {}) if name not in _COUNTED]
-    stacked = {name: torch.stack([own[name] for own in states], 1) for name in names}
+    stacked = {name: torch.stack([state[name] for state in states], 1) for name in names}
     return Demonstrations.from_rollout(
         rollout, first=True, states=stacked or None, achieved_reward=achieved_reward, **facts
     )

@@ -83,10 +83,10 @@ class MixedReplay:
     Example:
         >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage
-        >>> own, shown = (TensorDictReplayBuffer(storage=LazyTensorStorage(9)) for _ in range(2))
-        >>> for buffer, x in ((own, 1.0), (shown, 2.0)):
+        >>> collected, shown = (TensorDictReplayBuffer(storage=LazyTensorStorage(9)) for _ in range(2))
+        >>> for buffer, x in ((collected, 1.0), (shown, 2.0)):
         ...     _ = buffer.extend(TensorDict({"x": torch.full((5, 1), x)}, [5]))
-        >>> mixed = MixedReplay(own, shown, share=0.25, batch_size=4)
+        >>> mixed = MixedReplay(collected, shown, share=0.25, batch_size=4)
         >>> mixed.sample(8)["x"].flatten().tolist()
         [1.0, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0, 2.0]
     """
@@ -165,6 +165,6 @@ class MixedReplay:
         if not bool(shown.all()):
             self.own.update_tensordict_priority(rows[~shown])
         if bool(shown.any()):
-            own = rows[shown]
-            own.set("index", own.get("index") - behind)
-            self.demonstrations.update_tensordict_priority(own)
+            demo_rows = rows[shown]
+            demo_rows.set("index", demo_rows.get("index") - behind)
+            self.demonstrations.update_tensordict_priority(demo_rows)

@@ -78,15 +78,15 @@ def in_layer(
     """
     rows = demonstrations.rows.copy()
     after = rows["next"].copy()
-    for own in (rows, after):
-        state = torch.cat((own["observation"], own["desired_goal"]), -1)
+    for tensordict in (rows, after):
+        state = torch.cat((tensordict["observation"], tensordict["desired_goal"]), -1)
         if state.shape[-1] != curriculum.state_width:
             raise ValueError(
                 f"the curriculum needs states of width {curriculum.state_width}, demonstrations of "
                 f"{demonstrations.task} have {state.shape[-1]}"
             )
         shown = curriculum.show(state, layer)
-        own.update(dict(zip(("observation", "achieved_goal", "desired_goal"), shown, strict=True)))
+        tensordict.update(dict(zip(("observation", "achieved_goal", "desired_goal"), shown, strict=True)))
     if layer < len(curriculum) - 1:
         after["terminated"] = torch.zeros_like(after["terminated"])
     rows.set("next", after)

@@ -78,11 +78,11 @@ class DemonstrationStarts(Transform):
         if len(given) != runs or (generators is not None and len(generators) != runs):
             raise ValueError(f"{runs} runs need demonstrations and a generator for each, got {len(given)}")
         first = usable(given[0])
-        self._shown = [first if single else usable(own) for own in given]
+        self._shown = [first if single else usable(demos) for demos in given]
         self.share, self.runs = share, runs
         self._generators = [None] * runs if generators is None else list(generators)
         self.walk = WalkBack(
-            [int(own.lengths.max()) for own in self._shown],
+            [int(demos.lengths.max()) for demos in self._shown],
             width=width,
             stride=stride,
             threshold=threshold,
@@ -113,10 +113,10 @@ class DemonstrationStarts(Transform):
         if not bool(over.any()):
             return
         achieved = after.get("terminated").flatten()
-        for run, (own, ended) in enumerate(
+        for run, (successes, ended) in enumerate(
             zip(achieved.chunk(self.runs), over.chunk(self.runs), strict=True)
         ):
-            self.walk.record(run, own[ended].tolist())
+            self.walk.record(run, successes[ended].tolist())
         self._back[over] = 0
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -145,8 +145,10 @@ class DemonstrationStarts(Transform):
         each = len(begun) // self.runs
         chosen: list[Tensor] = []
         parts: list[dict[str, Tensor]] = []
-        for run, (own, generator) in enumerate(zip(begun.chunk(self.runs), self._generators, strict=True)):
-            new = own.nonzero().flatten()
+        for run, (run_begun, generator) in enumerate(
+            zip(begun.chunk(self.runs), self._generators, strict=True)
+        ):
+            new = run_begun.nonzero().flatten()
             if len(new) == 0:
                 continue  # draws nothing, as when the run is trained alone
             u = torch.rand(len(new), 3, generator=generator, dtype=torch.float64)
@@ -164,7 +166,7 @@ class DemonstrationStarts(Transform):
             parts.append({name: entry[rows] for name, entry in (shown.states or {}).items()})
         if not chosen:
             return torch.empty(0, dtype=torch.int64), {}
-        return torch.cat(chosen), {name: torch.cat([own[name] for own in parts]) for name in parts[0]}
+        return torch.cat(chosen), {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
     def _environment(self) -> Any:
         """Finds the environment below that can start at a given state; raises if there is none."""
@@ -187,16 +189,18 @@ class DemonstrationStarts(Transform):
         return {
             "walk": self.walk.state_dict(),
             "back": None if self._back is None else self._back.clone(),
-            "generators": [None if own is None else own.get_state() for own in self._generators],
+            "generators": [
+                None if generator is None else generator.get_state() for generator in self._generators
+            ],
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restores the state that :meth:`get_extra_state` returned."""
         self.walk.load_state_dict(state["walk"])
         self._back = None if state["back"] is None else state["back"].clone()
-        for generator, own in zip(self._generators, state["generators"], strict=True):
-            if generator is not None and own is not None:
-                generator.set_state(own)
+        for generator, generator_state in zip(self._generators, state["generators"], strict=True):
+            if generator is not None and generator_state is not None:
+                generator.set_state(generator_state)
 
 
 class _Outcomes(Transform):

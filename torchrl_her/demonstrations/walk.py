@@ -84,7 +84,7 @@ class WalkBack:
             raise ValueError(f"threshold must be in (0, 1], got {threshold}")
         self.width, self.stride, self.threshold, self.samples = width, stride, threshold, samples
         self._longest = list(longest)
-        self.back = [min(width, own) for own in longest]
+        self.back = [min(width, length) for length in longest]
         self._outcomes: list[list[bool]] = [[] for _ in longest]
 
     def window(self, run: int) -> tuple[int, int]:
@@ -93,10 +93,10 @@ class WalkBack:
 
     def record(self, run: int, outcomes: Sequence[bool]) -> None:
         """Records whether episodes of a run that started at demonstrations achieved their goal."""
-        for own in outcomes:  # one by one: any of them may complete a step back
+        for outcome in outcomes:  # one by one: any of them may complete a step back
             self.back[run], self._outcomes[run] = step_back(
                 self.back[run],
-                [*self._outcomes[run], own],
+                [*self._outcomes[run], outcome],
                 stride=self.stride,
                 threshold=self.threshold,
                 samples=self.samples,
@@ -109,7 +109,7 @@ class WalkBack:
 
     def state_dict(self) -> dict[str, Any]:
         """Plain data that :meth:`load_state_dict` takes."""
-        outcomes = [list(own) for own in self._outcomes]
+        outcomes = [list(run_outcomes) for run_outcomes in self._outcomes]
         return {"back": list(self.back), "outcomes": outcomes, "longest": list(self._longest)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -121,4 +121,4 @@ class WalkBack:
         if len(state["back"]) != len(self.back):
             raise ValueError(f"the state is that of {len(state['back'])} runs, not of {len(self.back)}")
         self.back, self._longest = list(state["back"]), list(state["longest"])
-        self._outcomes = [list(own) for own in state["outcomes"]]
+        self._outcomes = [list(run_outcomes) for run_outcomes in state["outcomes"]]
