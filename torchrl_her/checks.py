@@ -50,10 +50,10 @@ def check_finite(tensors: Mapping[str, Tensor]) -> None:
         Traceback (most recent call last):
         ValueError: goals must be finite, got nan in it
     """
-    floats = {name: own for name, own in tensors.items() if own.is_floating_point()}
-    if not floats or bool(sum(own.sum() for own in floats.values()).isfinite()):  # type: ignore[union-attr]
+    floats = {name: tensor for name, tensor in tensors.items() if tensor.is_floating_point()}
+    if not floats or bool(sum(tensor.sum() for tensor in floats.values()).isfinite()):  # type: ignore[union-attr]
         return
-    for name, own in floats.items():
-        wrong = own[~own.isfinite()]
+    for name, tensor in floats.items():
+        wrong = tensor[~tensor.isfinite()]
         if len(wrong) > 0:
             raise ValueError(f"{name} must be finite, got {wrong[0].item()} in it")

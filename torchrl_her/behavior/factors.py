@@ -214,8 +214,8 @@ class ValueCutoff(GoalFactor):
 
     def __call__(self, offers: GoalCandidates) -> Tensor:
         value = self.values(offers.start, offers.goals, offers.counts).mean(-1).nan_to_num(-math.inf)
-        own = self.cutoff.to(value)[offers.run].unsqueeze(1)
-        believed = value >= own
+        cutoff = self.cutoff.to(value)[offers.run].unsqueeze(1)
+        believed = value >= cutoff
         return believed | (~believed.any(1, keepdim=True) & (value == value.amax(1, keepdim=True)))
 
     def record(self, ended: Tensor, achieved: Tensor) -> None:

@@ -76,8 +76,8 @@ class AchievedGoals:
         place = (self._written.unsqueeze(1) + rank) % self.capacity + run.unsqueeze(1) * self.capacity
         self._written += added
         flat = place.flatten()
-        for own, new in zip(self._rows, (goals, observations), strict=True):
-            own[flat[which]] = new[which].to(own)
+        for stored, new in zip(self._rows, (goals, observations), strict=True):
+            stored[flat[which]] = new[which].to(stored)
 
     def draw(self, counts: Sequence[int], width: int, generators: Generators) -> Tensor:
         """Draws goals for episodes of several runs, all goals of a run being equally likely.
@@ -112,7 +112,7 @@ class AchievedGoals:
         rows = []
         for part in self._rows or ():
             blocks = zip(part.split(self.capacity), self.sizes, strict=True)
-            rows.append([own[:size].clone() for own, size in blocks])
+            rows.append([ring[:size].clone() for ring, size in blocks])
         return {"written": self._written.clone(), "capacity": self.capacity, "rows": rows}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -131,8 +131,8 @@ class AchievedGoals:
         if state["rows"]:
             goals, observations = (self._empty(blocks[0]) for blocks in state["rows"])
             for part, blocks in zip((goals, observations), state["rows"], strict=True):
-                for own, block in zip(part.split(capacity), blocks, strict=True):
-                    own[: len(block)] = block
+                for ring, block in zip(part.split(capacity), blocks, strict=True):
+                    ring[: len(block)] = block
             self._rows = goals, observations
 
     def _empty(self, like: Tensor) -> Tensor:
@@ -141,5 +141,5 @@ class AchievedGoals:
     def _at(self, part: int, index: Tensor) -> Tensor:
         if self._rows is None:
             raise ValueError("no goals were added yet")
-        own = self._rows[part]
-        return own.index_select(0, index.flatten()).view(*index.shape, *own.shape[1:])
+        rows = self._rows[part]
+        return rows.index_select(0, index.flatten()).view(*index.shape, *rows.shape[1:])

@@ -135,7 +135,7 @@ class BehaviorGoals(Transform):
         check_whole(candidates=candidates)
         if update_on not in get_args(UpdateOn):
             raise ValueError(f"update_on must be one of {', '.join(get_args(UpdateOn))}, got {update_on!r}")
-        own = weights_by_run(weights, runs)
+        run_weights = weights_by_run(weights, runs)
         if truncated_key is None and not continues_after_termination:
             raise ValueError(
                 "continues_after_termination=False needs a truncated_key, to say where the environment ended"
@@ -143,7 +143,7 @@ class BehaviorGoals(Transform):
         out_keys = [desired_goal_key, real_goal_key, proposed_key, reached_key]
         super().__init__(in_keys=[observation_key, achieved_goal_key, desired_goal_key], out_keys=out_keys)
         self.generators: Generators = check_generators(runs, generators) or [None]
-        self.reward_fn, self.weights, self.factors = reward_fn, own, list(factors)
+        self.reward_fn, self.weights, self.factors = reward_fn, run_weights, list(factors)
         self.remember = remember
         self.update_on, self.greedy, self.real_share, self.candidates = (
             update_on,
@@ -169,8 +169,8 @@ class BehaviorGoals(Transform):
         """Switches the memory of goals and the proposals of a run on or off. Switching on restarts IBS."""
         if active and not self._active[run] and self.weights:
             self.weights[run].clear()
-            if isinstance(own := self.weights[run], InstructiveWeights):
-                own.restart()
+            if isinstance(weights := self.weights[run], InstructiveWeights):
+                weights.restart()
         self._active[run] = active
 
     def success(self) -> Tensor:
@@ -183,9 +183,11 @@ class BehaviorGoals(Transform):
         """Returns the transform's whole state as tensors and plain data; it is a part of ``state_dict()``."""
         return {
             "memory": self.memory.state_dict(),
-            "weights": [own.state_dict() for own in self.weights],
-            "factors": [own.state_dict() for own in self.factors],
-            "generators": [None if own is None else own.get_state() for own in self.generators],
+            "weights": [weights.state_dict() for weights in self.weights],
+            "factors": [factor.state_dict() for factor in self.factors],
+            "generators": [
+                None if generator is None else generator.get_state() for generator in self.generators
+            ],
             "ended": self.ended,
             "achieved": self.achieved,
             "active": list(self._active),
@@ -203,11 +205,11 @@ class BehaviorGoals(Transform):
         for name, each in parts.items():
             if len(each) != len(state[name]):
                 raise ValueError(f"the state has {len(state[name])} {name}, not {len(each)}")
-            for own, was in zip(each, state[name], strict=True):
-                own.load_state_dict(was)
-        for generator, own in zip(self.generators, state["generators"], strict=True):
-            if generator is not None and own is not None:
-                generator.set_state(own)
+            for part, was in zip(each, state[name], strict=True):
+                part.load_state_dict(was)
+        for generator, generator_state in zip(self.generators, state["generators"], strict=True):
+            if generator is not None and generator_state is not None:
+                generator.set_state(generator_state)
         self.ended, self.achieved = state["ended"].clone(), state["achieved"].clone()
         self._active = list(state["active"])
 
@@ -293,8 +295,8 @@ class BehaviorGoals(Transform):
             active = torch.tensor(self._active, device=goals.device)
             part = active.repeat_interleave(len(goals) // self.runs)
         if self.layer_key is not None:
-            own = self._get(tensordict, self.layer_key).reshape(-1) == self.layer
-            part = own if part is None else part & own
+            in_layer = self._get(tensordict, self.layer_key).reshape(-1) == self.layer
+            part = in_layer if part is None else part & in_layer
         return part
 
     def _remember(self, before: TensorDictBase, after: TensorDictBase, achieved: Tensor) -> None:
@@ -350,18 +352,18 @@ class BehaviorGoals(Transform):
     def _sample(self, counts: Sequence[int]) -> Sequence[Tensor]:
         """Draws goals of each run that has episodes, as many as the most demanding factor needs."""
         number = max((factor.samples for factor in self.factors), default=0)
-        own = [min(1, count) for count in counts]
+        draws = [min(1, count) for count in counts]
         if number == 0:
             return ()
-        goals = self.memory.goals(self.memory.draw(own, number, self.generators))
-        return [part.flatten(0, 1) for part in goals.split(own)]
+        goals = self.memory.goals(self.memory.draw(draws, number, self.generators))
+        return [part.flatten(0, 1) for part in goals.split(draws)]
 
     def _likelihood(self, offers: GoalCandidates) -> Tensor:
         """Returns the likelihood [m, c] that each goal is proposed."""
         likelihood = offers.goals.new_ones(offers.goals.shape[:-1])
         if self.weights and not self.weights[0].alike:
-            own = self._weights_of_runs()(offers.goals, range(self.runs), offers.counts)
-            likelihood = checked_weights(own, offers.goals)
+            weights = self._weights_of_runs()(offers.goals, range(self.runs), offers.counts)
+            likelihood = checked_weights(weights, offers.goals)
         for factor in self.factors:
             likelihood = likelihood * factor(offers)
         return likelihood
@@ -370,9 +372,10 @@ class BehaviorGoals(Transform):
         """Counts the episodes with proposed goals that have ended, and those that achieved their goal."""
         if not bool(ended.any()):
             return
-        counts = [own.reshape(self.runs, -1).sum(1) for own in (ended, ended & achieved)]
+        counts = [flags.reshape(self.runs, -1).sum(1) for flags in (ended, ended & achieved)]
         self.ended, self.achieved = (
-            total.to(own.device) + own for total, own in zip((self.ended, self.achieved), counts, strict=True)
+            total.to(count.device) + count
+            for total, count in zip((self.ended, self.achieved), counts, strict=True)
         )
         for factor in self.factors:
             factor.record(*counts)

@@ -135,8 +135,8 @@ class GuidedExploration(TensorDictModuleBase):
         """
         runs = len(self.generators)
         learned = policy.state_dict()
-        for name, own in self.module.state_dict().items():
-            own.chunk(runs)[run].copy_(learned[name].chunk(runs)[run])
+        for name, tensor in self.module.state_dict().items():
+            tensor.chunk(runs)[run].copy_(learned[name].chunk(runs)[run])
         self.layer[run] = layer
 
     @torch.no_grad()
@@ -169,12 +169,12 @@ class GuidedExploration(TensorDictModuleBase):
         if top is not None and bool((there & (guided >= 0)).any()):
             seen, *_ = self._look(state, guided)  # some act as in the next layer from now on
         rows = TensorDict({self.input_key: seen}, tensordict.batch_size)
-        own = tensordict.get(action_key)
-        acts = guided >= 0 if own.ndim == guided.ndim else (guided >= 0).squeeze(-1)
+        policy_action = tensordict.get(action_key)
+        acts = guided >= 0 if policy_action.ndim == guided.ndim else (guided >= 0).squeeze(-1)
         # Greedy: whether it is called depends on other runs, so it must not draw numbers for this one.
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             action = self.guide(rows).get(action_key)
-        return tensordict.set(action_key, torch.where(acts, action, own))
+        return tensordict.set(action_key, torch.where(acts, action, policy_action))
 
     def _begin(self, begun: Tensor, top: Tensor | None) -> Tensor:
         """Draws which of the episodes that begin are guided; episodes under way stay as they are."""
@@ -185,13 +185,13 @@ class GuidedExploration(TensorDictModuleBase):
         runs = len(self.generators)
         tops = [None] * runs if top is None else list(top.chunk(runs))
         blocks = zip(self.guided.chunk(runs), begun.chunk(runs), tops, strict=True)
-        for (guided, new, own), layer, generator in zip(
+        for (guided, new, episode_layer), layer, generator in zip(
             blocks, self.layer.tolist(), self.generators, strict=True
         ):
-            first = layer if own is None else 0
+            first = layer if episode_layer is None else 0
             if first >= 0 and bool(new.any()):  # without a start, a run draws nothing
                 drawn = torch.rand(new.shape, generator=generator, device=new.device) < self.share
-                drawn = drawn if own is None else drawn & (own > 0)
+                drawn = drawn if episode_layer is None else drawn & (episode_layer > 0)
                 guided.copy_(torch.where(new, torch.where(drawn, first, -1), guided))
         return self.guided
 

@@ -355,7 +355,7 @@ class CurriculumProgress:
     @property
     def successes(self) -> list[list[float]]:
         """Copies of the R windows: samples of the present layer, the latest at the end."""
-        return [list(own) for own in self._successes]
+        return [list(samples) for samples in self._successes]
 
     @property
     def evaluations(self) -> list[int]:
@@ -393,8 +393,8 @@ class CurriculumProgress:
         """
         if successes.ndim != 2 or len(successes) != self.runs:
             raise ValueError(f"successes must be [{self.runs}, n], got {list(successes.shape)}")
-        samples = [_samples(own) for own in successes]  # all runs are checked before any sample is counted
-        return torch.tensor([self._record(run, own) for run, own in enumerate(samples)])
+        samples = [_samples(row) for row in successes]  # all runs are checked before any sample is counted
+        return torch.tensor([self._record(run, run_samples) for run, run_samples in enumerate(samples)])
 
     def record_run(self, run: int, successes: Tensor) -> bool:
         """Adds samples of success of one run, one after the other.
@@ -435,15 +435,15 @@ class CurriculumProgress:
         if not all(0 <= layer < len(self.curriculum) for layer in layers):
             raise ValueError(f"the state's layers are {layers}, but there are {len(self.curriculum)} layers")
         self.layers, self._expert = layers, state["expert"].tolist()
-        self._successes = [list(own)[-self.window :] for own in state["successes"]]
+        self._successes = [list(samples)[-self.window :] for samples in state["successes"]]
         self._evaluations = list(state["evaluations"])
 
     def _record(self, run: int, samples: list[float]) -> bool:
-        own, last = self._successes[run], len(self.curriculum) - 1
+        latest, last = self._successes[run], len(self.curriculum) - 1
         for sample in samples:
-            own.append(sample)
-            del own[: -self.window]
-            if len(own) < self.window or sum(own) / self.window < self.success_threshold:
+            latest.append(sample)
+            del latest[: -self.window]
+            if len(latest) < self.window or sum(latest) / self.window < self.success_threshold:
                 continue
             if self.layers[run] < last:
                 self.set_layer(run, self.layers[run] + 1)

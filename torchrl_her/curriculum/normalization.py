@@ -51,11 +51,11 @@ def count_inputs(
     """
     check_finite({f"{key!r}": rows.get(key) for key in (observation_key, desired_goal_key)})
     undo, layers = norm.snapshot(), progress.curriculum.layers
-    for run, own in zip(runs, rows.split(list(counts)), strict=True):
-        parts = [(progress.layer_of(run), own)]
+    for run, run_rows in zip(runs, rows.split(list(counts)), strict=True):
+        parts = [(progress.layer_of(run), run_rows)]
         if progress.by_episode:
-            which = own.get(layer_key).squeeze(-1)
-            parts = [(layer, own[which == place]) for place, layer in enumerate(layers)]
+            which = run_rows.get(layer_key).squeeze(-1)
+            parts = [(layer, run_rows[which == place]) for place, layer in enumerate(layers)]
         for layer, part in parts:
             shown = len(layer.observation)
             seen = (part.get(observation_key)[..., :shown], part.get(desired_goal_key))

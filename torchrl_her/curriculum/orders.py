@@ -104,14 +104,14 @@ class EpisodeLayers(CurriculumProgress):
         raise ValueError(f"run {run} cannot be moved to layer {layer}: each episode has a layer of its own")
 
     def state_dict(self) -> dict[str, Any]:
-        states = [None if own is None else own.get_state() for own in self.generators]
+        states = [None if generator is None else generator.get_state() for generator in self.generators]
         return {**super().state_dict(), "generators": states}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
-        for generator, own in zip(self.generators, state["generators"], strict=True):
-            if generator is not None and own is not None:
-                generator.set_state(own)
+        for generator, generator_state in zip(self.generators, state["generators"], strict=True):
+            if generator is not None and generator_state is not None:
+                generator.set_state(generator_state)
 
 
 class TeacherStudent(EpisodeLayers):

@@ -263,13 +263,13 @@ class StateToObs(_LayerTransform):
         terminated = ended
         for layer in below:
             rule = cast(RewardFunction, self.curriculum.layers[layer].reward_fn)
-            own = rule(achieved, tensordict.get(self.out_keys[2]))
+            result = rule(achieved, tensordict.get(self.out_keys[2]))
             if rows is None:
-                reward, terminated = own[0].to(reward.dtype), own[1]
+                reward, terminated = result[0].to(reward.dtype), result[1]
             else:
                 here = (rows == layer).unsqueeze(-1)
-                reward = torch.where(here, own[0].to(reward.dtype), reward)
-                terminated = torch.where(here, own[1], terminated)
+                reward = torch.where(here, result[0].to(reward.dtype), reward)
+                terminated = torch.where(here, result[1], terminated)
         done = terminated.clone()
         if self.truncated_key is not None:
             truncated = tensordict.get(self.truncated_key)
@@ -386,7 +386,7 @@ class LayerOutcomes(Transform):
                 place[flags.reshape(runs, -1)].bincount(minlength=layers * runs).view(runs, layers)
                 for flags in (ended, achieved)
             ]
-            self.progress.record_episodes(*(own.cpu() for own in counts))
+            self.progress.record_episodes(*(count.cpu() for count in counts))
         return next_tensordict
 
 

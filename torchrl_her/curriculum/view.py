@@ -87,16 +87,18 @@ class LayerView:
                 out.set(key, torch.full_like(layers, self.layer))
         reached = keys.after(out, self.reward_fn)
         reward, ends = ask_reward(self.reward_fn, reached, entry_of(out, keys.goals[1]))
-        own = {key: entry_of(rows, key) for key in (keys.reward, keys.terminated, keys.truncated, keys.done)}
-        flat = {key: entry.view(reward.shape) for key, entry in own.items()}
+        stored = {
+            key: entry_of(rows, key) for key in (keys.reward, keys.terminated, keys.truncated, keys.done)
+        }
+        flat = {key: entry.view(reward.shape) for key, entry in stored.items()}
         terminated = torch.where(played, flat[keys.terminated], ends)
         done = terminated | flat[keys.done]
         changes = {
-            keys.reward: torch.where(played, flat[keys.reward], reward.to(own[keys.reward].dtype)),
+            keys.reward: torch.where(played, flat[keys.reward], reward.to(stored[keys.reward].dtype)),
             keys.terminated: terminated,
             keys.truncated: flat[keys.truncated] | (done & ~terminated & ~played),
             keys.done: done,
         }
         for key, entry in changes.items():
-            out.set(key, entry.view(own[key].shape))
+            out.set(key, entry.view(stored[key].shape))
         return out

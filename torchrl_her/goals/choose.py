@@ -179,9 +179,9 @@ def _likelihoods(
 ) -> Iterator[Tensor]:
     """Yields the likelihoods [m, W] of all goals in the lines of transitions, part by part."""
     for part in parts:
-        own = candidates.line[part]
+        line = candidates.line[part]
         yield combine(
             between(candidates.first[part], candidates.end[part], lines.shape[1]),
-            None if weight is None else weight[own],
-            None if keep is None else keep(part, lines[own]),
+            None if weight is None else weight[line],
+            None if keep is None else keep(part, lines[line]),
         )

@@ -98,7 +98,7 @@ def log_neighbor_density(points: Tensor, samples: Tensor, k: int, *, least_dista
     if not 0 < least_distance < math.inf:
         raise ValueError(f"least_distance must be positive and finite, got {least_distance}")
     center = known.mean(0)
-    flat, known = ((own - center).clamp_(-_FARTHEST, _FARTHEST) for own in (flat, known))
+    flat, known = ((x - center).clamp_(-_FARTHEST, _FARTHEST) for x in (flat, known))
     parts = [_kth_distance(part, known, k) for part in flat.split(max(1, _CHUNK // max(n, k * g)))]
     distance = torch.cat(parts).view(points.shape[:-1]).clamp_min_(least_distance)
     ball = g * 0.5 * math.log(math.pi) - math.lgamma(g * 0.5 + 1.0)  # volume of the unit ball

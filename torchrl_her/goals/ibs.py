@@ -207,7 +207,7 @@ class HistogramsOfRuns(WeightsOfRuns):
         )
 
     def __call__(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> Tensor:
-        tables = [own.table for run in runs if isinstance(own := self.own[run], Instructiveness)]
+        tables = [weights.table for run in runs if isinstance(weights := self.own[run], Instructiveness)]
         if not tables:
             return goals.new_ones(goals.shape[:-1])
         return _look_up(torch.cat(tables), self._cells(goals, counts), goals)
@@ -216,8 +216,8 @@ class HistogramsOfRuns(WeightsOfRuns):
         size, cells = self.own[0].grid.num_cells, self._cells(goals, counts)
         added = cells.bincount(minlength=len(runs) * size).view(len(runs), size)
         parts = zip(runs, added, cells.split(list(counts)), strict=True)
-        for place, (run, own, part) in enumerate(parts):
-            self.own[run]._add(own, part - place * size)
+        for place, (run, histogram, part) in enumerate(parts):
+            self.own[run]._add(histogram, part - place * size)
 
     def _cells(self, goals: Tensor, counts: Sequence[int]) -> Tensor:
         """Returns the cell [n, ...] of each goal in the joined tables of the given runs."""

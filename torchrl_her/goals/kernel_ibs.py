@@ -151,8 +151,8 @@ class KernelInstructiveness(InstructiveWeights):
         self._virtual, self._keys = self._real[:0], self._real.new_empty(0)
 
     def state_dict(self) -> dict[str, Any]:
-        own = {"written": self.written, "virtual": self._virtual.clone(), "keys": self._keys.clone()}
-        return {**super().state_dict(), **own}
+        state = {"written": self.written, "virtual": self._virtual.clone(), "keys": self._keys.clone()}
+        return {**super().state_dict(), **state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)

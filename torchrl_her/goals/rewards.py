@@ -220,10 +220,10 @@ def _call(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor) ->
             raise
         raise ValueError(f"{_FORM}, got {error}") from error
     several = answer if isinstance(answer, tuple | list) else [answer]
-    if len(several) == 2 and all(isinstance(own, Tensor) for own in several):
+    if len(several) == 2 and all(isinstance(value, Tensor) for value in several):
         reward, terminated = several
         return reward, terminated
-    kinds = " and ".join(type(own).__name__ for own in several)
+    kinds = " and ".join(type(value).__name__ for value in several)
     raise ValueError(
         f"{_FORM}, got {kinds}; a function of rewards alone comes as EnvReward(function), where no goal ends "
         "an episode"

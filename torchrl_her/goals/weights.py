@@ -97,10 +97,12 @@ def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: in
     Raises:
         ValueError: there are not as many as runs.
     """
-    own = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
-    if own and len(own) != runs:
-        raise ValueError(f"{runs} runs need a list of {runs} weights, one of each run, got {len(own)}")
-    return own
+    run_weights = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
+    if run_weights and len(run_weights) != runs:
+        raise ValueError(
+            f"{runs} runs need a list of {runs} weights, one of each run, got {len(run_weights)}"
+        )
+    return run_weights
 
 
 def checked_weights(weight: Tensor, goals: Tensor) -> Tensor:
