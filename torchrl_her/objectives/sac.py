@@ -59,9 +59,9 @@ class PenalizedSACLoss(SACLoss):
         self.action_penalty, self.cloning, self.runs = action_penalty, cloning, runs
         self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
         self.noise = noise or RunNoise()
-        if runs > 1:
-            start: Tensor = self.log_alpha  # type: ignore[has-type]
-            self.log_alpha = nn.Parameter(start.detach().repeat(runs))
+        start: Tensor = self.log_alpha.detach()  # type: ignore[has-type]
+        dtype = next(self.actor_network_params.values(True, True)).dtype  # as fused steps need it
+        self.log_alpha = nn.Parameter(start.to(dtype).repeat(runs) if runs > 1 else start.to(dtype))
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         weights = self._maybe_get_priority_weight(tensordict)
