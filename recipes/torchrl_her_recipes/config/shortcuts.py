@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import cache
 from typing import Any
 
 from torchrl_her_recipes.config import groups
@@ -56,8 +57,14 @@ def option_names() -> dict[str, list[str]]:
     """Returns the names of the options of each group, in groups with choices those of all choices."""
     names = {group: ["name"] if group in KINDS else [] for group in GROUPS}
     for group, known in names.items():
-        known += dict.fromkeys(own.name for kind in choices_of(group).values() for own in fields(kind))
+        kinds = choices_of(group).values()
+        known += dict.fromkeys(name for kind in kinds for name in _field_names(kind))  # type: ignore[arg-type]
     return names
+
+
+@cache
+def _field_names(kind: type[groups.Group]) -> list[str]:
+    return [own.name for own in fields(kind)]
 
 
 def chosen(group: str, *values: Nested) -> str:
