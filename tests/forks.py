@@ -16,7 +16,15 @@ from typing import Any
 import pytest
 
 _ROOT = Path(__file__).parents[1]
-_IMPORTED = ["torchrl_her_recipes.components", "torchrl_her_recipes.cli", "torchrl_her_recipes.runs.run"]
+_IMPORTED = [
+    "pandas",
+    "torch.utils.tensorboard",
+    "torchrl_her_envs.throwing.env",
+    "torchrl_her_recipes.cli",
+    "torchrl_her_recipes.components",
+    "torchrl_her_recipes.runs.run",
+    "torchrl_her_recipes.studies.study",
+]
 
 
 @cache

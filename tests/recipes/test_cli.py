@@ -16,6 +16,7 @@ from torchrl_her_recipes import cli
 from torchrl_her_recipes.config.shipped import CONF, load_preset
 
 from .small import overrides
+from .studies.forked_worker import fork_workers
 
 PRESETS = sorted((CONF / "preset").glob("*.yaml"))
 ROBOTICS = find_spec("gymnasium_robotics") is not None
@@ -48,7 +49,8 @@ def test_the_default_folder_names_task_and_seed() -> None:
     assert folder.name.endswith("robot_v0_s2")
 
 
-def test_sweeps(capsys: pytest.CaptureFixture[str]) -> None:
+def test_sweeps(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    fork_workers(monkeypatch)
     assert cli.main(["train", "-m", "algo=her,no_hindsight", *overrides(epochs=1)]) == 0
     (sweep,) = Path("runs").iterdir()
     assert sorted(path.name for path in sweep.iterdir() if path.is_dir()) == [
@@ -90,7 +92,7 @@ def test_every_preset_runs(preset: Path) -> None:
         pytest.skip("needs the extra robotics")
     shrunk = [
         option
-        for option in overrides(folder="out", epochs=1, epoch_frames=800)
+        for option in overrides(folder="out", epochs=1, epoch_frames=480, episodes=2)
         if not option.startswith("num_runs")
     ]
     assert cli.main(["train", f"preset={preset.stem}", *shrunk, "num_runs=1"]) == 0

@@ -16,6 +16,7 @@ from torchrl_her_recipes.studies.jobs import Job, Outcome
 from torchrl_her_recipes.studies.workers_local import LocalWorkers
 
 from ..small import overrides, small
+from ..studies.forked_worker import fork_workers
 
 MODULE = '''
 from dataclasses import dataclass
@@ -57,7 +58,10 @@ def test_the_command_line_imports_before_it_reads_the_command(
     assert "TD3 again" in capsys.readouterr().out
 
 
-def test_worker_processes_of_studies_import_them_too(own: str, tmp_path: Path) -> None:
+def test_worker_processes_of_studies_import_them_too(
+    own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fork_workers(monkeypatch)
     import_modules([own, own])
     assert imported_modules() == [own]
     recipe = small(learner="own_td3", patience=2.0, epochs=1)

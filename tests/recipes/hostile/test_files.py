@@ -113,7 +113,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole")
     recipe = small(task="hand_v0", algo="her_ibs", epochs=1, epoch_frames=480, hidden=8, keep_buffer=False)
     run(build(recipe), folder / "run", progress=False)
-    shutil.rmtree(folder / "run" / "tensorboard")
     tiny_policy().save(folder / "policy.safetensors", card=False)
     env = make_env("hand_v0", num_envs=2, seed=0)
     played = env.rollout(20, make_controller(env), break_when_any_done=False)

@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import pytest
 import torch
 
-from torchrl_her import Instructiveness, load_checkpoint
+from torchrl_her import Instructiveness
 from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalFactor, InverseDensity, ValueCutoff
 from torchrl_her.curriculum import EpisodeLayers, LayerOutcomes, TeacherStudent
 from torchrl_her.replay_buffers import rows_of_run
-from torchrl_her_recipes import Components, Recipe, build, make_recipe, resume, run
+from torchrl_her_recipes import Components, Recipe, RunResult, build, make_recipe, resume, run
 from torchrl_her_recipes.components.behavior import scaled_cutoffs
 from torchrl_her_recipes.runs.curriculum import move_on
 
-from ..small import assert_same, small, stop_after
+from ..small import assert_same_runs, small, stop_after
 
 PLAIN: dict[str, Any] = {"task": "hand_v0", "algo": "her", "behavior.goal_memory": 5_000}
 LAYERS: dict[str, Any] = {"task": "hand_v1", "algo": "cher_ibs", "normalize": True, "guided_share": 0.5}
 WAYS: dict[str, dict[str, Any]] = {
-    "uniform_achieved": {**PLAIN, "behavior": "uniform_achieved"},
+    "uniform_achieved": {**PLAIN, "behavior": "uniform_achieved", "num_runs": 2},
     "ibs": {**PLAIN, "behavior": "ibs"},
     "mega": {**PLAIN, "behavior": "mega", "normalize": True},
-    "discover": {**PLAIN, "behavior": "discover", "learner": "td3"},
+    "discover": {**PLAIN, "behavior": "discover", "learner": "td3", "num_runs": 2},
     "all at once": {**LAYERS, "order": "all_at_once"},
     "teacher": {**LAYERS, "order": "teacher_student", "behavior": "mega", "behavior.goal_memory": 5_000},
     "every layer": {**LAYERS, "order": "all_at_once", "every_layer": True, "task_share": 1.0},
@@ -33,32 +34,41 @@ WAYS: dict[str, dict[str, Any]] = {
 
 
 def recipe(way: str, **options: Any) -> Recipe:
-    return small(**{**WAYS[way], "epoch_frames": 960, **options})
+    return small(**{**WAYS[way], "epoch_frames": 480, **options})
 
 
-def trained(own: Recipe) -> Components:
-    components = build(own)
-    run(components, progress=False)
-    return components
+Whole = Callable[[str], tuple[Components, RunResult]]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """Trains each way once."""
+
+    @cache
+    def train(way: str) -> tuple[Components, RunResult]:
+        components = build(recipe(way))
+        return components, run(components, tmp_path_factory.mktemp("whole"), progress=False)
+
+    return train
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(way: str, tmp_path: Path) -> None:
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    run(build(recipe(way)), whole, progress=False)
+def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(way: str, whole: Whole, tmp_path: Path) -> None:
+    folder = whole(way)[1].folder
+    assert folder is not None
     components = build(recipe(way))
-    stop_after(components, 18)  # in the second epoch
-    assert run(components, stopped, progress=False).interrupted
-    assert not resume(stopped, progress=False).interrupted
-    assert_same(load_checkpoint(whole / "checkpoint.pt"), load_checkpoint(stopped / "checkpoint.pt"))
-    tables = [pd.read_csv(folder / "metrics.csv").drop(columns="seconds") for folder in (whole, stopped)]
-    pd.testing.assert_frame_equal(*tables, check_exact=True)
+    stop_after(components, 9)  # in the second epoch
+    assert run(components, tmp_path, progress=False).interrupted
+    assert not resume(tmp_path, progress=False).interrupted
+    assert_same_runs(folder, tmp_path)
 
 
 @pytest.mark.parametrize("way", ["ibs", "mega", "teacher"])
 def test_runs_side_by_side_are_those_that_they_would_be_alone(way: str) -> None:
-    options: dict[str, Any] = {"dtype": "float64", "epochs": 1, "frames_per_update": 40.0}
-    both, alone = (trained(recipe(way, **options, **own)) for own in ({"num_runs": 2}, {"seed": 1}))
+    options: dict[str, Any] = {"dtype": "float64", "frames_per_update": 40.0}
+    both, alone = (build(recipe(way, **options, **own)) for own in ({"num_runs": 2}, {"seed": 1}))
+    for components in (both, alone):
+        run(components, progress=False)
     rows, single = rows_of_run(both.buffer, 1), rows_of_run(alone.buffer)
     assert len(rows) == len(single)
     for key in ("desired_goal", "action", ("next", "reward")):
@@ -66,13 +76,12 @@ def test_runs_side_by_side_are_those_that_they_would_be_alone(way: str) -> None:
 
 
 @pytest.mark.parametrize("way", ["uniform_achieved", "ibs", "mega", "discover"])
-def test_goals_are_proposed_and_counted(way: str) -> None:
-    components = trained(recipe(way, num_runs=2))
+def test_goals_are_proposed_and_counted(way: str, whole: Whole) -> None:
+    components, result = whole(way)
     behavior = components.behavior
     assert behavior is not None
     assert min(behavior.memory.sizes) > 0
-    table = run(build(recipe(way)), progress=False).rows
-    assert 0.0 <= table[-1]["proposed_success"] <= 1.0
+    assert 0.0 <= result.rows[-1]["proposed_success"] <= 1.0
     stored = rows_of_run(components.buffer, 0)
     assert not {"proposed", "real_desired_goal", "achieved_goal"} & set(stored.keys())
 
@@ -148,8 +157,8 @@ def test_ibs_proposals_shrink_their_sigma_with_the_epochs() -> None:
 # Episodes with layers of their own
 
 
-def test_one_buffer_holds_rows_of_all_layers() -> None:
-    components = trained(recipe("all at once"))
+def test_one_buffer_holds_rows_of_all_layers(whole: Whole) -> None:
+    components, _ = whole("all at once")
     assert components.curriculum is not None
     assert isinstance(components.curriculum.progress, EpisodeLayers)
     rows = rows_of_run(components.buffer, 0)
@@ -161,8 +170,8 @@ def test_one_buffer_holds_rows_of_all_layers() -> None:
     assert (rows["observation"][~first][:, 5:7] != 0).any()
 
 
-def test_the_full_task_alone_is_played_and_trains_every_layer() -> None:
-    components = trained(recipe("every layer"))
+def test_the_full_task_alone_is_played_and_trains_every_layer(whole: Whole) -> None:
+    components, _ = whole("every layer")
     rows = rows_of_run(components.buffer, 0)
     rows = rows[~rows["virtual"].squeeze(-1)]
     reach, throw = (rows[rows["layer"].squeeze(-1) == layer] for layer in (0, 1))
@@ -172,15 +181,14 @@ def test_the_full_task_alone_is_played_and_trains_every_layer() -> None:
     assert torch.equal(reach["desired_goal"], throw["observation"][:, 5:7])  # the hand is to be at the ball
 
 
-def test_a_teacher_knows_both_layers() -> None:
-    components = trained(recipe("teacher"))
+def test_a_teacher_knows_both_layers(whole: Whole) -> None:
+    components, result = whole("teacher")
     assert components.curriculum is not None
     teacher = components.curriculum.progress
     assert isinstance(teacher, TeacherStudent)
     assert isinstance(components.env.transform[-1], LayerOutcomes)
-    rows = run(build(recipe("teacher")), progress=False).rows
-    assert 0.0 < rows[-1]["mean_layer"] < 1.0
-    assert "layer" not in rows[-1]
+    assert 0.0 < result.rows[-1]["mean_layer"] < 1.0
+    assert "layer" not in result.rows[-1]
 
 
 def test_the_policy_itself_begins_episodes() -> None:

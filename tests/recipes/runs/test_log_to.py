@@ -108,7 +108,7 @@ def test_after_a_kill_and_a_resumption_each_step_is_there_once(after: int, tmp_p
 
 
 def test_a_logger_that_joins_later_is_told_the_whole_table(tmp_path: Path) -> None:
-    run(build(small(epochs=2, epoch_frames=480, log=[])), tmp_path, progress=False)
+    run(build(small(epochs=2, epoch_frames=480)), tmp_path, progress=False)
     assert not (tmp_path / "tensorboard").exists()
     resume(tmp_path, options={"epochs": 3, "log": ["tensorboard"]}, progress=False)
     steps = [event.step for event in events(tmp_path / "tensorboard").Scalars("epoch/run_0")]

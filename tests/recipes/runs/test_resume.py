@@ -40,8 +40,8 @@ KILLS = 20
 ALL: dict[str, Any] = {
     "task": "hand_v1",
     "algo": "cher_ibs",
-    "seed": 5,  # of which the first layer ends before the last epoch
-    "epochs": 5,
+    "seed": 5,  # of which the first layer ends with the first epoch
+    "epochs": 3,
     "epoch_frames": 480,
     "episodes": 10,
     "window": 10,
@@ -80,7 +80,7 @@ def damage(path: Path) -> None:
 def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not(
     most: int, tmp_path: Path
 ) -> None:
-    recipe, draw = small(**ALL), random.Random(0)
+    recipe, draw = small(**ALL, log="tensorboard"), random.Random(0)
     run(build(recipe), tmp_path / "whole", progress=False)
     server()
     began = time.perf_counter()
@@ -100,7 +100,7 @@ def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not
     assert not list(folder.glob("*.part.*"))
     events = EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
-    assert [event.step for event in events.Scalars("success/run_0")] == [480, 960, 1_440, 1_920, 2_400]
+    assert [event.step for event in events.Scalars("success/run_0")] == [480, 960, 1_440]
 
 
 # Interrupted
@@ -136,7 +136,7 @@ def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not
     ],
 )
 def test_ctrl_c_at_any_batch_changes_nothing(options: dict[str, Any], tmp_path: Path) -> None:
-    recipe, draw = small(**{**options, "epochs": 3}), random.Random(1)
+    recipe, draw = small(**{"epoch_frames": 480, **options, "epochs": 3}), random.Random(1)
     run(build(recipe), tmp_path / "whole", progress=False)
     left = recipe.total_frames // (recipe.collection.num_envs * recipe.collection.steps_per_batch)
     batch = draw.randrange(left // 2)
@@ -431,7 +431,7 @@ def test_a_full_disk_does_not_end_a_run(tmp_path: Path) -> None:
 def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "metrics.part.csv").symlink_to("/dev/full")
     with pytest.warns(UserWarning, match=r"no table after 800 frames, the run continues: .*No space left"):
-        result = run(build(small(epochs=2, epoch_frames=800)), tmp_path, progress=False)
+        result = run(build(small(epochs=2, epoch_frames=800, log="tensorboard")), tmp_path, progress=False)
     assert len(result.rows) == len(RunFolder(tmp_path).rows()) == 2
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert [event.step for event in events.Scalars("success/run_0")] == [800, 1600]

@@ -17,7 +17,9 @@ from torchrl_her_recipes import Components, Recipe, build, load_policy, play, re
 
 from ..small import assert_same, small
 
-RECIPE = small(algo="filtered_her", seed=3, pictures=True, epsilon_start=1.0, epsilon_decay=0.9)
+RECIPE = small(
+    algo="filtered_her", seed=3, pictures=True, epsilon_start=1.0, epsilon_decay=0.9, log="tensorboard"
+)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -17,11 +16,12 @@ from typing import Any, Literal, NoReturn
 import pytest
 
 from torchrl_her_recipes.config.study import Study
-from torchrl_her_recipes.studies import worker_main, workers_local
+from torchrl_her_recipes.studies import workers_local
 from torchrl_her_recipes.studies.study import StudyResult, run_study
 from torchrl_her_recipes.studies.workers_local import LocalWorkers
 
 from ...forks import fork
+from .forked_worker import serve
 
 Whom = Literal["parent", "worker", "both"]
 WHOM: tuple[Whom, ...] = ("parent", "worker", "both")
@@ -129,14 +129,10 @@ class _Fork:
 
 
 def _serve(jobs: int, answers: int, others: list[int]) -> NoReturn:
-    """A worker, in a session of its own."""
+    """A worker."""
     try:
-        os.setsid()
-        os.dup2(jobs, 0)
-        os.dup2(answers, 1)
-        for own in (jobs, answers, *others):
+        for own in others:
             os.close(own)
-        sys.stdin, sys.stdout = os.fdopen(0), os.fdopen(1, "w")
-        worker_main.main()
+        serve(jobs, answers)
     finally:
         os._exit(0)

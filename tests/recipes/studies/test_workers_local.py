@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,15 @@ from torchrl_her_recipes.studies.jobs import Job, Outcome, Progress, can_resume
 from torchrl_her_recipes.studies.workers_local import LocalWorkers
 
 from ..small import small
+from .forked_worker import fork_workers
 
 LONG = 10_000  # epochs
 
 
 @pytest.fixture
-def workers() -> Iterator[LocalWorkers]:
+def workers(monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalWorkers]:
     """One worker."""
+    fork_workers(monkeypatch)
     workers = LocalWorkers(1)
     yield workers
     workers.close()
@@ -69,13 +70,14 @@ def test_one_process_does_several_jobs_until_it_is_told_to_stop(
 def test_a_process_that_dies_takes_only_its_job_along(
     tmp_path: Path, workers: LocalWorkers, submit: Callable[[Job], Future[Outcome]]
 ) -> None:
+    before = set(active_children())
     outcome = submit(job(tmp_path, epochs=LONG))
     wait_until(lambda: bool(workers.progress()), during=outcome)
-    (pid,) = children()
-    os.kill(pid, signal.SIGKILL)
+    (process,) = set(active_children()) - before
+    process.kill()
     assert outcome.result().error == "its process was ended by SIGKILL, perhaps for want of memory"
     assert workers.progress() == {}
-    assert children() == []  # the next job gets a new one
+    assert set(active_children()) == before  # the next job gets a new one
 
 
 def test_ctrl_c_while_they_are_closed_blocks_nobody() -> None:
@@ -89,13 +91,6 @@ def test_ctrl_c_while_they_are_closed_blocks_nobody() -> None:
     with pytest.raises(KeyboardInterrupt):
         workers.close()
     workers.close()
-
-
-def children() -> list[int]:
-    """Worker processes of this one."""
-    command = ["pgrep", "-P", str(os.getpid()), "-f", "worker_main"]
-    listed = subprocess.run(command, capture_output=True, text=True, check=False)
-    return [int(line) for line in listed.stdout.split()]
 
 
 def test_how_many_at_once() -> None:
