@@ -76,7 +76,7 @@ class Options:
     tau: float = 0.02
     action_penalty: float = 0.3  # keeps tanh from its ends, where its gradient vanishes
     max_grad_norm: float = 3.0
-    average_decay: float = 0.9995  # decay of the average of weights that is evaluated
+    ema_decay: float = 0.9995  # decay of the average of weights that is evaluated
     # Exploration: a share epsilon of the actions has noise, a fifth of it is uniform
     epsilon_decay: float = 0.9  # each epoch
     epsilon_end: float = 0.05
@@ -159,7 +159,7 @@ def train(options: Options) -> Iterator[Evaluation]:
     optimizer = torch.optim.Adam(loss.parameters(), lr=options.learning_rate)
     target = make_target_updater(loss, tau=options.tau, hard_interval=0)
     learner = FusedLearner(loss, optimizer, target, max_grad_norm=options.max_grad_norm)
-    average = PolicyAverage(actor, decay=options.average_decay)  # steadier than the actor itself
+    average = PolicyAverage(actor, decay=options.ema_decay)  # steadier than the actor itself
     buffer = make_buffer(options, progress)
     buffer.set_rng(torch.Generator().manual_seed(options.seed))
     collector = Collector(

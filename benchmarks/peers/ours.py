@@ -54,11 +54,11 @@ class OursHalf(Ours):
 
     name: ClassVar[str] = "this, DDPG, bfloat16"
     differs: ClassVar[str] = (
-        "as our DDPG, with `products=bfloat16`: what is multiplied between hidden layers has three digits."
+        "as our DDPG, with `matmul_dtype=bfloat16`: products between hidden layers are of three digits."
     )
 
     def make(self, recipe: Recipe) -> Trainer:
-        return super().make(recipe.replace(products="bfloat16"))
+        return super().make(recipe.replace(matmul_dtype="bfloat16"))
 
 
 class OursTD3(Ours):

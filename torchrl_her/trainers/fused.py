@@ -27,7 +27,7 @@ from torchrl_her.trainers.fused_weights import FusedWeights
 from torchrl_her.trainers.fusing import FUSED, action_key, is_plain_adam, network_of, why_not_fused
 from torchrl_her.trainers.learner import check_idle, check_rows, idle_runs
 
-Products = Literal["float32", "bfloat16"]
+MatmulDtype = Literal["float32", "bfloat16"]
 
 
 class FusedLearner:
@@ -47,7 +47,7 @@ class FusedLearner:
         target: update of the loss's target networks.
         max_grad_norm: to which the gradients of each network of each run are clipped separately; all
             critics count as one network.
-        products: the type of the numbers that are multiplied between hidden layers of at least 32 units.
+        matmul_dtype: the type of the numbers that are multiplied between hidden layers of at least 32 units.
             ``"bfloat16"`` makes a step of 3 x 256 units in two thirds of the time on processors with
             AVX512-BF16, and takes longer on others. It needs weights in float32. Sums, weights and Adam's
             moments stay float32, and so do the products of the first and the last layer. The action, which
@@ -79,7 +79,7 @@ class FusedLearner:
         target: TargetNetUpdater,
         *,
         max_grad_norm: float = 3.0,
-        products: Products = "float32",
+        matmul_dtype: MatmulDtype = "float32",
     ) -> None:
         self.loss, self.optimizer, self.target, self.max_grad_norm = loss, optimizer, target, max_grad_norm
         reason = why_not_fused(loss, target)
@@ -87,11 +87,12 @@ class FusedLearner:
             raise ValueError(f"these gradient steps cannot be fused: {reason}; use LossLearner")
         self._check_adam(loss)
         self._fused, dtype = FUSED[type(loss)], next(iter(loss.parameters())).dtype
-        if products not in get_args(Products):
-            raise ValueError(f"products must be one of {', '.join(get_args(Products))}, got {products!r}")
-        if products == "bfloat16" and dtype != torch.float32:
-            raise ValueError(f"products='bfloat16' needs weights in torch.float32, got {dtype}")
-        self._products = products
+        if matmul_dtype not in get_args(MatmulDtype):
+            known = ", ".join(get_args(MatmulDtype))
+            raise ValueError(f"matmul_dtype must be one of {known}, got {matmul_dtype!r}")
+        if matmul_dtype == "bfloat16" and dtype != torch.float32:
+            raise ValueError(f"matmul_dtype='bfloat16' needs weights in torch.float32, got {dtype}")
+        self._matmul_dtype = matmul_dtype
         self._steps, self._kinds = load_steps(dtype), structures(dtype)
         self._weights = FusedWeights(loss, optimizer, self._kinds)
         self._keys: list[NestedKey] = list(getattr(loss, self._fused.actor).in_keys)
@@ -155,7 +156,7 @@ class FusedLearner:
         job.critic, job.critic_layers = self._critic, len(self._critic)
         job.critics, job.critic_tensors = weights.critics, weights.critic_tensors
         job.tensors = weights.table()
-        job.max_norm, job.tau, job.bfloat16 = self.max_grad_norm, self.tau, self._products == "bfloat16"
+        job.max_norm, job.tau, job.bfloat16 = self.max_grad_norm, self.tau, self._matmul_dtype == "bfloat16"
         return call
 
     def _run(self, call: FusedCall, first: int, steps: int) -> Tensor:

@@ -80,9 +80,7 @@ def make_agent(
         ),
         norm=norm,
         average=(
-            PolicyAverage(player, decay=options.average_decay, runs=runs)
-            if options.average_decay > 0
-            else None
+            PolicyAverage(player, decay=options.ema_decay, runs=runs) if options.ema_decay > 0 else None
         ),
         guide=guide,
     )

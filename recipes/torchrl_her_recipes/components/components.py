@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl_her.behavior import BehaviorGoals
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.native.library import CannotCompile
-from torchrl_her.trainers.fused import FusedLearner, Products
+from torchrl_her.trainers.fused import FusedLearner, MatmulDtype
 from torchrl_her.trainers.fusing import is_plain_adam, why_not_fused
 from torchrl_her.trainers.graphs import GraphLearner, why_not_recorded
 from torchrl_her.trainers.learner import Learner, LossLearner
@@ -115,8 +115,8 @@ class Components(Agent):
             return GraphLearner(*parts, max_grad_norm=norm, runs=runs, compile=choice == "always")
         if reason is None:
             try:
-                products = cast(Products, self.recipe.learner.products)
-                return FusedLearner(*parts, max_grad_norm=norm, products=products)
+                matmul_dtype = cast(MatmulDtype, self.recipe.learner.matmul_dtype)
+                return FusedLearner(*parts, max_grad_norm=norm, matmul_dtype=matmul_dtype)
             except CannotCompile as error:
                 reason = str(error)
                 if choice == "auto":

@@ -34,6 +34,7 @@ GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
 }
 KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)}
 # groups that had options before, and the groups that have them now
+FORMER_NAMES = {"products": "matmul_dtype", "average_decay": "ema_decay"}
 FORMER = {"ibs": ("weights", "behavior"), "novelty": ("weights",), "curriculum": ("order",)}
 # groups whose options are always named with them: ``file`` alone would be unclear
 LONG_ONLY = ("demonstrations",)
@@ -78,13 +79,17 @@ def chosen(group: str, *values: Nested) -> str:
 
 
 def renamed(name: str) -> list[str]:
-    """Returns the names that an option has now, if its group had it before.
+    """Returns the names that an option has now, if it had another one or was in another group before.
 
     Example:
         >>> renamed("curriculum.window"), renamed("curriculum.order"), renamed("curriculum.layers")
         (['order.window'], ['order'], [])
+        >>> renamed("learner.average_decay")
+        ['learner.ema_decay']
     """
-    names, (group, _, own) = option_names(), str(name).partition(".")
+    names, (group, dot, own) = option_names(), str(name).partition(".")
+    if now := FORMER_NAMES.get(own or group):
+        return [group + dot + now if own else now]
     homes = [] if own in names.get(group, ()) else FORMER.get(group, ())
     return [home if own == home else f"{home}.{own}" for home in homes if own in (home, *names[home])]
 

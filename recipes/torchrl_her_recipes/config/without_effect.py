@@ -57,8 +57,8 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     processes = groups.collection.processes
     yield processes > 0, f"with processes={processes}", ["demonstrations.starts_share"]
     on_gpu = not learner.device.startswith(("cpu", "auto"))
-    yield on_gpu, f"with learner.device={learner.device}", ["learner.products"]
-    yield groups.run.dtype == "float64", "with dtype=float64", ["learner.products"]
+    yield on_gpu, f"with learner.device={learner.device}", ["learner.matmul_dtype"]
+    yield groups.run.dtype == "float64", "with dtype=float64", ["learner.matmul_dtype"]
 
 
 def _options(groups: Any, group: str) -> list[str]:

@@ -154,8 +154,8 @@ def _fallen(rows: Sequence[Row], recipe: Recipe) -> str | None:
     learner, helps = recipe.learner, [f"learning_rate below {recipe.learner.learning_rate:g}"]
     if learner.norm != "layer":
         helps.insert(0, "norm=layer")
-    if not getattr(learner, "average_decay", 1.0):
-        helps.insert(0, "average_decay=0.999")
+    if not getattr(learner, "ema_decay", 1.0):
+        helps.insert(0, "ema_decay=0.999")
     return (
         f"success was {max(means):.0%} and has fallen to {means[-1]:.0%}; best.safetensors has the best "
         f"policy. What helps: {' or '.join(helps)}"
@@ -164,7 +164,7 @@ def _fallen(rows: Sequence[Row], recipe: Recipe) -> str | None:
 
 _DIFFER = (
     f"the runs have differed by more than half in success for {_LONG} epochs: report the worst run, too. "
-    "What helps: more gradient steps (a lower frames_per_update), average_decay=0.999 or, in a curriculum, "
+    "What helps: more gradient steps (a lower frames_per_update), ema_decay=0.999 or, in a curriculum, "
     "guided_share=0.5"
 )
 

@@ -281,7 +281,7 @@ def test_a_few_demonstrations_teach_what_no_reward_has_taught_yet(tmp_path: Path
     shown = asked(str(path), episodes=20, share=0.5, q_filter=False) | short
     successes = []
     for options in (short, shown):
-        result = run(build(small(**options, average_decay=0.0, compile="never")), progress=False)
+        result = run(build(small(**options, ema_decay=0.0, compile="never")), progress=False)
         successes.append(sum(result.successes) / 3)
     without, with_demonstrations = successes
     assert without < 0.25

@@ -45,7 +45,7 @@ def test_actions_that_are_collected_are_the_actors_own() -> None:
 
 
 def test_without_an_average_the_last_weights_play() -> None:
-    components = build(small(average_decay=0.0))
+    components = build(small(ema_decay=0.0))
     assert components.average is None
     assert components.greedy is components.actor
     assert components.trainer().average is None
@@ -68,7 +68,7 @@ def test_values_of_discrete_actions_are_those_of_the_network_that_learns() -> No
 
 
 def test_each_run_has_the_average_that_it_would_have_alone() -> None:
-    options = {"dtype": "float64", "epochs": 2, "average_decay": 0.99}
+    options = {"dtype": "float64", "epochs": 2, "ema_decay": 0.99}
     _, together = trained(num_runs=2, seed=5, **options)
     _, alone = trained(seed=6, **options)
     assert together.steps[1] == alone.steps[0] > 0

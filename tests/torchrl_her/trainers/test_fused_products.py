@@ -73,7 +73,7 @@ def test_factors_between_hidden_layers_are_rounded(
     rows = make_rows(algorithm, (1, BATCH), dtype=torch.float32)
     others = [twin(loss) for _ in range(2)]
     exact = slopes_of(make(FusedLearner, loss), rows.clone())
-    fused = slopes_of(make(FusedLearner, others[0], products="bfloat16"), rows.clone())
+    fused = slopes_of(make(FusedLearner, others[0], matmul_dtype="bfloat16"), rows.clone())
     monkeypatch.setattr(StackedLinear, "forward", product_of_hidden_layers)
     wanted = slopes_of(make(LossLearner, others[1]), rows.clone())
     distance = (fused - wanted).norm() / wanted.norm()
@@ -83,12 +83,12 @@ def test_factors_between_hidden_layers_are_rounded(
 
 def test_numbers_without_digits_to_lose_give_the_same_results() -> None:
     learners = []
-    for products in ("float32", "bfloat16"):
+    for matmul_dtype in ("float32", "bfloat16"):
         torch.manual_seed(0)
         loss = make_loss("dqn", dtype=torch.float32, hidden=32, depth=2)
         for parameter in loss.parameters():
             parameter.data = (parameter.data * 12).round() / 4
-        learners.append(make(FusedLearner, loss, products=products))
+        learners.append(make(FusedLearner, loss, matmul_dtype=matmul_dtype))
     rows = make_rows("dqn", (1, BATCH), dtype=torch.float32)
     for key in ("observation", "desired_goal"):
         for where in (rows, rows["next"]):
@@ -101,17 +101,19 @@ def test_a_number_that_is_none_stays_one() -> None:
     loss = make_loss("dqn", dtype=torch.float32, hidden=32)
     rows = make_rows("dqn", (1, BATCH), dtype=torch.float32)
     rows["observation"][0, 0, 0] = torch.nan
-    measured = make(FusedLearner, loss, products="bfloat16").update(rows)
+    measured = make(FusedLearner, loss, matmul_dtype="bfloat16").update(rows)
     assert all(value.isnan().all() for value in measured.values())
 
 
 def test_weights_of_another_type_are_refused() -> None:
     loss = make_loss("ddpg", dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"products='bfloat16' needs weights in torch.float32, got torch.f"):
-        make(FusedLearner, loss, products="bfloat16")
+    with pytest.raises(
+        ValueError, match=r"matmul_dtype='bfloat16' needs weights in torch.float32, got torch.f"
+    ):
+        make(FusedLearner, loss, matmul_dtype="bfloat16")
 
 
 def test_products_that_there_are_not_are_refused() -> None:
     loss = make_loss("ddpg", dtype=torch.float32)
-    with pytest.raises(ValueError, match="products must be one of float32, bfloat16, got 'float16'"):
-        make(FusedLearner, loss, products="float16")
+    with pytest.raises(ValueError, match="matmul_dtype must be one of float32, bfloat16, got 'float16'"):
+        make(FusedLearner, loss, matmul_dtype="float16")

@@ -36,8 +36,8 @@ class LearnerConfig(Choice):
     needs: ClassVar[Needs] = (
         ("normalize", bool, "normalize_clip normalize_least_std"),
         ("hard_update_interval", not_, "tau"),
-        ("compile", "never".__ne__, "products"),
-        ("hidden", lambda width: width >= 32, "products"),
+        ("compile", "never".__ne__, "matmul_dtype"),
+        ("hidden", lambda width: width >= 32, "matmul_dtype"),
     )
     actions: ClassVar[Actions] = "continuous"
     stacks: ClassVar[bool] = True
@@ -74,7 +74,7 @@ class LearnerConfig(Choice):
         above=0,
     )
     tau: float = option(0.05, "rate of the soft target update", at_least=0, at_most=1)
-    average_decay: float = option(
+    ema_decay: float = option(
         0.9995,
         "what stays, in a gradient step, of the average of the actor's weights that is evaluated and kept; "
         "0: no average",
@@ -88,7 +88,7 @@ class LearnerConfig(Choice):
         "on a GPU through torch.compile, too",
         choices=("auto", "always", "never"),
     )
-    products: str = option(
+    matmul_dtype: str = option(
         "float32",
         "numbers that compiled gradient steps multiply between hidden layers; bfloat16: a third less time at "
         "hidden=256 where the processor has AVX512-BF16, more elsewhere",
