@@ -215,12 +215,12 @@ class _Transitions(NamedTuple):
         """
         if keep is None:
             return None
-        own = before[self.row]
+        achieved = before[self.row]
         if starts is None:
-            return lambda which, goals: keep(own[which].unsqueeze(1), goals)
+            return lambda which, goals: keep(achieved[which].unsqueeze(1), goals)
         start = starts[self.episode]
         return lambda which, goals: (
-            keep(own[which].unsqueeze(1), goals) | keep(start[which].unsqueeze(1), goals)
+            keep(achieved[which].unsqueeze(1), goals) | keep(start[which].unsqueeze(1), goals)
         )
 
     def draws(self, generators: Generators, position: Tensor | None) -> RunDraws:

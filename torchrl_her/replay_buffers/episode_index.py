@@ -117,14 +117,14 @@ def index_episodes(
         first = torch.cat((begins, behind))
         return EpisodeIndex(slots, lanes, oldest, begins, begins, begins, begins, first)
     lengths = begins.diff(append=behind)
-    own, order = trajectory[(begins + oldest) % slots].sort(stable=True)
+    ordered_ids, order = trajectory[(begins + oldest) % slots].sort(stable=True)
     ordered_begins, ordered_lengths = begins[order], lengths[order]
     ordered_places = ordered_lengths.cumsum(0) - ordered_lengths
     places = torch.empty_like(begins).index_copy_(0, order, ordered_places)
     last = (ordered_begins + ordered_lengths - 1 + oldest) % slots
     whole = done[last]
     opens = torch.ones_like(whole)
-    opens[1:] = (own[1:] != own[:-1]) | whole[:-1]
+    opens[1:] = (ordered_ids[1:] != ordered_ids[:-1]) | whole[:-1]
     for after, before in seams:  # two runs are one episode only if these agree
         opens[1:] |= _differ(after[last[:-1]], before[(ordered_begins[1:] + oldest) % slots])
     first = torch.cat((ordered_places[opens], behind))

@@ -115,10 +115,10 @@ def ends_of_held(lanes: Tensor, order: Tensor, held: int) -> Tensor:
     Args:
         lanes, order, held: as for :func:`broken`.
     """
-    own = order[order < held]
-    last = torch.ones_like(own, dtype=torch.bool)
-    last[:-1] = lanes[own[1:]] != lanes[own[:-1]]
-    return torch.zeros_like(lanes, dtype=torch.bool).index_fill_(0, own[last], True)
+    rows = order[order < held]
+    last = torch.ones_like(rows, dtype=torch.bool)
+    last[:-1] = lanes[rows[1:]] != lanes[rows[:-1]]
+    return torch.zeros_like(lanes, dtype=torch.bool).index_fill_(0, rows[last], True)
 
 
 def _jumps(rows: TensorDictBase, keys: TransitionKeys, last: Tensor, new: Tensor, where: Tensor) -> Tensor:

@@ -49,12 +49,12 @@ def split_layers(
     layer = rows.get(key, None)
     if layer is None:
         raise KeyError(f"episodes of several layers need the entry {key!r}, got {list(rows.keys())}")
-    own = layer.reshape(-1)[episodes.rows[:, 0]]
-    least, most = int(own.min()), int(own.max())
+    episode_layers = layer.reshape(-1)[episodes.rows[:, 0]]
+    least, most = int(episode_layers.min()), int(episode_layers.max())
     if least < 0 or most >= len(layers):
         raise ValueError(f"{key!r} must be in [0, {len(layers) - 1}], got {least if least < 0 else most}")
     for number, rule in enumerate(layers):
-        which = own == number
+        which = episode_layers == number
         if rule.view is not None:
             yield number, rule.view(rows), episodes, run
         elif bool(which.any()):

@@ -219,16 +219,16 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         row = _flat(index, storage.shape).to(stored.after.device)
         shape, row = row.shape, row.flatten()
         sampler, ends = self._slice_sampler(storage), None
-        own = torch.arange(len(row), device=row.device).unsqueeze(-1)
+        groups = torch.arange(len(row), device=row.device).unsqueeze(-1)
         inside = _moved(info.get(MASK), row.device)  # type: ignore[call-overload]  # TorchRL's keys may be nested
         if len(shape) == 2:  # a row for each slice: output_layout="batch_time"
-            own = own.view(shape)
+            groups = groups.view(shape)
         elif sampler is not None:
             ends = self._ends(sampler, info, row.device)
             place = stored.episodes.place(row)
-            own = slice_positions(place, stored.episodes.episode(place)[0], ends, inside)
+            groups = slice_positions(place, stored.episodes.episode(place)[0], ends, inside)
         generator = self.generator if self.generator is not None else generator_of(storage)
-        rows, goals, lenders = self._choose(stored, row, own, generator)
+        rows, goals, lenders = self._choose(stored, row, groups, generator)
         if self.weights is not None:
             self.weights.update(goals)
         ahead = None if self.options.n_steps == 1 else self._look_ahead(stored, row, rows, goals)
@@ -323,8 +323,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _may_relabel(self, storage: Storage) -> bool:
         """Returns whether the buffer has a user's function that may call :meth:`relabel`."""
         for buffer in self._buffers(storage):
-            own = functions_on_batches(buffer)
-            if all(each is None or each.__module__.startswith("torchrl.") for each in own):
+            functions = functions_on_batches(buffer)
+            if all(each is None or each.__module__.startswith("torchrl.") for each in functions):
                 return False
         return True
 
@@ -343,25 +343,25 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return None
 
     def _choose(
-        self, stored: _Stored, row: Tensor, own: Tensor, generator: torch.Generator | None
+        self, stored: _Stored, row: Tensor, groups: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draws which places [V] in a batch of rows [B] become virtual, and their goals [V, g].
 
         With metadata, also the rows [B] of their own episodes that achieved these goals; -1 for none.
 
-        ``own``, [G, L], are the places in the batch that get the same goal: single ones, or those of a slice.
+        ``groups``, [G, L], are the places in the batch that share a goal: single ones, or those of a slice.
         """
-        coin = torch.rand(len(own), device=row.device, generator=generator)
+        coin = torch.rand(len(groups), device=row.device, generator=generator)
         becomes = coin < self.k / (self.k + 1)
         sources = self.options.sources
         bounds = torch.tensor(list(sources.values()), device=row.device).cumsum(0)[:-1]
         # The same random number also selects the source.
-        own, number = own[becomes], torch.bucketize(coin[becomes] * (self.k + 1), bounds, right=True)
+        groups, number = groups[becomes], torch.bucketize(coin[becomes] * (self.k + 1), bounds, right=True)
         virtual = torch.zeros_like(row, dtype=torch.bool)
         goals = stored.after.new_zeros(len(row), *stored.after.shape[1:])
         lenders = torch.full_like(row, -1) if self.metadata else None
         for place, source in enumerate(sources):
-            part = own[number == place]
+            part = groups[number == place]
             lent, valid = self._draw(stored, row[part], source, generator)
             part, lent = part[valid], lent[valid]
             virtual.index_fill_(0, part.flatten(), True)

@@ -195,11 +195,13 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self.layers = check_layers(layers)
         check_whole(refill=refill, least=1)
         self.refill = refill
-        own = weights_by_run(weights, runs)
-        super().__init__(reward_fn, options, weights=own[0] if own and runs == 1 else None, **changes)
+        run_weights = weights_by_run(weights, runs)
+        super().__init__(
+            reward_fn, options, weights=run_weights[0] if run_weights and runs == 1 else None, **changes
+        )
         if refill > 1 and self.options.per == "episode":
             raise ValueError(f"refill={refill} is for per='transition': the filter looks at each of them")
-        self._weights = own  # weights of several runs
+        self._weights = run_weights  # weights of several runs
         self.runs = runs
         # reward functions of runs that do not use ``reward_fn``
         self._own_rewards: dict[int, RewardFunction] = {}
@@ -352,7 +354,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         state["cursors"] = [self._cursor] if self.runs == 1 else list(self._rings.cursors)
         state["sizes"] = self.sizes
         state.update(self._held.state_dict())
-        state["recent"] = [own.state_dict() for own in self._recent]
+        state["recent"] = [recent.state_dict() for recent in self._recent]
         state["episodes"], state["all_over"] = self._episodes, self._all_over
         state.update(self._counts.state_dict())
         state["weights"] = [weights.state_dict() for weights in self.goal_weights]
@@ -373,12 +375,12 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         recent = state_dict["recent"]
         if len(recent) != max(1, len(self.layers)):
             raise ValueError(f"the state is that of {len(recent)} layers, not of {max(1, len(self.layers))}")
-        self._recent = [RecentGoals.from_state(own) for own in recent]
+        self._recent = [RecentGoals.from_state(saved) for saved in recent]
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
         self._counts.load_state_dict(state_dict)
-        for weights, own in zip(self.goal_weights, state_dict["weights"], strict=False):
-            weights.load_state_dict(own)
+        for weights, saved in zip(self.goal_weights, state_dict["weights"], strict=False):
+            weights.load_state_dict(saved)
 
     def dumps(self, path: str | Path) -> None:
         super().dumps(path)
@@ -403,7 +405,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._rings.empty(run)
         self._counts.empty(run)
         self._held = self._held.without_run(run)
-        self._recent = [own.without_run(run) for own in self._recent]
+        self._recent = [recent.without_run(run) for recent in self._recent]
         if self.goal_weights:
             self.goal_weights[run].clear()
 
@@ -453,9 +455,9 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         places = Places(run, len(batch), runs=self.runs, device=lanes.device)
         most = self.k * self.refill + 1  # copies of a transition
         entries = max(1, min(_ROWS, self.capacity) // most), _ROWS // most
-        own = None if run is None else run[episodes.rows[:, :1]].flatten()
+        episode_runs = None if run is None else run[episodes.rows[:, :1]].flatten()
         recent, settings, drafts, first_id = list(self._recent), self._settings(), [], self._episodes
-        for layer, shown, part, run_of in self._by_layer(rows, episodes, own):
+        for layer, shown, part, run_of in self._by_layer(rows, episodes, episode_runs):
             lately = recent[layer].after(shown, part, run_of, self._keys, sizes=self.options.remembered)
             recent[layer] = lately
             for piece in split_runs(part, run_of, settings, each=entries[0], together=entries[1]):
@@ -485,7 +487,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     def _settings(self) -> list[Hashable]:
         """Returns settings of each run that must be equal in runs that are written at once."""
-        alike = [own.alike for own in self.goal_weights] or [True] * self.runs
+        alike = [weights.alike for weights in self.goal_weights] or [True] * self.runs
         return [(id(self.reward_of(run)), alike[run], self._times(run)) for run in range(self.runs)]
 
     def _times(self, run: int) -> int:
@@ -498,10 +500,10 @@ class HERWriter(HindsightBase, RoundRobinWriter):
     def _draft(self, chunk: Chunk, recent: RecentGoals, *, weighted: bool, first_id: int) -> _Draft:
         """Returns the transitions of some episodes. Nothing is written or counted yet."""
         runs, virtual = chunk.piece.runs, None
-        own = self.goal_weights if weighted else []
+        weights = self.goal_weights if weighted else []
         drawn = draw_for_runs(
             chunk,
-            weights=self._weights_of_runs() if own and not own[runs[0]].alike else None,
+            weights=self._weights_of_runs() if weights and not weights[runs[0]].alike else None,
             generators=[self._rng] if self.generators is None else [self.generators[run] for run in runs],
             recent=recent,
             times=self._times(runs[0]),
@@ -551,8 +553,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
 
     def _weights_of_runs(self) -> WeightsOfRuns:
         """Returns the weights of all runs as one object; there must be weights."""
-        own = self.goal_weights
-        return own[0].of_runs(own) if isinstance(own[0], GoalWeights) else WeightsOfRuns(own)
+        weights = self.goal_weights
+        return weights[0].of_runs(weights) if isinstance(weights[0], GoalWeights) else WeightsOfRuns(weights)
 
     def _store(self, rows: TensorDictBase, runs: list[int], counts: list[int]) -> None:
         """Writes rows slice by slice, which is far faster than the plain writer's index for each row.

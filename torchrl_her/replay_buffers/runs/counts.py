@@ -46,11 +46,11 @@ class RunCounts:
         totals: R, ever.
 
     Example:
-        >>> own = RunCounts(2)
-        >>> own.add([1], real=[3])
-        >>> own.empty(1)
-        >>> own.add([0, 1], real=[1, 2])
-        >>> [counts.real for counts in own.counts], [totals.real for totals in own.totals]
+        >>> run_counts = RunCounts(2)
+        >>> run_counts.add([1], real=[3])
+        >>> run_counts.empty(1)
+        >>> run_counts.add([0, 1], real=[1, 2])
+        >>> [counts.real for counts in run_counts.counts], [totals.real for totals in run_counts.totals]
         ([1, 2], [1, 5])
     """
 
@@ -66,8 +66,8 @@ class RunCounts:
         """
         for position, run in enumerate(runs):
             for counts in (self.counts[run], self.totals[run]):
-                for name, own in numbers.items():
-                    setattr(counts, name, getattr(counts, name) + own[position])
+                for name, values in numbers.items():
+                    setattr(counts, name, getattr(counts, name) + values[position])
 
     def empty(self, run: int) -> None:
         """Counts a run from 0 again; its totals are kept."""

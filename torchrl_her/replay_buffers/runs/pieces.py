@@ -40,7 +40,7 @@ class Piece(NamedTuple):
         if run is None:
             return [len(index)]
         numbers = run.index_select(0, index).bincount(minlength=max(self.runs) + 1).tolist()
-        return [numbers[own] for own in self.runs]
+        return [numbers[run_index] for run_index in self.runs]
 
 
 def split_runs(
@@ -89,10 +89,10 @@ def _shares(episodes: Episodes, run: Tensor, runs: int, each: int) -> Iterator[_
     numbers = run.bincount(minlength=runs).tolist()
     longest = episodes.lengths.new_zeros(runs).scatter_reduce_(0, run, episodes.lengths, "amax").tolist()
     begin = 0
-    for own, (number, horizon) in enumerate(zip(numbers, longest, strict=True)):
+    for run_index, (number, horizon) in enumerate(zip(numbers, longest, strict=True)):
         at_once = max(1, each // max(1, horizon))
         for start in range(0, number, at_once):
-            yield _Share(own, begin + start, min(at_once, number - start), horizon)
+            yield _Share(run_index, begin + start, min(at_once, number - start), horizon)
         begin += number
 
 
@@ -101,8 +101,8 @@ def _join(episodes: Episodes, shares: list[_Share]) -> Piece:
     horizon = max(share.horizon for share in shares)
     first, last = shares[0], shares[-1]
     if last.begin + last.number - first.begin == sum(share.number for share in shares):  # without a gap
-        own = slice(first.begin, last.begin + last.number)
-        rows, lengths = episodes.rows[own], episodes.lengths[own]
+        span = slice(first.begin, last.begin + last.number)
+        rows, lengths = episodes.rows[span], episodes.lengths[span]
     else:
         parts = [slice(share.begin, share.begin + share.number) for share in shares]
         rows = torch.cat([episodes.rows[part] for part in parts])

@@ -85,7 +85,9 @@ class RecentGoals:
 
     def without_run(self, run: int) -> RecentGoals:
         """Returns the memory without one run's goals."""
-        return RecentGoals({name: (*own[:run], None, *own[run + 1 :]) for name, own in self.goals.items()})
+        return RecentGoals(
+            {name: (*goals[:run], None, *goals[run + 1 :]) for name, goals in self.goals.items()}
+        )
 
     def lines(self, name: str, runs: Sequence[int]) -> tuple[Tensor, Episodes]:
         """Joins the goals of one kind of some runs, which all have goals.
@@ -93,15 +95,15 @@ class RecentGoals:
         Returns:
             ``(goals, lines)``: [p, g], and where those of each run lie in there, as those of an episode do.
         """
-        own = [goals for run in runs if (goals := self.goals[name][run]) is not None]
-        goals = own[0] if len(own) == 1 else torch.cat([part.to(own[-1]) for part in own])
-        lengths = torch.tensor([len(part) for part in own], device=goals.device)
+        parts = [goals for run in runs if (goals := self.goals[name][run]) is not None]
+        goals = parts[0] if len(parts) == 1 else torch.cat([part.to(parts[-1]) for part in parts])
+        lengths = torch.tensor([len(part) for part in parts], device=goals.device)
         step = torch.arange(int(lengths.max()), device=goals.device).minimum(lengths.unsqueeze(-1) - 1)
         return goals, Episodes((lengths.cumsum(0) - lengths).unsqueeze(-1) + step, lengths)
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain data that :meth:`from_state` takes."""
-        return {name: list(own) for name, own in self.goals.items()}
+        return {name: list(goals) for name, goals in self.goals.items()}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Sequence[Tensor | None]]) -> RecentGoals:

@@ -63,9 +63,9 @@ class RunsSampler(Sampler):
         """Draws indices [batch_size] of rows: R equal blocks."""
         n, sizes = _share(self, storage, batch_size), self._sizes.tolist()
         place = torch.zeros(self.runs, n, dtype=torch.int64, device=self.device)
-        for own, size, generator in zip(place, sizes, generators_of(self), strict=True):
+        for block, size, generator in zip(place, sizes, generators_of(self), strict=True):
             if size:
-                own.random_(size, generator=generator)
+                block.random_(size, generator=generator)
         return rows_of(place, [size > 0 for size in sizes], self.capacity), {}
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
@@ -187,7 +187,7 @@ class RunsPrioritizedSampler(PrioritizedSampler):
         """Draws indices [batch_size] of rows, R equal blocks, with their importance weights."""
         n = _share(self, storage, batch_size)
         filled = (self._sizes > 0).tolist()
-        counts = [n * own for own in filled]
+        counts = [n * has_rows for has_rows in filled]
         u = uniform(counts, 1, generators_of(self), dtype=torch.float64, device=self.device)
         if not all(filled):
             drawn = torch.tensor(filled, device=u.device).view(-1, 1, 1).expand(-1, n, 1)
@@ -253,10 +253,10 @@ class RunsPrioritizedSampler(PrioritizedSampler):
 
     def _warn_of(self, run: Tensor) -> None:
         """Warns about priorities that are not finite, once for each run [n]."""
-        for own in sorted(set(run.tolist()) - self._warned):
-            self._warned.add(own)
+        for run_index in sorted(set(run.tolist()) - self._warned):
+            self._warned.add(run_index)
             warnings.warn(
-                f"run {own} was given priorities that are not finite; they are ignored, now and later",
+                f"run {run_index} was given priorities that are not finite; they are ignored, now and later",
                 RuntimeWarning,
                 stacklevel=4,
             )
@@ -339,8 +339,8 @@ def rows_of(place: Tensor, filled: Sequence[bool], capacity: int) -> Tensor:
     row = place + torch.arange(0, len(filled) * capacity, capacity, device=place.device).unsqueeze(-1)
     if not all(filled):
         stand_in = list(filled).index(True)
-        for run, own in enumerate(filled):
-            if not own:
+        for run, has_rows in enumerate(filled):
+            if not has_rows:
                 row[run] = row[stand_in]
     return row.flatten()
 

@@ -206,13 +206,13 @@ def unpack(packed: Tensor, fields: Sequence[Field]) -> TensorDict:
     shape, device = packed.shape[:1], packed.device
     typed: dict[torch.dtype, Tensor] = {}
     source: dict[Any, Any] = {}
-    for key, dtype, own, begin, end in fields:
+    for key, dtype, entry_shape, begin, end in fields:
         if dtype not in typed:
             typed[dtype] = packed.view(dtype) if dtype != torch.bool else packed.view(torch.uint8).view(dtype)
         size = dtype.itemsize
         entry = typed[dtype][:, begin // size : end // size]
-        if len(own) != 1:
-            entry = entry.unflatten(1, own) if own else entry.squeeze(1)
+        if len(entry_shape) != 1:
+            entry = entry.unflatten(1, entry_shape) if entry_shape else entry.squeeze(1)
         *path, last = _path(key)
         target = source
         for part in path:
@@ -223,11 +223,11 @@ def unpack(packed: Tensor, fields: Sequence[Field]) -> TensorDict:
 
 def _tensordict(source: dict[Any, Any], shape: torch.Size, device: torch.device) -> TensorDict:
     """Makes a tensordict of tensors that fit, without checks, which would take most of the time."""
-    own = {
+    entries = {
         key: _tensordict(entry, shape, device) if isinstance(entry, dict) else entry
         for key, entry in source.items()
     }
-    return TensorDict._new_unsafe(source=own, batch_size=shape, device=device)
+    return TensorDict._new_unsafe(source=entries, batch_size=shape, device=device)
 
 
 def _is_plain_node(entry: Any, shape: torch.Size) -> bool:
