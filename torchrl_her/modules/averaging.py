@@ -56,9 +56,9 @@ class PolicyAverage(nn.Module):
         self.module = deepcopy(policy).requires_grad_(False)
         self.decay, self._policy = decay, (policy,)  # in a tuple, so that it is not a submodule
         self.register_buffer("steps", torch.zeros(runs, dtype=torch.int64))
-        self._weights = [list(own.parameters()) for own in (self.module, policy)]
+        self._weights = [list(module.parameters()) for module in (self.module, policy)]
         self._copies = next(self.module.buffers(), None) is not None
-        wrong = [own.shape for own in self._weights[0] if runs > 1 and own.shape[:1] != (runs,)]
+        wrong = [weight.shape for weight in self._weights[0] if runs > 1 and weight.shape[:1] != (runs,)]
         if wrong:
             raise ValueError(f"the weights of {runs} runs must be stacked, got a parameter {list(wrong[0])}")
 
@@ -77,14 +77,16 @@ class PolicyAverage(nn.Module):
         """
         made = [0 if run in idle else steps for run in range(len(self.steps))]
         self.steps += torch.tensor(made, device=self.steps.device)
-        kept = [self._kept(done) ** own for done, own in zip(self.steps.tolist(), made, strict=True)]
+        kept = [self._kept(done) ** count for done, count in zip(self.steps.tolist(), made, strict=True)]
         averaged, learned = self._weights
         if len(set(kept)) == 1:
             torch._foreach_lerp_(averaged, learned, 1.0 - kept[0])
         else:
-            for own, now in zip(averaged, learned, strict=True):
-                share = torch.tensor([1.0 - each for each in kept], dtype=own.dtype, device=own.device)
-                own.lerp_(now, share.view(-1, *[1] * (own.ndim - 1)))
+            for average, now in zip(averaged, learned, strict=True):
+                share = torch.tensor(
+                    [1.0 - each for each in kept], dtype=average.dtype, device=average.device
+                )
+                average.lerp_(now, share.view(-1, *[1] * (average.ndim - 1)))
         if self._copies:
             self._copy_buffers()
 
@@ -92,8 +94,8 @@ class PolicyAverage(nn.Module):
     def restart(self) -> None:
         """Restarts the average from the policy's present weights."""
         self.steps.zero_()
-        for own, now in zip(*self._weights, strict=True):
-            own.copy_(now)
+        for average, now in zip(*self._weights, strict=True):
+            average.copy_(now)
         self._copy_buffers()
 
     def _kept(self, done: int) -> float:
@@ -101,5 +103,5 @@ class PolicyAverage(nn.Module):
         return min(self.decay, (1 + done) / (10 + done))
 
     def _copy_buffers(self) -> None:
-        for own, now in zip(self.module.buffers(), self.policy.buffers(), strict=True):
-            own.copy_(now)
+        for buffer, now in zip(self.module.buffers(), self.policy.buffers(), strict=True):
+            buffer.copy_(now)

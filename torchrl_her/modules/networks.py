@@ -87,8 +87,8 @@ class StackedBatchNorm(nn.Module):
         """Normalizes [R, rows, width] entry by entry; the shape stays."""
         runs, rows, width = x.shape
         flat = x.transpose(0, 1).reshape(rows, runs * width)
-        own = (self.running_mean, self.running_var, self.weight, self.bias)
-        mean, variance, weight, bias = (each.view(-1) for each in own)
+        tensors = (self.running_mean, self.running_var, self.weight, self.bias)
+        mean, variance, weight, bias = (each.view(-1) for each in tensors)
         learns = self.training and self.weight.requires_grad
         flat = nn.functional.batch_norm(flat, mean, variance, weight, bias, learns)
         return flat.view(rows, runs, width).transpose(0, 1)
@@ -161,7 +161,7 @@ def hidden_layers(
         if word not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {word!r}")
     widths = [inputs, hidden + joined, *[hidden] * (depth - 2)]
-    return [hidden_layer(own, hidden, runs=runs, norm=norm, activation=activation) for own in widths]
+    return [hidden_layer(width, hidden, runs=runs, norm=norm, activation=activation) for width in widths]
 
 
 class ActorNet(nn.Module):
@@ -251,8 +251,8 @@ class CriticNet(nn.Module):
         first, *rest = hidden_layers(
             inputs, hidden, depth, joined=actions, runs=runs, norm=norm, activation=activation
         )
-        own = [StackedBatchNorm(inputs, runs=runs)] if norm == "batch" else []
-        self.first = nn.Sequential(*own, first)
+        norms = [StackedBatchNorm(inputs, runs=runs)] if norm == "batch" else []
+        self.first = nn.Sequential(*norms, first)
         self.rest = nn.Sequential(*rest, StackedLinear(hidden, outputs, runs=runs, bound=_LAST_LAYER))
 
     def forward(self, *inputs: Tensor) -> Tensor:

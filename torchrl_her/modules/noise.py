@@ -59,11 +59,11 @@ class RunNoise:
             torch.Size([3, 2])
         """
         sources: Sequence[torch.Generator | None] = self.generators or [None]
-        devices = [None if own is None else own.device for own in sources]
+        devices = [None if source is None else source.device for source in sources]
         drawn = [
             torch.arange(count, device=device)
             if run in self.idle
-            else torch.randperm(of, generator=own, device=device)[:count]
-            for run, (own, device) in enumerate(zip(sources, devices, strict=True))
+            else torch.randperm(of, generator=source, device=device)[:count]
+            for run, (source, device) in enumerate(zip(sources, devices, strict=True))
         ]
         return torch.stack(drawn).sort(-1).values

@@ -139,14 +139,14 @@ class RunningNorm(nn.Module):
         super().__init__()
         if not widths:
             raise ValueError("widths must name at least one entry to normalize, got none")
-        check_whole(runs=runs, **{f"the width of {key!r}": own for key, own in widths.items()})
+        check_whole(runs=runs, **{f"the width of {key!r}": size for key, size in widths.items()})
         for name, number in (("clip", clip), ("least_std", least_std)):
             if number is not None and not number > 0:
                 raise ValueError(f"{name} must be above 0, got {number}")
         self.widths = {unravel_key(key): width for key, width in widths.items()}
         self.runs, self.clip, self.least_std, self.frozen = runs, clip, least_std, False
         ends = list(accumulate(self.widths.values(), initial=0))
-        self._columns = {key: slice(*own) for key, own in zip(self.widths, pairwise(ends), strict=True)}
+        self._columns = {key: slice(*bounds) for key, bounds in zip(self.widths, pairwise(ends), strict=True)}
         # Without values, mean 0 and variance 1 leave all as it is.
         for name, start in (("n", 0.0), ("mean", 0.0), ("var", 1.0)):
             self.register_buffer(name, torch.full((runs, ends[-1]), start, dtype=torch.float64))
@@ -159,7 +159,7 @@ class RunningNorm(nn.Module):
     def moments_of(self, key: NestedKey, run: int = 0) -> Moments:
         """Returns number, mean and variance of an entry's values so far, [width] each, as views."""
         columns = self.columns_of(key)
-        return Moments(*(own[run, columns] for own in (self.n, self.mean, self.var)))
+        return Moments(*(statistic[run, columns] for statistic in (self.n, self.mean, self.var)))
 
     @property
     def std(self) -> Tensor:
@@ -183,8 +183,8 @@ class RunningNorm(nn.Module):
         columns = torch.arange(self.n.shape[-1], device=self.n.device)
         columns = columns if key is None else columns[self.columns_of(key)]
         columns = columns if places is None else columns[list(places)]
-        for own, start in ((self.n, 0.0), (self.mean, 0.0), (self.var, 1.0)):
-            (own if run is None else own[run : run + 1])[:, columns] = start
+        for statistic, start in ((self.n, 0.0), (self.mean, 0.0), (self.var, 1.0)):
+            (statistic if run is None else statistic[run : run + 1])[:, columns] = start
 
     @torch.no_grad()
     def update(
@@ -220,8 +220,8 @@ class RunningNorm(nn.Module):
             for run, part in zip(runs, values.flatten(0, -2).split(shares), strict=True)
             if len(part) > 0
         ]
-        for own, moments_of_part in new:
-            _add(own, moments_of_part)
+        for running, moments_of_part in new:
+            _add(running, moments_of_part)
         return undo
 
     def snapshot(self) -> Callable[[], None]:
@@ -235,11 +235,11 @@ class RunningNorm(nn.Module):
             >>> norm.n.tolist()
             [[0.0]]
         """
-        before = [(own, own.clone()) for own in (self.n, self.mean, self.var)]
+        before = [(statistic, statistic.clone()) for statistic in (self.n, self.mean, self.var)]
 
         def put_back() -> None:
-            for own, value in before:
-                own.copy_(value)
+            for statistic, value in before:
+                statistic.copy_(value)
 
         return put_back
 
@@ -259,15 +259,15 @@ class RunningNorm(nn.Module):
             ValueError: the values are wider, or are not finite, which would spoil the statistics for good;
                 or the weight is negative or not finite.
         """
-        width, own = values.shape[-1], self.moments_of(key, run)
-        if width > len(own.mean):
-            raise ValueError(f"{key!r} must have a width of at most {len(own.mean)}, got {width}")
+        width, running = values.shape[-1], self.moments_of(key, run)
+        if width > len(running.mean):
+            raise ValueError(f"{key!r} must have a width of at most {len(running.mean)}, got {width}")
         if not 0 <= weight < math.inf:
             raise ValueError(f"weight must be at least 0 and finite, got {weight}")
         if self.frozen or values.numel() == 0 or weight == 0:
             return
         new = self._finite_moments(key, values)
-        _add(Moments(*(each[:width] for each in own)), new._replace(n=new.n * weight))
+        _add(Moments(*(each[:width] for each in running)), new._replace(n=new.n * weight))
 
     def normalize(self, key: NestedKey, values: Tensor) -> Tensor:
         """Returns normalized values of one entry.
@@ -288,9 +288,9 @@ class RunningNorm(nn.Module):
         self._check_blocks(values.shape[:-1])
         if not values.is_floating_point():  # means and deviations would be rounded to whole numbers, too
             values = values.to(torch.get_default_dtype())
-        n, mean, std = (own[:, columns] for own in (self.n, self.mean, self.std))
+        n, mean, std = (statistic[:, columns] for statistic in (self.n, self.mean, self.std))
         limit = torch.where(n > 0, self.clip, torch.inf)  # values stay as they are before the first update
-        mean, std, limit = (own.to(values).unsqueeze(1) for own in (mean, std, limit))
+        mean, std, limit = (tensor.to(values).unsqueeze(1) for tensor in (mean, std, limit))
         return normalize(by_run(values, self.runs), mean, std, limit).view(values.shape)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -339,9 +339,9 @@ class RunningNorm(nn.Module):
         return f"{self.widths}, runs={self.runs}, clip={self.clip}, least_std={self.least_std}"
 
 
-def _add(own: Moments, new: Moments) -> None:
+def _add(running: Moments, new: Moments) -> None:
     """Merges moments into others, in place: other processes may share their memory."""
-    for each, value in zip(own, merge(own, new), strict=True):
+    for each, value in zip(running, merge(running, new), strict=True):
         each.copy_(value)
 
 

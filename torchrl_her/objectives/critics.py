@@ -76,12 +76,12 @@ def critic_values(loss: LossModule, transitions: TensorDictBase) -> Tensor | Non
     training, values = network.training, []
     network.eval()  # batch normalization neither uses nor changes the statistics of this batch
     try:
-        for own in params.data.unbind(0) if params.ndim else [params.data]:
-            with own.to_module(network, preserve_module_state=False):
+        for weights in params.data.unbind(0) if params.ndim else [params.data]:
+            with weights.to_module(network, preserve_module_state=False):
                 values.append(network(transitions.select(*network.in_keys)).get(key))
     finally:
         network.train(training)
-    return torch.cat([own.mean(-1, keepdim=True) for own in values], -1)
+    return torch.cat([value.mean(-1, keepdim=True) for value in values], -1)
 
 
 def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
@@ -104,8 +104,8 @@ def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
         return values.amin(0)
     drawn = noise.subsets(count, len(values)).to(values.device)  # [R, count]
     blocks = values.reshape(len(values), len(drawn), -1)
-    own = torch.arange(len(drawn), device=values.device)
-    return blocks[drawn.T, own].amin(0).view(values.shape[1:])
+    run = torch.arange(len(drawn), device=values.device)
+    return blocks[drawn.T, run].amin(0).view(values.shape[1:])
 
 
 def checked_subset(target_critics: int, critics: int) -> int:
@@ -138,8 +138,8 @@ def as_critics(
             normalization, whose statistics a stack of critics cannot move.
     """
     check_whole(critics=critics)
-    for own in [critic] if isinstance(critic, TensorDictModule) else critic:
-        if any(isinstance(layer, StackedBatchNorm) for layer in own.modules()):
+    for module in [critic] if isinstance(critic, TensorDictModule) else critic:
+        if any(isinstance(layer, StackedBatchNorm) for layer in module.modules()):
             raise ValueError("norm must be none or layer in critics of this loss, got 'batch'; DDPG has it")
     if isinstance(critic, TensorDictModule):
         return critic

@@ -172,10 +172,10 @@ def make_sac_loss(
         >>> loss.num_qvalue_nets
         2
     """
-    own = as_critics(critic, critics)
+    networks = as_critics(critic, critics)
     loss = PenalizedSACLoss(
         actor,
-        own,
+        networks,
         action_spec=action_spec,
         num_qvalue_nets=critics,
         loss_function="l2",
@@ -189,7 +189,7 @@ def make_sac_loss(
         cloning=cloning,
     )
     keep_weights(loss, critic)
-    loss.set_keys(state_action_value=(own[0] if isinstance(own, list) else own).out_keys[0])
+    loss.set_keys(state_action_value=(networks[0] if isinstance(networks, list) else networks).out_keys[0])
     set_soft_targets(loss, gamma, reward_range)
     return loss
 

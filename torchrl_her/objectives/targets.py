@@ -84,7 +84,7 @@ class _BuffersToo(TargetNetUpdater):
     def step(self) -> None:
         super().step()
         for name, buffers in self._buffers.items():
-            source, target = (getattr(self.loss_module, own) for own in (name, f"target_{name}"))
+            source, target = (getattr(self.loss_module, attribute) for attribute in (name, f"target_{name}"))
             self._step(source.select(*buffers), target.select(*buffers))
 
 
@@ -132,10 +132,10 @@ class RunsHardUpdate(HardUpdate, _BuffersToo):
     def _step(self, p_source: TensorDictBase, p_target: TensorDictBase) -> None:
         dim, runs = p_target.ndim, len(self.counts)  # a stack of N critics is [N, R, ...]
         for key, target in p_target.items(True, True):
-            source, own = (
+            source, delayed = (
                 each.data.unflatten(dim, (runs, -1)).movedim(dim, 0) for each in (p_source.get(key), target)
             )
-            own[self._due] = source[self._due]
+            delayed[self._due] = source[self._due]
 
     def state_dict(self) -> dict[str, Any]:
         return {**super().state_dict(), "counts": list(self.counts)}

@@ -160,10 +160,10 @@ def make_td3_loss(
         >>> loss.num_qvalue_nets
         2
     """
-    own = as_critics(critic, critics)
+    networks = as_critics(critic, critics)
     loss = PenalizedTD3Loss(
         actor,
-        own,
+        networks,
         action_spec=action_spec,
         num_qvalue_nets=critics,
         loss_function="l2",
@@ -175,7 +175,7 @@ def make_td3_loss(
         cloning=cloning,
     )
     keep_weights(loss, critic)
-    key = (own[0] if isinstance(own, list) else own).out_keys[0]
+    key = (networks[0] if isinstance(networks, list) else networks).out_keys[0]
     estimator = clamped_td0(gamma, reward_range)
     loss.set_keys(state_action_value=key)
     estimator.set_keys(value=key)

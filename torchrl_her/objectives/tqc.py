@@ -119,8 +119,8 @@ def make_tqc_loss(
         >>> make_tqc_loss(actor, critic, action_spec=spec).top_quantiles_to_drop_per_net
         2
     """
-    own = as_critics(critic, critics)
-    first = own[0] if isinstance(own, list) else own
+    networks = as_critics(critic, critics)
+    first = networks[0] if isinstance(networks, list) else networks
     quantiles = getattr(first.module, "outputs", None)
     if not isinstance(quantiles, int):
         raise ValueError(
@@ -135,7 +135,7 @@ def make_tqc_loss(
         )
     loss = PenalizedTQCLoss(
         actor,
-        own,
+        networks,
         action_spec=action_spec,
         num_qvalue_nets=critics,
         top_quantiles_to_drop_per_net=dropped_quantiles,
