@@ -210,7 +210,7 @@ def _processor_flags() -> str:
 
 
 def _cache() -> Path:
-    if own := os.environ.get("TORCHRL_HER_CACHE"):
-        return Path(own)
+    if path := os.environ.get("TORCHRL_HER_CACHE"):
+        return Path(path)
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "torchrl_her"

@@ -54,7 +54,7 @@ class RunsAdam(torch.optim.Adam):
     def start(self, parameter: nn.Parameter) -> dict[str, Tensor]:
         """Initializes the state of a parameter before its first step."""
         dim = self._dims[id(parameter)]
-        shape = [size if own == dim else 1 for own, size in enumerate(parameter.shape)]
+        shape = [size if i == dim else 1 for i, size in enumerate(parameter.shape)]
         state: dict[str, Tensor] = self.state[parameter]
         state["step"] = torch.zeros(shape, dtype=torch.float32, device=parameter.device)
         state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter.data) for _ in range(2))
@@ -70,20 +70,20 @@ class RunsAdam(torch.optim.Adam):
     def step(self, closure: Callable[[], float] | None = None) -> Any:
         """Makes one step for each run, with its own bias corrections."""
         for group in self.param_groups:
-            parameters = [own for own in group["params"] if own.grad is not None]
-            states = [self.state[own] or self.start(own) for own in parameters]
-            gradients = [own.grad for own in parameters]
-            first, second = ([own[name] for own in states] for name in ("exp_avg", "exp_avg_sq"))
+            parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
+            states = [self.state[parameter] or self.start(parameter) for parameter in parameters]
+            gradients = [parameter.grad for parameter in parameters]
+            first, second = ([entries[name] for entries in states] for name in ("exp_avg", "exp_avg_sq"))
             beta1, beta2 = group["betas"]
             torch._foreach_lerp_(first, gradients, 1 - beta1)
             torch._foreach_mul_(second, beta2)
             torch._foreach_addcmul_(second, gradients, gradients, 1 - beta2)
-            for own, state, m, v in zip(parameters, states, first, second, strict=True):
+            for parameter, state, m, v in zip(parameters, states, first, second, strict=True):
                 state["step"] += 1
                 count = state["step"].double()
-                size = (group["lr"] / (1 - beta1**count)).to(own.dtype)
-                spread = (1 - beta2**count).sqrt().to(own.dtype)
-                own.sub_(size * m / (v.sqrt() / spread + group["eps"]))
+                size = (group["lr"] / (1 - beta1**count)).to(parameter.dtype)
+                spread = (1 - beta2**count).sqrt().to(parameter.dtype)
+                parameter.sub_(size * m / (v.sqrt() / spread + group["eps"]))
 
 
 def dim_of_runs(loss: nn.Module) -> dict[int, int]:

@@ -180,14 +180,16 @@ def load_newest_checkpoint(path: str | Path, *, keep: int = 2) -> dict[str, Any]
         {'epoch': 2}
     """
     path, damage = Path(path), []
-    for own in [file for file in _generations(path, keep) if file.exists()] or [path]:
+    for candidate in [file for file in _generations(path, keep) if file.exists()] or [path]:
         try:
-            state = load_checkpoint(own)
+            state = load_checkpoint(candidate)
         except CheckpointError as error:
             damage.append(str(error))
             continue
         if damage:
-            warnings.warn(f"{'; '.join(damage)}; {own.name}, the one before, is used instead", stacklevel=2)
+            warnings.warn(
+                f"{'; '.join(damage)}; {candidate.name}, the one before, is used instead", stacklevel=2
+            )
         return state
     raise CheckpointError("; ".join(damage))
 
@@ -211,16 +213,16 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
         collector: made in the same way as the one that the state is of.
         state: the state.
     """
-    own = {name: value for name, value in state.items() if name != "carrier"}
+    collector_state = {name: value for name, value in state.items() if name != "carrier"}
     if state["carrier"] is None:
-        collector.load_state_dict(own)
+        collector.load_state_dict(collector_state)
         return
-    collector.load_state_dict(own, strict=False)  # the collector keeps its policy
+    collector.load_state_dict(collector_state, strict=False)  # the collector keeps its policy
     carrier: Any = carrier_of(collector)
     shown = TensorDict.from_dict(state["carrier"], batch_size=carrier.batch_size)
     set_carrier(collector, carrier.empty().update(shown))
-    if "traj_pool" in own:  # TorchRL has drawn new ids, but the episodes have theirs
-        set_next_ids(collector, own["traj_pool"])
+    if "traj_pool" in collector_state:  # TorchRL has drawn new ids, but the episodes have theirs
+        set_next_ids(collector, collector_state["traj_pool"])
 
 
 def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> dict[str, Any]:
@@ -236,10 +238,10 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> d
     Keyword Args:
         copy: whether the transitions are copied. If not, save them before the buffer changes.
     """
-    own = torch.clone if copy else _alone
+    convert = torch.clone if copy else _alone
     blocks = [bounds_of_run(buffer, run) for run in range(runs_of(buffer))]
     state: dict[str, Any] = {
-        "rows": [_block(buffer, *bounds, own) for bounds in blocks],
+        "rows": [_block(buffer, *bounds, convert) for bounds in blocks],
         "blocks": blocks,
         "capacity": _capacity(buffer),
         "cursor": last_written(buffer.storage),
@@ -250,19 +252,19 @@ def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> d
 
 
 def _block(
-    buffer: TensorDictReplayBuffer, begin: int, end: int, own: Callable[[Tensor], Tensor]
+    buffer: TensorDictReplayBuffer, begin: int, end: int, convert: Callable[[Tensor], Tensor]
 ) -> dict[str, Any] | None:
-    """Returns the stored rows from ``begin`` to ``end``, mapped by ``own``; None if there are none."""
+    """Returns the stored rows from ``begin`` to ``end``, mapped by ``convert``; None if there are none."""
     storage = buffer.storage
     if begin == end:
         return None
     if isinstance(storage, PackedStorage) and storage.packed is not None:
         return {
-            "packed": own(storage.packed[begin:end]),
+            "packed": convert(storage.packed[begin:end]),
             "fields": [tuple(field) for field in storage.fields],
         }
     rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # without what transforms add
-    return {"entries": rows.apply(own).to_dict(), "shape": list(rows.batch_size)}
+    return {"entries": rows.apply(convert).to_dict(), "shape": list(rows.batch_size)}
 
 
 def _capacity(buffer: TensorDictReplayBuffer) -> int:
@@ -275,8 +277,8 @@ def _alone(rows: Tensor) -> Tensor:
     if not rows.is_contiguous():
         return rows.clone()
     start = rows.storage_offset() * rows.itemsize
-    own = rows.untyped_storage()[start : start + rows.nbytes]
-    return torch.empty(0, dtype=rows.dtype, device=rows.device).set_(own, 0, rows.shape, rows.stride())
+    storage = rows.untyped_storage()[start : start + rows.nbytes]
+    return torch.empty(0, dtype=rows.dtype, device=rows.device).set_(storage, 0, rows.shape, rows.stride())
 
 
 def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:

@@ -192,7 +192,7 @@ class FusedLearner:
         # As its step() would: schedulers of learning rates check it.
         self.optimizer._opt_called = True  # type: ignore[attr-defined]
         return (kind * (steps * self.runs))(
-            *(own for run in range(self.runs) for own in numbers(counts[run % len(counts)]))
+            *(entry for run in range(self.runs) for entry in numbers(counts[run % len(counts)]))
         )
 
     def _layers(self, name: str | None) -> Any:
@@ -202,14 +202,14 @@ class FusedLearner:
 
     def _check(self, rows: TensorDictBase, steps: int) -> None:
         """Raises an error if something has changed since the learner was made that it does not support."""
-        if rows.numel() == steps * self.runs and any(own.norm == Norm.BATCHNORM for own in self._critic):
+        if rows.numel() == steps * self.runs and any(layer.norm == Norm.BATCHNORM for layer in self._critic):
             raise ValueError("batches must have at least 2 rows for batch normalization, got 1")
         if self.loss.reduction not in ("mean", "none"):
             raise ValueError(f"reduction={self.loss.reduction!r} cannot be fused: use LossLearner")
         if not all(parameter.requires_grad for parameter in self._weights.parameters):
             raise ValueError("parameters were frozen, but a fused step trains all of them: use LossLearner")
-        own = self.loss.loss_mask_key
-        for key in AUTO_LOSS_MASK_KEYS if own == "auto" else () if own is None else (own,):
+        mask_key = self.loss.loss_mask_key
+        for key in AUTO_LOSS_MASK_KEYS if mask_key == "auto" else () if mask_key is None else (mask_key,):
             if rows.get(key, None) is not None:
                 raise ValueError(
                     f"a fused step learns from all rows, but {key!r} masks some: use LossLearner, or set "

@@ -130,8 +130,8 @@ class FusedCall:
 
     def _read_bounds(self, low: Any, high: Any) -> None:
         self.job.low, self.job.high = (
-            self._keep(torch.as_tensor(own).to(self._dtype).expand(self._actions).contiguous())
-            for own in (low, high)
+            self._keep(torch.as_tensor(bound).to(self._dtype).expand(self._actions).contiguous())
+            for bound in (low, high)
         )
 
     def _read_rows(
@@ -140,7 +140,7 @@ class FusedCall:
         job = self.job
         job.entries = len(keys)
         job.seen, job.next_seen = (
-            self._joined(rows, own, inputs) for own in (keys, [under_next(key) for key in keys])
+            self._joined(rows, seen_keys, inputs) for seen_keys in (keys, [under_next(key) for key in keys])
         )
         action = rows.get(action_key)
         if self._algorithm is Algorithm.DQN:
@@ -189,7 +189,7 @@ class FusedCall:
         """Returns the address of an entry [R, S * B, width], by default in the type of the weights."""
         if value.device.type != "cpu":
             raise ValueError(f"{name!r} must be on the CPU to be fused, got it on {value.device}")
-        own = value.to(dtype or self._dtype).contiguous()
-        if own.numel() != self.priorities.numel() * width:
+        entry = value.to(dtype or self._dtype).contiguous()
+        if entry.numel() != self.priorities.numel() * width:
             raise ValueError(f"{name!r} must have {width} columns, got a shape of {list(value.shape)}")
-        return self._keep(own)
+        return self._keep(entry)

@@ -46,17 +46,17 @@ class FusedWeights:
         self.actor_tensors, self.critic_tensors = len(actor), len(critic)
         temperature = [(loss.log_alpha, None)] if is_stochastic else []
         self.parameters: list[nn.Parameter] = [
-            own for own, _ in (*actor, *critic, *temperature) if isinstance(own, nn.Parameter)
+            tensor for tensor, _ in (*actor, *critic, *temperature) if isinstance(tensor, nn.Parameter)
         ]
         # Each tensor of each network: which parameter, its target, and which of how many critics in it.
         self._places = [
-            *((own, delayed, 0, 1) for own, delayed in actor),
+            *((tensor, delayed, 0, 1) for tensor, delayed in actor),
             *(
-                (own, delayed, n, self.critics if stacked else 1)
+                (tensor, delayed, n, self.critics if stacked else 1)
                 for n in range(self.critics)
-                for own, delayed in critic
+                for tensor, delayed in critic
             ),
-            *((own, delayed, 0, 1) for own, delayed in temperature),
+            *((tensor, delayed, 0, 1) for tensor, delayed in temperature),
         ]
         self._memory: list[tuple[int, list[Tensor]]] = []  # addresses from which the table was made
         self._table: Any = None
@@ -68,18 +68,20 @@ class FusedWeights:
             ValueError: tensors do not fit each other, are not contiguous, not on the CPU or of another type
                 than when the learner was made; or Adam's counts of steps differ.
         """
-        states = [self._optimizer.state[own] or self._start(own) for own in self.parameters]
+        states = [self._optimizer.state[parameter] or self._start(parameter) for parameter in self.parameters]
         if not self._memory or not all(
-            own.data_ptr() == address
+            parameter.data_ptr() == address
             and all(state[name] is kept for name, kept in zip(_STATE, tensors, strict=True))
-            for own, state, (address, tensors) in zip(self.parameters, states, self._memory, strict=True)
+            for parameter, state, (address, tensors) in zip(
+                self.parameters, states, self._memory, strict=True
+            )
         ):
             for state in states:
                 state["step"] = state["step"].to(torch.float32)  # float64 where that is torch's default
             self._check(states)
             self._memory = [
-                (own.data_ptr(), [state[name] for name in _STATE])
-                for own, state in zip(self.parameters, states, strict=True)
+                (parameter.data_ptr(), [state[name] for name in _STATE])
+                for parameter, state in zip(self.parameters, states, strict=True)
             ]
             rows = [self._row(*place) for place in self._places]
             kind = self._kinds.tensors
@@ -123,10 +125,10 @@ class FusedWeights:
         state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter.data) for _ in range(2))
         return state
 
-    def _row(self, own: Tensor, target: Tensor | None, critic: int, critics: int) -> Sequence[Any]:
-        height, width = own.shape[-2:] if own.ndim > 1 else (1, 1)
-        offset, state = critic * (own.numel() // critics), self._state(own)
-        tensors = (own, target, state.get("exp_avg"), state.get("exp_avg_sq"))
+    def _row(self, tensor: Tensor, target: Tensor | None, critic: int, critics: int) -> Sequence[Any]:
+        height, width = tensor.shape[-2:] if tensor.ndim > 1 else (1, 1)
+        offset, state = critic * (tensor.numel() // critics), self._state(tensor)
+        tensors = (tensor, target, state.get("exp_avg"), state.get("exp_avg_sq"))
         counter = _address(state.get("step"), 0) if critic == 0 else None  # a stack of critics has one
         return height, width, *(_address(each, offset) for each in tensors), counter
 

@@ -181,7 +181,7 @@ def _obstacles(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
     yield from _strange_keys(loss, fused)
     yield from _strange_targets(loss, fused)
     # TorchRL puts one hook on each loss, which warns if nothing updates its targets.
-    if _has_hooks(loss, own=1) or any(_has_hooks(module) for module in _modules(loss, fused)):
+    if _has_hooks(loss, expected=1) or any(_has_hooks(module) for module in _modules(loss, fused)):
         yield "hooks on the loss or its networks"
     parameters = list(loss.parameters())
     if not all(p.requires_grad for p in parameters):
@@ -212,9 +212,9 @@ def _strange_networks(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
             yield f"a {type(net).__name__} as network of {name}"
         elif (layers := layers_of(net)) is None:
             yield f"other layers than those of a plain {kind.__name__} in training mode"
-        elif [tuple(own.shape[-2:]) for own in net.state_dict().values()] != tensor_shapes(layers):
+        elif [tuple(tensor.shape[-2:]) for tensor in net.state_dict().values()] != tensor_shapes(layers):
             yield f"parameters beside those of the layers in {name}"
-        elif fused.algorithm is not Algorithm.DDPG and any(own.norm == Norm.BATCHNORM for own in layers):
+        elif fused.algorithm is not Algorithm.DDPG and any(layer.norm == Norm.BATCHNORM for layer in layers):
             yield f"batch normalization in {name} of a {type(loss).__name__}"
         elif kind is CriticNet and fused.algorithm is not Algorithm.TQC and layers[-1].outputs != 1:
             yield f"critics with {layers[-1].outputs} outputs"
@@ -286,9 +286,9 @@ def _strange_targets(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
         yield "hooks on the value estimator"
 
 
-def _has_hooks(module: nn.Module, own: int = 0) -> bool:
+def _has_hooks(module: nn.Module, expected: int = 0) -> bool:
     pre = len(module._forward_pre_hooks) + len(module._backward_pre_hooks)
-    return pre > own or bool(module._forward_hooks or module._backward_hooks)
+    return pre > expected or bool(module._forward_hooks or module._backward_hooks)
 
 
 def _modules(loss: LossModule, fused: FusedLoss) -> list[nn.Module]:

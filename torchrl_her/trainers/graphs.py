@@ -96,15 +96,17 @@ class GraphLearner(LossLearner):
         seen = rows.select(*self._keys, strict=False).split(self.steps_per_graph * batch, last)
         made = [self._recorded_for(part, part.shape[-1] // batch)(part) for part in seen]
         if self._priority is not None and "priority" in made[0]:
-            rows.set(self._priority, torch.cat([own["priority"] for own in made], last))
-        measured: TensorDictBase = torch.cat([own["measured"] for own in made])
+            rows.set(self._priority, torch.cat([result["priority"] for result in made], last))
+        measured: TensorDictBase = torch.cat([result["measured"] for result in made])
         return dict(measured.items())
 
     def _recorded_for(self, rows: TensorDictBase, steps: int) -> _Recorded:
         rates = tuple(float(group["lr"]) for group in self.optimizer.param_groups)
         key = (steps, rows.shape, rates)
         if key not in self._recorded:
-            self._recorded = {known: own for known, own in self._recorded.items() if known[-1] == rates}
+            self._recorded = {
+                known: recorded for known, recorded in self._recorded.items() if known[-1] == rates
+            }
             noise = getattr(self.loss, "noise", None)
             self._recorded[key] = _Recorded(
                 lambda rows: self._steps(rows, steps),
@@ -118,7 +120,7 @@ class GraphLearner(LossLearner):
         last = rows.ndim - 1
         parts = rows.split(rows.shape[last] // steps, last)
         measured = [self._step(part) for part in parts]
-        together = {name: torch.stack([own[name] for own in measured]) for name in measured[0]}
+        together = {name: torch.stack([losses[name] for losses in measured]) for name in measured[0]}
         out = TensorDict({"measured": TensorDict(together, [steps])})
         if self._priority is not None and parts[0].get(self._priority, None) is not None:
             out["priority"] = torch.cat([part.get(self._priority) for part in parts], last)

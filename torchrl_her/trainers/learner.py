@@ -54,25 +54,25 @@ def check_idle(
         torch.optim.Adam: "trainers.RunsAdam(loss, lr=..., runs=R)",
         HardUpdate: "make_target_updater(loss, tau=0, hard_interval=..., runs=R)",
     }
-    for own in (optimizer, target):
-        if idle and type(own) in remedies:
+    for part in (optimizer, target):
+        if idle and type(part) in remedies:
             raise ValueError(
-                f"runs {list(idle)} are idle, but {type(own).__name__} counts the steps of all runs "
-                f"together: take torchrl_her.{remedies[type(own)]}"
+                f"runs {list(idle)} are idle, but {type(part).__name__} counts the steps of all runs "
+                f"together: take torchrl_her.{remedies[type(part)]}"
             )
 
 
 @contextmanager
 def idle_runs(loss: LossModule, target: TargetNetUpdater | None, idle: Sequence[int]) -> Iterator[None]:
     """Marks in a loss and its target update, in the ``with`` block, the runs that do not learn."""
-    parts: list[Any] = [own for own in (getattr(loss, "noise", None), target) if hasattr(own, "idle")]
-    for own in parts:
-        own.idle = tuple(idle)
+    parts: list[Any] = [part for part in (getattr(loss, "noise", None), target) if hasattr(part, "idle")]
+    for part in parts:
+        part.idle = tuple(idle)
     try:
         yield
     finally:
-        for own in parts:
-            own.idle = ()
+        for part in parts:
+            part.idle = ()
 
 
 class LossLearner:
@@ -170,7 +170,7 @@ class LossLearner:
         groups: dict[str, list[nn.Parameter]] = {}
         dims, dim_of = run_dims(self.loss), {}
         for name, parameter in self.loss.named_parameters():
-            own = name.split(".")[0]
-            groups.setdefault(own, []).append(parameter)
-            dim_of[own] = dims.get(name, 0)
-        return [(parameters, dim_of[own]) for own, parameters in groups.items()]
+            network = name.split(".")[0]
+            groups.setdefault(network, []).append(parameter)
+            dim_of[network] = dims.get(name, 0)
+        return [(parameters, dim_of[network]) for network, parameters in groups.items()]

@@ -56,11 +56,11 @@ def keep_runs(
     finally:
         with torch.no_grad():
             for key, entry, dim in _entries(loss, optimizer, runs):
-                own = _of_runs(entry, dim, kept, runs)
+                values = _of_runs(entry, dim, kept, runs)
                 # the state of an optimizer is made at its first step, and begins with zeros
-                own = before.get(key, torch.zeros_like(own))
+                values = before.get(key, torch.zeros_like(values))
                 blocks = entry.unflatten(dim, (runs, -1))
-                blocks.index_copy_(dim, torch.tensor(list(kept), device=entry.device), own)
+                blocks.index_copy_(dim, torch.tensor(list(kept), device=entry.device), values)
 
 
 def _entries(loss: nn.Module, optimizer: torch.optim.Optimizer, runs: int) -> list[tuple[int, Tensor, int]]:

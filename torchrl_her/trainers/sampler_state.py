@@ -31,14 +31,14 @@ def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
     """
     if isinstance(sampler, SamplerEnsemble):
         # Whole trees of the ensemble's members: the number of filled rows of each is not known here.
-        own: dict[str, Any] = {
+        state: dict[str, Any] = {
             str(i): sampler_state_dict(part, capacity_of(part)) for i, part in enumerate(samplers_in(sampler))
         }
     elif isinstance(sampler, PrioritizedSampler) and not isinstance(sampler, RunsPrioritizedSampler):
-        own = _priorities(sampler, size)
+        state = _priorities(sampler, size)
     else:
-        own = {key: _copy(value) for key, value in sampler.state_dict().items()}
-    return {"kind": type(sampler).__name__, "own": own, "remaining": vars(sampler).get(_REMAINING)}
+        state = {key: _copy(value) for key, value in sampler.state_dict().items()}
+    return {"kind": type(sampler).__name__, "own": state, "remaining": vars(sampler).get(_REMAINING)}
 
 
 def load_sampler_state_dict(sampler: Sampler, state: dict[str, Any]) -> None:
@@ -79,12 +79,12 @@ def _priorities(sampler: PrioritizedSampler, size: int) -> dict[str, Any]:
     }
 
 
-def _load_priorities(sampler: PrioritizedSampler, own: dict[str, Any]) -> None:
+def _load_priorities(sampler: PrioritizedSampler, saved: dict[str, Any]) -> None:
     state = sampler.state_dict()
-    if own["sum"] is not None:
-        filled = torch.arange(len(own["sum"]))
-        state["_sum_tree"][filled] = own["sum"]
-        state["_min_tree"][filled] = own["min"]
-    state["_max_priority"] = tuple(own["max_priority"])
-    state["_alpha"], state["_beta"] = own["alpha"], own["beta"]
+    if saved["sum"] is not None:
+        filled = torch.arange(len(saved["sum"]))
+        state["_sum_tree"][filled] = saved["sum"]
+        state["_min_tree"][filled] = saved["min"]
+    state["_max_priority"] = tuple(saved["max_priority"])
+    state["_alpha"], state["_beta"] = saved["alpha"], saved["beta"]
     sampler.load_state_dict(state)

@@ -79,7 +79,7 @@ def _check_batch(batch: TensorDictBase) -> None:
     """Refuses a batch that has NaN or infinity in entries that networks or rewards read."""
     names = [name for key in _MUST_BE_FINITE for name in (key, ("next", key))]
     entries = {name: batch.get(name, None) for name in names}
-    check_finite({f"the collected {name!r}": own for name, own in entries.items() if own is not None})
+    check_finite({f"the collected {name!r}": entry for name, entry in entries.items() if entry is not None})
 
 
 class Trainer:
@@ -265,13 +265,13 @@ class Trainer:
         priority = rows.get(key, None)
         if priority is None:
             return
-        own = drawn.select("index")
+        priorities = drawn.select("index")
         # The type of the sampler's trees, also for networks in float64.
-        own.set(key, priority.flatten(0, 1).float())
+        priorities.set(key, priority.flatten(0, 1).float())
         if idle:  # idle runs were given rows of other runs
             learned = [run for run in range(self.runs) if run not in idle]
-            own = own.view(self.runs, -1)[learned].flatten()
-        self.buffer.update_tensordict_priority(own)  # does nothing under a sampler without priorities
+            priorities = priorities.view(self.runs, -1)[learned].flatten()
+        self.buffer.update_tensordict_priority(priorities)  # does nothing under a sampler without priorities
 
     def state_dict(self) -> dict[str, Any]:
         """Returns counters, the measurements of the present epoch, and the state of TorchRL's schedulers.
@@ -285,7 +285,7 @@ class Trainer:
             "outside": self._outside,
         }
         measured = None if self._measured is None else _joined(self._measured)
-        schedules = [own.state_dict() for own in self._schedulers]
+        schedules = [scheduler.state_dict() for scheduler in self._schedulers]
         return {**counters, "credit": self._credit, "measured": measured, "schedules": schedules}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -294,12 +294,12 @@ class Trainer:
         self._credit, self._outside = state["credit"], state["outside"]
         measured = state["measured"]
         self._measured = None if measured is None else [measured] if measured else []
-        for own, saved in zip(self._schedulers, state["schedules"], strict=True):
-            own.load_state_dict(saved)
+        for scheduler, saved in zip(self._schedulers, state["schedules"], strict=True):
+            scheduler.load_state_dict(saved)
 
     @property
     def _schedulers(self) -> list[ParameterScheduler]:
-        return [own for own in self.schedules if isinstance(own, ParameterScheduler)]
+        return [schedule for schedule in self.schedules if isinstance(schedule, ParameterScheduler)]
 
 
 def _without(value: Tensor, idle: list[int]) -> Tensor:
@@ -312,7 +312,7 @@ def _joined(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     if not measured:
         return {}
     # Measurements from before a stop come from a file, so perhaps from another device.
-    return {key: torch.cat([own[key].to(last) for own in measured]) for key, last in measured[-1].items()}
+    return {key: torch.cat([step[key].to(last) for step in measured]) for key, last in measured[-1].items()}
 
 
 def _means(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:
