@@ -156,26 +156,28 @@ class Network {
     void backward(const Pass& pass, Matrix slope, Matrix* joined_slope = nullptr) {
         for (int i = int(layers_.size()) - 1; i >= 0; --i) {
             const Layer& layer = layers_[i];
-            const int own = layer.inputs - layer.joined;
+            const int unjoined = layer.inputs - layer.joined;
             activation_slope(layer, pass.values[i + 1], slope);
             if (layer.norm) normalization_slope(i, pass, slope);
             if (layer.inputs == 0) return;
             if (pass.learns) weight_slope(i, pass.values[i], slope);
             if (layer.joined && joined_slope)
-                multiply(Product<real>{slope.data, slope.row, 1, transposed(i, own, layer.joined), padded(layer.joined),
-                                       joined_slope->data, joined_slope->row, layer.outputs, nullptr, false},
+                multiply(Product<real>{slope.data, slope.row, 1, transposed(i, unjoined, layer.joined),
+                                       padded(layer.joined), joined_slope->data, joined_slope->row, layer.outputs,
+                                       nullptr, false},
                          slope.rows, layer.joined);
             const bool done = i == 0 || (layer.joined && !pass.learns);  // nothing before the joint is asked for
             if (done) return;
-            Matrix before = matrix(*arena_, slope.rows, own);
+            Matrix before = matrix(*arena_, slope.rows, unjoined);
             if (paired(i))
-                multiply(Product<Pair>{columns_paired(slope, layer.outputs), pairs(layer.outputs), 1, back_pairs(i, own),
-                                       padded(own), before.data, before.row, pairs(layer.outputs), nullptr, false},
-                         slope.rows, own);
+                multiply(Product<Pair>{columns_paired(slope, layer.outputs), pairs(layer.outputs), 1,
+                                       back_pairs(i, unjoined), padded(unjoined), before.data, before.row,
+                                       pairs(layer.outputs), nullptr, false},
+                         slope.rows, unjoined);
             else
-                multiply(Product<real>{slope.data, slope.row, 1, back(i, own), padded(own), before.data, before.row,
-                                       layer.outputs, nullptr, false},
-                         slope.rows, own);
+                multiply(Product<real>{slope.data, slope.row, 1, back(i, unjoined), padded(unjoined),
+                                       before.data, before.row, layer.outputs, nullptr, false},
+                         slope.rows, unjoined);
             slope = before;
         }
     }
@@ -261,16 +263,16 @@ class Network {
         transpose(value(p) + long(first) * p.columns, count, p.columns, out);
         return out;
     }
-    const real* back(int layer, int own) {
-        if (!transposed_[layer]) transposed_[layer] = transposed(layer, 0, own);
+    const real* back(int layer, int unjoined) {
+        if (!transposed_[layer]) transposed_[layer] = transposed(layer, 0, unjoined);
         return transposed_[layer];
     }
-    const Pair* back_pairs(int layer, int own) {
+    const Pair* back_pairs(int layer, int unjoined) {
         if (!transposed_pairs_[layer]) {
             const Parameter& p = parameter(layer, kWeight);
-            const Pair* rows = columns_paired({const_cast<real*>(value(p)), own, p.columns, p.columns}, p.columns);
-            transposed_pairs_[layer] = arena_->take_pairs(long(pairs(p.columns)) * padded(own));
-            transpose(rows, own, pairs(p.columns), transposed_pairs_[layer]);
+            const Pair* rows = columns_paired({const_cast<real*>(value(p)), unjoined, p.columns, p.columns}, p.columns);
+            transposed_pairs_[layer] = arena_->take_pairs(long(pairs(p.columns)) * padded(unjoined));
+            transpose(rows, unjoined, pairs(p.columns), transposed_pairs_[layer]);
         }
         return transposed_pairs_[layer];
     }
@@ -299,9 +301,9 @@ class Network {
         const int rows = out.rows;
         const real *mean = value(parameter(layer, kMean)), *variance = value(parameter(layer, kVariance));
         if (pass.learns) {
-            const Matrix own = matrix(*arena_, 2, n);
-            real *__restrict sum = own[0], *__restrict squares = own[1];
-            std::fill_n(sum, 2 * own.row, real(0));
+            const Matrix statistics = matrix(*arena_, 2, n);
+            real *__restrict sum = statistics[0], *__restrict squares = statistics[1];
+            std::fill_n(sum, 2 * statistics.row, real(0));
             for (int r = 0; r < rows; ++r)
                 for (int c = 0; c < n; ++c) sum[c] += in[r][c];
             for (int c = 0; c < n; ++c) sum[c] /= rows;
@@ -386,24 +388,24 @@ class Network {
     }
 
     void weight_slope(int layer, Matrix in, Matrix slope) {
-        const Layer& own = layers_[layer];
+        const Layer& shape = layers_[layer];
         Parameter &weight = parameter(layer, kWeight), &bias = parameter(layer, kBias);
-        weight.gradient = matrix(*arena_, own.inputs, own.outputs);
-        bias.gradient = matrix(*arena_, 1, own.outputs);
+        weight.gradient = matrix(*arena_, shape.inputs, shape.outputs);
+        bias.gradient = matrix(*arena_, 1, shape.outputs);
         Matrix& out = weight.gradient;
         if (paired(layer))
-            multiply(Product<Pair>{rows_paired(in.data, in.row, slope.rows, own.inputs), 1, padded(own.inputs),
-                                   rows_paired(slope.data, slope.row, slope.rows, own.outputs), padded(own.outputs),
+            multiply(Product<Pair>{rows_paired(in.data, in.row, slope.rows, shape.inputs), 1, padded(shape.inputs),
+                                   rows_paired(slope.data, slope.row, slope.rows, shape.outputs), padded(shape.outputs),
                                    out.data, out.row, pairs(slope.rows), nullptr, false},
-                     own.inputs, own.outputs);
+                     shape.inputs, shape.outputs);
         else
             multiply(Product<real>{in.data, 1, in.row, slope.data, slope.row, out.data, out.row, slope.rows, nullptr,
                                    false},
-                     own.inputs, own.outputs);
+                     shape.inputs, shape.outputs);
         real* sum = bias.gradient.data;
-        std::fill_n(sum, own.outputs, real(0));
+        std::fill_n(sum, shape.outputs, real(0));
         for (int r = 0; r < slope.rows; ++r)
-            for (int c = 0; c < own.outputs; ++c) sum[c] += slope[r][c];
+            for (int c = 0; c < shape.outputs; ++c) sum[c] += slope[r][c];
     }
 };
 

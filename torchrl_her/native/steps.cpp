@@ -110,11 +110,11 @@ class Learner {
     real* weights_ = nullptr;
     Matrix seen_{}, next_seen_{};  // the networks' inputs
 
-    Parameter parameter(const Tensors& own) const {
-        const long at = long(run_) * own.rows * own.columns;
+    Parameter parameter(const Tensors& tensors) const {
+        const long at = long(run_) * tensors.rows * tensors.columns;
         const auto of_run = [at](real* all) { return all ? all + at : nullptr; };
-        return {own.rows,          own.columns, of_run(own.value), of_run(own.target), of_run(own.first_moment),
-                of_run(own.second_moment), {}};
+        return {tensors.rows, tensors.columns, of_run(tensors.value), of_run(tensors.target),
+                of_run(tensors.first_moment), of_run(tensors.second_moment), {}};
     }
 
     real& loss(int which) { return job_.losses[(long(which) * job_.steps + step_ - job_.first_step) * job_.runs + run_]; }
@@ -173,14 +173,14 @@ class Learner {
             real sum = 0;
             for (int a = 0; a < actions; ++a) {
                 const real log_scale = std::min(std::max(out[b][actions + a], kLeastScale), kGreatestScale);
-                const real scale = std::exp(log_scale), own = noise[b * actions + a];
-                const real before = out[b][a] + scale * own, squashed = std::tanh(before);
+                const real scale = std::exp(log_scale), eps = noise[b * actions + a];
+                const real before = out[b][a] + scale * eps, squashed = std::tanh(before);
                 const real half = (job_.high[a] - job_.low[a]) / 2, middle = (job_.high[a] + job_.low[a]) / 2;
                 const real z = -2 * before, softplus = z > 20 ? z : std::log1p(std::exp(z));
                 draw.scale[b][a] = scale;
                 draw.tanh[b][a] = std::min(std::max(squashed, -kMostTanh), kMostTanh);
                 draw.action[b][a] = middle + half * draw.tanh[b][a];
-                sum += -own * own / 2 - log_scale - kHalfLogTwoPi - 2 * (kLogTwo - before - softplus) - std::log(half);
+                sum += -eps * eps / 2 - log_scale - kHalfLogTwoPi - 2 * (kLogTwo - before - softplus) - std::log(half);
             }
             draw.log_likelihood[b] = sum;
         }
@@ -224,8 +224,8 @@ class Learner {
         if (job_.algorithm == kTd3)
             for (int b = 0; b < job_.batch; ++b)
                 for (int a = 0; a < job_.actions; ++a) {
-                    const real own = noise_of(job_.noise)[b * job_.actions + a] * job_.policy_noise;
-                    const real noise = std::min(std::max(own, -job_.noise_limit), job_.noise_limit);
+                    const real unclipped = noise_of(job_.noise)[b * job_.actions + a] * job_.policy_noise;
+                    const real noise = std::min(std::max(unclipped, -job_.noise_limit), job_.noise_limit);
                     action[b][a] = std::min(std::max(action[b][a] + noise, job_.low[a]), job_.high[a]);
                 }
         return {action, nullptr};
@@ -300,11 +300,11 @@ class Learner {
                 const real* goal = wanted[b];
                 real distances = 0, costs = 0;
                 for (int q = 0; q < quantiles; ++q) {
-                    const real own = out[b][q], above = (q + real(0.5)) / quantiles, below = 1 - above;
+                    const real quantile = out[b][q], above = (q + real(0.5)) / quantiles, below = 1 - above;
                     real distance = 0, cost = 0, pull = 0;
 #pragma omp simd reduction(+ : distance, cost, pull)
                     for (int k = 0; k < kept; ++k) {
-                        const real error = goal[k] - own, size = std::abs(error), part = error < 0 ? below : above;
+                        const real error = goal[k] - quantile, size = std::abs(error), part = error < 0 ? below : above;
                         distance += size;
                         cost += part * (size <= 1 ? error * error / 2 : size - real(0.5));
                         pull += part * (size <= 1 ? error : error < 0 ? real(-1) : real(1));
@@ -331,30 +331,31 @@ class Learner {
         for (int n = 1; n <= followed; ++n) {
             Pass valued = networks_[n].pass(seen_);
             const Matrix value = networks_[n].forward(valued, action.data, action.row);
-            Matrix slope = matrix(arena_, batch, 1), own = n == 1 ? action_slope : matrix(arena_, batch, actions);
+            Matrix slope = matrix(arena_, batch, 1),
+                   critic_slope = n == 1 ? action_slope : matrix(arena_, batch, actions);
             for (int b = 0; b < batch; ++b) {
                 slope[b][0] = -weights_[b] / (real(batch) * followed);
                 sum += value[b][0] * weights_[b] / followed;
             }
-            networks_[n].backward(valued, slope, &own);
+            networks_[n].backward(valued, slope, &critic_slope);
             if (n > 1)
                 for (int b = 0; b < batch; ++b)
-                    for (int a = 0; a < actions; ++a) action_slope[b][a] += own[b][a];
+                    for (int a = 0; a < actions; ++a) action_slope[b][a] += critic_slope[b][a];
         }
         const real price = job_.penalty / (real(batch) * actions);
         const real saturation = job_.saturation / (real(batch) * actions);
         double excesses = 0;
         for (int b = 0; b < batch; ++b)
             for (int a = 0; a < actions; ++a) {
-                const real own = action[b][a], size = std::abs(own);
-                action_slope[b][a] += 2 * price * own;
-                squares += own * own;
+                const real x = action[b][a], size = std::abs(x);
+                action_slope[b][a] += 2 * price * x;
+                squares += x * x;
                 if (saturation == 0) continue;
                 const real excess = std::atanh(std::min(size, kLargestAction)) - kFreeArgument;
                 if (excess <= 0) continue;
                 excesses += excess * excess;
                 if (size < kLargestAction)
-                    action_slope[b][a] += 2 * saturation * std::copysign(excess, own) / (1 - own * own);
+                    action_slope[b][a] += 2 * saturation * std::copysign(excess, x) / (1 - x * x);
             }
         loss(0) = real(squares * price + excesses * saturation - sum / batch);
         actor.backward(acted, action_slope);
@@ -381,7 +382,7 @@ class Learner {
         for (int n = 0; n < job_.critics; ++n) {
             const int outputs = values[n].columns;
             const real parts = real(job_.critics) * outputs;
-            Matrix slope = matrix(arena_, batch, outputs), own = matrix(arena_, batch, actions);
+            Matrix slope = matrix(arena_, batch, outputs), critic_slope = matrix(arena_, batch, actions);
             for (int b = 0; b < batch; ++b) {
                 if (follows_mean) {
                     std::fill_n(slope[b], outputs, -weights_[b] / batch / parts);
@@ -394,9 +395,9 @@ class Learner {
                 slope[b][0] = least == n ? -weights_[b] / batch : 0;
                 if (least == n) actor_loss -= values[n][b][0] * weights_[b];
             }
-            networks_[n + 1].backward(passes[n], slope, &own);
+            networks_[n + 1].backward(passes[n], slope, &critic_slope);
             for (int b = 0; b < batch; ++b)
-                for (int a = 0; a < actions; ++a) action_slope[b][a] += own[b][a];
+                for (int a = 0; a < actions; ++a) action_slope[b][a] += critic_slope[b][a];
         }
         const real price = job_.penalty / (real(batch) * actions);
         Matrix slope = matrix(arena_, batch, 2 * actions);

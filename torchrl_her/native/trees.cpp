@@ -55,7 +55,7 @@ void her_trees_draw(const float* const* levels, const int64_t* widths, int heigh
             const int count = static_cast<int>(std::min<int64_t>(GROUP, draws - begin));
             int64_t node[GROUP];
             double mass[GROUP];
-            float own[GROUP];  // the value of the node
+            float node_value[GROUP];
             for (int i = 0; i < count; ++i) {
                 mass[i] = masses[run * draws + begin + i];
                 const double within = std::min(mass[i], end);
@@ -65,14 +65,14 @@ void her_trees_draw(const float* const* levels, const int64_t* widths, int heigh
                 if (child > 0) mass[i] -= sums[child - 1];
                 mass[i] = std::max(mass[i], 0.0);
                 node[i] = child;
-                own[i] = top[child];
+                node_value[i] = top[child];
             }
             for (int level = height - 2; level >= 0; --level) {
                 const float* table = levels[level] + run * widths[level];
                 for (int i = 0; i < count; ++i) __builtin_prefetch(table + node[i] * FAN);
                 for (int i = 0; i < count; ++i) {
                     const float* children = table + node[i] * FAN;
-                    const float within = std::min(static_cast<float>(mass[i]), below(own[i]));
+                    const float within = std::min(static_cast<float>(mass[i]), below(node_value[i]));
                     double running = 0.0;
                     float before = 0.0f;
                     int child = 0;
@@ -88,13 +88,13 @@ void her_trees_draw(const float* const* levels, const int64_t* widths, int heigh
                         before = 0.0f;
                     }
                     mass[i] = std::max(mass[i] - before, 0.0);
-                    own[i] = children[child];
+                    node_value[i] = children[child];
                     node[i] = node[i] * FAN + child;
                 }
             }
             for (int i = 0; i < count; ++i) {
                 leaf[run * draws + begin + i] = node[i];
-                value[run * draws + begin + i] = own[i];
+                value[run * draws + begin + i] = node_value[i];
             }
         }
     }
