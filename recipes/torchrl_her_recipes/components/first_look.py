@@ -256,7 +256,8 @@ def propose_layers(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
 
     The achieved goal must be observed, and other entries of the observation, as many, must be nearer to it in
     the steps in which it moves than in others: those of a hand, for instance, that pushes it. They are to
-    come as near as they ever did, or to half of the distance at which the task's goals are achieved.
+    touch it; or, where they have come nearer than half of the distance at which the task's goals are
+    achieved, as fingers that go around it do, they are to be that near.
 
     Args:
         rows: transitions [n] of random actions.
@@ -293,9 +294,9 @@ def propose_layers(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
         "desired_goal": list(place),
     }
     task = {"observation": others + place, "achieved_goal": list(place), "desired_goal": "desired_goal"}
-    # To touch a block is not enough where fingers have to go around it.
     closest = float((seen[:, best : best + width] - goal).norm(dim=-1).min())
-    threshold = float(f"{max(closest, radius / 2):.2g}")
+    around = closest < radius / 2
+    threshold = float(f"{radius / 2 if around else max(near[best][0], radius):.2g}")
     return [{"name": "reach", **reach, "threshold": threshold}, {"name": "task", **task}]
 
 

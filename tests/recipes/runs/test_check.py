@@ -107,7 +107,7 @@ def test_a_block_that_lies_still_is_told_and_layers_are_proposed() -> None:
     assert [reach[key] for key in GOALS] == [[0, 2], [2], [1]]
     assert [task[key] for key in GOALS] == [[0, 2, 1], [1], "desired_goal"]
     assert reach["threshold"] == 0.05  # half of the task's, since the hand comes to the block itself
-    assert look(arm=0.08).layers[0]["threshold"] == 0.08  # no nearer than it can come
+    assert 0.1 <= look(arm=0.08).layers[0]["threshold"] < 0.3  # it can but touch it
     assert "threshold" not in task  # the environment's own
     assert "algo=cher curriculum=layers.yaml" in said(facts, algo="filtered_her")
     assert "entries 2 to 2 of the observation" in said(facts, algo="filtered_her")
