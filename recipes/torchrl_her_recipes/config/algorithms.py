@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from torchrl_her_recipes.config.options import AUTO, REGISTERED, what_there_is
 
@@ -34,66 +35,50 @@ class Algorithm:
     summary: str = ""
 
 
+_filtered = partial(Algorithm, filter=True)
+_cher = partial(Algorithm, curriculum=True, filter=True)
+_unfiltered_cher = partial(Algorithm, curriculum=True)
+
 ALGORITHMS: dict[str, Algorithm] = {
     algorithm.name: algorithm
     for algorithm in (
         Algorithm(name="no_hindsight", virtual=False, weights="none", summary="the learner alone"),
         Algorithm(name="her", summary="hindsight experience replay"),
-        Algorithm(
-            name="filtered_her", filter=True, summary="HER without virtual goals that were achieved already"
-        ),
+        _filtered(name="filtered_her", summary="HER without virtual goals that were achieved already"),
         Algorithm(
             name="her_ibs", weights="ibs", summary="HER that prefers instructive goals: weights q* - q"
         ),
-        Algorithm(
-            name="filtered_her_ibs",
-            filter=True,
-            weights="ibs",
-            summary="Filtered-HER that prefers instructive goals",
+        _filtered(
+            name="filtered_her_ibs", weights="ibs", summary="Filtered-HER that prefers instructive goals"
         ),
         Algorithm(
             name="her_ibs_sequential",
             weights="ibs_sequential",
             summary="HER with weights q* alone; prioritized replay does the rest",
         ),
-        Algorithm(
+        _filtered(
             name="filtered_her_rare",
-            filter=True,
             weights="rare",
             summary="Filtered-HER that prefers goals with few others around them",
         ),
-        Algorithm(
+        _filtered(
             name="filtered_her_rnd",
-            filter=True,
             weights="rnd",
             summary="Filtered-HER that prefers goals new to a network (RND)",
         ),
-        Algorithm(name="cher", curriculum=True, filter=True, summary="Filtered-HER with a curriculum: CHER"),
-        Algorithm(
+        _cher(name="cher", summary="Filtered-HER with a curriculum: CHER"),
+        _cher(
             name="cher_ibs",
-            curriculum=True,
-            filter=True,
             weights="ibs",
             summary="CHER that prefers instructive goals in the layers that say so",
         ),
-        Algorithm(
-            name="cher_rare",
-            curriculum=True,
-            filter=True,
-            weights="rare",
-            summary="CHER that prefers goals with few others around them",
+        _cher(
+            name="cher_rare", weights="rare", summary="CHER that prefers goals with few others around them"
         ),
-        Algorithm(
-            name="cher_rnd",
-            curriculum=True,
-            filter=True,
-            weights="rnd",
-            summary="CHER that prefers goals new to a network (RND)",
-        ),
-        Algorithm(name="unfiltered_cher", curriculum=True, summary="CHER without the filter"),
-        Algorithm(
+        _cher(name="cher_rnd", weights="rnd", summary="CHER that prefers goals new to a network (RND)"),
+        _unfiltered_cher(name="unfiltered_cher", summary="CHER without the filter"),
+        _unfiltered_cher(
             name="unfiltered_cher_ibs",
-            curriculum=True,
             weights="ibs",
             summary="CHER that prefers instructive goals, without the filter",
         ),

@@ -28,7 +28,10 @@ class LoggerSpec:
 
 
 _HERE = "torchrl_her_recipes.runs.loggers"
-LOGGERS: dict[str, LoggerSpec] = {}
+LOGGERS: dict[str, LoggerSpec] = {
+    "tensorboard": LoggerSpec(name="tensorboard", factory=f"{_HERE}.tensorboard:open_tensorboard"),
+    "wandb": LoggerSpec(name="wandb", factory=f"{_HERE}.wandb_run:open_wandb", needs="wandb"),
+}
 
 
 def register_logger(spec: LoggerSpec) -> None:
@@ -40,13 +43,6 @@ def register_logger(spec: LoggerSpec) -> None:
     if spec.name in LOGGERS:
         raise ValueError(f"there is a logger {spec.name!r} already")
     LOGGERS[spec.name] = spec
-
-
-for _spec in (
-    LoggerSpec(name="tensorboard", factory=f"{_HERE}.tensorboard:open_tensorboard"),
-    LoggerSpec(name="wandb", factory=f"{_HERE}.wandb_run:open_wandb", needs="wandb"),
-):
-    register_logger(_spec)
 
 
 def check_loggers(value: Any) -> tuple[str, ...]:

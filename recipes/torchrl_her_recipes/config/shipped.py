@@ -14,9 +14,31 @@ CONF = Path(__file__).parent.parent / "conf"
 _TRAINED = Path(__file__).parent.parent / "trained"
 
 
+def shipped_names(kind: str) -> list[str]:
+    """Returns the names of the presets, spaces or studies that come with the package.
+
+    Args:
+        kind: ``preset``, ``space`` or ``study``.
+    """
+    return sorted(path.stem for path in (CONF / kind).glob("*.yaml"))
+
+
+def find_file(kind: str, name: str) -> Path:
+    """Returns the file of a preset, space or study, by its name or as the path of a YAML file.
+
+    Raises:
+        ValueError: there is no such file; the message lists the names of the package.
+    """
+    path = Path(name) if str(name).endswith((".yaml", ".yml")) else CONF / kind / f"{name}.yaml"
+    if "\0" in str(name) or not path.is_file():
+        known = what_there_is(name, shipped_names(kind), "studies" if kind == "study" else f"{kind}s")
+        raise ValueError(f"there is no {kind} {shown(name)}{known}")
+    return path
+
+
 def preset_names() -> list[str]:
     """Returns the names of all presets that come with the package."""
-    return sorted(path.stem for path in (CONF / "preset").glob("*.yaml"))
+    return shipped_names("preset")
 
 
 def load_preset(name: str) -> dict[str, Any]:
@@ -34,7 +56,7 @@ def load_preset(name: str) -> dict[str, Any]:
 
 
 def _load(name: str, above: tuple[Path, ...]) -> dict[str, Any]:
-    path = _path(name)
+    path = find_file("preset", name)
     if path in above:
         raise ValueError(f"the preset {name!r} begins with itself")
     values = read_mapping(path)
@@ -42,21 +64,14 @@ def _load(name: str, above: tuple[Path, ...]) -> dict[str, Any]:
     with naming(path):
         place(values)  # unknown names
         if first is not None:
-            _path(first)
+            find_file("preset", first)
     return values if first is None else merge(_load(first, (*above, path)), values)
 
 
 def preset_summary(name: str) -> str:
     """Returns the purpose of a preset in one line: the comment that its file begins with."""
-    first, *_ = [*_path(name).read_text().splitlines(), ""]
+    first, *_ = [*find_file("preset", name).read_text().splitlines(), ""]
     return first.lstrip("# ") if first.startswith("#") else ""
-
-
-def _path(name: str) -> Path:
-    path = Path(name) if str(name).endswith((".yaml", ".yml")) else CONF / "preset" / f"{name}.yaml"
-    if "\0" in str(name) or not path.is_file():
-        raise ValueError(f"there is no preset {shown(name)}{what_there_is(name, preset_names(), 'presets')}")
-    return path
 
 
 def policy_files() -> dict[str, Path]:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.choices.learners import BY_ACTIONS
-from torchrl_her_recipes.config.options import AUTO, what_there_is
+from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.plain_files import read_yaml, shown
 from torchrl_her_recipes.config.recipe import Recipe, compose, drop_other_goal_sources
-from torchrl_her_recipes.config.shipped import CONF
+from torchrl_her_recipes.config.shipped import find_file, shipped_names
 from torchrl_her_recipes.config.shortcuts import locate, merge, place
 from torchrl_her_recipes.config.values import as_kind
 from torchrl_her_recipes.config.without_effect import without_effect
@@ -21,7 +20,6 @@ from torchrl_her_recipes.config.without_effect import without_effect
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
 
-_SPACES = CONF / "space"
 _RANGE = ("low", "high")
 _KINDS = {"float": _RANGE, "log_float": _RANGE, "int": _RANGE, "log_int": _RANGE, "choice": ("values",)}
 _MOST = 100  # values of a choice
@@ -192,7 +190,7 @@ def _idle(recipe: Recipe) -> set[tuple[str, str]]:
 
 def space_names() -> list[str]:
     """Returns the names of all spaces that come with the package, one for each learner."""
-    return sorted(path.stem for path in _SPACES.glob("*.yaml"))
+    return shipped_names("space")
 
 
 def space_summary(name: str) -> str:
@@ -216,10 +214,7 @@ def load_space(name: str) -> Space:
         >>> load_space("ddpg").ranges["learning_rate"]
         {'kind': 'log_float', 'low': 0.0002, 'high': 0.005}
     """
-    path = Path(name) if name.endswith((".yaml", ".yml")) else _SPACES / f"{name}.yaml"
-    if not path.is_file():
-        raise ValueError(f"there is no space {name!r}{what_there_is(name, space_names(), 'spaces')}")
-    return Space(name=str(path) if path.parent != _SPACES else name, ranges=read_yaml(path))
+    return Space(name=name, ranges=read_yaml(find_file("space", name)))
 
 
 def space_for(recipe: Recipe) -> Space:

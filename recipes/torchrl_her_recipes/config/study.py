@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.metrics import AXES
-from torchrl_her_recipes.config.options import what_there_is
 from torchrl_her_recipes.config.plain_files import naming, read_mapping
 from torchrl_her_recipes.config.recipe import Recipe, compose
-from torchrl_her_recipes.config.shipped import CONF, load_preset
+from torchrl_her_recipes.config.shipped import find_file, load_preset, shipped_names
 from torchrl_her_recipes.config.shortcuts import locate, merge, place
 
-_STUDIES = CONF / "study"
 _LENGTHS = ("num_runs", "epochs", "epoch_frames", "frames")
 _QUICK: dict[str, Any] = {
     "num_runs": 2,
@@ -118,28 +115,12 @@ class Study:
             raise ValueError(f"vary of {self.name} must hold lists of values by option, got {self.vary!r}")
         if strange := [name for name in (*self.recipe, *self.vary) if not isinstance(name, str)]:
             raise ValueError(f"options of {self.name} must be names, got {strange[0]!r}")
-        if not isinstance(self.cases, Mapping) or not all(
-            isinstance(name, str) and re.fullmatch(r"\w[\w.=+-]*", name) and isinstance(own, Mapping)
-            for name, own in self.cases.items()
-        ):
-            raise ValueError(
-                f"cases of {self.name} must hold options by name, such as no_filter; got {self.cases!r}"
-            )
         tasks = [_task_of(task) for task in self.vary.get("task", ())]
-        if not isinstance(self.for_task, Mapping) or not all(
-            task in tasks and isinstance(own, Mapping) for task, own in self.for_task.items()
-        ):
-            raise ValueError(
-                f"for_task of {self.name} must hold options by one of the tasks that vary "
-                f"({', '.join(map(str, tasks)) or 'none'}), got {self.for_task!r}"
-            )
-        for task, own in self.for_task.items():
-            if both := _set_in(own, self.vary):
-                raise ValueError(f"for_task of {self.name} sets {both[0]} for {task}, which varies")
-        for case, own in self.cases.items():
-            if both := _set_in(own, self.vary):
-                raise ValueError(f"cases of {self.name} set {both[0]} in {case}, which varies")
-            if long := _set_in(own, _LENGTHS):
+        by = f"by one of the tasks that vary ({', '.join(map(str, tasks)) or 'none'})"
+        self._check_sets("for_task", by, lambda task: task in tasks)
+        self._check_sets("cases", "by name, such as no_filter", re.compile(r"\w[\w.=+-]*").fullmatch)
+        for case, options in self.cases.items():
+            if long := _set_in(options, _LENGTHS):
                 raise ValueError(f"cases of {self.name} set {long[0]} in {case}: it must be the same in all")
         drawn = [self.figure] if isinstance(self.figure, str) else list(self.figure)
         if not drawn or not set(drawn) <= set(AXES):
@@ -147,6 +128,17 @@ class Study:
             raise ValueError(f"figure of {self.name} must be some of {known}; got {self.figure!r}")
         object.__setattr__(self, "figure", drawn)
         read_orders(self.expect)  # raises if an order is not valid
+
+    def _check_sets(self, field: str, by: str, is_name: Callable[[str], object]) -> None:
+        """Checks a mapping whose entries are sets of options, none of which may be among those that vary."""
+        sets = getattr(self, field)
+        if not isinstance(sets, Mapping) or not all(
+            isinstance(name, str) and is_name(name) and isinstance(own, Mapping) for name, own in sets.items()
+        ):
+            raise ValueError(f"{field} of {self.name} must hold options {by}; got {sets!r}")
+        for name, options in sets.items():
+            if both := _set_in(options, self.vary):
+                raise ValueError(f"{field} of {self.name} must not set {both[0]} in {name}, since it varies")
 
     def combinations(self) -> Iterator[dict[str, Any]]:
         """Yields the options that are specific to each combination, in the order of :meth:`cells`."""
@@ -208,7 +200,7 @@ def _word(name: str, value: Any, values: Sequence[Any]) -> str:
 
 def study_names() -> list[str]:
     """Returns the names of all studies that come with the package."""
-    return sorted(path.stem for path in _STUDIES.glob("*.yaml"))
+    return shipped_names("study")
 
 
 def load_study(
@@ -225,9 +217,7 @@ def load_study(
     Raises:
         ValueError: there is no such study, or a number below 1.
     """
-    path = Path(name) if name.endswith((".yaml", ".yml")) else _STUDIES / f"{name}.yaml"
-    if not path.is_file():
-        raise ValueError(f"there is no study {name!r}{what_there_is(name, study_names(), 'studies')}")
+    path = find_file("study", name)
     for option, value in (("seeds", seeds), ("frames", frames)):
         if value is not None and value < 1:
             raise ValueError(f"{option} must be at least 1, got {value}")
@@ -236,38 +226,25 @@ def load_study(
     known = [field.name for field in fields(Study) if field.name != "name"]
     if unknown := [key for key in values if key not in known]:
         raise ValueError(f"{path}: unknown {', '.join(unknown)}; a study has preset, {', '.join(known)}")
+    sizes = {"num_runs": seeds, "frames": frames}
+    asked = merge(_QUICK if quick else {}, {name: size for name, size in sizes.items() if size is not None})
     with naming(path):
-        study = _shortened(path, values, preset, seeds=seeds, frames=frames, quick=quick)
+        study = Study(name=path.stem, **values)
+        if not study.name.strip("."):
+            raise ValueError("a study has the name of its file, which must not be a bare suffix")
+        shared = merge(load_preset(preset) if preset else {}, study.recipe, asked)
+        for_task = {task: merge(own, asked) for task, own in study.for_task.items()}
+        study = replace(study, recipe=shared, for_task=for_task)
         cells = list(study.cells())  # raises if a combination is not valid
         combined = dict.fromkeys(curve_label(label, recipe) for label, recipe in cells)
         named = (name for order in read_orders(study.expect) for name in (order.more, order.less))
         if strange := next((name for name in named if name not in combined), None):
             there = ", ".join(combined)
             raise ValueError(f"expect must name combinations, which are {there}; got {strange!r}")
-    if path.parent == _STUDIES:  # this package's own files may name modules
+    if name in study_names():  # this package's own files may name modules
         for _, recipe in cells:
             permit_task(recipe.task.name)
     return study
-
-
-def _shortened(
-    path: Path,
-    values: Mapping[str, Any],
-    preset: str | None,
-    *,
-    seeds: int | None,
-    frames: int | None,
-    quick: bool,
-) -> Study:
-    """Makes the study that a file describes, at the requested size."""
-    study = Study(name=path.stem, **values)
-    if not study.name.strip("."):
-        raise ValueError("a study has the name of its file, which must not be a bare suffix")
-    sizes = {"num_runs": seeds, "frames": frames}
-    asked = merge(_QUICK if quick else {}, {name: size for name, size in sizes.items() if size is not None})
-    recipe = merge(load_preset(preset) if preset else {}, study.recipe, asked)
-    for_task = {task: merge(own, asked) for task, own in study.for_task.items()}
-    return replace(study, recipe=recipe, for_task=for_task)
 
 
 def _set_in(own: Mapping[str, Any], names: Iterable[str]) -> list[str]:

@@ -122,7 +122,10 @@ def test_mappings_are_named_by_what_differs() -> None:
         ({"cases": {"a/b": {}}}, "cases of own must hold options by name, such as no_filter; got"),
         ({"cases": {"few": 3}}, "cases of own must hold options by name, such as no_filter; got"),
         ({"cases": {"few": {"kk": 3}}}, "no option 'kk'"),
-        ({"cases": {"few": {"k": 3}}, "vary": {"k": [1, 2]}}, "cases of own set k in few, which varies"),
+        (
+            {"cases": {"few": {"k": 3}}, "vary": {"k": [1, 2]}},
+            "cases of own must not set k in few",
+        ),
         (
             {"cases": {"long": {"run": {"epochs": 3}}}},
             "cases of own set epochs in long: it must be the same in all",
@@ -133,12 +136,12 @@ def test_mappings_are_named_by_what_differs() -> None:
         ({"vary": {"kk": [1]}}, "no option 'kk'"),
         (
             {"vary": {"task": ["hand_v0"]}, "for_task": {"hand_v1": {"k": 2}}},
-            r"for_task of own must hold options by one of the tasks that vary \(hand_v0\), got",
+            r"for_task of own must hold options by one of the tasks that vary \(hand_v0\); got",
         ),
-        ({"vary": {"k": [1]}, "for_task": {"hand_v1": {}}}, r"the tasks that vary \(none\), got"),
+        ({"vary": {"k": [1]}, "for_task": {"hand_v1": {}}}, r"the tasks that vary \(none\); got"),
         (
             {"vary": {"task": ["hand_v1"], "k": [1, 2]}, "for_task": {"hand_v1": {"hindsight": {"k": 2}}}},
-            "for_task of own sets k for hand_v1, which varies",
+            "for_task of own must not set k in hand_v1, since it varies",
         ),
     ],
 )

@@ -166,21 +166,26 @@ class DDPGConfig(NoiseConfig):
     clamp_targets: bool = option(True, _CLAMPED)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _SomeCritics(LearnerConfig):
+    critics: int = option(2, _CRITICS, at_least=1)
+    target_critics: int = option(0, _TARGET_CRITICS, at_least=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.target_critics > self.critics:
+            raise ValueError(f"target_critics={self.target_critics} must be at most critics={self.critics}")
+
+
 @LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
-class TD3Config(DDPGConfig):
+class TD3Config(_SomeCritics, DDPGConfig):
     """Two critics and smoothed targets (Fujimoto et al., 2018)."""
 
     name = "td3"
     maker = f"{_MAKERS}.td3:TD3Builder"
 
     norm: str = _norm()
-    critics: int = option(2, _CRITICS, at_least=1)
-    target_critics: int = option(0, _TARGET_CRITICS, at_least=0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_target_critics(self.target_critics, self.critics)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,18 +206,11 @@ class EntropyConfig(LearnerConfig):
 
 @LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
-class SACConfig(EntropyConfig):
+class SACConfig(_SomeCritics, EntropyConfig):
     """Soft actor-critic with a learned temperature (Haarnoja et al., 2018)."""
 
     name = "sac"
     maker = f"{_MAKERS}.sac:SACBuilder"
-
-    critics: int = option(2, _CRITICS, at_least=1)
-    target_critics: int = option(0, _TARGET_CRITICS, at_least=0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_target_critics(self.target_critics, self.critics)
 
 
 @LEARNERS.register
@@ -246,11 +244,6 @@ class TQCConfig(EntropyConfig):
             raise ValueError(
                 f"dropped_quantiles={self.dropped_quantiles} must be below quantiles={self.quantiles}"
             )
-
-
-def _check_target_critics(target_critics: int, critics: int) -> None:
-    if target_critics > critics:
-        raise ValueError(f"target_critics={target_critics} must be at most critics={critics}")
 
 
 @LEARNERS.register
