@@ -1,4 +1,4 @@
-"""Draws the pictures of a report into files, with alternative texts."""
+"""Draws the pictures of a report, one panel in each file, with alternative texts."""
 
 from __future__ import annotations
 
@@ -8,18 +8,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from torchrl_her_envs.registry import make_env
-from torchrl_her_envs.throwing.env import ThrowingEnv
 from torchrl_her_envs.throwing.tasks import TASKS
 from torchrl_her_recipes.reports.compare import Final, values_of
 from torchrl_her_recipes.reports.formatting import MEASURES, show, show_interval
-from torchrl_her_recipes.reports.plots import plot_finals, plot_measure, plot_share
 from torchrl_her_recipes.reports.results import Combination
-from torchrl_her_recipes.runs.plots import Rows, band, colors
+from torchrl_her_recipes.runs.plots import Rows, band, colors, draw_curves, draw_goals
 
 _MIME = {".svg": "image/svg+xml", ".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}
+_WIDTH, _HEIGHT = 4.4, 3.9  # inches: as wide as a phone, in letters that can be read there
+_INK = "#1a202c"
 
 
 @dataclass(frozen=True)
@@ -68,14 +71,26 @@ def draw_pictures(
 def _curve(
     task: str, name: str, curves: Mapping[str, Rows], palette: Mapping[str, str], figures: Path
 ) -> Picture:
-    beside = "return" if name == "q" else None
-    stem = _stem(figures, name, task)
-    plot_measure(curves, name, stem, title=task, palette=palette, beside=beside)
+    """Draws a metric of several algorithms; beside Q of the start, the medians of the returns are dashed."""
+    figure, axes = _panel(task)
+    draw_curves(axes, curves, name, palette)
+    handles, _ = axes.get_legend_handles_labels()
+    if name == "q":
+        for label, rows in curves.items():
+            frames, _, middle, _ = band(rows, "return")
+            axes.plot(frames, middle, color=palette[label], linestyle="--", linewidth=1.2)
+        handles += [Line2D([], [], color=_INK, linestyle="--", label="return")]
+    axes.set_xlabel("environment steps of each run")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    if name.startswith("rows_"):
+        axes.yaxis.set_major_formatter(EngFormatter(sep=""))
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
     ends = ", ".join(
         f"{label} {show(float(band(rows, name)[2][-1]), name)}" for label, rows in curves.items()
     )
     what = MEASURES.get(name, "Q of the initial state")
-    return Picture(Path(f"{stem}.svg"), f"{task}: {what} over environment steps. Last medians: {ends}.")
+    path = _save(figure, _stem(figures, name, task))
+    return Picture(path, f"{task}: {what} over environment steps. Last medians: {ends}.")
 
 
 def _final(
@@ -84,10 +99,25 @@ def _final(
     palette: Mapping[str, str],
     figures: Path,
 ) -> Picture:
-    stem = _stem(figures, "final", task)
-    plot_finals(ends, stem, title=task, palette=palette)
+    """Draws success at the end: each run, the interquartile mean with its interval, the published number."""
+    figure, axes = _panel(task, height=1.5 + 0.42 * len(ends))
+    for place, (label, (values, final)) in enumerate(ends.items()):
+        color = palette[label]
+        axes.scatter(values, [place + 0.22] * len(values), s=9, color=color, alpha=0.45, linewidths=0)
+        axes.plot([final.low, final.high], [place, place], color=color, linewidth=4, alpha=0.5)
+        axes.plot([final.iqm], [place], "o", color=color, markersize=6)
+        if final.published is not None:
+            axes.plot([final.published], [place], "D", color=_INK, markersize=6, fillstyle="none")
+    axes.set(ylim=(len(ends) - 0.5, -0.5), xlim=(-0.02, 1.02), xlabel="success at the end")
+    axes.set_yticks(range(len(ends)), list(ends))
+    axes.xaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.grid(axis="x", alpha=0.3)
+    if any(final.published is not None for _, final in ends.values()):
+        mark = Line2D([], [], marker="D", linestyle="", color=_INK, fillstyle="none", label="published")
+        figure.legend(handles=[mark], loc="outside lower center", frameon=False)
     said = ", ".join(f"{label} {show_interval(row, 'success')}" for label, (_, row) in ends.items())
-    return Picture(Path(f"{stem}.svg"), f"{task}: success at the end. {said}.")
+    path = _save(figure, _stem(figures, "final", task))
+    return Picture(path, f"{task}: success at the end. {said}.")
 
 
 def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Picture]:
@@ -100,14 +130,34 @@ def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Pictu
     env = make_env(task)
     env.reset()
     target = next(iter(maps.values())).target
-    shares = {label: goals.share for label, goals in maps.items()} | {"target q*": target}
-    return [_map(task, label, share, env, float(target.max()), figures) for label, share in shares.items()]
+    limit, pictures = max(float(target.max()), 1e-9), []
+    for label, share in (
+        {label: goals.share for label, goals in maps.items()} | {"target q*": target}
+    ).items():
+        figure = Figure(figsize=(2.5, 2.7), layout="constrained")
+        axes = figure.subplots()
+        draw_goals(axes, share, env, limit=limit)
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(f"{task}\n{label}", fontsize=10)
+        path = _save(figure, _stem(figures, "goals", task, label)).with_suffix(".png")
+        pictures.append(Picture(path, f"{task}: where the virtual goals of {label} lie on the screen."))
+    return pictures
 
 
-def _map(task: str, label: str, share: np.ndarray, env: ThrowingEnv, limit: float, figures: Path) -> Picture:
-    stem = _stem(figures, "goals", task, label)
-    plot_share(share, env, stem, limit=max(limit, 1e-9), title=f"{task}\n{label}")
-    return Picture(Path(f"{stem}.png"), f"{task}: where the virtual goals of {label} lie on the screen.")
+def _panel(title: str, *, height: float = _HEIGHT) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    axes = figure.subplots()
+    axes.set_title(title)
+    return figure, axes
+
+
+def _save(figure: Figure, stem: Path) -> Path:
+    """Writes a picture as .svg, which is returned, and as .png for programs that cannot show that."""
+    path = Path(f"{stem}.svg")
+    figure.savefig(path, metadata={"Date": None})
+    figure.set_layout_engine("none")  # it is laid out already, which takes longer than drawing it
+    figure.savefig(f"{stem}.png", dpi=120)
+    return path
 
 
 def _stem(figures: Path, *words: str) -> Path:
