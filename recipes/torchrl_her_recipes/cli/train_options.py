@@ -12,7 +12,14 @@ import click
 from click.shell_completion import CompletionItem
 
 from torchrl_her_envs.registry import task_names
-from torchrl_her_recipes.cli.overrides import ARGUMENTS, check_once, parse_override, split_sweep, sweep
+from torchrl_her_recipes.cli.overrides import (
+    ARGUMENTS,
+    check_once,
+    parse_override,
+    parse_value,
+    split_sweep,
+    sweep,
+)
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
 from torchrl_her_recipes.config.options import AUTO
@@ -39,19 +46,15 @@ class RunRequest:
 
 def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest]:
     """Returns the runs that arguments describe."""
-    pairs = [parse_override(text, ARGUMENTS) for text in options]
-    check_once(pairs, ARGUMENTS)
-    given = dict(pairs)
-    folder = given.pop("folder", None)
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     if not multirun:
-        for name, text in given.items():
-            _check_single(name, text)
-        (values,) = sweep(list(given.items()))
+        values = single(options)
+        folder = values.pop("folder", None)
         recipe = _recipe(values)
         yield RunRequest(recipe, Path(folder or f"runs/{now}_{label(recipe)}"))
         return
-    root = Path(folder or f"runs/sweep_{now}")
+    given = dict(_pairs(options))
+    root = Path(given.pop("folder", "") or f"runs/sweep_{now}")
     before: list[Recipe] = []
     for number, values in enumerate(sweep(list(given.items()))):
         recipe = _recipe(values)
@@ -64,18 +67,20 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
 
 def single(options: tuple[str, ...]) -> dict[str, Any]:
     """Returns the values of arguments, none of which may be a sweep."""
+    pairs = _pairs(options)
+    for name, text in pairs:
+        if name != "folder" and len(split_sweep(text)) > 1:
+            raise ValueError(
+                f"{name} must be one value, got {text}; several are a sweep: torchrl-her train -m"
+            )
+    return {name: value if name in ARGUMENTS else parse_value(value) for name, value in pairs}
+
+
+def _pairs(options: tuple[str, ...]) -> list[tuple[str, str]]:
+    """Splits arguments into names and texts of values, and checks the names."""
     pairs = [parse_override(text, ARGUMENTS) for text in options]
     check_once(pairs, ARGUMENTS)
-    for name, text in pairs:
-        _check_single(name, text)
-    (values,) = sweep(pairs)
-    return values
-
-
-def _check_single(name: str, text: str) -> None:
-    """Raises a ValueError for several values without ``-m``."""
-    if len(split_sweep(text)) > 1:
-        raise ValueError(f"{name} must be one value, got {text}; several are a sweep: torchrl-her train -m")
+    return pairs
 
 
 def _recipe(values: Mapping[str, Any]) -> Recipe:
