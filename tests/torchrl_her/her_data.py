@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_her import EnvReward, GoalReward
+from torchrl_her import EnvReward, GoalReward, GoalWeights
 
 # The goal of state t of episode e of environment n is (1000 n + 100 e + t, 0): never equal to another.
 WANTED = -7.0
@@ -77,6 +77,24 @@ def _point(x: Tensor) -> Tensor:
     return torch.stack((x, torch.zeros_like(x)), -1)
 
 
+def along(path: list[float], episodes: int = 1) -> TensorDict:
+    """A batch [N, T] of episodes whose achieved goals are those of a path; the observation is the step."""
+    batch, states = make_batch([[len(path) - 1]] * episodes), torch.tensor(path)
+    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = states[:-1], states[1:]
+    batch["observation"][..., 0] = torch.arange(len(path) - 1.0)
+    return batch
+
+
+def tags(x: Tensor) -> list[float]:
+    return x[..., 0].tolist()
+
+
+def pairs(rows: TensorDict) -> set[tuple[float, float]]:
+    """Observations and the goals that they were given; real goals are left out."""
+    found = zip(tags(rows["observation"]), tags(rows["desired_goal"]), strict=True)
+    return {pair for pair in found if pair[1] != WANTED}
+
+
 def costly(lengths: list[list[int]]) -> tuple[EnvReward, TensorDict]:
     """A reward that costs a quarter for each step that an episode has lasted, and a batch with that cost."""
     batch, near = make_batch(lengths), GoalReward(0.5)
@@ -90,3 +108,16 @@ def costly(lengths: list[list[int]]) -> tuple[EnvReward, TensorDict]:
     after = batch["next"]
     after["reward"] = rule(after["achieved_goal"], after["desired_goal"], after)[0]
     return rule, batch
+
+
+class PreferFar(GoalWeights):
+    """A goal is as useful as it is far away; counts the goals that were chosen."""
+
+    def __init__(self) -> None:
+        self.chosen = 0
+
+    def __call__(self, goals: Tensor) -> Tensor:
+        return goals[..., 0]
+
+    def update(self, goals: Tensor) -> None:
+        self.chosen += len(goals)

@@ -203,16 +203,6 @@ def test_weights_are_finite_and_only_goals_that_are_not_have_none(
     assert not weights.divergence < 0
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64])
-def test_weights_have_the_shape_and_type_of_goals(dtype: torch.dtype) -> None:
-    weights = KernelInstructiveness((10 * uniform(9, 2)).to(dtype), sigma=3.0)
-    weights.update((10 * uniform(50, 2, seed=1)).to(dtype))
-    found = weights((10 * uniform(12, 2, seed=2)).view(3, 4, 2).to(dtype))
-    assert found.shape == (3, 4)
-    assert found.dtype == (dtype if dtype.is_floating_point else torch.float32)
-    assert weights(torch.zeros(3, 0, 2)).shape == (3, 0)
-
-
 def test_it_goes_on_as_it_was_saved(tmp_path: Any) -> None:
     first, second = (KernelInstructiveness(uniform(50, 3), sigma=0.2, samples=40) for _ in range(2))
     asked = uniform(30, 3, seed=9)

@@ -164,16 +164,6 @@ def test_weights_are_finite_and_only_goals_that_are_not_have_none(
             assert not finite.any() or float(weight.max()) == 1.0
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64])
-def test_weights_have_the_shape_and_type_of_goals(dtype: torch.dtype) -> None:
-    weights = RareGoals()
-    weights.update((10 * random(50, 2)).to(dtype))
-    found = weights((10 * random(3, 4, 2, seed=1)).to(dtype))
-    assert found.shape == (3, 4)
-    assert found.dtype == (dtype if dtype.is_floating_point else torch.float32)
-    assert weights(torch.zeros(3, 0, 2)).shape == (3, 0)
-
-
 def test_goals_of_another_width_are_refused() -> None:
     weights = RareGoals()
     weights.update(random(5, 2))

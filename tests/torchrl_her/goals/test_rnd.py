@@ -136,15 +136,6 @@ def test_weights_are_finite_and_only_goals_that_are_not_have_none(
             assert not finite.any() or float(weight.max()) == 1.0
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64])
-def test_weights_have_the_shape_and_type_of_goals(dtype: torch.dtype) -> None:
-    weights = taught(NetworkNovelty(), (10 * uniform(50)).to(dtype), 2)
-    found = weights((10 * uniform(12, seed=1)).view(3, 4, 2).to(dtype))
-    assert found.shape == (3, 4)
-    assert found.dtype == (dtype if dtype.is_floating_point else torch.float32)
-    assert weights(torch.zeros(3, 0, 2)).shape == (3, 0)
-
-
 def test_emptying_starts_again_and_takes_goals_of_any_width() -> None:
     weights, fresh = taught(NetworkNovelty(), uniform(50), 5), NetworkNovelty()
     with pytest.raises(ValueError, match="goals of 2 numbers were learned, got goals of 3"):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
+from torch import Tensor
 
 from torchrl_her import GoalWeights
+from torchrl_her.goals import KernelInstructiveness, NetworkNovelty, RareGoals
 from torchrl_her.goals.weights import checked_weights, normalized_weights
 
 
@@ -48,3 +52,20 @@ def test_weights_from_logarithms_by_hand() -> None:
     torch.testing.assert_close(found, torch.tensor([[0.25, 1.0], [tiny, 0.0]]))
     assert normalized_weights(logs, torch.zeros(2, 2, 3, dtype=torch.int64)).dtype == torch.float32
     assert normalized_weights(torch.full((2,), float("nan")), torch.zeros(2, 1)).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64])
+@pytest.mark.parametrize(
+    "make",
+    [lambda real: KernelInstructiveness(real, sigma=3.0), lambda _: RareGoals(), lambda _: NetworkNovelty()],
+)
+def test_weights_have_the_shape_and_type_of_goals(
+    make: Callable[[Tensor], GoalWeights], dtype: torch.dtype
+) -> None:
+    weights = make((10 * torch.rand(9, 2)).to(dtype))
+    for _ in range(2):
+        weights.update((10 * torch.rand(50, 2)).to(dtype))
+    found = weights((10 * torch.rand(3, 4, 2)).to(dtype))
+    assert found.shape == (3, 4)
+    assert found.dtype == (dtype if dtype.is_floating_point else torch.float32)
+    assert weights(torch.zeros(3, 0, 2)).shape == (3, 0)

@@ -16,10 +16,21 @@ from torchrl_her.trainers import RunsAdam
 from ..lost_game import SPEC, rows, say
 
 
+def make_loss(*, runs: int = 1, **options: Any) -> LossModule:
+    actor, critic = make_stochastic_actor((4, 2), SPEC, runs=runs), make_critic((4, 2), 3, runs=runs)
+    loss = make_sac_loss(actor, critic, action_spec=SPEC, runs=runs, **{"gamma": 0.5, **options})
+    SoftUpdate(loss, tau=0.1)
+    return loss
+
+
+def without_entropy(loss: LossModule) -> LossModule:
+    loss.log_alpha.data.fill_(-50.0)
+    return loss
+
+
 def test_two_critics_learn_the_value_of_a_lost_game() -> None:
     torch.manual_seed(0)
-    critic = make_critic((4, 2), 3)
-    loss = make_sac_loss(make_stochastic_actor((4, 2), SPEC), critic, action_spec=SPEC, gamma=0.5)
+    loss = make_loss()
     learner = LossLearner(loss, torch.optim.Adam(loss.parameters(), lr=3e-3), SoftUpdate(loss, tau=0.1))
     for _ in range(150):
         batch = rows(64, action=torch.rand(1, 64, 3) * 4 - 2)[0]
@@ -28,20 +39,22 @@ def test_two_critics_learn_the_value_of_a_lost_game() -> None:
     assert batch["td_error"].shape == (64,)
 
 
-@pytest.mark.parametrize("gamma", [-0.1, 1.0])
-def test_a_discount_out_of_range_is_named(gamma: float) -> None:
-    actor, critic = make_stochastic_actor((4, 2), SPEC), make_critic((4, 2), 3)
-    with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):
-        make_sac_loss(actor, critic, action_spec=SPEC, gamma=gamma)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gamma": -0.1}, r"gamma must be in \[0, 1\), got -0.1"),
+        ({"gamma": 1.0}, r"gamma must be in \[0, 1\), got 1.0"),
+        ({"temperature": 0.0}, "temperature must be positive, got 0"),
+    ],
+)
+def test_what_cannot_be_is_named(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_loss(**options)
 
 
 def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None:
     """By hand: critics that say 0, with targets of -5 and -7, and a temperature so low that it is nothing."""
-    loss = make_sac_loss(
-        make_stochastic_actor((4, 2), SPEC), make_critic((4, 2), 3), action_spec=SPEC, gamma=0.5
-    )
-    SoftUpdate(loss, tau=0.1)
-    loss.log_alpha.data.fill_(-50.0)
+    loss = without_entropy(make_loss())
     say(loss, [0.0, 0.0], [-5.0, -7.0])
     batch = rows(3, action=torch.rand(1, 3, 3))[0]
     batch["steps_to_next_obs"] = torch.tensor([[1], [2], [3]])
@@ -52,19 +65,10 @@ def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None
 
 def test_targets_of_critics_that_are_drawn_and_the_mean_for_the_actor() -> None:
     """By hand: the least of two of three targets, which differ from run to run and from step to step."""
-    loss = make_sac_loss(
-        make_stochastic_actor((4, 2), SPEC, runs=2),
-        make_critic((4, 2), 3, runs=2),
-        action_spec=SPEC,
-        critics=3,
-        target_critics=2,
-        gamma=0.5,
-        runs=2,
-        generators=[torch.Generator().manual_seed(run) for run in range(2)],
-        reduction="none",
+    generators = [torch.Generator().manual_seed(run) for run in range(2)]
+    loss = without_entropy(
+        make_loss(runs=2, critics=3, target_critics=2, generators=generators, reduction="none")
     )
-    SoftUpdate(loss, tau=0.1)
-    loss.log_alpha.data.fill_(-50.0)
     say(loss, [0.0, 0.0, 3.0], [-2.0, -4.0, -6.0])
     batch = rows(2, action=torch.rand(2, 2, 3), runs=2)
     seen = set()
@@ -79,20 +83,9 @@ def test_targets_of_critics_that_are_drawn_and_the_mean_for_the_actor() -> None:
 
 
 def test_targets_may_be_clamped_to_possible_returns() -> None:
-    losses = [
-        make_sac_loss(
-            make_stochastic_actor((4, 2), SPEC),
-            make_critic((4, 2), 3),
-            action_spec=SPEC,
-            gamma=0.5,
-            reward_range=bounds,
-        )
-        for bounds in (None, (-1.0, 0.0))
-    ]
     batch, errors = rows(1, action=torch.rand(1, 1, 3))[0], []
-    for loss in losses:
-        SoftUpdate(loss, tau=0.1)
-        loss.log_alpha.data.fill_(-50.0)
+    for bounds in (None, (-1.0, 0.0)):
+        loss = without_entropy(make_loss(reward_range=bounds))
         say(loss, [0.0, 0.0], [-9.0, 9.0])
         loss(batch)
         errors += batch["td_error"].tolist()
@@ -102,12 +95,10 @@ def test_targets_may_be_clamped_to_possible_returns() -> None:
 def own_and_torchrls(**options: Any) -> tuple[LossModule, SACLoss]:
     """Our loss, and TorchRL's with the same weights."""
     actor, critic = make_stochastic_actor((4, 2), SPEC), make_critic((4, 2), 3)
-    ours = make_sac_loss(actor, critic, action_spec=SPEC, gamma=0.5, **options)
-    plain = SACLoss(actor, critic, action_spec=SPEC, loss_function="l2")
+    ours, plain = make_loss(**options), SACLoss(actor, critic, action_spec=SPEC, loss_function="l2")
     plain.make_value_estimator(gamma=0.5)
     plain.load_state_dict(ours.state_dict())
-    for loss in (ours, plain):
-        SoftUpdate(loss, tau=0.1)
+    SoftUpdate(plain, tau=0.1)
     return ours, plain
 
 
@@ -135,22 +126,9 @@ def test_the_penalty_is_the_mean_square_of_the_drawn_actions() -> None:
 
 
 def test_each_run_has_a_temperature_of_its_own() -> None:
-    loss = make_sac_loss(
-        make_stochastic_actor((4, 2), SPEC, runs=3),
-        make_critic((4, 2), 3, runs=3),
-        action_spec=SPEC,
-        runs=3,
-        temperature=0.2,
-        reduction="none",
-    )
+    loss = make_loss(runs=3, temperature=0.2, reduction="none")
     learner = LossLearner(loss, RunsAdam(loss, lr=0.1, runs=3), SoftUpdate(loss, tau=0.1), runs=3)
     assert loss.log_alpha.exp().tolist() == pytest.approx([0.2] * 3)
     learner.update(rows(8, action=torch.rand(1, 8, 3)).expand(3, 8).clone(), idle=[1])
     changed = (loss.log_alpha.exp() - 0.2).abs() > 1e-3
     assert changed.tolist() == [True, False, True]
-
-
-def test_a_temperature_must_be_positive() -> None:
-    actor, critic = make_stochastic_actor((4, 2), SPEC), make_critic((4, 2), 3)
-    with pytest.raises(ValueError, match="temperature must be positive, got 0"):
-        make_sac_loss(actor, critic, action_spec=SPEC, temperature=0.0)

@@ -14,9 +14,16 @@ from torchrl_her.objectives import clamped_td0, make_td3_loss
 from ..lost_game import SPEC, rows, say
 
 
+def make_loss(critic: Any = None, *, runs: int = 1, **options: Any) -> LossModule:
+    actor, critic = make_actor((4, 2), 3, runs=runs), critic or make_critic((4, 2), 3, runs=runs)
+    loss = make_td3_loss(actor, critic, action_spec=SPEC, **{"gamma": 0.5, **options})
+    SoftUpdate(loss, tau=0.1)
+    return loss
+
+
 def test_two_critics_learn_the_value_of_a_lost_game() -> None:
     torch.manual_seed(0)
-    loss = make_td3_loss(make_actor((4, 2), 3), make_critic((4, 2), 3), action_spec=SPEC, gamma=0.5)
+    loss = make_loss()
     learner = LossLearner(loss, torch.optim.Adam(loss.parameters(), lr=3e-3), SoftUpdate(loss, tau=0.1))
     for _ in range(150):
         batch = rows(64, action=torch.rand(1, 64, 3) * 4 - 2)[0]
@@ -26,10 +33,21 @@ def test_two_critics_learn_the_value_of_a_lost_game() -> None:
     assert float(loss(batch)["pred_value"].mean()) == pytest.approx(-2.0, abs=0.3)
 
 
-@pytest.mark.parametrize("gamma", [-0.1, 1.0])
-def test_a_discount_out_of_range_is_named(gamma: float) -> None:
-    with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):
-        make_td3_loss(make_actor((4, 2), 3), make_critic((4, 2), 3), action_spec=SPEC, gamma=gamma)
+SUBSET = r"target_critics must be from 0 \(all\) to the number of critics, 3, got "
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gamma": -0.1}, r"gamma must be in \[0, 1\), got -0.1"),
+        ({"gamma": 1.0}, r"gamma must be in \[0, 1\), got 1.0"),
+        ({"critics": 3, "target_critics": -1}, f"{SUBSET}-1"),
+        ({"critics": 3, "target_critics": 4}, f"{SUBSET}4"),
+    ],
+)
+def test_what_cannot_be_is_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_loss(**options)
 
 
 def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None:
@@ -37,10 +55,7 @@ def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None
     critic = make_critic((4, 2), 3)
     for parameter in critic.parameters():
         parameter.data.zero_()
-    loss = make_td3_loss(
-        make_actor((4, 2), 3), critic, action_spec=SPEC, gamma=0.5, reward_range=(-10.0, 0.0)
-    )
-    SoftUpdate(loss, tau=0.1)
+    loss = make_loss(critic, reward_range=(-10.0, 0.0))
     say(loss, [0.0, 0.0], [-5.0, -7.0])
     batch = rows(3, action=torch.rand(1, 3, 3))[0]
     batch["steps_to_next_obs"] = torch.tensor([[1], [2], [3]])
@@ -50,13 +65,11 @@ def test_rows_of_several_steps_discount_the_next_value_by_their_number() -> None
 def own_and_torchrls(**options: Any) -> tuple[LossModule, TD3Loss]:
     """Our loss, and TorchRL's with the same weights."""
     actor, critic = make_actor((4, 2), 3), make_critic((4, 2), 3)
-    ours = make_td3_loss(actor, critic, action_spec=SPEC, gamma=0.5, **options)
-    plain = TD3Loss(actor, critic, action_spec=SPEC, loss_function="l2")
+    ours, plain = make_loss(**options), TD3Loss(actor, critic, action_spec=SPEC, loss_function="l2")
     plain.make_value_estimator(clamped_td0(0.5, (-1.0, 0.0)))
     plain.value_estimator.set_keys(value="state_action_value")
     plain.load_state_dict(ours.state_dict())
-    for loss in (ours, plain):
-        SoftUpdate(loss, tau=0.1)
+    SoftUpdate(plain, tau=0.1)
     return ours, plain
 
 
@@ -81,13 +94,7 @@ def test_the_penalty_is_the_mean_square_of_the_actions() -> None:
 def test_the_targets_of_a_run_have_its_own_noise() -> None:
     """Two runs of one program, and the second of them alone."""
     generators = [torch.Generator().manual_seed(seed) for seed in (1, 2)]
-    loss = make_td3_loss(
-        make_actor((4, 2), 3, runs=2),
-        make_critic((4, 2), 3, runs=2),
-        action_spec=SPEC,
-        generators=generators,
-        reduction="none",
-    )
+    loss = make_loss(runs=2, generators=generators, reduction="none")
     first = loss.noise(torch.zeros(2, 5, 3))
     alone = torch.Generator().manual_seed(2)
     assert torch.equal(first[1].flatten(), torch.empty(15).normal_(generator=alone))
@@ -95,17 +102,8 @@ def test_the_targets_of_a_run_have_its_own_noise() -> None:
 
 def test_targets_of_critics_that_are_drawn_and_the_mean_for_the_actor() -> None:
     """By hand: the least of two of three targets, which differ from step to step."""
-    loss = make_td3_loss(
-        make_actor((4, 2), 3),
-        make_critic((4, 2), 3),
-        action_spec=SPEC,
-        critics=3,
-        target_critics=2,
-        gamma=0.5,
-        reward_range=(-10.0, 0.0),
-        generators=[torch.Generator().manual_seed(0)],
-    )
-    SoftUpdate(loss, tau=0.1)
+    generators = [torch.Generator().manual_seed(0)]
+    loss = make_loss(critics=3, target_critics=2, reward_range=(-10.0, 0.0), generators=generators)
     say(loss, [-1.0, -3.0, -8.0], [-2.0, -4.0, -6.0])
     batch = rows(2, action=torch.rand(1, 2, 3))[0]
     seen = set()
@@ -118,29 +116,16 @@ def test_targets_of_critics_that_are_drawn_and_the_mean_for_the_actor() -> None:
     assert seen == {-3.0, -4.0}  # -1 + half of -4 (critics 0 and 1) or of -6
 
 
-@pytest.mark.parametrize("target_critics", [-1, 4])
-def test_more_critics_than_there_are_cannot_be_drawn(target_critics: int) -> None:
-    message = rf"target_critics must be from 0 \(all\) to the number of critics, 3, got {target_critics}"
-    with pytest.raises(ValueError, match=message):
-        make_td3_loss(
-            make_actor((4, 2), 3),
-            make_critic((4, 2), 3),
-            action_spec=SPEC,
-            critics=3,
-            target_critics=target_critics,
-        )
-
-
 @pytest.mark.parametrize(("critics", "given"), [(0, 1), (3, 2)])
 def test_the_number_of_critics_is_checked(critics: int, given: int) -> None:
     own = [make_critic((4, 2), 3) for _ in range(given)]
     with pytest.raises(ValueError, match=r"critics must be at least 1, got 0|must be 3 critics, got 2"):
-        make_td3_loss(make_actor((4, 2), 3), own, action_spec=SPEC, critics=critics)
+        make_loss(own, critics=critics)
 
 
 def test_critics_of_a_list_are_taken_as_they_are() -> None:
     own = [make_critic((4, 2), 3) for _ in range(3)]
-    loss = make_td3_loss(make_actor((4, 2), 3), own, action_spec=SPEC, critics=3)
+    loss = make_loss(own, critics=3)
     weights = loss.qvalue_network_params["module", "first", "0", "0", "weight"]
     assert weights.shape[0] == 3
     assert all(

@@ -40,10 +40,10 @@ from torchrl.data.replay_buffers.samplers import (
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictMaxValueWriter
 from torchrl.envs.transforms import MultiStepTransform, RewardScaling
 
-from torchrl_her import EnvReward, GoalReward, GoalWeights, HERSampleUnit, HERWriter
+from torchrl_her import GoalReward, HERSampleUnit, HERWriter
 from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
 
-from ..her_data import WANTED, costly, make_batch, tag
+from ..her_data import WANTED, PreferFar, along, costly, make_batch, pairs, tag, tags
 
 pytestmark = pytest.mark.filterwarnings("ignore:the reward function gives")  # made up as each test needs it
 REWARD = GoalReward(0.5)  # tags differ by at least 1
@@ -88,36 +88,12 @@ def flat(lengths: list[list[int]], **options: Any) -> TensorDict:
     return make_batch(lengths, **options).reshape(-1)
 
 
-def tags(x: Tensor) -> list[float]:
-    return x[..., 0].tolist()
-
-
-def pairs(rows: TensorDict) -> set[tuple[float, float]]:
-    """Observations and the goals that they were given; real goals are left out."""
-    own = zip(tags(rows["observation"]), tags(rows["desired_goal"]), strict=True)
-    return {pair for pair in own if pair[1] != WANTED}
-
-
 def virtual_rows(buffer: TensorDictReplayBuffer, size: int = 2_000) -> TensorDict:
     rows = buffer.sample(size)
     return rows[rows["virtual"].squeeze(-1)]
 
 
 # Where goals come from
-
-
-@pytest.mark.parametrize(
-    ("strategy", "expected"),
-    [
-        ("future", {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)}),
-        ("final", {(0, 3), (1, 3), (2, 3)}),
-        ("episode", {(t, g) for t in range(3) for g in range(1, 4)}),
-    ],
-)
-def test_goals_are_those_of_next_states(strategy: str, expected: set[tuple[int, int]]) -> None:
-    buffer = make_buffer(strategy=strategy)
-    buffer.extend(flat([[3]]))
-    assert pairs(buffer.sample(500)) == expected
 
 
 def test_torchrl_never_lends_the_last_state_and_lends_goals_that_are_achieved_already() -> None:
@@ -134,14 +110,6 @@ def test_every_candidate_is_as_likely_as_any_other() -> None:
     first = rows["desired_goal"][rows["observation"][:, 0] == 0, 0]
     shares = [(first == goal).float().mean().item() for goal in (1, 2, 3, 4)]
     assert shares == pytest.approx([0.25] * 4, abs=0.04)  # five standard deviations
-
-
-def test_episodes_of_length_one() -> None:
-    buffer = make_buffer(k=NEVER_REAL)
-    buffer.extend(flat([[1, 1, 1]], terminated=True))
-    rows = buffer.sample(100)
-    assert pairs(rows) == {(0, 1), (100, 101), (200, 201)}
-    assert (rows["next", "reward"] == 0).all()
 
 
 def test_rows_of_an_open_episode_may_take_goals_up_to_the_newest() -> None:
@@ -273,36 +241,12 @@ def test_no_goal_ever_leaks(
 # What follows from a goal
 
 
-def test_reward_terminated_and_done_are_recomputed_and_truncated_stays() -> None:
-    buffer = make_buffer(strategy="final")
-    buffer.extend(flat([[3]]))
-    rows = virtual_rows(buffer)
-    last = rows["observation"][:, :1] == 2
-    after = rows["next"]
-    assert torch.equal(after["reward"], last.float() - 1)
-    for key in ("terminated", "truncated", "done"):
-        assert torch.equal(after[key], last)
-    assert torch.equal(rows["desired_goal"], after["desired_goal"])
-
-
 def test_torchrl_leaves_terminated_as_it_was() -> None:
     buffer = make_torchrl()
     buffer.extend(flat([[3]]))
     after = buffer.sample()["next"]
     assert (after["reward"] == 0).any()
     assert not after["terminated"].any()
-
-
-def test_a_real_termination_is_undone_where_the_goal_is_not_reached() -> None:
-    reward = EnvReward(
-        lambda a, d: -torch.ones_like(a[..., :1]), lambda a, d: torch.zeros_like(a[..., :1]).bool()
-    )
-    buffer = make_buffer(reward=reward)
-    buffer.extend(flat([[3]], terminated=True))
-    rows = buffer.sample(300)
-    virtual = rows["virtual"]
-    assert not rows["next", "done"][virtual].any()
-    assert rows["next", "done"][~virtual].any()
 
 
 def test_real_rows_and_other_entries_stay_and_the_storage_is_untouched() -> None:
@@ -338,19 +282,6 @@ def test_transforms_see_the_lent_goal_and_torchrls_do_not() -> None:
     assert (rows["desired_goal"][:, 0] != WANTED).all()
 
 
-def test_the_reward_is_asked_in_the_order_achieved_desired() -> None:
-    def compute_reward(achieved: Tensor, desired: Tensor) -> Tensor:
-        return (achieved[..., :1] >= desired[..., :1]).float() - 1.0
-
-    reward = EnvReward(compute_reward, lambda a, d: compute_reward(a, d) == 0)
-    buffer = make_buffer(reward=reward, strategy="episode")
-    buffer.extend(flat([[6]]))
-    rows = virtual_rows(buffer)
-    expected = (rows["next", "achieved_goal"][:, :1] >= rows["desired_goal"][:, :1]).float() - 1.0
-    assert torch.equal(rows["next", "reward"], expected)
-    assert 0 < (expected == 0).float().mean() < 1
-
-
 def test_shapes_and_kinds_of_numbers_are_those_of_the_storage() -> None:
     batch = flat([[4]])
     batch["next", "reward"] = batch["next", "reward"].double().squeeze(-1)
@@ -366,28 +297,9 @@ def test_shapes_and_kinds_of_numbers_are_those_of_the_storage() -> None:
 # Filter and weights
 
 
-def along(path: list[float], episodes: int = 1) -> TensorDict:
-    """Episodes whose achieved goals are those of a path; the observation is the step."""
-    batch = make_batch([[len(path) - 1]] * episodes)
-    states = torch.tensor(path)
-    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = states[:-1], states[1:]
-    batch["observation"][..., 0] = torch.arange(len(path) - 1.0)
-    return batch.reshape(-1)
-
-
-def test_the_filter_leaves_out_goals_already_achieved_before_the_action() -> None:
-    buffer = make_buffer(filter_achieved=True)
-    buffer.extend(along([0, 0, 0, 1, 2, 3]))  # the ball moves from step 2 on
-    assert pairs(buffer.sample(2_000)) == {
-        (t, g)
-        for t, goals in ((0, (1, 2, 3)), (1, (1, 2, 3)), (2, (1, 2, 3)), (3, (2, 3)), (4, (3,)))
-        for g in goals
-    }
-
-
 def test_rows_without_a_candidate_stay_real() -> None:
     buffer = make_buffer(filter_achieved=True, k=NEVER_REAL)
-    buffer.extend(along([0, 1, 1, 1]))
+    buffer.extend(along([0, 1, 1, 1]).reshape(-1))
     rows = buffer.sample(300)
     assert torch.equal(rows["virtual"], rows["observation"][:, :1] == 0)
     assert pairs(rows) == {(0.0, 1.0)}
@@ -396,59 +308,10 @@ def test_rows_without_a_candidate_stay_real() -> None:
     assert not rows["next", "terminated"][real].any()
 
 
-def test_the_filter_asks_the_reward_even_where_nothing_ever_terminates() -> None:
-    endless = EnvReward(lambda a, d: REWARD(a, d)[0], lambda a, d: torch.zeros_like(a[..., :1]).bool())
-    buffer = make_buffer(reward=endless, filter_achieved=True)
-    buffer.extend(along([0, 0, 0]))
-    assert not buffer.sample(100)["virtual"].any()
-
-
-def test_where_episodes_go_on_at_goals_the_filter_keeps_what_teaches_to_stay() -> None:
-    endless = EnvReward(lambda a, d: REWARD(a, d)[0], lambda a, d: torch.zeros_like(a[..., :1]).bool())
-    stays = along([0, 9, 9])  # the last transition had its goal before, but not at the start
-    for reward, steps in ((REWARD, {0.0}), (endless, {0.0, 9.0})):
-        buffer = make_buffer(reward=reward, filter_achieved=True, k=NEVER_REAL)
-        buffer.extend(stays)
-        rows = buffer.sample(100)
-        assert set(rows["achieved_goal"][..., 0][rows["virtual"].squeeze(-1)].tolist()) == steps
-
-
-class PreferFar(GoalWeights):
-    """A goal is as useful as it is far away."""
-
-    def __init__(self) -> None:
-        self.lent = 0
-
-    def __call__(self, goals: Tensor) -> Tensor:
-        return goals[..., 0]
-
-    def update(self, goals: Tensor) -> None:
-        self.lent += len(goals)
-
-
-@pytest.mark.parametrize("weighted", [False, True])
-def test_goals_that_pass_the_filter_are_drawn_in_proportion(weighted: bool) -> None:
-    weights = PreferFar() if weighted else None
-    buffer = make_buffer(filter_achieved=True, weights=weights, k=NEVER_REAL)
-    buffer.extend(along([0, 0, 1, 3, 0], episodes=3))
-    rows = buffer.sample(16_000)
-    time, goal = rows["observation"][:, 0], rows["desired_goal"][:, 0]
-    virtual = rows["virtual"].squeeze(-1)
-    for t, kept in enumerate([[1.0, 3.0], [1.0, 3.0], [3.0, 0.0], [0.0]]):  # the goal 0 is achieved at first
-        drawn = goal[(time == t) & virtual]
-        total = sum(kept) if weighted else len(kept)
-        assert (len(drawn) > 3_500) == bool(total)
-        for value in kept if total else []:
-            share = (drawn == value).float().mean().item()
-            assert share == pytest.approx((value if weighted else 1) / total, abs=0.05)  # six deviations
-    if weights is not None:
-        assert weights.lent == int(virtual.sum())
-
-
 def test_many_rows_are_drawn_piece_by_piece(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchrl_her.replay_buffers.sample_unit.LIKELIHOODS", 64)
     buffer = make_buffer(weights=PreferFar(), strategy="episode", k=NEVER_REAL)
-    buffer.extend(along([5, 0, 1, 3]))
+    buffer.extend(along([5, 0, 1, 3]).reshape(-1))
     rows = buffer.sample(3_000)
     assert (rows["desired_goal"][:, 0] == 3).float().mean().item() == pytest.approx(0.75, abs=0.04)
 
@@ -463,28 +326,6 @@ def test_weights_that_promise_to_be_alike_are_not_asked() -> None:
     buffer = make_buffer(weights=Alike())
     buffer.extend(flat([[4]]))
     assert buffer.sample(50)["virtual"].any()
-
-
-@pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf")])
-def test_weights_that_cannot_be_are_refused(bad: float) -> None:
-    class Bad(GoalWeights):
-        def __call__(self, goals: Tensor) -> Tensor:
-            return torch.full(goals.shape[:-1], bad)
-
-    buffer = make_buffer(weights=Bad())
-    buffer.extend(flat([[4]]))
-    with pytest.raises(ValueError, match="weights of goals must be finite and at least 0"):
-        buffer.sample(20)
-
-
-def test_weights_may_be_yes_or_no() -> None:
-    class Never(GoalWeights):
-        def __call__(self, goals: Tensor) -> Tensor:
-            return torch.zeros(goals.shape[:-1], dtype=torch.bool)
-
-    buffer = make_buffer(weights=Never())
-    buffer.extend(flat([[4]]))
-    assert not buffer.sample(20)["virtual"].any()
 
 
 # Buffers
@@ -617,7 +458,8 @@ def test_seeds_make_sampling_repeat(per: bool, weighted: bool) -> None:
     for seed in (1, 1, 2):
         weights = PreferFar() if weighted else None
         buffer = make_buffer(seed=seed, per=per, filter_achieved=True, weights=weights)
-        buffer.extend(along([0, 0, 0, 1, 2, 3, 4]))  # the filter refuses some of the first proposals
+        # the filter refuses some of the first proposals
+        buffer.extend(along([0, 0, 0, 1, 2, 3, 4]).reshape(-1))
         batches.append(buffer.sample(200))
     same, again, differs = batches
     for key in same.keys(True, True):
@@ -659,33 +501,6 @@ def test_a_used_unit_can_be_copied_to_another_process() -> None:
 
 
 # Options
-
-
-def test_keys_of_ones_own() -> None:
-    batch = flat([[4]])
-    for rows in (batch, batch["next"]):
-        rows.rename_key_("desired_goal", ("goals", "wanted")).rename_key_("achieved_goal", ("goals", "got"))
-    batch["next"].rename_key_("reward", "cost")
-    buffer = make_buffer(
-        achieved_goal_key=("goals", "got"),
-        desired_goal_key=("goals", "wanted"),
-        reward_key="cost",
-        virtual_key=None,
-    )
-    buffer.extend(batch)
-    rows = buffer.sample(100)
-    assert "virtual" not in rows.keys()
-    lent = rows["goals", "wanted"][:, 0] != WANTED
-    assert lent.any()
-    assert torch.equal(rows["goals", "wanted"], rows["next", "goals", "wanted"])
-    assert (rows["next", "cost"][lent] == 0).any()
-
-
-def test_bad_options_are_named() -> None:
-    with pytest.raises(ValueError, match="k must be at least 0, got -1"):
-        HERSampleUnit(REWARD, k=-1)
-    with pytest.raises(ValueError, match="unknown goal strategy 'nearest'"):
-        HERSampleUnit(REWARD, strategy="nearest")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -810,15 +625,14 @@ def test_a_slice_gets_one_goal_and_keeps_its_ends(kind: str, filtered: bool) -> 
 
 
 def test_the_filter_looks_at_all_of_a_slice() -> None:
-    batch, path = make_batch([[4]]), torch.tensor([0.0, 1.0, 2.0, 1.0, 3.0])
-    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    batch = along([0.0, 1.0, 2.0, 1.0, 3.0])
     goals = {}
     for filtered in (False, True):
         sampler = SliceSampler(slice_len=3, traj_key=IDS)
         buffer = make_buffer(sampler=sampler, k=NEVER_REAL, filter_achieved=filtered)
         buffer.extend(batch.squeeze(0))
         rows = buffer.sample(600)
-        goals[filtered] = set(zip(tags(rows["observation"]), tags(rows["desired_goal"]), strict=True))
+        goals[filtered] = pairs(rows)
     # Slices 0-2 and 1-3: 1 is achieved in the last state of the first one, but before, too.
     early, late = {(float(t), g) for t in range(3) for g in (1.0, 3.0)}, {(float(t), 3.0) for t in (1, 2, 3)}
     assert goals[False] == early | late
@@ -834,45 +648,6 @@ def test_whole_episodes_need_slices() -> None:
 
 
 # Several steps
-
-
-@pytest.mark.parametrize("ndim", [1, 2])
-@pytest.mark.parametrize("n_steps", [2, 3, 10])
-def test_returns_over_several_steps_by_hand(n_steps: int, ndim: int) -> None:
-    batch = make_batch([[4]])
-    batch["next", "reward"][0, :, 0] = torch.tensor([-1.0, -2.0, -4.0, -8.0])
-    buffer = make_buffer(ndim=ndim, strategy="final", k=1, n_steps=n_steps, gamma=0.5)
-    buffer.extend(batch.squeeze(0) if ndim == 1 else batch)
-    sums = {
-        2: ([-2.0, -4.0, -8.0, -8.0], [-1.5, -1.5, -1.0, 0.0], [2, 2, 2, 1]),
-        3: ([-3.0, -6.0, -8.0, -8.0], [-1.75, -1.5, -1.0, 0.0], [3, 3, 2, 1]),
-        10: ([-4.0, -6.0, -8.0, -8.0], [-1.75, -1.5, -1.0, 0.0], [4, 3, 2, 1]),
-    }[n_steps]
-    rows = buffer.sample(200)
-    for is_virtual in (False, True):
-        own = rows[rows["virtual"].flatten() == is_virtual]
-        step = own["observation"][:, 0].long()
-        assert set(step.tolist()) == {0, 1, 2, 3}
-        assert torch.equal(own["next", "reward"][:, 0], torch.tensor(sums[is_virtual])[step])
-        assert torch.equal(own["steps_to_next_obs"][:, 0], torch.tensor(sums[2])[step])
-        behind = step + torch.tensor(sums[2])[step]
-        assert torch.equal(own["next", "observation"][:, 0], behind.float())
-        assert torch.equal(own["next", "truncated"][:, 0], behind == 4)
-        assert torch.equal(own["next", "done"][:, 0], behind == 4)
-        assert torch.equal(own["next", "terminated"][:, 0], (behind == 4) & is_virtual)
-        assert torch.equal(own["desired_goal"], own["next", "desired_goal"])
-        assert "state" not in own["next"].keys()
-
-
-def test_goals_that_are_passed_on_the_way_cut_the_steps() -> None:
-    batch, path = make_batch([[4]]), torch.tensor([0.0, 1.0, 2.0, 3.0, 1.0])
-    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
-    buffer = make_buffer(strategy="final", k=NEVER_REAL, n_steps=3, gamma=0.5)
-    buffer.extend(batch.squeeze(0))
-    rows = buffer.sample(100)
-    first = rows[rows["observation"][:, 0] == 0][0]
-    assert (first["next", "reward"].item(), first["next", "terminated"].item()) == (0.0, True)
-    assert (first["steps_to_next_obs"].item(), first["next", "observation"][0].item()) == (1, 1.0)
 
 
 def test_steps_never_cross_episodes_in_a_ring() -> None:
@@ -1106,40 +881,6 @@ def test_ends_of_slices_under_another_key_are_refused() -> None:
         buffer.sample(4)
 
 
-@pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.5}])
-def test_a_fall_terminates_virtual_transitions_too(options: dict[str, Any]) -> None:
-    """An episode that terminated without success would have done so for any goal."""
-    never = EnvReward(lambda a, d: REWARD(a, d)[0] - 1.0, lambda a, d: torch.zeros_like(a[..., :1]).bool())
-    buffer = make_buffer(reward=never, k=NEVER_REAL, **options)
-    batch = flat([[4]], terminated=True)
-    batch["next", "reward"].fill_(-1.0)
-    buffer.extend(batch)
-    rows = buffer.sample(100)
-    at_end = rows["next", "observation"][:, 0] == 4
-    assert torch.equal(rows["next", "terminated"][:, 0], at_end)
-    assert torch.equal(rows["next", "done"][:, 0], at_end)
-
-
-@pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.5}])
-def test_what_a_fall_cost_is_kept_for_other_goals(options: dict[str, Any]) -> None:
-    never = EnvReward(lambda a, d: REWARD(a, d)[0] - 1.0, lambda a, d: torch.zeros_like(a[..., :1]).bool())
-    drawn = []
-    for cost in (0.0, 5.0):
-        buffer = make_buffer(reward=never, k=NEVER_REAL, **options)
-        batch = flat([[4]], terminated=True)
-        own = never(batch["next", "achieved_goal"], batch["next", "desired_goal"])[0]
-        batch["next", "reward"] = own - torch.where(batch["next", "terminated"], cost, 0.0)
-        buffer.extend(batch)
-        torch.manual_seed(0)
-        drawn.append(buffer.sample(100))
-    free, costly = drawn
-    assert torch.equal(free["desired_goal"], costly["desired_goal"])
-    at_end = free["next", "observation"][:, :1] == 4
-    steps = free.get("steps_to_next_obs", torch.ones_like(at_end, dtype=torch.int64))
-    expected = free["next", "reward"] - torch.where(at_end, 5.0 * 0.5 ** (steps - 1), 0.0)
-    torch.testing.assert_close(costly["next", "reward"], expected)
-
-
 def test_a_buffer_that_is_shared_between_processes_is_refused() -> None:
     buffer = make_beside(shared=True)
     buffer.extend(flat([[5]]))
@@ -1178,13 +919,3 @@ def test_virtual_transitions_are_rewarded_with_their_own_info(ndim: int, filtere
     steps = [step % 1000 for step in tags(rows["observation"])]
     seen = set(zip(steps, tags(after["reward"]), tags(after["terminated"]), strict=True))
     assert seen == {(0.0, -1.25, False), (1.0, -1.5, False), (2.0, -0.75, True)}
-
-
-def test_returns_over_several_steps_have_the_info_of_each() -> None:
-    rule, batch = costly([[3]])
-    options = {"strategy": "final", "k": NEVER_REAL, "achieved_reward": -0.9, "n_steps": 2, "gamma": 0.5}
-    buffer = make_buffer(reward=rule, **options)
-    buffer.extend(batch.reshape(-1))
-    rows = buffer.sample(100)
-    returns = set(zip(tags(rows["observation"]), tags(rows["next", "reward"]), strict=True))
-    assert returns == {(0.0, -1.25 - 0.5 * 1.5), (1.0, -1.5 - 0.5 * 0.75), (2.0, -0.75)}

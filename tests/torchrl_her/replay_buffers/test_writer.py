@@ -29,7 +29,7 @@ from torchrl.envs.transforms import MultiStepTransform
 from torchrl_her import EnvReward, GoalReward, GoalWeights, HERSampleUnit, HERWriter
 from torchrl_her.replay_buffers.runs import RunsSampler
 
-from ..her_data import WANTED, costly, make_batch, tag
+from ..her_data import WANTED, PreferFar, along, costly, make_batch, pairs, tag, tags
 
 pytestmark = pytest.mark.filterwarnings("ignore:the reward function gives")  # made up as each test needs it
 REWARD = GoalReward(0.5)  # tags differ by at least 1
@@ -52,72 +52,7 @@ def split(buffer: TensorDictReplayBuffer) -> tuple[TensorDict, TensorDict]:
     return rows[~virtual], rows[virtual]
 
 
-def tags(x: Tensor) -> list[float]:
-    return x[..., 0].tolist()
-
-
-# Where virtual goals come from
-
-
-@pytest.mark.parametrize("strategy", ["future", "final", "episode"])
-def test_goals_are_achieved_by_next_states_of_the_same_episode(strategy: str) -> None:
-    buffer = make_buffer(strategy=strategy, k=8)
-    buffer.extend(make_batch([[5, 3], [2, 6]]))
-    _, virtual = split(buffer)
-    assert len(virtual) == 8 * 16
-    lengths = {0: 5, 100: 3, 1000: 2, 1100: 6}
-    for observation, goal in zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True):
-        origin, t = divmod(observation, 100)
-        length = lengths[int(origin * 100)]
-        allowed = {
-            "future": range(int(t) + 1, length + 1),
-            "final": [length],
-            "episode": range(1, length + 1),
-        }
-        assert goal - origin * 100 in allowed[strategy]
-
-
-def test_future_reaches_every_later_state_and_the_state_that_this_action_led_to() -> None:
-    buffer = make_buffer(k=200)
-    buffer.extend(make_batch([[3]]))
-    _, virtual = split(buffer)
-    goals = {t: set(tags(virtual["desired_goal"][virtual["observation"][:, 0] == t])) for t in range(3)}
-    assert goals == {0: {1.0, 2.0, 3.0}, 1: {2.0, 3.0}, 2: {3.0}}
-
-
-def test_the_goal_is_replaced_in_next_too() -> None:
-    buffer = make_buffer()
-    buffer.extend(make_batch([[6]]))
-    _, virtual = split(buffer)
-    assert torch.equal(virtual["desired_goal"], virtual["next", "desired_goal"])
-    assert (virtual["desired_goal"][:, 0] != WANTED).all()
-
-
 # What follows from a virtual goal
-
-
-def test_reward_terminated_and_done_are_recomputed_and_truncated_stays() -> None:
-    buffer = make_buffer(strategy="final", k=1)
-    buffer.extend(make_batch([[3]]))
-    _, virtual = split(buffer)
-    order = virtual["observation"][:, 0].argsort()
-    after = virtual["next"][order]
-    assert after["reward"].flatten().tolist() == [-1.0, -1.0, 0.0]
-    assert after["terminated"].flatten().tolist() == [False, False, True]
-    assert after["truncated"].flatten().tolist() == [False, False, True]
-    assert after["done"].flatten().tolist() == [False, False, True]
-
-
-def test_a_real_termination_is_undone_when_the_virtual_goal_is_not_reached_there() -> None:
-    reward = EnvReward(
-        lambda a, d: -torch.ones_like(a[..., :1]), lambda a, d: torch.zeros_like(a[..., :1]).bool()
-    )
-    buffer = make_buffer(reward=reward, k=1)
-    buffer.extend(make_batch([[3]], terminated=True))
-    real, virtual = split(buffer)
-    assert real["next", "terminated"].sum() == 1
-    assert not virtual["next", "terminated"].any()
-    assert not virtual["next", "done"].any()
 
 
 def test_success_at_the_last_step_is_terminated_and_truncated_at_once() -> None:
@@ -132,29 +67,6 @@ def test_success_at_the_last_step_is_terminated_and_truncated_at_once() -> None:
         assert last["truncated"].all()
 
 
-def test_real_rows_and_all_other_entries_stay_as_they_were() -> None:
-    batch = make_batch([[4, 2]])
-    buffer = make_buffer()
-    index = buffer.extend(batch.clone())
-    stored = buffer[:][index.flatten()]
-    flat = batch.reshape(-1).exclude("state", ("next", "state"))
-    for key in flat.keys(True, True):
-        assert torch.equal(stored[key], flat[key]), key
-    _, virtual = split(buffer)
-    real_by_tag = {float(row["observation"][0]): row for row in flat}
-    for row in virtual:
-        origin = real_by_tag[float(row["observation"][0])]
-        for key in ("action", "achieved_goal", ("next", "observation"), ("next", "achieved_goal")):
-            assert torch.equal(row[key], origin[key])
-
-
-def test_the_state_that_holds_the_real_goal_is_not_stored() -> None:
-    buffer = make_buffer()
-    buffer.extend(make_batch([[4]]))
-    assert "state" not in buffer[:].keys()
-    assert ("next", "state") not in buffer[:].keys(True)
-
-
 def test_an_input_made_of_the_goal_follows_the_virtual_goal_when_made_after_sampling() -> None:
     def with_input(rows: TensorDict) -> TensorDict:
         return rows.set("input", torch.cat((rows["observation"], rows["desired_goal"]), -1))
@@ -167,40 +79,7 @@ def test_an_input_made_of_the_goal_follows_the_virtual_goal_when_made_after_samp
     assert rows["virtual"].any()
 
 
-def test_the_reward_is_asked_in_the_order_achieved_desired() -> None:
-    # Asymmetric: achieved is anything at or beyond the desired goal.
-    def compute_reward(achieved: Tensor, desired: Tensor) -> Tensor:
-        return (achieved[..., :1] >= desired[..., :1]).float() - 1.0
-
-    buffer = make_buffer(
-        reward=EnvReward(compute_reward, lambda a, d: compute_reward(a, d) == 0), strategy="episode"
-    )
-    buffer.extend(make_batch([[6]]))
-    _, virtual = split(buffer)
-    expected = (virtual["next", "achieved_goal"][:, :1] >= virtual["desired_goal"][:, :1]).float() - 1.0
-    assert torch.equal(virtual["next", "reward"], expected)
-    assert 0 < (expected == 0).float().mean() < 1
-
-
 # The filter
-
-
-def test_filter_leaves_out_goals_already_achieved_before_the_action() -> None:
-    batch = make_batch([[5]])
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0, 2.0, 3.0])  # the ball moves from step 2 on
-    batch["achieved_goal"][0, :, 0] = still[:-1]
-    batch["next", "achieved_goal"][0, :, 0] = still[1:]
-    buffer = make_buffer(filter_achieved=True, k=50)
-    buffer.extend(batch)
-    real, virtual = split(buffer)
-    assert len(real) == 5
-    pairs = set(zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True))
-    # Not (0, 0) and (1, 0): the goal 0 is where the ball already is. Step 2 achieves 1 by itself: kept.
-    assert pairs == {
-        (t, g)
-        for t, goals in ((0, (1, 2, 3)), (1, (1, 2, 3)), (2, (1, 2, 3)), (3, (2, 3)), (4, (3,)))
-        for g in goals
-    }
 
 
 def test_an_episode_in_which_nothing_moved_writes_real_rows_only() -> None:
@@ -255,35 +134,6 @@ def test_refill_is_for_single_transitions() -> None:
         HERWriter(REWARD, refill=0)
 
 
-def test_the_filter_asks_the_reward_even_where_nothing_ever_terminates() -> None:
-    reward = GoalReward(0.5)
-    endless = EnvReward(lambda a, d: reward(a, d)[0], lambda a, d: torch.zeros_like(a[..., :1]).bool())
-    batch = make_batch([[4]])
-    batch["achieved_goal"].zero_()
-    batch["next", "achieved_goal"].zero_()
-    buffer = make_buffer(reward=endless, filter_achieved=True)
-    buffer.extend(batch)
-    assert len(split(buffer)[1]) == 0
-
-
-@pytest.mark.parametrize("ends", [True, False])
-def test_where_episodes_go_on_at_goals_the_filter_keeps_what_teaches_to_stay(ends: bool) -> None:
-    """From 0 to 1, and staying there: the last transition had its goal before, but not at the start."""
-    reward = GoalReward(0.5)
-    rule = EnvReward(lambda a, d: reward(a, d)[0], lambda a, d: reward(a, d)[1] & ends)
-    batch, path = make_batch([[4]]), torch.tensor([0.0, 0.0, 1.0, 1.0, 0.0])
-    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
-    batch["observation"][..., 0] = torch.arange(4.0)
-    buffer = make_buffer(reward=rule, filter_achieved=True, strategy="episode", k=8)
-    buffer.extend(batch)
-    virtual = split(buffer)[1]
-    goals = {
-        step: set(virtual["desired_goal"][..., 0][virtual["observation"][..., 0] == step].tolist())
-        for step in range(4)
-    }
-    assert goals == {0: {1.0}, 1: {1.0}, 2: {0.0} if ends else {0.0, 1.0}, 3: {0.0} if ends else {0.0, 1.0}}
-
-
 # Rewards that read more than goals
 
 
@@ -297,14 +147,6 @@ def test_virtual_transitions_are_rewarded_with_their_own_info(per: str) -> None:
     assert virtual["next", "reward"].flatten().tolist() == [-1.25, -1.5, -0.75, -1.25, -0.5]
     assert virtual["next", "terminated"].flatten().tolist() == [False, False, True, False, True]
     assert buffer.writer.counts.virtual_positive == 2
-
-
-def test_returns_over_several_steps_have_the_info_of_each() -> None:
-    rule, batch = costly([[3]])
-    buffer = make_buffer(reward=rule, strategy="final", k=1, n_steps=2, gamma=0.5, achieved_reward=-0.9)
-    buffer.extend(batch)
-    reward = split(buffer)[1]["next", "reward"].flatten().tolist()
-    assert reward == [-1.25 - 0.5 * 1.5, -1.5 - 0.5 * 0.75, -0.75]
 
 
 def test_the_filter_reads_the_info_of_the_state_before_the_action() -> None:
@@ -346,42 +188,6 @@ def test_an_entry_that_a_reward_reads_must_be_there() -> None:
 # Episodes, environments, batches
 
 
-class PreferFar(GoalWeights):
-    """A goal is as useful as it is far away."""
-
-    def __call__(self, goals: Tensor) -> Tensor:
-        return goals[..., 0]
-
-
-@pytest.mark.parametrize("weighted", [False, True])
-def test_goals_that_pass_the_filter_are_drawn_in_proportion(weighted: bool) -> None:
-    batch = make_batch([[4]] * 2_000)
-    path = torch.tensor([0.0, 0.0, 1.0, 3.0, 0.0])
-    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
-    batch["observation"][..., 0] = torch.arange(4.0)
-    buffer = make_buffer(80_000, k=2, filter_achieved=True, weights=PreferFar() if weighted else None)
-    buffer.extend(batch)
-    virtual = buffer[:][buffer[:]["virtual"].squeeze(-1)]
-    time, goal = virtual["observation"][:, 0], virtual["desired_goal"][:, 0]
-    for t, kept in enumerate([[1.0, 3.0], [1.0, 3.0], [3.0, 0.0], [0.0]]):  # the goal 0 is achieved at first
-        drawn = goal[time == t]
-        total = sum(kept) if weighted else len(kept)
-        assert len(drawn) == (4_000 if total else 0)
-        for value in (0.0, 1.0, 3.0):
-            expected = (value if weighted else 1.0) / total if value in kept and total else 0.0
-            share = (drawn == value).sum().item() / 4_000
-            assert share == pytest.approx(expected, abs=0.05)  # six standard deviations
-
-
-def test_episodes_of_length_one_and_success_at_the_first_step() -> None:
-    buffer = make_buffer(k=2)
-    buffer.extend(make_batch([[1, 1, 1]], terminated=True))
-    real, virtual = split(buffer)
-    assert tags(virtual["desired_goal"]) == [t + 1 for t in tags(virtual["observation"])]
-    assert (virtual["next", "reward"] == 0).all()
-    assert (len(real), len(virtual)) == (3, 6)
-
-
 def test_an_open_episode_is_held_back_until_it_closes() -> None:
     buffer = make_buffer(strategy="final", k=1)
     first = buffer.extend(make_batch([[5], [2, 9]], steps=3))
@@ -414,7 +220,7 @@ def test_flat_rows_are_told_apart_by_their_trajectories() -> None:
     assert torch.equal(buffer[:][index]["observation"], shuffled["observation"])
     _, virtual = split(buffer)
     last = {0: 4.0, 1: 102.0, 10: 1003.0, 11: 1103.0}
-    for observation, goal in zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True):
+    for observation, goal in pairs(virtual):
         assert goal == last[int(observation // 100)]
 
 
@@ -452,9 +258,7 @@ def test_an_environment_reset_from_outside_leaks_nothing(how: str) -> None:
         buffer.extend(with_env_ids(later))
         assert "env_ids" not in buffer[:].keys()
         assert ("next", "env_ids") not in buffer[:].keys(True)
-    _, virtual = split(buffer)
-    pairs = set(zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True))
-    assert pairs == {(0.0, 3.0), (1.0, 3.0), (2.0, 3.0), (100.0, 102.0), (101.0, 102.0)}
+    assert pairs(buffer[:]) == {(0.0, 3.0), (1.0, 3.0), (2.0, 3.0), (100.0, 102.0), (101.0, 102.0)}
 
 
 def test_an_episode_longer_than_the_buffer_is_said_once() -> None:
@@ -600,16 +404,6 @@ def test_weights_choose_goals_and_are_told_what_was_written() -> None:
     assert buffer.writer.weights.written == 10
 
 
-def test_weights_of_zero_write_no_virtual_row() -> None:
-    class Nothing(GoalWeights):
-        def __call__(self, goals: Tensor) -> Tensor:
-            return torch.zeros(goals.shape[:-1])
-
-    buffer = make_buffer(weights=Nothing())
-    buffer.extend(make_batch([[5]]))
-    assert [len(rows) for rows in split(buffer)] == [5, 0]
-
-
 def roundtrip(buffer: TensorDictReplayBuffer, other: TensorDictReplayBuffer, path: Path | None) -> None:
     if path is None:
         other.writer.load_state_dict(buffer.writer.state_dict())
@@ -685,8 +479,7 @@ def test_counts_by_hand() -> None:
 
 
 def test_a_goal_that_was_achieved_before_is_no_useful_positive() -> None:
-    batch, path = make_batch([[2]]), torch.tensor([5.0, 0.0, 0.0])
-    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    batch = along([5.0, 0.0, 0.0])
     buffer = make_buffer(strategy="final", k=1)
     buffer.extend(batch)
     counts = buffer.writer.counts
@@ -704,56 +497,7 @@ def test_totals_outlive_an_emptied_buffer() -> None:
     assert (buffer.writer.totals.real, buffer.writer.counts.real) == (6, 3)
 
 
-@pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf")])
-def test_weights_that_cannot_be_are_refused(bad: float) -> None:
-    class Bad(GoalWeights):
-        def __call__(self, goals: Tensor) -> Tensor:
-            return torch.full(goals.shape[:-1], bad)
-
-    with pytest.raises(ValueError, match="weights of goals must be finite and at least 0"):
-        make_buffer(weights=Bad()).extend(make_batch([[3]], terminated=True))
-
-
-def test_weights_may_be_yes_or_no() -> None:
-    class Never(GoalWeights):
-        def __call__(self, goals: Tensor) -> Tensor:
-            return torch.zeros(goals.shape[:-1], dtype=torch.bool)
-
-    buffer = make_buffer(weights=Never())
-    buffer.extend(make_batch([[3]], terminated=True))
-    assert buffer.writer.counts.virtual == 0
-
-
 # Options
-
-
-def test_keys_of_ones_own() -> None:
-    batch = make_batch([[4]])
-    renamed = batch.rename_key_("desired_goal", ("goals", "wanted")).rename_key_(
-        "achieved_goal", ("goals", "got")
-    )
-    after = renamed["next"]
-    after.rename_key_("desired_goal", ("goals", "wanted")).rename_key_("achieved_goal", ("goals", "got"))
-    after.rename_key_("reward", "cost")
-    buffer = make_buffer(
-        achieved_goal_key=("goals", "got"),
-        desired_goal_key=("goals", "wanted"),
-        reward_key="cost",
-        virtual_key=None,
-    )
-    buffer.extend(renamed)
-    rows = buffer[:]
-    assert "virtual" not in rows.keys()
-    relabeled = rows["goals", "wanted"][:, 0] != WANTED
-    assert relabeled.sum() == 16
-    assert torch.equal(rows["goals", "wanted"], rows["next", "goals", "wanted"])
-
-
-def test_bad_options_are_named() -> None:
-    with pytest.raises(ValueError, match="k must be at least 0, got -1"):
-        HERWriter(REWARD, k=-1)
-    with pytest.raises(ValueError, match="unknown goal strategy 'nearest'"):
-        HERWriter(REWARD, strategy="nearest")  # type: ignore[arg-type]
 
 
 def test_a_storage_of_two_dimensions_is_refused() -> None:
@@ -850,7 +594,7 @@ def test_environments_of_several_workers_are_told_apart_by_their_ids(joined: boo
     real, virtual = split(buffer)
     assert (len(real), len(virtual), buffer.writer.held_back) == (32, 32, 0)
     last = {0: 5.0, 1: 103.0, 10: 1004.0, 11: 1104.0, 20: 2002.0, 21: 2106.0, 30: 3008.0}
-    for observation, goal in zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True):
+    for observation, goal in pairs(virtual):
         assert goal == last[int(observation // 100)]
 
 
@@ -883,9 +627,7 @@ def test_ids_that_are_used_again_join_no_episodes() -> None:
     buffer = make_buffer(strategy="final", k=1)
     buffer.extend(first)
     buffer.extend(again)
-    _, virtual = split(buffer)
-    pairs = set(zip(tags(virtual["observation"]), tags(virtual["desired_goal"]), strict=True))
-    assert pairs == {(0.0, 3.0), (1.0, 3.0), (2.0, 3.0)} | {(100.0 + t, 104.0) for t in range(4)}
+    assert pairs(buffer[:]) == {(0.0, 3.0), (1.0, 3.0), (2.0, 3.0)} | {(100.0 + t, 104.0) for t in range(4)}
 
 
 def test_batches_in_another_form_are_refused_while_episodes_are_open() -> None:
@@ -909,8 +651,7 @@ def make_sliced(**options: Any) -> TensorDictReplayBuffer:
 
 
 def test_whole_episodes_by_hand() -> None:
-    batch, path = make_batch([[4]]), torch.tensor([0.0, 1.0, 2.0, 1.0, 5.0])
-    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    batch = along([0.0, 1.0, 2.0, 1.0, 5.0])
     buffer = make_sliced(k=200)
     buffer.extend(batch)
     rows = buffer[:]
@@ -954,8 +695,7 @@ def test_an_episode_that_does_not_terminate_for_its_goal_is_truncated() -> None:
 
 
 def test_goals_of_whole_episodes_follow_weights_and_filter() -> None:
-    batch, path = make_batch([[4]]), torch.tensor([1.0, 1.0, 2.0, 1.0, 6.0])
-    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
+    batch = along([1.0, 1.0, 2.0, 1.0, 6.0])
     buffer = make_buffer(
         per="episode", k=4_000, filter_achieved=True, weights=PreferFar(), seed=3, capacity=20_000
     )
@@ -1011,48 +751,6 @@ def _ends(rows: TensorDict) -> Tensor:
 
 
 # Several steps
-
-
-@pytest.mark.parametrize("n_steps", [2, 3, 10])
-def test_returns_over_several_steps_by_hand(n_steps: int) -> None:
-    batch, gamma = make_batch([[4]]), 0.5
-    batch["next", "reward"][0, :, 0] = torch.tensor([-1.0, -2.0, -4.0, -8.0])
-    buffer = make_buffer(strategy="final", k=1, n_steps=n_steps, gamma=gamma)
-    buffer.extend(batch)
-    real, virtual = split(buffer)
-    sums = {
-        2: ([-2.0, -4.0, -8.0, -8.0], [-1.5, -1.5, -1.0, 0.0], [2, 2, 2, 1]),
-        3: ([-3.0, -6.0, -8.0, -8.0], [-1.75, -1.5, -1.0, 0.0], [3, 3, 2, 1]),
-        10: ([-4.0, -6.0, -8.0, -8.0], [-1.75, -1.5, -1.0, 0.0], [4, 3, 2, 1]),
-    }[n_steps]
-    for rows, reward in ((real, sums[0]), (virtual, sums[1])):
-        rows = rows[rows["observation"][:, 0].argsort()]
-        assert rows["next", "reward"].flatten().tolist() == reward
-        assert rows["steps_to_next_obs"].flatten().tolist() == sums[2]
-        behind = [t + steps for t, steps in enumerate(sums[2])]
-        assert tags(rows["next", "observation"]) == behind
-        at_end = [state == 4 for state in behind]
-        assert rows["next", "truncated"].flatten().tolist() == at_end
-        assert rows["next", "done"].flatten().tolist() == at_end
-        assert rows["next", "terminated"].flatten().tolist() == (
-            at_end if rows["virtual"][0] else [False] * 4
-        )
-
-
-def test_goals_that_are_passed_on_the_way_cut_the_steps() -> None:
-    batch, path = make_batch([[4]]), torch.tensor([0.0, 1.0, 2.0, 3.0, 1.0])
-    batch["achieved_goal"][..., 0], batch["next", "achieved_goal"][..., 0] = path[:-1], path[1:]
-    buffer = make_buffer(strategy="final", k=1, n_steps=3, gamma=0.5)
-    buffer.extend(batch)
-    _, virtual = split(buffer)
-    first = virtual[virtual["observation"][:, 0] == 0].squeeze(0)
-    assert first["next", "reward"].item() == 0.0  # the goal 1 is achieved by the first step, not by the last
-    assert (first["next", "terminated"].item(), first["next", "done"].item()) == (True, True)
-    assert (first["steps_to_next_obs"].item(), first["next", "observation"][0].item()) == (1, 1.0)
-    assert not first["next", "truncated"].item()
-    second = virtual[virtual["observation"][:, 0] == 1].squeeze(0)
-    assert second["next", "reward"].item() == -1.5
-    assert (second["steps_to_next_obs"].item(), second["next", "terminated"].item()) == (3, True)
 
 
 def test_steps_never_cross_episodes_or_environments() -> None:
@@ -1133,46 +831,6 @@ def test_flat_rows_of_two_environments_without_ids_are_refused_at_once() -> None
 
 
 # Ends that have nothing to do with the goal
-
-
-def fall(lengths: list[list[int]]) -> TensorDict:
-    """Episodes that terminate in their last step without success."""
-    batch = make_batch(lengths, terminated=True)
-    batch["next", "reward"].fill_(-1.0)
-    return batch
-
-
-@pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.5}, {"per": "episode"}])
-def test_a_fall_terminates_virtual_transitions_too(options: dict[str, Any]) -> None:
-    never = EnvReward(lambda a, d: REWARD(a, d)[0] - 1.0, lambda a, d: torch.zeros_like(a[..., :1]).bool())
-    buffer = make_buffer(reward=never, k=2, **options)
-    buffer.extend(fall([[4]]))
-    _, virtual = split(buffer)
-    at_end = virtual["next", "observation"][:, 0] == 4
-    assert at_end.any()
-    assert torch.equal(virtual["next", "terminated"][:, 0], at_end)
-    assert torch.equal(virtual["next", "done"][:, 0], at_end)
-
-
-@pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.5}, {"per": "episode"}])
-def test_what_a_fall_cost_is_kept_for_other_goals(options: dict[str, Any]) -> None:
-    never = EnvReward(lambda a, d: REWARD(a, d)[0] - 1.0, lambda a, d: torch.zeros_like(a[..., :1]).bool())
-    stored = []
-    for cost in (0.0, 5.0):
-        batch = fall([[4]])
-        end = batch["next"][:, -1]
-        batch["next", "reward"][:, -1] = never(end["achieved_goal"], end["desired_goal"])[0] - cost
-        torch.manual_seed(0)
-        buffer = make_buffer(reward=never, k=2, **options)
-        buffer.extend(batch)
-        stored.append(split(buffer)[1])
-    free, costly = stored
-    assert torch.equal(free["desired_goal"], costly["desired_goal"])
-    at_end = free["next", "observation"][:, :1] == 4
-    steps = free.get("steps_to_next_obs", torch.ones_like(at_end, dtype=torch.int64))
-    expected = free["next", "reward"] - torch.where(at_end, 5.0 * 0.5 ** (steps - 1), 0.0)
-    torch.testing.assert_close(costly["next", "reward"], expected)
-    assert at_end.any()
 
 
 def test_slices_of_a_list_are_refused() -> None:
