@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -105,99 +106,78 @@ def test_every_preset_runs(preset: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("command", "message"),
     [
-        (["train", "task=hand_v9"], "unknown task 'hand_v9'; did you mean hand_v0? The tasks are hand_reach"),
-        (["train", "algo=sarsa"], "unknown algorithm 'sarsa'; the algorithms are no_hindsight, her, filt"),
-        (["train", "speed=3"], "no option 'speed'"),
-        (["train", "seed=1", "seed=2"], "seed=1 and seed=2 set the same option: give one of them"),
+        ("train task=hand_v9", "unknown task 'hand_v9'; did you mean hand_v0? The tasks are hand_reach"),
+        ("train algo=sarsa", "unknown algorithm 'sarsa'; the algorithms are no_hindsight, her, filt"),
+        ("train speed=3", "no option 'speed'"),
+        ("train seed=1 seed=2", "seed=1 and seed=2 set the same option: give one of them"),
+        ("train task=bit_flip task.options.X=3", "bit_flip takes no option 'X'; its options are bits"),
+        ("train task=bit_flip 'task.options={1: 2}'", "a mapping of options by name, got {1: 2}"),
+        ("train task=bit_flip threshold=0.1", "threshold=0.1 has no effect with task=bit_flip"),
+        ("train task=bit_flip dtype=float64", "dtype=float64 has no effect with task=bit_flip"),
+        ("train task.options.threshold=1 threshold=2", "are the same option: give one of them"),
+        ("train learner=sac algo=cher layer_epsilon=0.5", "has no effect with learner=sac"),
+        ("train algo=cher layers=3", "list of layers, each with its options by name, got 3"),
+        ("train -m seed=0,0", "the sweep has the same run twice: seed=0; give each value once"),
+        ("train -m seed=1,2,01 k=2,3", "same run twice: seed=1 k=2; give each value once"),
+        ("train -m algo=her,", "algo needs a value, got 'algo=her,'"),
+        ("train task=3", "task must be text, got 3"),
+        ("train task=[hand_v0", "[hand_v0 cannot be read as a value of YAML"),
         (
-            ["train", "task=bit_flip", "task.options.X=3"],
-            "bit_flip takes no option 'X'; its options are bits",
-        ),
-        (
-            ["train", "task=bit_flip", "task.options={1: 2}"],
-            "a mapping of options by name, got {1: 2}",
-        ),
-        (["train", "task=bit_flip", "threshold=0.1"], "threshold=0.1 has no effect with task=bit_flip"),
-        (["train", "task=bit_flip", "dtype=float64"], "dtype=float64 has no effect with task=bit_flip"),
-        (["train", "task.options.threshold=1", "threshold=2"], "are the same option: give one of them"),
-        (["train", "learner=sac", "algo=cher", "layer_epsilon=0.5"], "has no effect with learner=sac"),
-        (
-            ["train", "algo=cher", "layers=3"],
-            "list of layers, each with its options by name, got 3",
-        ),
-        (["train", "-m", "seed=0,0"], "the sweep has the same run twice: seed=0; give each value once"),
-        (["train", "-m", "seed=1,2,01", "k=2,3"], "same run twice: seed=1 k=2; give each value once"),
-        (["train", "-m", "algo=her,"], "algo needs a value, got 'algo=her,'"),
-        (["train", "task=3"], "task must be text, got 3"),
-        (["train", "task=[hand_v0"], "[hand_v0 cannot be read as a value of YAML"),
-        (
-            ["train", "task_options.continuing_task=false"],
+            "train task_options.continuing_task=false",
             "written task.options.NAME=VALUE: task.options.continuing_task, not task_options.continuing_task",
         ),
         (
-            ["train", "task=bit_flip", "action_penalty=0"],
+            "train task=bit_flip action_penalty=0",
             "action_penalty=0 has no effect with learner=dqn: leave it out",
         ),
+        ("--import no_such_module list", "there is no module 'no_such_module', neither in this folder"),
+        ("--import own.py list", "named as in an import statement, without .py; got 'own.py'"),
+        ("trian", "unknown command 'trian'; did you mean train? The commands are check, train, record, play"),
+        ("train lerning_rate=3", "no option 'lerning_rate'; did you mean learning_rate?"),
+        ("train hand_v0", "got 'hand_v0'; did you mean task=hand_v0?"),
+        ("train weights.flor=3", "no option 'weights.flor'; did you mean floor?"),
+        ("train ibs.sigma=3", "ibs.sigma is called weights.sigma now"),
+        ("train curriculum.order=all_at_once", "curriculum.order is called order now"),
+        ("train seed=1,2", "several are a sweep: torchrl-her train -m"),
+        ("train learner=ddpg critics=5", "learner=ddpg has no option critics"),
+        ("train task=bit_flip action_penalty=50", "action_penalty=50 has no effect with learner=dqn"),
+        ("train algo=no_hindsight k=8", "k=8 has no effect with algo=no_hindsight"),
+        ("train algo=her window=8", "window=8 has no effect with algo=her"),
+        ("train -x", "No such option '-x'"),
+        ("train --dry", "No such option '--dry'\n"),
+        ("train --folde x", "No such option '--folde'. Did you mean '--folder'?"),
+        ("train frames=1000 epochs=3", "frames=1000 and epochs=3 say the same: give one of them"),
+        ("train strategy=mine", "one of your own must be registered by a module, as in torchrl-her --import"),
+        ("train --resume", "Option '--resume' requires an argument"),
+        ("play hand_v0 --goals 0", "0 is not in the range x>=1"),
+        ("play hand_v0 --out x.png", "its suffix must be one of .gif, .mp4"),
+        ("study biass", "there is no study 'biass'; did you mean bias?"),
+        ("train epochs=many", "epochs must be a whole number, got 'many'"),
+        ("train preset=no", "there is no preset 'no'; the presets are demo"),
+        ("train buffer_size=10", "must fit buffer_size=10"),
+        ("train threshold=-1", "threshold must be above 0, got -1.0"),
+        ("train folder=/proc/nothing/here", "cannot use /proc/nothing"),
+        ("train folder=", "folder needs a value, got 'folder='"),
+        ("train buffer_size=99999999999999", "buffer_size=99999999999999 needs 11000000 GB"),
+        ("train hidden=10000000", "there is not enough memory: can't allocate memory: you tried to"),
+        ("train --resume nowhere", "nowhere is no folder of a run"),
+        ("train --resume=nowhere", "nowhere is no folder of a run"),
         (
-            ["--import", "no_such_module", "list"],
-            "there is no module 'no_such_module', neither in this folder",
-        ),
-        (["--import", "own.py", "list"], "named as in an import statement, without .py; got 'own.py'"),
-        (
-            ["trian"],
-            "unknown command 'trian'; did you mean train? The commands are check, train, record, play",
-        ),
-        (["train", "lerning_rate=3"], "no option 'lerning_rate'; did you mean learning_rate?"),
-        (["train", "hand_v0"], "got 'hand_v0'; did you mean task=hand_v0?"),
-        (["train", "weights.flor=3"], "no option 'weights.flor'; did you mean floor?"),
-        (["train", "ibs.sigma=3"], "ibs.sigma is called weights.sigma now"),
-        (["train", "curriculum.order=all_at_once"], "curriculum.order is called order now"),
-        (["train", "seed=1,2"], "several are a sweep: torchrl-her train -m"),
-        (["train", "learner=ddpg", "critics=5"], "learner=ddpg has no option critics"),
-        (
-            ["train", "task=bit_flip", "action_penalty=50"],
-            "action_penalty=50 has no effect with learner=dqn",
-        ),
-        (["train", "algo=no_hindsight", "k=8"], "k=8 has no effect with algo=no_hindsight"),
-        (["train", "algo=her", "window=8"], "window=8 has no effect with algo=her"),
-        (["train", "-x"], "No such option '-x'"),
-        (["train", "--dry"], "No such option '--dry'\n"),
-        (["train", "--folde", "x"], "No such option '--folde'. Did you mean '--folder'?"),
-        (["train", "frames=1000", "epochs=3"], "frames=1000 and epochs=3 say the same: give one of them"),
-        (
-            ["train", "strategy=mine"],
-            "one of your own must be registered by a module, as in torchrl-her --import",
-        ),
-        (["train", "--resume"], "Option '--resume' requires an argument"),
-        (["play", "hand_v0", "--goals", "0"], "0 is not in the range x>=1"),
-        (["play", "hand_v0", "--out", "x.png"], "its suffix must be one of .gif, .mp4"),
-        (["study", "biass"], "there is no study 'biass'; did you mean bias?"),
-        (["train", "epochs=many"], "epochs must be a whole number, got 'many'"),
-        (["train", "preset=no"], "there is no preset 'no'; the presets are demo"),
-        (["train", "buffer_size=10"], "must fit buffer_size=10"),
-        (["train", "threshold=-1"], "threshold must be above 0, got -1.0"),
-        (["train", "folder=/proc/nothing/here"], "cannot use /proc/nothing"),
-        (["train", "folder="], "folder needs a value, got 'folder='"),
-        (["train", "buffer_size=99999999999999"], "buffer_size=99999999999999 needs 11000000 GB"),
-        (["train", "hidden=10000000"], "there is not enough memory: can't allocate memory: you tried to"),
-        (["train", "--resume", "nowhere"], "nowhere is no folder of a run"),
-        (["train", "--resume=nowhere"], "nowhere is no folder of a run"),
-        (
-            ["play", "nowhere"],
+            "play nowhere",
             "nowhere is neither the folder of a run, nor the file of an exported policy, nor one",
         ),
         (
-            ["fly"],
+            "fly",
             "unknown command 'fly'; the commands are check, train, record, play, export, plot, study, report",
         ),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    command: str, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(arguments) == 2
+    assert cli.main(shlex.split(command)) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("torchrl-her: ")
     assert message in captured.err
