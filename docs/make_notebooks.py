@@ -41,7 +41,7 @@ def execute(paths: Sequence[Path], folder: Path) -> Iterator[Any]:
             notebook = nbformat.read(path, as_version=4)
             forget = nbformat.v4.new_code_cell("%reset -f")
             notebook.cells.insert(0, forget)
-            client = NotebookClient(notebook, timeout=MOST_SECONDS, km=manager)
+            client = NotebookClient(notebook, timeout=MOST_SECONDS, km=manager, coalesce_streams=True)
             client.execute()
             client.kc.stop_channels()
             notebook.cells.remove(forget)
