@@ -165,13 +165,13 @@ def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_state, "_worlds", lambda _env, _processes: None)
-    recipe = small(epochs=2)
-    run(press_ctrl_c(build(recipe), 12), tmp_path / "run", progress=False)
+    recipe = small(epochs=2, epoch_frames=480)
+    run(press_ctrl_c(build(recipe), 8), tmp_path / "run", progress=False)
     held = load_checkpoint(tmp_path / "run" / "checkpoint.pt")["buffer"]["writer"]["held"]
     components = build(recipe)
     result = resume(tmp_path / "run", components=components, progress=False)
-    assert [row["frames"] for row in result.rows] == [800, 1_600]
-    assert result.rows[-1]["rows_real"] + components.buffer.writer.held_back == 1_600
+    assert [row["frames"] for row in result.rows] == [480, 960]
+    assert result.rows[-1]["rows_real"] + components.buffer.writer.held_back == 960
     assert held["collector"]["traj_ids"].max() < components.collector._carrier["collector", "traj_ids"].min()
 
 
@@ -201,7 +201,7 @@ def test_environments_that_cannot_be_saved_go_on_bit_for_bit_between_epochs(
     ],
 )
 def test_a_finished_run_that_is_given_more_epochs(options: dict[str, Any], tmp_path: Path) -> None:
-    recipe = small(epochs=4, checkpoint_interval=2, **options)
+    recipe = small(epochs=4, epoch_frames=480, checkpoint_interval=2, **options)
     run(build(recipe), tmp_path / "whole", progress=False)
     run(build(recipe.replace(epochs=2)), tmp_path / "part", progress=False)
     (tmp_path / "part" / "config.yaml").write_text((tmp_path / "whole" / "config.yaml").read_text())
@@ -212,10 +212,10 @@ def test_a_finished_run_that_is_given_more_epochs(options: dict[str, Any], tmp_p
 def test_epochs_extend_a_finished_run_and_an_interrupted_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recipe, whole = small(algo="filtered_her", epochs=2, epoch_frames=800), tmp_path / "whole"
+    recipe, whole = small(algo="filtered_her", epochs=2, epoch_frames=480), tmp_path / "whole"
     run(build(recipe.replace(epochs=4)), whole, progress=False)
     run(build(recipe), tmp_path / "ended", progress=False)
-    run(press_ctrl_c(build(recipe), 12), tmp_path / "stopped", progress=False)
+    run(press_ctrl_c(build(recipe), 8), tmp_path / "stopped", progress=False)
     for name, folder in (("epochs", tmp_path / "ended"), ("run.epochs", tmp_path / "stopped")):
         assert cli.main(["train", "--resume", str(folder), f"{name}=4"]) == 0
         assert_same_runs(whole, folder)
@@ -380,7 +380,7 @@ def test_what_a_killed_run_left_half_written_is_removed(tmp_path: Path) -> None:
 def test_on_the_command_line_a_warning_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run(build(small(epochs=3, epoch_frames=800)), tmp_path, callbacks=[Stop(2)], progress=False)
+    run(build(small(epochs=3, epoch_frames=480)), tmp_path, callbacks=[Stop(2)], progress=False)
     damage(tmp_path / "checkpoint.pt")
     assert cli.main(["train", "--resume", str(tmp_path)]) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "damaged" in line]
@@ -388,7 +388,7 @@ def test_on_the_command_line_a_warning_is_one_line(
 
 
 def test_the_one_before_a_damaged_checkpoint_is_used(tmp_path: Path) -> None:
-    recipe = small(epochs=3, epoch_frames=800)
+    recipe = small(epochs=3, epoch_frames=480)
     for name, callbacks in (("whole", []), ("part", [Stop(2)])):
         run(build(recipe), tmp_path / name, callbacks=callbacks, progress=False)
     damage(tmp_path / "part" / "checkpoint.pt")
@@ -401,7 +401,7 @@ def test_the_one_before_a_damaged_checkpoint_is_used(tmp_path: Path) -> None:
 
 
 def test_damaged_checkpoints_alone_are_refused(tmp_path: Path) -> None:
-    run(build(small(epochs=2)), tmp_path, callbacks=[Stop(1)], progress=False)
+    run(build(small(epochs=2, epoch_frames=480)), tmp_path, callbacks=[Stop(1)], progress=False)
     for path in tmp_path.glob("checkpoint*.pt"):
         damage(path)
     with pytest.raises(
@@ -411,7 +411,7 @@ def test_damaged_checkpoints_alone_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_run_before_its_first_epoch_can_be_resumed(tmp_path: Path) -> None:
-    recipe = small(epochs=1)
+    recipe = small(epochs=1, epoch_frames=480)
     run(build(recipe), tmp_path / "whole", progress=False)
     assert run(press_ctrl_c(build(recipe), 0), tmp_path / "part", progress=False).interrupted
     (tmp_path / "part" / "checkpoint.1.pt").replace(tmp_path / "part" / "checkpoint.pt")
@@ -424,7 +424,7 @@ def test_a_full_disk_does_not_end_a_run(tmp_path: Path) -> None:
     (tmp_path / "checkpoint.part.pt").symlink_to("/dev/full")
     said = "no checkpoint after 0 frames, the run continues: .*No space left on device"
     with pytest.warns(UserWarning, match=said):
-        run(build(small(epochs=2)), tmp_path, progress=False)
+        run(build(small(epochs=2, epoch_frames=480)), tmp_path, progress=False)
     assert load_checkpoint(tmp_path / "checkpoint.pt")["trainer"]["epochs"] == 2
 
 
@@ -442,7 +442,7 @@ def test_a_full_disk_at_the_end_says_what_is_missing(tmp_path: Path) -> None:
     (tmp_path / "policy.part.safetensors").symlink_to("/dev/full")
     said = r"cannot write .*: no space left on device; policy\.safetensors will be written by: .* --resume"
     with pytest.raises(OSError, match=said):
-        run(build(small(epochs=1)), tmp_path, progress=False)
+        run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
     resume(tmp_path, progress=False)
     assert (tmp_path / "policy.safetensors").is_file()
 
@@ -469,7 +469,7 @@ def test_parts_that_were_swapped_must_be_given_to_resume(tmp_path: Path) -> None
         components.critic = None
         return components
 
-    recipe = small(epochs=2, checkpoint_interval=1)
+    recipe = small(epochs=2, epoch_frames=480)
     run(swapped(recipe.replace(epochs=1)), tmp_path / "run", progress=False)
     with pytest.raises(ValueError, match="the run's critic was NoneType, not TensorDictModule"):
         resume(tmp_path / "run", progress=False)
