@@ -61,14 +61,14 @@ class MixedReplay:
     part are divided by their mean, so that a share of the rows has that share of the weight. New priorities
     go to the buffer that a row came from.
 
-    What is written goes into the own buffer, whose writer and size this one shows. A
+    What is written goes into the buffer of collected transitions, whose writer and size this one shows. A
     :class:`~torchrl_her.Trainer` takes it in place of a buffer.
 
     Nair et al., Overcoming exploration in reinforcement learning with demonstrations, 2018 (arXiv
     1709.10089).
 
     Args:
-        own: the buffer that is trained from; for one run or several.
+        collected: the buffer that is trained from; for one run or several.
         demonstrations: buffer of demonstrations of as many runs, with the same transforms.
 
     Keyword Args:
@@ -93,43 +93,43 @@ class MixedReplay:
 
     def __init__(
         self,
-        own: TensorDictReplayBuffer,
+        collected: TensorDictReplayBuffer,
         demonstrations: TensorDictReplayBuffer,
         *,
         share: float = 0.125,
         batch_size: int = 256,
         demonstration_key: str = DEMONSTRATION,
     ) -> None:
-        if runs_of(own) != runs_of(demonstrations):
+        if runs_of(collected) != runs_of(demonstrations):
             raise ValueError(
-                f"buffers must have equally many runs, got {runs_of(own)} and {runs_of(demonstrations)}"
+                f"buffers must have equally many runs, got {runs_of(collected)} and {runs_of(demonstrations)}"
             )
-        self.own, self.demonstrations = own, demonstrations
-        self.runs, self.batch_size = runs_of(own), batch_size
+        self.collected, self.demonstrations = collected, demonstrations
+        self.runs, self.batch_size = runs_of(collected), batch_size
         self.shown = demonstration_rows(share, batch_size)
         self.demonstration_key = demonstration_key
 
     @property
     def writer(self) -> Any:
         """Writer of the run's own buffer."""
-        return self.own.writer
+        return self.collected.writer
 
     @property
     def priority_key(self) -> str:
         """Key of new priorities."""
-        return self.own.priority_key
+        return self.collected.priority_key
 
     def __len__(self) -> int:
-        return len(self.own)
+        return len(self.collected)
 
     def extend(self, data: TensorDictBase) -> Tensor:
         """Writes a collected batch into the buffer of the runs' own transitions."""
-        return self.own.extend(data)
+        return self.collected.extend(data)
 
     def sample(self, batch_size: int) -> TensorDictBase:
         """Samples rows [R * S * B]: R equal blocks, one for each run, of S batches of B rows.
 
-        Under ``index``, demonstrations count on from the last row of the own storage.
+        Under ``index``, demonstrations count on from the last row of the storage of collected ones.
         """
         steps, rest = divmod(batch_size, self.runs * self.batch_size)
         if rest or not steps:
@@ -140,15 +140,15 @@ class MixedReplay:
             raise RuntimeError("some runs have no demonstrations: write them with write_demonstrations")
         parts = []
         for buffer, count in (
-            (self.own, self.batch_size - self.shown),
+            (self.collected, self.batch_size - self.shown),
             (self.demonstrations, self.shown),
         ):
             rows = buffer.sample(self.runs * steps * count).view(self.runs, steps, count)
             if (weight := rows.get(WEIGHT, None)) is not None:
                 rows.set(WEIGHT, weight / weight.flatten(1).mean(1).view(-1, *[1] * (weight.ndim - 1)))
-            flag = torch.full((*rows.shape, 1), buffer is not self.own, device=rows["index"].device)
+            flag = torch.full((*rows.shape, 1), buffer is not self.collected, device=rows["index"].device)
             parts.append(rows.set(self.demonstration_key, flag))
-        parts[1].set("index", parts[1].get("index") + self.own.storage.max_size)
+        parts[1].set("index", parts[1].get("index") + self.collected.storage.max_size)
         known = [set(part.keys(True, True)) for part in parts]
         both = [part.select(*(known[0] & known[1])) for part in parts]
         mixed: TensorDictBase = torch.cat(both, 2)
@@ -160,10 +160,10 @@ class MixedReplay:
         Args:
             rows: [n], with ``index`` and the new priorities.
         """
-        behind = self.own.storage.max_size
+        behind = self.collected.storage.max_size
         shown = rows.get("index").reshape(len(rows)) >= behind
         if not bool(shown.all()):
-            self.own.update_tensordict_priority(rows[~shown])
+            self.collected.update_tensordict_priority(rows[~shown])
         if bool(shown.any()):
             demo_rows = rows[shown]
             demo_rows.set("index", demo_rows.get("index") - behind)

@@ -78,8 +78,8 @@ class GoalHistogram(GoalWeights):
         self.counts, self._newest = torch.zeros_like(self.counts), self._newest[:0]
 
     @classmethod
-    def of_runs(cls, own: Sequence[GoalWeights]) -> WeightsOfRuns:
-        return HistogramsOfRuns(own) if HistogramsOfRuns.fits(own) else WeightsOfRuns(own)
+    def of_runs(cls, weights: Sequence[GoalWeights]) -> WeightsOfRuns:
+        return HistogramsOfRuns(weights) if HistogramsOfRuns.fits(weights) else WeightsOfRuns(weights)
 
     def state_dict(self) -> dict[str, Any]:
         return {"counts": self.counts.clone(), "newest": self._newest.clone()}
@@ -185,7 +185,7 @@ class HistogramsOfRuns(WeightsOfRuns):
     """Histograms of several runs over one grid, counted and looked up for all runs at once.
 
     Args:
-        own: R, of each run: all :class:`GoalHistogram`, or all :class:`Instructiveness`, over the same grid.
+        weights: R, of each run: all :class:`GoalHistogram` or all :class:`Instructiveness`, over one grid.
 
     Example:
         >>> grid = GoalGrid(0.0, 1.0, [2])
@@ -195,33 +195,35 @@ class HistogramsOfRuns(WeightsOfRuns):
         ([1, 0], [1, 1])
     """
 
-    own: Sequence[GoalHistogram]
+    weights: Sequence[GoalHistogram]
 
     @staticmethod
-    def fits(own: Sequence[GoalWeights]) -> bool:
+    def fits(weights: Sequence[GoalWeights]) -> bool:
         """Returns whether all weights are histograms over one grid; False for subclasses."""
-        first = own[0]
+        first = weights[0]
         return type(first) in (GoalHistogram, Instructiveness) and all(
-            type(weights) is type(first) and weights.grid is first.grid  # type: ignore[attr-defined]
-            for weights in own
+            type(other) is type(first) and other.grid is first.grid  # type: ignore[attr-defined]
+            for other in weights
         )
 
     def __call__(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> Tensor:
-        tables = [weights.table for run in runs if isinstance(weights := self.own[run], Instructiveness)]
+        tables = [
+            histogram.table for run in runs if isinstance(histogram := self.weights[run], Instructiveness)
+        ]
         if not tables:
             return goals.new_ones(goals.shape[:-1])
         return _look_up(torch.cat(tables), self._cells(goals, counts), goals)
 
     def update(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> None:
-        size, cells = self.own[0].grid.num_cells, self._cells(goals, counts)
+        size, cells = self.weights[0].grid.num_cells, self._cells(goals, counts)
         added = cells.bincount(minlength=len(runs) * size).view(len(runs), size)
         parts = zip(runs, added, cells.split(list(counts)), strict=True)
         for place, (run, histogram, part) in enumerate(parts):
-            self.own[run]._add(histogram, part - place * size)
+            self.weights[run]._add(histogram, part - place * size)
 
     def _cells(self, goals: Tensor, counts: Sequence[int]) -> Tensor:
         """Returns the cell [n, ...] of each goal in the joined tables of the given runs."""
-        cells, size = self.own[0].grid.cell(goals), self.own[0].grid.num_cells
+        cells, size = self.weights[0].grid.cell(goals), self.weights[0].grid.num_cells
         for position, part in enumerate(cells.split(list(counts))):
             part += position * size
         return cells

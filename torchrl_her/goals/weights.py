@@ -47,16 +47,16 @@ class GoalWeights:
         """Restores the state that :meth:`state_dict` returned."""
 
     @classmethod
-    def of_runs(cls, own: Sequence[GoalWeights]) -> WeightsOfRuns:
+    def of_runs(cls, weights: Sequence[GoalWeights]) -> WeightsOfRuns:
         """Combines the weights of several runs, all of this class, into one object for all runs."""
-        return WeightsOfRuns(own)
+        return WeightsOfRuns(weights)
 
 
 class WeightsOfRuns:
     """Weights of goals of several runs, each with weights of its own, which are called one after the other.
 
     Args:
-        own: R, of each run.
+        weights: R, of each run.
 
     Example:
         >>> class Times(GoalWeights):
@@ -70,8 +70,8 @@ class WeightsOfRuns:
         [3.0, 40.0, 50.0]
     """
 
-    def __init__(self, own: Sequence[GoalWeights]) -> None:
-        self.own = own
+    def __init__(self, weights: Sequence[GoalWeights]) -> None:
+        self.weights = weights
 
     def __call__(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> Tensor:
         """Returns the weights [n, ...] of goals of the given runs.
@@ -82,13 +82,13 @@ class WeightsOfRuns:
             counts: m numbers of goals, of each of these runs; they sum to n.
         """
         parts = goals.split(list(counts))
-        return torch.cat([self.own[run](part) for run, part in zip(runs, parts, strict=True)])
+        return torch.cat([self.weights[run](part) for run, part in zip(runs, parts, strict=True)])
 
     def update(self, goals: Tensor, runs: Sequence[int], counts: Sequence[int]) -> None:
         """Updates the weights of the given runs with the virtual goals [n, g] that were written."""
         for run, part in zip(runs, goals.split(list(counts)), strict=True):
             if len(part):
-                self.own[run].update(part)
+                self.weights[run].update(part)
 
 
 def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: int) -> list[GoalWeights]:

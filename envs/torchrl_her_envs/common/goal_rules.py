@@ -57,7 +57,7 @@ class GoalEnds:
 
     Args:
         name: name of the environment, for messages.
-        own: whether any goal ends an episode by the environment's ``compute_terminated``; None if it has no
+        env_ends: whether goals end an episode by the environment's ``compute_terminated``; None if it has no
             such function.
         tells_success: whether the infos of steps have ``is_success``.
 
@@ -69,7 +69,7 @@ class GoalEnds:
         ended, went_on: steps at achieved goals in which the environment itself ended the episode, or went on.
 
     Example:
-        >>> ends = GoalEnds("walk", own=None, tells_success=True)
+        >>> ends = GoalEnds("walk", env_ends=None, tells_success=True)
         >>> ends.found() is None  # no goal was met so far
         True
         >>> met, stops = np.array([True, False]), np.array([False, True])
@@ -81,8 +81,8 @@ class GoalEnds:
         (array([False,  True]), array([ True, False]))
     """
 
-    def __init__(self, name: str, *, own: bool | None, tells_success: bool) -> None:
-        self.name, self.own, self.tells_success = name, own, tells_success
+    def __init__(self, name: str, *, env_ends: bool | None, tells_success: bool) -> None:
+        self.name, self.env_ends, self.tells_success = name, env_ends, tells_success
         self.rule: Ends = "watch"
         self.steps = self.ended = self.went_on = 0
 
@@ -98,7 +98,7 @@ class GoalEnds:
             ValueError: the environment lacks what is asked for.
         """
         lacks = {"success": not self.tells_success and "info['is_success']"}
-        lacks["own"] = self.own is None and "compute_terminated"
+        lacks["own"] = self.env_ends is None and "compute_terminated"
         if lack := lacks.get(termination):
             others = ", ".join(own for own in ("success", "reward", "never") if not lacks.get(own))
             raise ValueError(
@@ -107,7 +107,7 @@ class GoalEnds:
             )
         found = self.found()
         if termination == "watch":
-            self.rule = "watch" if self.own is None else found or "own"
+            self.rule = "watch" if self.env_ends is None else found or "own"
         elif termination == "auto":
             self.rule = found or "never"
             say_once(self.line())
@@ -119,15 +119,15 @@ class GoalEnds:
 
         Its own function decides if it has one. If not, and it went on at a goal, goals never end an episode.
         """
-        if self.own is not None:
-            return "own" if self.own else "never"
+        if self.env_ends is not None:
+            return "own" if self.env_ends else "never"
         if self.went_on:
             return "never"
         return ("success" if self.tells_success else "reward") if self.ended else None
 
     def line(self) -> str:
         """Returns a line that explains the rule; empty if the environment's own function decides."""
-        if self.own is not None:
+        if self.env_ends is not None:
             return ""
         by, where = "reward", "the reward is that of an achieved goal"
         if self.tells_success:
@@ -172,7 +172,7 @@ class GoalEnds:
         return terminated, truncated
 
     def _say_contrary(self, what: str, instead: str) -> None:
-        instead = instead if self.own is None else "own"
+        instead = instead if self.env_ends is None else "own"
         say_once(
             f"{self.name} {what}, against task.options.termination={self.rule}: "
             f"task.options.termination={instead} does as the environment"

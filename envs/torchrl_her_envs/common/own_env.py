@@ -275,7 +275,7 @@ class OwnGoalEnv(GoalEnv):
         self._latest: list[TensorDictBase] = []
         self._steps = torch.zeros(count, 1, dtype=torch.int64)
         if rules is None:
-            self.goal_ends = GoalEnds(name, own=None, tells_success=True)  # while it is tried
+            self.goal_ends = GoalEnds(name, env_ends=None, tells_success=True)  # while it is tried
             rules = self._try_out(check_termination(termination), achieved_reward)
         self.rules, self.goal_ends, self.dense_reward = rules, rules.ends, rules.dense
         self.missed_reward, self.achieved_reward = rules.missed_reward, rules.achieved_reward
@@ -571,7 +571,7 @@ class OwnGoalEnv(GoalEnv):
         if callable(getattr(first, "compute_terminated", None)):
             pairs = torch.cat((one, other)).unsqueeze(1), torch.cat((one, other))
             own = bool(self._ask("compute_terminated", *pairs, torch.cat((info, info))).any())
-        ends = GoalEnds(self._name, own=own, tells_success=_SUCCESS in self.observation_spec)
+        ends = GoalEnds(self._name, env_ends=own, tells_success=_SUCCESS in self.observation_spec)
         if ends.tells_success:
             reached = after[_SUCCESS].flatten()
         ends.apply(reached, after["terminated"].flatten(), after["truncated"].flatten())

@@ -270,7 +270,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         ):
             self._terminated_of = self._function(TERMINATED, goals, info)
             own = bool(self._terminated_of.tried.any())
-        self.goal_ends = GoalEnds(id, own=own, tells_success=trial.success is not None)
+        self.goal_ends = GoalEnds(id, env_ends=own, tells_success=trial.success is not None)
         self.goal_ends.apply(
             met if trial.success is None else trial.success, trial.terminated, trial.truncated
         )

@@ -95,7 +95,7 @@ def resolved(recipe: Recipe) -> Recipe:
             task = goal_env(env)
             facts = EnvFacts(max_steps=task.max_steps, batched=task.batched)
             ends: GoalEnds | None = getattr(task, "goal_ends", None)
-        open_ends = ends is not None and ends.own is None and ends_open(recipe)
+        open_ends = ends is not None and ends.env_ends is None and ends_open(recipe)
         if (needs_layers or open_ends) and not facts.batched:
             look = look_at(recipe.replace(seed=0), seconds=None)
             facts, ends = replace(facts, layers=_needed_layers(look) if needs_layers else None), look.ends

@@ -142,7 +142,7 @@ def test_new_priorities_go_to_the_buffer_that_a_row_is_of(runs: int) -> None:
     rows = out.sample(runs * 4 * B)
     rows.set("td_error", rows["index"].float() + 1)
     out.update_tensordict_priority(rows)
-    for buffer, offset, capacity in ((out.own, 0, 100), (out.demonstrations, runs * 100, 60)):
+    for buffer, offset, capacity in ((out.collected, 0, 100), (out.demonstrations, runs * 100, 60)):
         own = rows["index"][(rows["demonstration"].flatten()) == (offset > 0)] - offset
         for run in range(runs):
             place = own[(own >= run * capacity) & (own < (run + 1) * capacity)].unique()
@@ -155,10 +155,10 @@ def test_new_priorities_go_to_the_buffer_that_a_row_is_of(runs: int) -> None:
 def test_rows_of_some_runs_alone_may_be_updated() -> None:
     out = mixed(range(2))
     rows = out.sample(2 * B)
-    before = [values(buffer, 0).clone() for buffer in (out.own, out.demonstrations)]
+    before = [values(buffer, 0).clone() for buffer in (out.collected, out.demonstrations)]
     last = rows.view(2, B)[1].select("index").set("td_error", torch.full((B,), 9.0))
     out.update_tensordict_priority(last)
-    after = [values(buffer, 0) for buffer in (out.own, out.demonstrations)]
+    after = [values(buffer, 0) for buffer in (out.collected, out.demonstrations)]
     assert all(torch.equal(one, other) for one, other in zip(before, after, strict=True))
     assert (values(out.demonstrations, 1) == 9).any()
 
@@ -181,9 +181,9 @@ def test_runs_side_by_side_draw_what_they_draw_alone() -> None:
 
 def test_it_shows_the_size_and_the_writer_of_the_own_buffer() -> None:
     out = mixed(range(2))
-    assert len(out) == len(out.own)
-    assert out.writer is out.own.writer
-    assert sizes_of(out) == sizes_of(out.own)  # type: ignore[arg-type]
+    assert len(out) == len(out.collected)
+    assert out.writer is out.collected.writer
+    assert sizes_of(out) == sizes_of(out.collected)  # type: ignore[arg-type]
     assert out.priority_key == "td_error"
 
 
