@@ -20,8 +20,7 @@ from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her.trainers.adam import RunsAdam
 from torchrl_her_recipes.components.curricula import CurriculumState, is_guided
 from torchrl_her_recipes.components.devices import CPU, place_of
-from torchrl_her_recipes.components.learner import Agent, AgentShape, LearnerBuilder, Networks
-from torchrl_her_recipes.components.normalization import acting, make_norm
+from torchrl_her_recipes.components.learner import Agent, AgentShape, LearnerBuilder, Networks, acting
 from torchrl_her_recipes.config.choices.learners import BY_ACTIONS, LEARNERS, Actions, LearnerConfig
 from torchrl_her_recipes.config.groups import CurriculumConfig, RunConfig
 from torchrl_her_recipes.config.options import AUTO
@@ -60,7 +59,7 @@ def make_agent(
     exploration = builder.exploration().to(device)
     options, runs = recipe.learner, shape.runs
     loss = builder.loss(actor, critics)
-    norm = make_norm(options, shape.widths, runs=runs)
+    norm = builder.norm()
     norm = None if norm is None else norm.to(device)
     player = acting(actor, norm)
     guide = _guide_of(player, recipe.curriculum, state, generators)
@@ -143,8 +142,9 @@ def make_player(
 ) -> TensorDictModuleBase:
     """The greedy policy with its normalization, whose weights and statistics can be loaded."""
     shape = shape_of(recipe.task.name, recipe.run, env, curriculum)
-    actor, _ = _networks(find_builder(recipe.learner, shape), recipe.seeds, recipe.curriculum, curriculum)
-    return acting(actor, make_norm(recipe.learner, shape.widths, runs=shape.runs))
+    builder = find_builder(recipe.learner, shape)
+    actor, _ = _networks(builder, recipe.seeds, recipe.curriculum, curriculum)
+    return acting(actor, builder.norm())
 
 
 def _guide_of(
@@ -153,7 +153,7 @@ def _guide_of(
     state: CurriculumState | None,
     generators: Sequence[torch.Generator],
 ) -> GuidedExploration | None:
-    if state is None or not is_guided(options, state.curriculum):
+    if state is None or not is_guided(options, state.progress):
         return None
     guide = GuidedExploration(
         policy,

@@ -7,10 +7,8 @@ from functools import partial
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
-from torchrl_her.behavior import BehaviorGoals
-from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import goal_env, reward_bounds, reward_range
 from torchrl_her_recipes.components.agents import make_agent
 from torchrl_her_recipes.components.behavior import make_asking, make_behavior
@@ -18,7 +16,6 @@ from torchrl_her_recipes.components.buffers import make_buffer
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import (
-    CurriculumState,
     in_layers,
     is_guided,
     make_curriculum_state,
@@ -57,9 +54,15 @@ def build(recipe: Recipe) -> Components:
     own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
     agent = make_agent(recipe, eval_env, own, rewards=bounds, state=state, device=devices.learner)
     behavior = make_behavior(recipe, task, agent, rewards=rewards, state=state)
-    env = _shown(recipe, task, state, behavior, None if shown is None else shown.starts)
+    progress = None if state is None else state.progress
+    env = in_layers(
+        task,
+        progress,
+        begins=is_guided(recipe.curriculum, progress),
+        behavior=behavior,
+        starts=None if shown is None else shown.starts,
+    )
     if processes:
-        progress = None if state is None else state.progress
         collector = ProcessCollector(recipe, agent.policy, progress, storing_device=devices.replay)
     else:
         collector = make_collector(env, agent.policy, recipe.collection.steps_per_batch, devices)
@@ -85,21 +88,6 @@ def build(recipe: Recipe) -> Components:
         demonstrations=shown,
         **vars(agent),
     )
-
-
-def _shown(
-    recipe: Recipe,
-    task: EnvBase,
-    state: CurriculumState | None,
-    behavior: BehaviorGoals | None,
-    starts: DemonstrationStarts | None,
-) -> EnvBase:
-    """The task's environments as the runs see them in training."""
-    if state is not None:
-        begins = is_guided(recipe.curriculum, state.curriculum)
-        return in_layers(task, state.progress, begins=begins, behavior=behavior, starts=starts)
-    own = behavior if starts is None else starts  # a recipe has one of them at most
-    return task if own is None else TransformedEnv(task, own, auto_unwrap=True)
 
 
 def make_collector(

@@ -47,8 +47,8 @@ def make_worker_env(recipe: Recipe, modules: Sequence[str] = ()) -> EnvBase:
     permit_task(recipe.task.name)
     import_modules(modules)
     env = make_task_envs(recipe, share_of_envs(recipe.collection), recipe.seeds)
-    if (progress := make_progress(recipe, env)) is not None:
-        env = in_layers(env, progress, begins=is_guided(recipe.curriculum, progress.curriculum))
+    progress = make_progress(recipe, env)
+    env = in_layers(env, progress, begins=is_guided(recipe.curriculum, progress))
     # Only ids tell there which environment a row belongs to: batches come one by one, or a node is replaced.
     if not recipe.collection.sync or recipe.collection.ray is not None:
         env = env if isinstance(env, TransformedEnv) else TransformedEnv(env)

@@ -174,35 +174,37 @@ def make_played_env(
     """Environments as a trained policy sees them: at the top of the curriculum, if there is one."""
     env = make_task_envs(recipe, num_envs, seeds, pictures=pictures)
     curriculum = make_curriculum(recipe, env)
-    if curriculum is not None:
-        return in_layers(env, at_the_top(curriculum, len(seeds)), behavior=behavior)
-    return env if behavior is None else TransformedEnv(env, behavior, auto_unwrap=True)
+    progress = None if curriculum is None else at_the_top(curriculum, len(seeds))
+    return in_layers(env, progress, behavior=behavior)
 
 
-def is_guided(options: CurriculumConfig, curriculum: Curriculum) -> bool:
+def is_guided(options: CurriculumConfig, progress: CurriculumProgress | None) -> bool:
     """Whether some episodes are begun by what was learned in the layer below."""
-    return options.guided_share > 0 and len(curriculum) > 1
+    return progress is not None and options.guided_share > 0 and len(progress.curriculum) > 1
 
 
 def in_layers(
     env: EnvBase,
-    progress: CurriculumProgress,
+    progress: CurriculumProgress | None,
     *,
     begins: bool = False,
     behavior: BehaviorGoals | None = None,
     starts: DemonstrationStarts | None = None,
-) -> TransformedEnv:
-    """An environment as the layers of its runs see it, with the networks' input.
+) -> EnvBase:
+    """An environment as its runs see it: in their layers, with the networks' input, and with proposed goals.
 
     Args:
         env: of the full task.
-        progress: of the runs.
+        progress: of the runs; None without a curriculum.
 
     Keyword Args:
         begins: whether steps say if they are the first of an episode, as ``is_init``.
         behavior: proposes goals, if there is one.
         starts: starts episodes at demonstrations; None if there are no such episodes.
     """
+    if progress is None:
+        chooses_goals = behavior if starts is None else starts  # a recipe has one of them at most
+        return env if chooses_goals is None else TransformedEnv(env, chooses_goals, auto_unwrap=True)
     curriculum = progress.curriculum
     shown = StateToObs(
         curriculum, progress, continues_after_termination=goal_env(env).continues_after_termination

@@ -155,12 +155,9 @@ def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SEC
             rows = env.rollout(task.max_steps, break_when_any_done=False)
             played += [episode for own in rows.unbind(0) for episode in _episodes(own)]
         duration = (time.perf_counter() - began) / sum(len(own) for own in played)
-        bounds = (
-            None if env.action_spec.dtype == torch.int64 else torch.stack(action_bounds(env), -1).tolist()
-        )
-        return _facts(
-            played, task, duration, None if bounds is None else [(low, high) for low, high in bounds]
-        )
+        low, high = (bound.tolist() for bound in action_bounds(env))
+        discrete = env.action_spec.dtype == torch.int64
+        return _facts(played, task, duration, None if discrete else list(zip(low, high, strict=True)))
 
 
 def _episodes(rows: TensorDictBase) -> Iterator[TensorDictBase]:

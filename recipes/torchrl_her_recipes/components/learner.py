@@ -17,6 +17,7 @@ from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.exploration import DecayingEpsilon, Exploration
 from torchrl_her.modules.normalization import RunningNorm
+from torchrl_her.modules.normalized import NormalizedPolicy
 from torchrl_her.objectives.cloning import Cloning
 
 Networks = tuple[TensorDictModule, list[TensorDictModule]]
@@ -59,6 +60,11 @@ class AgentShape:
     dtype: torch.dtype = torch.float32
 
 
+def acting(actor: TensorDictModuleBase, norm: RunningNorm | None) -> TensorDictModuleBase:
+    """An actor as it plays, on what environments show."""
+    return actor if norm is None else NormalizedPolicy(actor, norm)
+
+
 class LearnerBuilder(ABC):
     """Builds networks, exploration and loss of a learner; a subclass for each learner.
 
@@ -91,6 +97,18 @@ class LearnerBuilder(ABC):
     @abstractmethod
     def networks(self, runs: int) -> Networks:
         """The actor and the critics of some runs side by side."""
+
+    def norm(self) -> RunningNorm | None:
+        """Statistics of inputs of each run, before anything was counted; None if nothing is normalized."""
+        options = self.options
+        if not options.normalize:
+            return None
+        return RunningNorm(
+            dict(self.shape.widths),
+            runs=self.shape.runs,
+            clip=options.normalize_clip,
+            least_std=options.normalize_least_std,
+        )
 
     def player(self, runs: int) -> TensorDictModule:
         """The actor alone; override this where critics need not be made for it."""

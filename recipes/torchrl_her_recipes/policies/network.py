@@ -15,8 +15,7 @@ from torchrl.data import Bounded, Categorical, TensorSpec
 from torchrl_her.modules.normalization import RunningNorm, normalize
 from torchrl_her.modules.normalized import NormalizedPolicy
 from torchrl_her_recipes.components.agents import find_builder
-from torchrl_her_recipes.components.learner import AgentShape, LearnerBuilder
-from torchrl_her_recipes.components.normalization import acting, make_norm
+from torchrl_her_recipes.components.learner import AgentShape, LearnerBuilder, acting
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.policies.info import KEYS, PolicyInfo
 
@@ -49,7 +48,7 @@ def load_network(info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor]
     builder = find_builder(recipe.learner, shape)
     check_weights(builder, weights)
     actor = builder.player(1)
-    player = _with_norm(builder, actor)
+    player = acting(actor, builder.norm())
     player.load_state_dict(dict(weights))
     net = builder.greedy(actor)
     scaled = {*info.low} != {-1.0} or {*info.high} != {1.0}
@@ -71,7 +70,9 @@ def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> Non
         raise ValueError(f"these are not the weights of an actor of learner={name}")
     with torch.device("meta"):  # without memory: only the shapes matter
         actor = builder.player(1)
-        wanted = {key: tuple(value.shape) for key, value in _with_norm(builder, actor).state_dict().items()}
+        wanted = {
+            key: tuple(value.shape) for key, value in acting(actor, builder.norm()).state_dict().items()
+        }
     if own != wanted:
         odd = next(key for key in {**wanted, **own} if own.get(key) != wanted.get(key))
         raise ValueError(
@@ -80,10 +81,6 @@ def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> Non
         )
     if odd := [key for key, value in weights.items() if not value.isfinite().all()]:
         raise ValueError(f"weights must be finite, got others in {odd[0]}")
-
-
-def _with_norm(builder: LearnerBuilder, actor: TensorDictModule) -> TensorDictModuleBase:
-    return acting(actor, make_norm(builder.options, builder.shape.widths, runs=1))
 
 
 class ScaledActions(nn.Module):

@@ -172,9 +172,7 @@ class RunFolder:
     @property
     def _parts(self) -> list[Path]:
         """Returns temporary files, which exist only while others are written."""
-        whole = (self.config, self.about, self.metrics, self.checkpoint, self.policy, self.best)
-        pictures = (self.curves, self.goals, self.goal_map, self.video)
-        return [part_of(path) for path in (*whole, *pictures)]
+        return [part_of(path) for path in vars(self).values() if path != self.path]
 
     @property
     def checkpoints(self) -> list[Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import LossModule
@@ -53,10 +54,16 @@ class DDPGBuilder(LearnerBuilder):
         return make_ddpg_loss(
             actor,
             critics[0],
-            gamma=self.options.gamma,
-            reward_range=self.bounds,
-            action_penalty=self.options.action_penalty,
             saturation_penalty=self.options.saturation_penalty,
-            reduction="none",
-            cloning=self.cloning,
+            **self.loss_options(),
         )
+
+    def loss_options(self) -> dict[str, Any]:
+        """Returns the options that losses of learners with continuous actions share."""
+        return {
+            "gamma": self.options.gamma,
+            "reward_range": self.bounds,
+            "action_penalty": self.options.action_penalty,
+            "reduction": "none",
+            "cloning": self.cloning,
+        }

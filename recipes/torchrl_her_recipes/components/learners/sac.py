@@ -48,17 +48,12 @@ class SACBuilder(DDPGBuilder):
 
     def soft(self, actor: TensorDictModule) -> dict[str, Any]:
         """Returns the options that losses with a stochastic policy share."""
-        return {
+        return self.loss_options() | {
             "action_spec": self.action_spec.to(place_of(actor)),
             "critics": self.options.critics,
-            "gamma": self.options.gamma,
-            "reward_range": self.bounds,
             "temperature": self.options.temperature,
-            "action_penalty": self.options.action_penalty,
             "runs": self.shape.runs,
             "generators": self.generators,
-            "reduction": "none",
-            "cloning": self.cloning,
         }
 
     @property

@@ -22,11 +22,7 @@ class TD3Builder(DDPGBuilder):
             action_spec=self.action_spec.to(place_of(actor)),
             critics=self.options.critics,
             target_critics=self.options.target_critics,
-            gamma=self.options.gamma,
-            reward_range=self.bounds,
-            action_penalty=self.options.action_penalty,
             saturation_penalty=self.options.saturation_penalty,
             generators=self.generators,
-            reduction="none",
-            cloning=self.cloning,
+            **self.loss_options(),
         )
