@@ -10,8 +10,7 @@ from click.shell_completion import CompletionItem
 
 import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `play`
 from torchrl_her_recipes.cli.say import file_name
-from torchrl_her_recipes.config.options import what_there_is
-from torchrl_her_recipes.config.shipped import policy_files, policy_path
+from torchrl_her_recipes.config.shipped import find_policy, policy_files
 
 _SUFFIXES = (".gif", ".mp4")
 _RUN = click.Path(path_type=Path)
@@ -65,7 +64,8 @@ def play(
     """
     sources = (source, *others)
     for name in sources:
-        _check_source(name)
+        if not Path(name).is_dir():
+            find_policy(name)  # before torch is imported
     if window and out is not None:
         raise click.UsageError("--window and --out cannot be given together")
     film = None if window else out or _film_of(Path(source), compared=bool(others))
@@ -79,15 +79,6 @@ def play(
     if film is not None and others:
         click.echo(film)
     return 0
-
-
-def _check_source(source: str) -> None:
-    if not Path(source).exists() and policy_path(source) is None:
-        known = what_there_is(source, policy_files(), "trained policies")
-        raise ValueError(
-            f"{source} is neither the folder of a run, nor the file of an exported policy, nor one of the "
-            f"trained policies{known}"
-        )
 
 
 def _film_of(source: Path, *, compared: bool) -> Path:
@@ -150,11 +141,7 @@ def _file_of(source: str, task: str | None, suffix: str) -> Path:
     home = recipes.RunFolder.of(path)
     if home is not None:
         return home.path / f"{file_name(task or home.recipe().task.name)}{suffix}"
-    if policy_path(source) is None and not path.is_file():
-        raise ValueError(
-            f"{source} is no folder of a run: it has no config.yaml; nor is it the file of an exported policy"
-            f"{what_there_is(source, policy_files(), 'trained policies')}"
-        )
+    find_policy(source)
     file = path.with_suffix(suffix) if path.is_file() else Path(f"{file_name(source)}{suffix}")
     if file == path:
         raise ValueError(f"{source} would be replaced by itself: give --out or --format onnx")

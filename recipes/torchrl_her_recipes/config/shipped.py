@@ -79,13 +79,22 @@ def policy_files() -> dict[str, Path]:
     return {path.stem: path for path in sorted(_TRAINED.glob(f"*{POLICY_SUFFIX}"))}
 
 
-def policy_path(name: str) -> Path | None:
-    """Returns the file of the packaged policy of this name or of this task; None if there is none.
+def find_policy(source: str | Path) -> Path:
+    """Returns the file of an exported policy, or of the packaged policy of this name or of this task.
+
+    Raises:
+        ValueError: there is no such file; the message lists the packaged policies.
 
     Example:
-        >>> policy_path("gym:FetchPush-v4").name
+        >>> find_policy("gym:FetchPush-v4").name
         'fetch_push.safetensors'
     """
-    files = policy_files()
+    name, files = str(source), policy_files()
     plays = (path for path in files.values() if read_header(path)["info"]["task"] == name)
-    return files.get(name) or next(plays, None)
+    path = files.get(name) or next(plays, None) or Path(source)
+    if not path.is_file():
+        raise ValueError(
+            f"{source} is neither the folder of a run, nor the file of an exported policy, nor one of the "
+            f"trained policies{what_there_is(name, files, 'trained policies')}"
+        )
+    return path

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any
@@ -69,38 +69,42 @@ class PolicyInfo:
     versions: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name, fits, wanted in self._checks():
+            if not fits:
+                got = str(getattr(self, name))[:80]
+                raise ValueError(f"{name} of a policy must {wanted}, got {got!r}")
+
+    def _checks(self) -> Iterator[tuple[str, bool, str]]:
+        """Yields the name of each value, whether it is one that a policy has, and what it must be."""
         for name in ("task", "algorithm", "learner"):
-            _check(name, isinstance(getattr(self, name), str), "be a name", getattr(self, name))
+            yield name, isinstance(getattr(self, name), str), "be a name"
         for name in ("seed", "frames"):
-            _check(
-                name, _is_count(getattr(self, name)), "be a whole number of at least 0", getattr(self, name)
-            )
+            yield name, _is_whole(getattr(self, name), least=0), "be a whole number of at least 0"
         named = isinstance(self.widths, dict) and tuple(self.widths) == KEYS
         wide = named and all(map(_is_width, self.widths.values()))
-        _check("widths", wide, f"be {' and '.join(KEYS)}, each from 1 to {_WIDEST}", self.widths)
-        _check("dtype", self.dtype in _FLOATS, f"be one of {', '.join(_FLOATS)}", self.dtype)
+        yield "widths", wide, f"be {' and '.join(KEYS)}, each from 1 to {_WIDEST}"
+        yield "dtype", self.dtype in _FLOATS, f"be one of {', '.join(_FLOATS)}"
         allowed = ("int64",) if self.discrete else _FLOATS
-        _check("action_dtype", self.action_dtype in allowed, f"be {' or '.join(allowed)}", self.action_dtype)
+        yield "action_dtype", self.action_dtype in allowed, f"be {' or '.join(allowed)}"
         known = (*_FLOATS, "float16", *_WHOLE)
-        _check("task_dtype", self.task_dtype in known, f"be one of {', '.join(known)}", self.task_dtype)
+        yield "task_dtype", self.task_dtype in known, f"be one of {', '.join(known)}"
         flat = len(self.action_shape) < 2 and all(map(_is_width, self.action_shape))
-        _check("action_shape", flat, f"have one width from 1 to {_WIDEST}, or none", self.action_shape)
+        yield "action_shape", flat, f"have one width from 1 to {_WIDEST}, or none"
         entries = math.prod(self.action_shape)
         for name in ("low", "high"):
-            own = getattr(self, name)
-            fits = len(own) == entries and all(map(_is_number, own))
-            _check(name, fits, f"have {entries} numbers", own)
+            limits = getattr(self, name)
+            yield name, len(limits) == entries and all(map(_is_number, limits)), f"have {entries} numbers"
         if self.discrete:
             fits = self.low == (0,) and 1 <= self.high[0] < _WIDEST
-            _check("high", fits, f"be the last of the actions from 0, below {_WIDEST}", self.high)
+            yield "high", fits, f"be the last of the actions from 0, below {_WIDEST}"
         for name in ("success", "reached"):
-            _check(name, _is_number(getattr(self, name)), "be a number", getattr(self, name))
+            yield name, _is_number(getattr(self, name)), "be a number"
         clip = self.normalize_clip
-        _check("normalize_clip", clip is None or (_is_number(clip) and clip > 0), "be above 0 or None", clip)
+        yield "normalize_clip", clip is None or (_is_number(clip) and clip > 0), "be above 0 or None"
         words = isinstance(self.versions, dict) and all(
-            isinstance(each, str) for pair in self.versions.items() for each in pair
+            isinstance(word, str) for pair in self.versions.items() for word in pair
         )
-        _check("versions", words, "name packages and their versions", self.versions)
+        yield "versions", words, "name packages and their versions"
 
     @property
     def discrete(self) -> bool:
@@ -195,17 +199,12 @@ def _words(widths: Mapping[str, int], shape: tuple[int, ...], high: tuple[float,
     return f"{seen} and " + (f"action [{shape[0]}]" if shape else f"action of {int(high[0]) + 1} choices")
 
 
-def _check(name: str, fits: bool, wanted: str, got: object) -> None:
-    if not fits:
-        raise ValueError(f"{name} of a policy must {wanted}, got {str(got)[:80]!r}")
+def _is_whole(value: object, *, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
 
 
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-
-def _is_width(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= _WIDEST
+def _is_width(value: Any) -> bool:
+    return _is_whole(value, least=1) and value <= _WIDEST
 
 
 def _is_number(value: object) -> bool:

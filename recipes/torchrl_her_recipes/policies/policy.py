@@ -27,7 +27,7 @@ from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.shipped import policy_files, policy_path
+from torchrl_her_recipes.config.shipped import find_policy
 from torchrl_her_recipes.policies.info import KEYS, PolicyInfo, describe_env, present_versions
 from torchrl_her_recipes.policies.model_card import card_path, check_free, write_model_card
 from torchrl_her_recipes.policies.network import load_network
@@ -106,7 +106,12 @@ class Policy(TensorDictModuleBase):
             raise ValueError(
                 f"run={run} has no effect with {source}, which holds a single policy: leave it out"
             )
-        path = _path_of(source)
+        path = find_policy(source)
+        if path.suffix != POLICY_SUFFIX:
+            why = "is for onnxruntime" if path.suffix == SUFFIX else f"does not end with {POLICY_SUFFIX}"
+            raise ValueError(
+                f"{path} {why} and cannot be loaded: `torchrl-her export RUN` writes a file that can"
+            )
         described, weights = read_policy(path)
         if not {"info", "recipe"} <= set(described):
             raise ValueError(
@@ -309,21 +314,6 @@ def _check_out(path: Path, *, card: bool) -> None:
         check_free(card_path(path))
     if path.suffix == SUFFIX:
         need_onnx()
-
-
-def _path_of(source: str | Path) -> Path:
-    """Returns the path of a policy's file, or of one that comes with the package."""
-    path = policy_path(str(source)) or Path(source)
-    if not path.is_file():
-        if path.suffix or len(path.parts) > 1:
-            raise ValueError(f"there is no file {path}")
-        raise ValueError(f"there is no policy {str(source)!r}; there are {', '.join(policy_files())}")
-    if path.suffix != POLICY_SUFFIX:
-        why = "is for onnxruntime" if path.suffix == SUFFIX else f"does not end with {POLICY_SUFFIX}"
-        raise ValueError(
-            f"{path} {why} and cannot be loaded: `torchrl-her export RUN` writes a file that can"
-        )
-    return path
 
 
 def _as_shown(actor: dict[str, Tensor], places: Tensor, width: int) -> dict[str, Tensor]:
