@@ -10,7 +10,7 @@ from torchrl_her_envs.registry import task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.plain_files import parse_yaml
 from torchrl_her_recipes.config.shipped import preset_names
-from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, locate
+from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, locate, split_name
 
 ARGUMENTS = ("preset", "folder")  # besides options; names, even if YAML reads something else in them
 _OPENING, _CLOSING = "[{(", "]})"
@@ -44,8 +44,8 @@ def _path(name: str, value: str) -> tuple[str, ...]:
     """Returns group, option and mapping entry that a name refers to."""
     if name in GROUPS and value.startswith("{"):  # a whole group
         return (name,)
-    head = name.split(".", 2)
-    return (*locate(".".join(head[:2])), *head[2:])
+    option, *entry = split_name(name)
+    return (*locate(option), *entry)
 
 
 def check_once(arguments: Sequence[tuple[str, str]], also: Sequence[str] = ()) -> None:

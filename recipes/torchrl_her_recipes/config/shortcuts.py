@@ -148,6 +148,17 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
     raise ValueError(f"no option {name!r}{nearest(name, every)}; `torchrl-her train -h` lists them")
 
 
+def split_name(name: str) -> list[str]:
+    """Splits a name into that of an option and, if there is one, that of an entry of its mapping.
+
+    Example:
+        >>> split_name("run.seed"), split_name("task.options.bits")
+        (['run.seed'], ['task.options', 'bits'])
+    """
+    group, *rest = name.split(".", 2)
+    return [".".join([group, *rest[:1]]), *rest[1:]]
+
+
 def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
     """Sorts values, by short or long names or as whole groups, into groups.
 
@@ -174,12 +185,11 @@ def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
         if name == "curriculum" and isinstance(value, list | tuple):
             placed.setdefault("curriculum", {})["layers"] = list(value)
             continue
-        head, *deeper = name.split(".", 2)[:2] + name.split(".")[2:]
-        group, own = locate(".".join([head, *deeper[:1]]), placed, base or {})
-        if len(deeper) > 1:
+        option, *entry = split_name(name)
+        group, own = locate(option, placed, base or {})
+        if entry:
             before = placed.get(group, {}).get(own)
-            entry = {".".join(deeper[1:]): value}
-            value = Entries(entry) if not isinstance(before, Mapping) else _join(before, entry)
+            value = _join(before if isinstance(before, Mapping) else Entries(), {entry[0]: value})
         elif name in shared and own in placed.get(group, {}):
             raise ValueError(f"{name} and {group}.{own} set the same option: give one of them")
         placed.setdefault(group, {})[own] = value

@@ -13,7 +13,7 @@ from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.plain_files import read_yaml, shown
 from torchrl_her_recipes.config.recipe import Recipe, compose, drop_other_goal_sources
 from torchrl_her_recipes.config.shipped import find_file, shipped_names
-from torchrl_her_recipes.config.shortcuts import locate, merge, place
+from torchrl_her_recipes.config.shortcuts import locate, merge, place, split_name
 from torchrl_her_recipes.config.values import as_kind
 from torchrl_her_recipes.config.without_effect import without_effect
 
@@ -75,7 +75,7 @@ class Space:
         Example:
             >>> load_space("dqn").without({"learner.gamma": 0.9}).ranges.get("gamma")
         """
-        given = {locate(".".join(name.split(".")[:2])) for name in names}
+        given = {locate(split_name(name)[0]) for name in names}
         left = {name: values for name, values in self.ranges.items() if locate(name) not in given}
         if not left:
             raise ValueError(f"all options of the space {self.name} are given: there is nothing to search")

@@ -25,8 +25,7 @@ from torchrl_her_recipes.config.plain_files import (
 from torchrl_her_recipes.config.study import Study
 from torchrl_her_recipes.reports.pictures import Picture
 from torchrl_her_recipes.reports.results import Combination, read_combinations
-from torchrl_her_recipes.runs.arrays import read_arrays
-from torchrl_her_recipes.runs.goal_map import GoalMap
+from torchrl_her_recipes.runs.goal_map import GoalMap, read_arrays
 
 _ABOUT, _RUNS, _GOALS = "about.yaml", "runs.csv", "goals.npz"
 _DAMAGE = (AttributeError, EOFError, LookupError, OSError, TypeError, ValueError, csv.Error, zlib.error)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import torch
@@ -11,7 +12,8 @@ from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_her.files.writing import written
 from torchrl_her.goals.ibs import GoalHistogram
-from torchrl_her_recipes.runs.arrays import read_arrays
+
+_LARGEST = 1 << 27  # bytes of all arrays of a file
 
 
 @dataclass(frozen=True)
@@ -73,3 +75,21 @@ def goal_map(buffer: TensorDictReplayBuffer, target: torch.Tensor | None) -> Goa
     shape = counted[0].grid.shape
     counts = torch.stack([own.counts.view(shape) for own in counted])
     return GoalMap(counts.cpu().numpy(), target.view(shape).cpu().numpy())
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Returns the arrays that ``numpy.savez`` wrote, if they hold numbers."""
+    with open(path, "rb") as file:
+        try:
+            with ZipFile(file) as archive:
+                size = sum(record.file_size for record in archive.infolist())
+            if size > _LARGEST:
+                raise ValueError(f"its arrays take {size:,} bytes, more than {_LARGEST:,}")
+            file.seek(0)
+            arrays = dict(np.load(file, allow_pickle=False))
+            if odd := [name for name, array in arrays.items() if array.dtype.kind not in "biuf"]:
+                raise ValueError(f"{odd[0][:80]!r} holds no numbers")
+            return arrays
+        except Exception as error:  # errors of any type: zlib's, zipfile's, those of Python's parser
+            said = str(error) if type(error) is ValueError else f"it holds no arrays ({type(error).__name__})"
+            raise ValueError(f"{path} is damaged: {said}") from error

@@ -95,31 +95,23 @@ class LogByName(Callback):
         """Opens the logger."""
         self._kept = run.trainer.frames
         try:
-            self._open(run)
+            self._opened(run)
         except Exception as error:  # a service may raise any error
             self.close()
             raise ValueError(f"log={self.name} cannot begin: {_reason(error)}") from error
 
     def on_epoch(self, run: RunView) -> None:
         """Logs the new rows."""
-
-        def tell() -> None:
-            if self._teller is None:
-                self._open(run)
-            else:
-                self._teller.on_epoch(run)
-
-        self._kept = run.trainer.frames if self._tried(tell, run) else self._kept
+        if self._tried(lambda: self._opened(run).on_epoch(run), run):
+            self._kept = run.trainer.frames
 
     def on_end(self, run: RunView) -> None:
         """Logs the pictures, and closes the logger."""
 
         def show() -> None:
-            if self._teller is None:
-                self._open(run)
-            assert self._teller is not None
-            self._teller.on_end(run)
-            self._teller.logger.close()
+            teller = self._opened(run)
+            teller.on_end(run)
+            teller.logger.close()
             self._teller = None
 
         self._tried(show, run)
@@ -133,10 +125,13 @@ class LogByName(Callback):
             except Exception as error:
                 warnings.warn(f"log={self.name} was not closed: {_reason(error)}", stacklevel=2)
 
-    def _open(self, run: RunView) -> None:
-        logger, known = load_name(LOGGERS[self.name].factory)(run, self._kept)
-        self._teller = LogTo(logger, after=known)
-        self._teller.on_start(run)
+    def _opened(self, run: RunView) -> LogTo:
+        """Returns the logger, which is opened first, and gets the rows so far, if it is not open."""
+        if self._teller is None:
+            logger, known = load_name(LOGGERS[self.name].factory)(run, self._kept)
+            self._teller = LogTo(logger, after=known)
+            self._teller.on_start(run)
+        return self._teller
 
     def _tried(self, what: Callable[[], None], run: RunView) -> bool:
         try:

@@ -42,7 +42,7 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
             while waiting:
                 for future in wait(waiting, _TICK, FIRST_COMPLETED).done:
                     job = waiting.pop(future)
-                    outcomes[job.label] = _outcome(future)
+                    outcomes[job.label] = outcome_of(future)
                     plan.progress[job.label] = kept_progress(job)
                     overview.ended(job, outcomes[job.label])
                 overview.show(list(waiting.values()))
@@ -59,7 +59,8 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
     return outcomes
 
 
-def _outcome(future: Future[Outcome]) -> Outcome:
+def outcome_of(future: Future[Outcome]) -> Outcome:
+    """Returns the outcome of a job, also if the worker itself has failed."""
     error = future.exception()
     return future.result() if error is None else Outcome(error=" ".join(f"{error!r}".split()))
 

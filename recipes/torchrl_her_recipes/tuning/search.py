@@ -31,6 +31,7 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.scores import score
 from torchrl_her_recipes.studies.jobs import Job, Outcome
+from torchrl_her_recipes.studies.schedule import outcome_of
 from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
 from torchrl_her_recipes.tuning.results import DEFAULT, folder_of, write_pictures, write_results
 
@@ -281,9 +282,7 @@ class _TrialRuns:
 
     def _collect(self) -> None:
         for future in wait(self._running, _TICK, FIRST_COMPLETED).done:
-            trial, error = self._running.pop(future), future.exception()
-            outcome = Outcome(error=" ".join(f"{error!r}".split())) if error else future.result()
-            self._end(trial, outcome)
+            self._end(self._running.pop(future), outcome_of(future))
 
     def _end(self, trial: Trial, outcome: Outcome) -> None:
         """Passes the result of a trial to Optuna, and writes the table again."""
