@@ -74,12 +74,12 @@ class RunDemonstrations:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Puts back what :meth:`state_dict` gave; the progress of the curriculum was put back before."""
-        runs = 1 if self.state is None else self.state.progress.runs
         if self.buffer is not None:
             self.buffer.empty()
             load_buffer_state_dict(self.buffer, state["buffer"])
-        for run in range(runs if self.state is not None else 0):
-            assert self.state is not None
+        if self.state is None:
+            return
+        for run in range(self.state.progress.runs):
             if self.buffer is not None:
                 set_layer_goals(self.buffer.writer, self.state.progress.layer_of(run), run=run)
             if self.starts is not None:

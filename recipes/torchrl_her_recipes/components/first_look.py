@@ -11,7 +11,6 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from torchrl_her.goals.rewards import Outcome, ask_reward, is_achieved, missed, outcomes
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
@@ -175,14 +174,13 @@ def _facts(
 ) -> Facts:
     rows = cast(TensorDictBase, torch.cat(cast(list[Tensor], played)))
     achieved_reward = task.achieved_reward
-    rule = task_reward(cast(EnvBase, task))
+    rule, judged_by = task_reward(task), judging(task)
 
     def meets(achieved: Outcome, desired: Tensor) -> Tensor:
         """[...] of bool."""
         return ~missed(rule, achieved, desired, achieved_reward)
 
     moved, kept, achieved, fallen = [], [], [], []
-    judged_by = judging(cast(EnvBase, task))
     for own in played:
         goals = own["next", "achieved_goal"]
         here, there = outcomes(rule, own["achieved_goal"], own), outcomes(rule, goals, own["next"])
