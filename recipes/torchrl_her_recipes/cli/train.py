@@ -59,7 +59,7 @@ def train(
         check_extending(changes)
         if not resume.is_dir():
             raise ValueError(f"{resume} is no folder of a run: it has no config.yaml")
-        _say_start(resume)
+        click.echo(f"run: {resume}")
         _say_finished(recipes.RunFolder(resume), changes)
         return _say_end(recipes.resume(resume, options=changes))
     wanted = list(requests(options, multirun=multirun))  # all are checked before the first one starts
@@ -74,7 +74,7 @@ def train(
 
 def _train(wanted: RunRequest) -> recipes.RunResult:
     components = recipes.build(wanted.recipe)
-    _say_start(wanted.folder)
+    click.echo(f"run: {wanted.folder}")
     if chosen := auto_options(wanted.recipe):
         values = (f"{name}={getattr(getattr(components.recipe, group), name)}" for group, name in chosen)
         click.echo(f"chosen for this environment (auto): {' '.join(values)}")
@@ -108,10 +108,6 @@ def _sweep(wanted: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
         click.echo("interrupted: the same command resumes it")
         return INTERRUPTED
     return FAILED if result.failed else 0
-
-
-def _say_start(folder: Path) -> None:
-    click.echo(f"run: {folder}")
 
 
 def _say_finished(home: recipes.RunFolder, changes: dict[str, Any]) -> None:

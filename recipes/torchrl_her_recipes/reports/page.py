@@ -26,6 +26,7 @@ from torchrl_her_recipes.runs.plots import band
 from torchrl_her_recipes.studies.plan import duration
 
 _AT_THE_END = ("success", "reached", "distance", "kl", "q_bias")  # shown with intervals
+_ABOUT = ("label", "task", "algorithm", "state", "runs", "epoch", "frames", "seconds", "differs")
 
 
 def write_report(study: Study, folder: Path, out: Path) -> Path:
@@ -149,7 +150,7 @@ def _write_tables(
     judged: Sequence[Judged],
 ) -> None:
     tables: dict[str, list[dict[str, Any]]] = {
-        "runs": [_about(cell) for cell in cells],
+        "runs": [{name: getattr(cell, name) for name in _ABOUT} for cell in cells],
         "final": [asdict(row) for row in finals],
         "differences": [asdict(row) for row in differences],
         "orders": [asdict(row) for row in judged],
@@ -164,11 +165,6 @@ def _write_tables(
 
 def _cell(value: object) -> object:
     return f"{value:.6g}" if isinstance(value, float) else value
-
-
-def _about(cell: Combination) -> dict[str, Any]:
-    columns = ("label", "task", "algorithm", "state", "runs", "epoch", "frames", "seconds", "differs")
-    return {name: getattr(cell, name) for name in columns}
 
 
 def _points(cell: Combination) -> list[dict[str, Any]]:

@@ -20,20 +20,18 @@ from torchrl_her_recipes.runs.goal_map import GoalMap
 
 Rows = Sequence[dict[str, float]]
 
-COLORS = {  # colors of algorithms, the same in every picture
-    "no_hindsight": "#1a202c",
+COLORS = {  # colors of algorithms, the same in every picture; others take them in this order
     "her": "#dd6b20",
-    "her_ibs": "#38a169",
-    "her_ibs_sequential": "#718096",
     "filtered_her": "#805ad5",
     "filtered_her_ibs": "#2b6cb0",
+    "her_ibs": "#38a169",
+    "unfiltered_cher": "#d53f8c",
+    "her_ibs_sequential": "#718096",
+    "no_hindsight": "#1a202c",
     "cher": "#c53030",
     "cher_ibs": "#0bc5ea",
-    "unfiltered_cher": "#d53f8c",
     "unfiltered_cher_ibs": "#975a16",
 }
-_ORDER = ("her", "filtered_her", "filtered_her_ibs", "her_ibs", "unfiltered_cher", "her_ibs_sequential")
-_COLORS = tuple(dict.fromkeys([*(COLORS[name] for name in _ORDER), *COLORS.values()]))  # colors of all others
 _REGIONS = {"goals": "#63b3ed", "reach": "#fc8181"}
 _MOST_LINES = 15  # runs that are drawn one by one
 _MOST_COLUMNS = 6  # panels beside each other
@@ -110,7 +108,7 @@ def colors(labels: Sequence[str]) -> dict[str, str]:
         {'her': '#dd6b20', 'window=20': '#805ad5'}
     """
     own = {label: COLORS[label] for label in labels if label in COLORS}
-    left = cycle([color for color in _COLORS if color not in own.values()] or _COLORS)
+    left = cycle([color for color in COLORS.values() if color not in own.values()] or COLORS.values())
     return {label: own.get(label) or next(left) for label in labels}
 
 
