@@ -16,12 +16,8 @@ ARGUMENTS = ("preset", "folder")  # besides options; names, even if YAML reads s
 _OPENING, _CLOSING = "[{(", "]})"
 
 
-def parse_override(text: str, also: Sequence[str] = ()) -> tuple[str, str]:
-    """Splits an argument into the name and the text of the value, and checks the name.
-
-    Args:
-        text: ``NAME=VALUE``.
-        also: names besides those of options.
+def parse_override(text: str) -> tuple[str, str]:
+    """Splits an argument ``NAME=VALUE`` into the name and the text of the value, and checks the name.
 
     Raises:
         ValueError: it has no ``=``, or no option has this name.
@@ -35,20 +31,19 @@ def parse_override(text: str, also: Sequence[str] = ()) -> tuple[str, str]:
         raise ValueError(f"an option is written NAME=VALUE, got {text!r}{_meant(text)}")
     if any(not part for part in split_sweep(value)):
         raise ValueError(f"{name} needs a value, got {text!r}")
-    if name not in also:
-        _path(name, value)
+    _path(name, value)
     return name, value
 
 
 def _path(name: str, value: str) -> tuple[str, ...]:
     """Returns group, option and mapping entry that a name refers to."""
-    if name in GROUPS and value.startswith("{"):  # a whole group
+    if name in ARGUMENTS or (name in GROUPS and value.startswith("{")):  # or a whole group
         return (name,)
     option, *entry = split_name(name)
     return (*locate(option), *entry)
 
 
-def check_once(arguments: Sequence[tuple[str, str]], also: Sequence[str] = ()) -> None:
+def check_once(arguments: Sequence[tuple[str, str]]) -> None:
     """Raises a ValueError for two values of one option.
 
     Example:
@@ -58,7 +53,7 @@ def check_once(arguments: Sequence[tuple[str, str]], also: Sequence[str] = ()) -
     """
     before: list[tuple[tuple[str, ...], str]] = []
     for name, value in arguments:
-        path = (name,) if name in also else _path(name, value)
+        path = _path(name, value)
         for other, text in before:
             shared = min(len(path), len(other))
             if path[:shared] == other[:shared]:

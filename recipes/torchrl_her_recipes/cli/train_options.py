@@ -78,8 +78,8 @@ def single(options: tuple[str, ...]) -> dict[str, Any]:
 
 def _pairs(options: tuple[str, ...]) -> list[tuple[str, str]]:
     """Splits arguments into names and texts of values, and checks the names."""
-    pairs = [parse_override(text, ARGUMENTS) for text in options]
-    check_once(pairs, ARGUMENTS)
+    pairs = [parse_override(text) for text in options]
+    check_once(pairs)
     return pairs
 
 
