@@ -206,7 +206,7 @@ def test_a_logger_whose_package_is_missing_names_the_extra(monkeypatch: pytest.M
         register_logger(LoggerSpec(name="tensorboard", factory="x:y"))
 
 
-@pytest.mark.parametrize("name", ["runs/plots.py", "reports/plots.py"])
+@pytest.mark.parametrize("name", ["runs/plots.py", "reports/pictures.py"])
 def test_importing_what_draws_leaves_matplotlib_s_backend_as_it_is(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
