@@ -240,7 +240,9 @@ class CurriculumConfig(Group):
             object.__setattr__(self, "layers", _read_layers(Path(self.name)))
         layers = self.layers
         if layers is not None and not (
-            isinstance(layers, list | tuple) and layers and all(isinstance(own, Mapping) for own in layers)
+            isinstance(layers, list | tuple)
+            and layers
+            and all(isinstance(layer, Mapping) for layer in layers)
         ):
             raise ValueError(
                 f"a curriculum must be a list of layers, each with its options by name, got {layers!r}"

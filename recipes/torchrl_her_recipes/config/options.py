@@ -46,16 +46,16 @@ def option(
 
 def check_options(group: Any) -> None:
     """Turns the values of a frozen group of options into their types, and checks their ranges."""
-    for own in fields(group):
-        value = getattr(group, own.name)
-        if own.default in (None, AUTO) and value == own.default:
+    for definition in fields(group):
+        value = getattr(group, definition.name)
+        if definition.default in (None, AUTO) and value == definition.default:
             continue
-        shown = _shown(group, own)
-        kind = _KINDS.get(str(own.type).removesuffix(" | None"))
+        shown = _shown(group, definition)
+        kind = _KINDS.get(str(definition.type).removesuffix(" | None"))
         if kind is not None:
             value = as_kind(shown, value, kind)
-            object.__setattr__(group, own.name, value)
-        _check_value(own, shown, value)
+            object.__setattr__(group, definition.name, value)
+        _check_value(definition, shown, value)
 
 
 def idle_options(group: Any) -> dict[str, str]:
@@ -70,7 +70,7 @@ def idle_options(group: Any) -> dict[str, str]:
         ((('processes', <class 'bool'>, 'sync'),), {'sync': 'with processes=0'})
     """
     idle: dict[str, str] = {}
-    shown = {own.name: _shown(group, own) for own in fields(group)}
+    shown = {definition.name: _shown(group, definition) for definition in fields(group)}
     for other, has_effect, names in group.needs:
         value = getattr(group, other)
         if other in idle or not has_effect(value):
@@ -80,12 +80,12 @@ def idle_options(group: Any) -> dict[str, str]:
     return idle
 
 
-def _shown(group: Any, own: Field[Any]) -> str:
-    return own.metadata.get("shown_as") or group.prefix + own.name
+def _shown(group: Any, definition: Field[Any]) -> str:
+    return definition.metadata.get("shown_as") or group.prefix + definition.name
 
 
-def _check_value(own: Field[Any], shown: str, value: Any) -> None:
-    choices, limits = own.metadata.get("choices", ()), own.metadata.get("limits", {})
+def _check_value(definition: Field[Any], shown: str, value: Any) -> None:
+    choices, limits = definition.metadata.get("choices", ()), definition.metadata.get("limits", {})
     if choices and value not in choices:
         raise ValueError(
             f"{shown} must be one of {', '.join(choices)}, got {value!r}{nearest(value, choices)}"
@@ -100,7 +100,7 @@ def _check_value(own: Field[Any], shown: str, value: Any) -> None:
     if not all(tests[name](limit) for name, limit in given.items()):  # NaN fails all of them
         allowed = " and ".join(f"{name.replace('_', ' ')} {limit}" for name, limit in given.items())
         raise ValueError(f"{shown} must be {allowed}, got {value}")
-    if isinstance(value, float) and not (isfinite(value) or own.metadata.get("infinite")):
+    if isinstance(value, float) and not (isfinite(value) or definition.metadata.get("infinite")):
         raise ValueError(f"{shown} must be finite, got {value}")
 
 

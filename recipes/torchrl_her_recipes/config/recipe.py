@@ -122,7 +122,7 @@ class Recipe:
         named = {group: {"name": getattr(self, group).name} for group in KINDS}
         if get_algorithm(self.hindsight.algo).weights is not None:
             del named["weights"]
-        return {group: named.get(group, {}) | asdict(own) for group, own in vars(self).items()}
+        return {group: named.get(group, {}) | asdict(options) for group, options in vars(self).items()}
 
     def changed(self) -> Nested:
         """Returns the values that differ from the defaults, by group and name.
@@ -132,11 +132,11 @@ class Recipe:
             {'learner': {'gamma': 0.9}, 'run': {'seed': 3}}
         """
         kept: Nested = {}
-        for group, own in self.to_dict().items():
+        for group, values in self.to_dict().items():
             defaults = {each.name: each.default for each in fields(getattr(self, group))}
             defaults |= {"name": KINDS[group].default} if group in KINDS else {}
-            kept[group] = {name: value for name, value in own.items() if value != defaults[name]}
-        return {group: own for group, own in kept.items() if own}
+            kept[group] = {name: value for name, value in values.items() if value != defaults[name]}
+        return {group: values for group, values in kept.items() if values}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
@@ -212,9 +212,9 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
         )
     if "epochs" in asked:
         below.get("run", {}).pop("frames", None)
-    for group, own in without_effect(SimpleNamespace(**_groups(over(below, given)))):
-        if own not in given.get(group, {}) and own in below.get(group, {}):
-            del below[group][own]
+    for group, option in without_effect(SimpleNamespace(**_groups(over(below, given)))):
+        if option not in given.get(group, {}) and option in below.get(group, {}):
+            del below[group][option]
     return Recipe(**_groups(over(below, given)))
 
 
@@ -239,7 +239,7 @@ def _drop_options_of_other_choices(below: Nested, given: Nested) -> None:
         for key, value in given.get(group, {}).items():
             if hasattr(asked, key) and not hasattr(choice, key):
                 raise ValueError(f"{key}={value} has no effect with {group}={choice.name}: leave it out")
-        allowed = {own.name: own.metadata.get("choices", ()) for own in fields(choice)}
+        allowed = {option.name: option.metadata.get("choices", ()) for option in fields(choice)}
         below[group] = {
             key: value
             for key, value in below.get(group, {}).items()
@@ -255,7 +255,7 @@ def _drop_options_of_another_task(below: Nested, given: Nested) -> None:
     if name is None or not isinstance(options, Mapping) or name == below["task"].get("name"):
         return
     takes = get_task_spec(str(name)).options
-    below["task"]["options"] = {own: value for own, value in options.items() if own in takes} or None
+    below["task"]["options"] = {option: value for option, value in options.items() if option in takes} or None
 
 
 def _drop_another_curriculum(below: Nested, given: Nested) -> None:

@@ -44,12 +44,12 @@ def _num_envs(recipe: Recipe, facts: EnvFacts) -> int:
 
 
 def _epoch_frames(recipe: Recipe, facts: EnvFacts) -> int:
-    own = recipe.collection
-    episodes = _EPISODES if not facts.batched else 4 * own.num_envs
+    collection = recipe.collection
+    episodes = _EPISODES if not facts.batched else 4 * collection.num_envs
     frames = episodes * facts.max_steps
     if recipe.run.frames is not None:  # a run shorter than an epoch is one epoch of its own length
         frames = min(frames, recipe.run.frames)
-    return max(frames, own.num_envs * own.steps_per_batch)
+    return max(frames, collection.num_envs * collection.steps_per_batch)
 
 
 # In this order: later ones depend on earlier ones.
@@ -73,10 +73,12 @@ def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
         >>> auto_options(Recipe().replace(gamma=0.95))[1:3]
         [('hindsight', 'goal_sources'), ('collection', 'num_envs')]
     """
-    homes = {own.name: group.name for group in fields(recipe) for own in fields(getattr(recipe, group.name))}
+    homes = {
+        option.name: group.name for group in fields(recipe) for option in fields(getattr(recipe, group.name))
+    }
     names = [(homes[name], name) for name in _VALUES]
     idle = without_effect(recipe)
-    return [own for own in names if getattr(getattr(recipe, own[0]), own[1]) == AUTO and own not in idle]
+    return [pair for pair in names if getattr(getattr(recipe, pair[0]), pair[1]) == AUTO and pair not in idle]
 
 
 def ends_open(recipe: Recipe) -> bool:
@@ -84,8 +86,8 @@ def ends_open(recipe: Recipe) -> bool:
 
     Example:
         >>> task = "gym:FetchPush-v4"
-        >>> own = {"task.options": {"termination": "never"}}
-        >>> [ends_open(Recipe().replace(task=task, **options)) for options in ({}, own)], ends_open(Recipe())
+        >>> never = {"task.options": {"termination": "never"}}
+        >>> [ends_open(Recipe().replace(task=task, **values)) for values in ({}, never)], ends_open(Recipe())
         ([True, False], False)
     """
     known = get_task_spec(recipe.task.name).options

@@ -85,10 +85,10 @@ def difference(search: Mapping[str, Any], other: Mapping[str, Any]) -> str:
         >>> difference(one.to_plain(), other.to_plain())
         'seed=0, not seed=3'
     """
-    mine, theirs = _flat(search), _flat(other)
-    for name in {**mine, **theirs}:
-        if mine.get(name) != theirs.get(name):
-            said = (f"{name}={own[name]}" if name in own else f"no {name}" for own in (mine, theirs))
+    first, second = _flat(search), _flat(other)
+    for name in {**first, **second}:
+        if first.get(name) != second.get(name):
+            said = (f"{name}={flat[name]}" if name in flat else f"no {name}" for flat in (first, second))
             return ", not ".join(said)
     return ""
 

@@ -65,13 +65,13 @@ def option_names() -> dict[str, list[str]]:
 
 @cache
 def _field_names(kind: type[groups.Group]) -> list[str]:
-    return [own.name for own in fields(kind)]
+    return [option.name for option in fields(kind)]
 
 
 def chosen(group: str, *values: Nested) -> str:
     """Returns the chosen name of a group from the first values that have one, or its default."""
     key = "algo" if group == "hindsight" else "name"
-    if name := next(filter(None, (own.get(group, {}).get(key) for own in values)), None):
+    if name := next(filter(None, (given.get(group, {}).get(key) for given in values)), None):
         return name
     if group == "weights" and (weights := get_algorithm(chosen("hindsight", *values)).weights):
         return weights
@@ -87,11 +87,11 @@ def renamed(name: str) -> list[str]:
         >>> renamed("learner.average_decay")
         ['learner.ema_decay']
     """
-    names, (group, dot, own) = option_names(), str(name).partition(".")
-    if now := FORMER_NAMES.get(own or group):
-        return [group + dot + now if own else now]
-    homes = [] if own in names.get(group, ()) else FORMER.get(group, ())
-    return [home if own == home else f"{home}.{own}" for home in homes if own in (home, *names[home])]
+    names, (group, dot, key) = option_names(), str(name).partition(".")
+    if now := FORMER_NAMES.get(key or group):
+        return [group + dot + now if key else now]
+    homes = [] if key in names.get(group, ()) else FORMER.get(group, ())
+    return [home if key == home else f"{home}.{key}" for home in homes if key in (home, *names[home])]
 
 
 def locate(name: str, *values: Nested) -> tuple[str, str]:
@@ -110,21 +110,21 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
         (('run', 'seed'), ('learner', 'name'), ('weights', 'floor'))
     """
     names = option_names()
-    group, _, own = name.partition(".")
-    if group == "task_options" or (group == "options" and own):
-        meant = ".".join(["task.options", *([own] if own else [])])
+    group, _, key = name.partition(".")
+    if group == "task_options" or (group == "options" and key):
+        meant = ".".join(["task.options", *([key] if key else [])])
         raise ValueError(f"options of the task are written task.options.NAME=VALUE: {meant}, not {name}")
     if now := renamed(name):
         raise ValueError(f"{name} is called {now[0]} now")
-    if own:
+    if key:
         if group not in names:
             home = next((each for each, known in names.items() if group in known and group != "name"), None)
             if home is not None:
                 raise ValueError(f"no option {name!r}: {group} is an option of the group {home}")
             raise ValueError(f"no group {group!r}{what_there_is(group, names, 'groups')}")
-        if own not in names[group]:
-            raise ValueError(f"no option {name!r}{what_there_is(own, names[group], f'options of {group}')}")
-        return group, own
+        if key not in names[group]:
+            raise ValueError(f"no option {name!r}{what_there_is(key, names[group], f'options of {group}')}")
+        return group, key
     if "name" in names.get(name, []):
         return name, "name"
     if name in names:
@@ -144,7 +144,7 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
     if name in TASK_OPTIONS:
         raise ValueError(f"{name} is an option of the task: write task.options.{name}=...")
     short = [known for group, known in names.items() if group not in LONG_ONLY]
-    every = [own for known in short for own in known if own != "name"] + named
+    every = [option for known in short for option in known if option != "name"] + named
     raise ValueError(f"no option {name!r}{nearest(name, every)}; `torchrl-her train -h` lists them")
 
 
@@ -171,13 +171,13 @@ def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
     """
     placed: Nested = {}
     names = option_names()
-    shared = [name for name in values if sum(name in own for own in names.values()) > 1]
+    shared = [name for name in values if sum(name in known for known in names.values()) > 1]
     for name, value in sorted(values.items(), key=lambda item: item[0] in shared):
         if not isinstance(name, str):
             raise ValueError(f"options must be names, got {name!r}")
         if name in (*GROUPS, *FORMER) and isinstance(value, Mapping):
-            for own, each in value.items():
-                group, key = locate(f"{name}.{own}")
+            for inner, each in value.items():
+                group, key = locate(f"{name}.{inner}")
                 placed.setdefault(group, {})[key] = each
             continue
         if value is None and "name" in names.get(name, []):
@@ -186,13 +186,13 @@ def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
             placed.setdefault("curriculum", {})["layers"] = list(value)
             continue
         option, *entry = split_name(name)
-        group, own = locate(option, placed, base or {})
+        group, field = locate(option, placed, base or {})
         if entry:
-            before = placed.get(group, {}).get(own)
+            before = placed.get(group, {}).get(field)
             value = _join(before if isinstance(before, Mapping) else Entries(), {entry[0]: value})
-        elif name in shared and own in placed.get(group, {}):
-            raise ValueError(f"{name} and {group}.{own} set the same option: give one of them")
-        placed.setdefault(group, {})[own] = value
+        elif name in shared and field in placed.get(group, {}):
+            raise ValueError(f"{name} and {group}.{field} set the same option: give one of them")
+        placed.setdefault(group, {})[field] = value
     return placed
 
 
@@ -216,13 +216,13 @@ def over(below: Nested, above: Nested) -> Nested:
         >>> over({"task": {"options": {"bits": 8, "max_steps": 9}}}, place({"task.options.bits": 4}))
         {'task': {'options': {'bits': 4, 'max_steps': 9}}}
     """
-    both = {group: dict(own) for group, own in below.items()}
-    for group, own in above.items():
-        mine = both.setdefault(group, {})
-        for name, value in own.items():
-            before = mine.get(name)
+    both = {group: dict(values) for group, values in below.items()}
+    for group, values in above.items():
+        merged = both.setdefault(group, {})
+        for name, value in values.items():
+            before = merged.get(name)
             keeps = isinstance(value, Entries) and isinstance(before, Mapping)
-            mine[name] = _join(before, value) if keeps else value
+            merged[name] = _join(before, value) if keeps else value
     return both
 
 

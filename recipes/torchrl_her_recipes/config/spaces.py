@@ -157,7 +157,7 @@ def _checked(name: str, values: Any) -> dict[str, Any]:
 
 def _checked_choice(name: str, values: Any) -> list[Any]:
     plain = isinstance(values, list) and all(
-        own is None or isinstance(own, str | int | float) for own in values
+        value is None or isinstance(value, str | int | float) for value in values
     )
     if not plain or not len(values) == len(set(map(repr, values))) in range(2, _MOST + 1):
         needed = f"a list of 2 to {_MOST} different numbers, texts, true or false"

@@ -133,7 +133,8 @@ class Study:
         """Checks a mapping whose entries are sets of options, none of which may be among those that vary."""
         sets = getattr(self, field)
         if not isinstance(sets, Mapping) or not all(
-            isinstance(name, str) and is_name(name) and isinstance(own, Mapping) for name, own in sets.items()
+            isinstance(name, str) and is_name(name) and isinstance(entry, Mapping)
+            for name, entry in sets.items()
         ):
             raise ValueError(f"{field} of {self.name} must hold options {by}; got {sets!r}")
         for name, options in sets.items():
@@ -143,8 +144,8 @@ class Study:
     def combinations(self) -> Iterator[dict[str, Any]]:
         """Yields the options that are specific to each combination, in the order of :meth:`cells`."""
         for values in product(*self.vary.values()):
-            own = dict(zip(self.vary, values, strict=True))
-            yield from ({**own, "case": case} for case in self.cases) if self.cases else (own,)
+            varied = dict(zip(self.vary, values, strict=True))
+            yield from ({**varied, "case": case} for case in self.cases) if self.cases else (varied,)
 
     def cells(self) -> Iterator[tuple[str, Recipe]]:
         """Yields the names and recipes of all combinations; the runs of a recipe are its seeds.
@@ -154,15 +155,15 @@ class Study:
                 a case sets an option that has no effect with what varies.
         """
         before: dict[str, Recipe] = {}
-        for own in self.combinations():
-            case = own.pop("case", "")
-            words = [_word(name, value, self.vary[name]) for name, value in own.items()]
+        for combination in self.combinations():
+            case = combination.pop("case", "")
+            words = [_word(name, value, self.vary[name]) for name, value in combination.items()]
             label = "_".join(word for word in (*words, case) if word).replace("/", "_") or self.name
             if label in before:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
-            for_task = self.for_task.get(_task_of(own.get("task")), {})
+            for_task = self.for_task.get(_task_of(combination.get("task")), {})
             # Unlike options of the whole study, these are never dropped silently.
-            asked = merge(self.cases.get(case, {}), own)
+            asked = merge(self.cases.get(case, {}), combination)
             try:
                 recipe = compose(merge(self.recipe, for_task), asked)
             except ValueError as error:
@@ -190,10 +191,12 @@ def _word(name: str, value: Any, values: Sequence[Any]) -> str:
     """Returns the part of a name for one of an option's ``values``; for mappings, the entries that differ."""
     if all(isinstance(each, Mapping) for each in values):
         entries = {key: [each.get(key) for each in values] for key in value}
-        differing = {key: own for key, own in entries.items() if any(other != own[0] for other in own)}
-        return "_".join(_word(key, value[key], own) for key, own in differing.items())
+        differing = {
+            key: column for key, column in entries.items() if any(other != column[0] for other in column)
+        }
+        return "_".join(_word(key, value[key], column) for key, column in differing.items())
     if isinstance(value, Mapping):
-        return "_".join(_word(name, own, [None]) for own in value.values())
+        return "_".join(_word(name, entry, [None]) for entry in value.values())
     short = name.rpartition(".")[2]
     return str(value) if short in ("task", "algo") else f"{short}={value}"
 
@@ -233,7 +236,7 @@ def load_study(
         if not study.name.strip("."):
             raise ValueError("a study has the name of its file, which must not be a bare suffix")
         shared = merge(load_preset(preset) if preset else {}, study.recipe, asked)
-        for_task = {task: merge(own, asked) for task, own in study.for_task.items()}
+        for_task = {task: merge(options, asked) for task, options in study.for_task.items()}
         study = replace(study, recipe=shared, for_task=for_task)
         cells = list(study.cells())  # raises if a combination is not valid
         combined = dict.fromkeys(curve_label(label, recipe) for label, recipe in cells)
@@ -247,10 +250,10 @@ def load_study(
     return study
 
 
-def _set_in(own: Mapping[str, Any], names: Iterable[str]) -> list[str]:
+def _set_in(options: Mapping[str, Any], names: Iterable[str]) -> list[str]:
     """Returns which of some options are set, by their names within their groups."""
     places = {locate(name) for name in names}
-    return [name for group, values in place(own).items() for name in values if (group, name) in places]
+    return [name for group, values in place(options).items() for name in values if (group, name) in places]
 
 
 def _task_of(task: Any) -> Any:

@@ -35,12 +35,12 @@ def check_versions(installed: Callable[[str], str] = metadata.version) -> None:
     Warns:
         UserWarning: one of them is inside of its range, but a release that was never tried.
     """
-    requirements = {own.name: own for own in map(Requirement, metadata.requires("torchrl-her") or [])}
+    requirements = {entry.name: entry for entry in map(Requirement, metadata.requires("torchrl-her") or [])}
     have = {name: Version(installed(name)) for name in TRIED}
     misfits = [
-        f"{name} {own.public}"
-        for name, own in have.items()
-        if not requirements[name].specifier.contains(own, prereleases=True)
+        f"{name} {version.public}"
+        for name, version in have.items()
+        if not requirements[name].specifier.contains(version, prereleases=True)
     ]
     if misfits:
         verb = "does" if len(misfits) == 1 else "do"
@@ -54,10 +54,10 @@ def check_versions(installed: Callable[[str], str] = metadata.version) -> None:
             f"tensordict {tensordict.public} does not fit torchrl {torchrl.public}; "
             f"install 'tensordict~={torchrl.major}.{torchrl.minor}.0'"
         )
-    for name, own in have.items():
-        if own.public not in TRIED[name]:
+    for name, version in have.items():
+        if version.public not in TRIED[name]:
             warnings.warn(
-                f"{name} {own.public} was never tried with this version of torchrl-her; "
+                f"{name} {version.public} was never tried with this version of torchrl-her; "
                 f"the tests were run with {', '.join(TRIED[name])}",
                 stacklevel=2,
             )

@@ -18,10 +18,12 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
         groups: A recipe, or any object with its groups as attributes.
     """
     idle = {
-        (group, name): why for group, own in vars(groups).items() for name, why in idle_options(own).items()
+        (group, name): why
+        for group, section in vars(groups).items()
+        for name, why in idle_options(section).items()
     }
     for holds, why, options in _rules(groups):
-        for group, _, name in (own.partition(".") for own in options if holds):
+        for group, _, name in (option.partition(".") for option in options if holds):
             idle |= {(group, name): why} if hasattr(getattr(groups, group), name) else {}
     return idle
 
@@ -62,4 +64,4 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
 
 
 def _options(groups: Any, group: str) -> list[str]:
-    return [f"{group}.{own.name}" for own in fields(getattr(groups, group))]
+    return [f"{group}.{option.name}" for option in fields(getattr(groups, group))]
