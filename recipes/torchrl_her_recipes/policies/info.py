@@ -153,14 +153,14 @@ class PolicyInfo:
         Raises:
             ValueError: they do; the message has both.
         """
-        own = describe_env(env)
+        entries = describe_env(env)
         wanted = {"widths": self.widths, "action_shape": self.action_shape}
-        counts = own["high"] == self.high if self.discrete else True
-        if {name: own[name] for name in wanted} != wanted or not counts:
-            theirs = _words(own["widths"], own["action_shape"], own["high"])
+        counts = entries["high"] == self.high if self.discrete else True
+        if {name: entries[name] for name in wanted} != wanted or not counts:
+            offered = _words(entries["widths"], entries["action_shape"], entries["high"])
             raise ValueError(
                 f"a policy of {self.task} cannot play {task}: it has other widths, {self.expects()}, and "
-                f"{task} has {theirs}"
+                f"{task} has {offered}"
             )
 
 
@@ -169,19 +169,19 @@ def describe_env(env: EnvBase) -> dict[str, Any]:
 
     Example:
         >>> from torchrl_her_envs import make_env
-        >>> own = describe_env(make_env("bit_flip", bits=4))
-        >>> own["widths"], own["action_shape"], own["high"]
+        >>> entries = describe_env(make_env("bit_flip", bits=4))
+        >>> entries["widths"], entries["action_shape"], entries["high"]
         ({'observation': 4, 'desired_goal': 4}, (), (3.0,))
     """
     task, action = goal_env(env), env.action_spec_unbatched
     shown = task.observation_spec
-    own = {"widths": {key: int(shown[key].shape[-1]) for key in KEYS}}
+    entries = {"widths": {key: int(shown[key].shape[-1]) for key in KEYS}}
     if isinstance(action, Categorical):
         whole = {"action_dtype": "int64", "task_dtype": "int64"}
-        return {**own, **whole, "action_shape": (), "low": (0.0,), "high": (float(action.space.n - 1),)}
+        return {**entries, **whole, "action_shape": (), "low": (0.0,), "high": (float(action.space.n - 1),)}
     low, high = task.action_limits()
     return {
-        **own,
+        **entries,
         "action_shape": tuple(action.shape),
         "task_dtype": str(low.dtype).removeprefix("torch."),
         "low": tuple(low.double().tolist()),

@@ -65,8 +65,8 @@ def training_command(recipe: Recipe) -> str:
         'torchrl-her train task=hand_v1 algo=cher seed=3'
     """
     words, changed = [], recipe.changed()
-    for group, own in recipe.to_dict().items():
-        for name, value in own.items():
+    for group, values in recipe.to_dict().items():
+        for name, value in values.items():
             named = name == "name" and group in GROUPS
             always = (group, name) in (("task", "name"), ("hindsight", "algo"), ("run", "seed"))
             if always or name in changed.get(group, {}):

@@ -65,7 +65,7 @@ def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> Non
     Shapes come from a file, so they are compared before memory is taken for them.
     """
     name = builder.options.name
-    own = {key: tuple(value.shape) for key, value in weights.items()}
+    shapes = {key: tuple(value.shape) for key, value in weights.items()}
     if builder.options.depth > len(weights):
         raise ValueError(f"these are not the weights of an actor of learner={name}")
     with torch.device("meta"):  # without memory: only the shapes matter
@@ -73,11 +73,11 @@ def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> Non
         wanted = {
             key: tuple(value.shape) for key, value in acting(actor, builder.norm()).state_dict().items()
         }
-    if own != wanted:
-        odd = next(key for key in {**wanted, **own} if own.get(key) != wanted.get(key))
+    if shapes != wanted:
+        odd = next(key for key in {**wanted, **shapes} if shapes.get(key) != wanted.get(key))
         raise ValueError(
             f"these are not the weights of an actor of learner={name}: {odd} must be "
-            f"{wanted.get(odd, 'missing')}, got {own.get(odd, 'nothing')}"
+            f"{wanted.get(odd, 'missing')}, got {shapes.get(odd, 'nothing')}"
         )
     if odd := [key for key, value in weights.items() if not value.isfinite().all()]:
         raise ValueError(f"weights must be finite, got others in {odd[0]}")
@@ -128,8 +128,8 @@ class TensorPolicy(nn.Module):
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
         norm = policy.norm if isinstance(policy, NormalizedPolicy) else None
-        own: Any = policy.actor if isinstance(policy, NormalizedPolicy) else policy
-        self.net: Any = copy.deepcopy(own.module).float().eval()
+        actor: Any = policy.actor if isinstance(policy, NormalizedPolicy) else policy
+        self.net: Any = copy.deepcopy(actor.module).float().eval()
         self.normalizes = norm is not None
         if norm is not None:
             for key in KEYS:
@@ -141,7 +141,7 @@ class TensorPolicy(nn.Module):
         if not self.normalizes:
             return list(inputs)
         constants = [[getattr(self, f"{key}_{name}") for name in _CONSTANTS] for key in KEYS]
-        return [normalize(value, *own) for value, own in zip(inputs, constants, strict=True)]
+        return [normalize(value, *stats) for value, stats in zip(inputs, constants, strict=True)]
 
     def forward(self, observation: Tensor, desired_goal: Tensor) -> Tensor:
         """Maps inputs [rows, width] to actions [rows, actions], or to integers [rows]."""

@@ -79,9 +79,9 @@ def write_onnx(
         OSError: The file cannot be written.
     """
     runtime = need_onnx()
-    path, own = Path(path), TensorPolicy(policy)
+    path, module = Path(path), TensorPolicy(policy)
     info = replace(info, dtype="float32", action_dtype="int64" if info.discrete else "float32")
-    proto = _graph_of(own, info)
+    proto = _graph_of(module, info)
     for name, facts in (("card", info.to_dict()), ("recipe", recipe.to_dict())):
         proto.metadata_props.add(key=f"torchrl_her.{name}", value=json.dumps(facts))
     seen = {key: states[key].reshape(-1, info.widths[key]).float() for key in KEYS}
@@ -89,16 +89,16 @@ def write_onnx(
         part.write_bytes(model := proto.SerializeToString())
         session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
         (action,) = session.run(["action"], {key: value.numpy() for key, value in seen.items()})
-        _check_actions(own, torch.from_numpy(action), info, seen)
+        _check_actions(module, torch.from_numpy(action), info, seen)
     return info
 
 
-def _check_actions(own: TensorPolicy, action: Tensor, info: PolicyInfo, seen: dict[str, Tensor]) -> None:
+def _check_actions(module: TensorPolicy, action: Tensor, info: PolicyInfo, seen: dict[str, Tensor]) -> None:
     """Raises a ValueError if actions differ from the policy's by more than :data:`TOLERANCE`.
 
     Of integers, the values are compared: two actions may have the same value.
     """
-    worst = float(own.deviation(action, *seen.values()).nan_to_num(torch.inf).max())
+    worst = float(module.deviation(action, *seen.values()).nan_to_num(torch.inf).max())
     scale = max([1.0, *(abs(side) for side in (*info.low, *info.high) if abs(side) < float("inf"))])
     limit = TOLERANCE * (1.0 if info.discrete else scale)
     if not worst <= limit:
@@ -109,13 +109,13 @@ def _check_actions(own: TensorPolicy, action: Tensor, info: PolicyInfo, seen: di
         )
 
 
-def _graph_of(own: TensorPolicy, info: PolicyInfo) -> Any:
+def _graph_of(module: TensorPolicy, info: PolicyInfo) -> Any:
     """Converts the policy to a protobuf without traces of the machine that made it."""
     inputs = tuple(torch.zeros(2, info.widths[key]) for key in KEYS)  # 2 rows: torch takes 1 for a constant
     batch = torch.export.Dim("batch")
     with _silent():
         program = torch.onnx.export(
-            own,
+            module,
             inputs,
             dynamo=True,
             dynamic_shapes=tuple({0: batch} for _ in KEYS),

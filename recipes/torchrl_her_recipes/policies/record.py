@@ -111,16 +111,16 @@ def _play(
     reward, parts = reward_range(goal_env(env))[1], []
     kept = played = achieved = 0
     while kept < episodes and played < _MOST * episodes:
-        own = demonstrate(env, player, max_steps=goal_env(env).max_steps, achieved_reward=reward)
-        own = own.select(range(min(len(own), (episodes if keep_all else _MOST * episodes) - played)))
-        good = own.achieved.nonzero().flatten()
+        batch = demonstrate(env, player, max_steps=goal_env(env).max_steps, achieved_reward=reward)
+        batch = batch.select(range(min(len(batch), (episodes if keep_all else _MOST * episodes) - played)))
+        good = batch.achieved.nonzero().flatten()
         if not keep_all and len(good) >= episodes - kept:  # later episodes are dropped
             good = good[: episodes - kept]
-            own = own.select(range(int(good[-1]) + 1))
-        played, achieved = played + len(own), achieved + len(good)
-        kept += len(own) if keep_all else len(good)
+            batch = batch.select(range(int(good[-1]) + 1))
+        played, achieved = played + len(batch), achieved + len(good)
+        kept += len(batch) if keep_all else len(good)
         if keep_all or len(good):
-            parts.append(own if keep_all else own.select(good))
+            parts.append(batch if keep_all else batch.select(good))
     if kept < episodes:
         raise ValueError(
             f"only {achieved} of {played} episodes of {name} by {facts['policy']} achieved their goal: "

@@ -80,12 +80,12 @@ class Viewer:
     @property
     def running(self) -> bool:
         """Whether an episode is still open."""
-        return any(own.running for own in self._episodes)
+        return any(episodes.running for episodes in self._episodes)
 
     @property
     def step_count(self) -> int:
         """Steps since the start of these episodes."""
-        return max(own.step_count for own in self._episodes)
+        return max(episodes.step_count for episodes in self._episodes)
 
     @property
     def max_steps(self) -> int:
@@ -107,8 +107,8 @@ class Viewer:
         """Achieved goals of each policy since the first start, and the number of ended episodes."""
         pairs = zip(self._before, self._episodes, strict=True)
         return [
-            Seen(before.achieved + own.achieved, before.goals + own.worlds - len(own.running))
-            for before, own in pairs
+            Seen(before.achieved + episodes.achieved, before.goals + episodes.worlds - len(episodes.running))
+            for before, episodes in pairs
         ]
 
     def start(self) -> None:
@@ -116,23 +116,23 @@ class Viewer:
         if self._round >= 0:
             self._before = self.seen
         self._round += 1
-        for own in self._episodes:
-            own.start(seed=self.view.seed + self._round)
+        for episodes in self._episodes:
+            episodes.start(seed=self.view.seed + self._round)
 
     def step(self) -> None:
         """Takes a step with each policy that has open episodes."""
-        for own in self._episodes:
-            own.step()
+        for episodes in self._episodes:
+            episodes.step()
 
     def frame(self) -> Tensor:
         """Returns the present picture [height, width, 3] of uint8."""
         if self._labels is None:
-            return beside([own.frame for own in self._episodes], gap=_GAP)
+            return beside([episodes.frame for episodes in self._episodes], gap=_GAP)
         shown = zip(self._episodes, self._labels, self.seen, strict=True)
         return beside(
             [
-                underlined(own.frame, [label, f"{seen.achieved} of {seen.goals} achieved"])
-                for own, label, seen in shown
+                underlined(episodes.frame, [label, f"{seen.achieved} of {seen.goals} achieved"])
+                for episodes, label, seen in shown
             ],
             gap=_GAP,
         )
@@ -159,11 +159,11 @@ def _check_comparable(policies: Sequence[Policy]) -> None:
     """Refuses policies of different tasks: with the same seeds they would not have the same goals."""
     first, *others = policies
     for other in others:
-        ours, theirs = _described(_task_of(first)), _described(_task_of(other))
-        if ours != theirs:
+        first_task, other_task = _described(_task_of(first)), _described(_task_of(other))
+        if first_task != other_task:
             raise ValueError(
-                f"only policies of the same task can be compared: {first.source} plays {ours}, and "
-                f"{other.source} plays {theirs}"
+                f"only policies of the same task can be compared: {first.source} plays {first_task}, and "
+                f"{other.source} plays {other_task}"
             )
 
 
@@ -174,10 +174,10 @@ def _task_of(policy: Policy) -> TaskConfig:
 def _described(task: TaskConfig) -> str:
     """Describes a task and its options that differ from their defaults, in words."""
     usual: dict[str, Any] = dict(get_task_spec(task.name).options)
-    own = {**usual, **(task.options or {})}
+    options = {**usual, **(task.options or {})}
     if task.threshold is not None:
-        own["threshold"] = task.threshold
-    other = [f"{name}={value}" for name, value in sorted(own.items()) if value != usual.get(name)]
+        options["threshold"] = task.threshold
+    other = [f"{name}={value}" for name, value in sorted(options.items()) if value != usual.get(name)]
     return " ".join([task.name, *other])
 
 

@@ -140,10 +140,10 @@ class Viewing:
 
     def status(self) -> str:
         """Describes goals, step and speed in a line."""
-        own, goals, first = self._viewer, self._viewer.view.goals, self._viewer.first_goal
+        viewer, goals, first = self._viewer, self._viewer.view.goals, self._viewer.first_goal
         which = f"goal {first}{self._where()}" if goals == 1 else f"goals {first} to {first + goals - 1}"
         speed = "paused" if self.paused else f"{self.rate} steps a second"
-        return f"{which}, step {own.step_count} of {own.max_steps}, {speed}"
+        return f"{which}, step {viewer.step_count} of {viewer.max_steps}, {speed}"
 
     def _where(self) -> str:
         """Formats the coordinates of the goal, if there are few."""

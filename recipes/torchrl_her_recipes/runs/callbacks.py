@@ -127,9 +127,9 @@ class EarlyStopping(Callback):
 
     def _is_good(self, values: Iterable[float]) -> bool:
         if self.at_least is not None:
-            return statistics.median(-math.inf if math.isnan(own) else own for own in values) >= self.at_least
+            return statistics.median(-math.inf if math.isnan(v) else v for v in values) >= self.at_least
         assert self.at_most is not None
-        return statistics.median(math.inf if math.isnan(own) else own for own in values) <= self.at_most
+        return statistics.median(math.inf if math.isnan(v) else v for v in values) <= self.at_most
 
 
 class Stopped(Exception):

@@ -31,7 +31,7 @@ def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDic
     played = [evaluate(env, player, max_steps=task.max_steps) for _ in range(rounds)]
     if rounds == 1:
         return played[0]
-    return torch.cat([own.unflatten(0, (runs, worlds)) for own in played], 1)[:, :episodes].flatten(0, 1)
+    return torch.cat([batch.unflatten(0, (runs, worlds)) for batch in played], 1)[:, :episodes].flatten(0, 1)
 
 
 def layer_success(
@@ -44,8 +44,8 @@ def layer_success(
     if state.layer_env is None or not bool(below.any()):
         return full
     played = play_greedily(components, state.layer_env, epoch)
-    own = at_the_end(played, played["next", "terminated"].squeeze(-1)).float().view(runs, -1)
-    return torch.where(below.unsqueeze(1), own, full)
+    in_layer = at_the_end(played, played["next", "terminated"].squeeze(-1)).float().view(runs, -1)
+    return torch.where(below.unsqueeze(1), in_layer, full)
 
 
 def move_on(components: Components, state: CurriculumState, samples: Tensor, frames: int) -> list[str]:

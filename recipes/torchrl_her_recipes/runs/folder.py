@@ -204,7 +204,7 @@ def remember(config: Path, task: str) -> None:
     """
     if not foreign_module(task):
         return
-    known = {path: own for path, own in _known().items() if Path(path).is_file()}
+    known = {path: digest for path, digest in _known().items() if Path(path).is_file()}
     known[str(config.resolve())] = _digest(config)
     try:
         _state_file().parent.mkdir(parents=True, exist_ok=True)

@@ -60,7 +60,7 @@ class GoalMap:
             ValueError: there are none, or they are not those of a map; the message names the file.
         """
         if counts is None or target is None or counts.ndim < 2 or counts.shape[1:] != target.shape:
-            got = [None if own is None else list(own.shape) for own in (counts, target)]
+            got = [None if array is None else list(array.shape) for array in (counts, target)]
             raise ValueError(
                 f"{path} is damaged: it must hold counts of the shape [runs, *target], got {got}"
             )
@@ -69,11 +69,11 @@ class GoalMap:
 
 def goal_map(buffer: TensorDictReplayBuffer, target: torch.Tensor | None) -> GoalMap | None:
     """Returns the map of the runs' virtual goals and their q* [cells]; None if goals are not counted."""
-    counted = [own for own in buffer.writer.goal_weights if isinstance(own, GoalHistogram)]
+    counted = [weights for weights in buffer.writer.goal_weights if isinstance(weights, GoalHistogram)]
     if not counted or target is None:
         return None
     shape = counted[0].grid.shape
-    counts = torch.stack([own.counts.view(shape) for own in counted])
+    counts = torch.stack([histogram.counts.view(shape) for histogram in counted])
     return GoalMap(counts.cpu().numpy(), target.view(shape).cpu().numpy())
 
 

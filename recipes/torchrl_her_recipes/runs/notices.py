@@ -59,14 +59,14 @@ def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) ->
         runs.setdefault(row["run"], []).append(row)
     rules = [_nothing_achieved, _nothing_to_relabel, _saturated, _beyond(bounds), _fallen]
     lines = [
-        f"seed {own[-1]['seed']:.0f}: {said}"
-        for own in runs.values()
+        f"seed {run[-1]['seed']:.0f}: {said}"
+        for run in runs.values()
         for rule in rules
-        if (said := rule(own, recipe)) and not any(rule(own[:end], recipe) for end in range(1, len(own)))
+        if (said := rule(run, recipe)) and not any(rule(run[:end], recipe) for end in range(1, len(run)))
     ]
     every = list(runs.values())
     if _differ(every) and not any(
-        _differ([own[:end] for own in every]) for end in range(_LONG, len(every[0]))
+        _differ([run[:end] for run in every]) for end in range(_LONG, len(every[0]))
     ):
         lines.append(_DIFFER)
     return lines
@@ -170,7 +170,7 @@ _DIFFER = (
 
 
 def _differ(runs: Sequence[Sequence[Row]]) -> bool:
-    last = [[row["success"] for row in own[-_LONG:]] for own in runs]
+    last = [[row["success"] for row in run[-_LONG:]] for run in runs]
     full = min(map(len, last)) == _LONG
     return full and all(max(epoch) - min(epoch) > _LITTLE for epoch in zip(*last, strict=True))
 

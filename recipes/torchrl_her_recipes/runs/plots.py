@@ -107,9 +107,9 @@ def colors(labels: Sequence[str]) -> dict[str, str]:
         >>> colors(["her", "window=20"])
         {'her': '#dd6b20', 'window=20': '#805ad5'}
     """
-    own = {label: COLORS[label] for label in labels if label in COLORS}
-    left = cycle([color for color in COLORS.values() if color not in own.values()] or COLORS.values())
-    return {label: own.get(label) or next(left) for label in labels}
+    fixed = {label: COLORS[label] for label in labels if label in COLORS}
+    left = cycle([color for color in COLORS.values() if color not in fixed.values()] or COLORS.values())
+    return {label: fixed.get(label) or next(left) for label in labels}
 
 
 def draw_curves(axes: Axes, curves: Mapping[str, Rows], name: str, palette: Mapping[str, str]) -> None:

@@ -97,17 +97,18 @@ def run(
         >>> result.stopped, [row["frames"] for row in result.rows]
         (True, [320, 640])
     """
-    own = _Run(components, None if folder is None else RunFolder(folder))
+    current = _Run(components, None if folder is None else RunFolder(folder))
     with torch.random.fork_rng(devices=[]), ExitStack() as stack:
         # Losses and policies of TorchRL draw from torch's own generator.
         torch.manual_seed(components.recipe.run.seed)
-        if own.home is not None:
+        if current.home is not None:
             check_installed(components.recipe.run.log)
-            own.home.create()
-            stack.enter_context(own.home.at_work())
-            own.save(own.home, goals=False)  # before config.yaml is written: a folder with one can be resumed
-            own.home.describe(components.recipe)
-        return own.train(callbacks, progress=progress)
+            current.home.create()
+            stack.enter_context(current.home.at_work())
+            # Saved before config.yaml is written: a folder with one can be resumed.
+            current.save(current.home, goals=False)
+            current.home.describe(components.recipe)
+        return current.train(callbacks, progress=progress)
 
 
 def run_score(
@@ -192,19 +193,19 @@ def resume(
                 f"epochs must be at least {done}, as many as the run in {home.path} has done, "
                 f"got {wanted.run.epochs}"
             )
-        own = _Run(components or build(wanted), home)
+        current = _Run(components or build(wanted), home)
         with torch.random.fork_rng(devices=[]):
             with naming(home.checkpoint, "is not of this run"):
-                load_run_state(own.parts, state)
+                load_run_state(current.parts, state)
             if options:
-                home.describe(own.recipe)
+                home.describe(current.recipe)
             home.policy.unlink(missing_ok=True)  # a policy of an earlier stop: it marks finished runs
-            if own.best.state is None:
+            if current.best.state is None:
                 # It may be newer than the checkpoint, as the last rows may be.
                 home.best.unlink(missing_ok=True)
-            own.save_best(home)
-            own.rows, own.has_buffer = home.rows()[: done * own.recipe.run.num_runs], has_buffer
-            return own.train(callbacks, progress=progress)
+            current.save_best(home)
+            current.rows, current.has_buffer = home.rows()[: done * current.recipe.run.num_runs], has_buffer
+            return current.train(callbacks, progress=progress)
 
 
 class _Run:
@@ -239,16 +240,16 @@ class _Run:
             def on_batch(_trainer: Trainer) -> None:
                 shown.batch()
                 check()
-                wanted = [own.on_batch(view) for own in hooks]  # calls all of them, also after a True
+                wanted = [hook.on_batch(view) for hook in hooks]  # calls all of them, also after a True
                 if any(wanted):
                     raise Stopped
 
             try:
-                for own in hooks:
-                    own.on_start(view)
+                for hook in hooks:
+                    hook.on_start(view)
                 while not self.has_ended and not stopped:
                     self.epoch(on_batch, shown)
-                    asked = [own.on_epoch(view) for own in hooks]
+                    asked = [hook.on_epoch(view) for hook in hooks]
                     stopped = any(asked)
                     for line in notices(rows, recipe, self.components.bounds):
                         shown.say(line)
@@ -270,8 +271,8 @@ class _Run:
                 if not saved:
                     self.save(home)
                 self.finish(home)
-            for own in hooks:
-                own.on_end(view)
+            for hook in hooks:
+                hook.on_end(view)
         return RunResult(
             rows=rows,
             folder=None if home is None else home.path,

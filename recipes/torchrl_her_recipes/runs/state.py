@@ -74,8 +74,10 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             partial(buffer_state_dict, buffer, copy=False), partial(load_buffer_state_dict, buffer)
         ),
         "generators": Part(
-            lambda: [own.get_state() for own in generators],
-            lambda states: [own.set_state(state) for own, state in zip(generators, states, strict=True)],
+            lambda: [generator.get_state() for generator in generators],
+            lambda states: [
+                generator.set_state(state) for generator, state in zip(generators, states, strict=True)
+            ],
         ),
         # For losses that draw random numbers, as SAC's.
         "torch_generator": Part(torch.get_rng_state, torch.set_rng_state),

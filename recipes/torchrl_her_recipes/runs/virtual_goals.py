@@ -54,8 +54,8 @@ def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> l
             every[run] = goals[torch.arange(number) % len(goals)]
         asking.set_active(found[-1], run=run)
         asking.memory.clear(run)
-        if (own := asking.generators[run]) is not None:
-            own.manual_seed(seed)
+        if (generator := asking.generators[run]) is not None:
+            generator.manual_seed(seed)
     asking.memory.add(every.flatten(0, 1), torch.zeros(every[..., 0].numel(), seen))
     return found
 
@@ -79,4 +79,4 @@ def _asking(env: EnvBase) -> BehaviorGoals:
     """Finds the transform of an environment that proposes goals."""
     transform = env.transform
     parts = transform if isinstance(transform, Compose) else [transform]
-    return next(own for own in parts if isinstance(own, BehaviorGoals))
+    return next(part for part in parts if isinstance(part, BehaviorGoals))

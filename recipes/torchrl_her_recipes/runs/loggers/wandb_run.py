@@ -51,11 +51,11 @@ def open_wandb(run: RunView, _frames: int) -> tuple[WandbRun, int]:
         )
     except wandb.errors.UsageError as error:
         raise ValueError(f"{error} Without an account, set WANDB_MODE=offline.") from error
-    own = logger.experiment
-    if own.offline:
-        _remove_others(home / "wandb", Path(own.dir).parent)
+    experiment = logger.experiment
+    if experiment.offline:
+        _remove_others(home / "wandb", Path(experiment.dir).parent)
         return logger, 0
-    return logger, max(own.starting_step - 1, 0)
+    return logger, max(experiment.starting_step - 1, 0)
 
 
 def _remove_others(home: Path, current: Path) -> None:
@@ -67,9 +67,9 @@ def _remove_others(home: Path, current: Path) -> None:
 
 def remembered(path: Path) -> str:
     """Reads the id of a run from a file; makes and writes a new one if there is none."""
-    if path.is_file() and (own := path.read_text().strip()):
-        return own
-    own = uuid.uuid4().hex[:12]
+    if path.is_file() and (run_id := path.read_text().strip()):
+        return run_id
+    run_id = uuid.uuid4().hex[:12]
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, own)
-    return own
+    write_text(path, run_id)
+    return run_id
