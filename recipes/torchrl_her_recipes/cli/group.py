@@ -45,8 +45,8 @@ class _Commands(click.Group):
             known = self.list_commands(ctx)
             raise click.UsageError(f"unknown command {args[0]!r}{what_there_is(args[0], known, 'commands')}")
         name, command, rest = super().resolve_command(ctx, args)
-        if command is not None and any(own.name == "folder" for own in command.params):
-            rest = [f"--{own}" if own.startswith("folder=") else own for own in rest]
+        if command is not None and any(parameter.name == "folder" for parameter in command.params):
+            rest = [f"--{argument}" if argument.startswith("folder=") else argument for argument in rest]
         return name, command, rest
 
     def list_commands(self, ctx: click.Context) -> list[str]:

@@ -129,9 +129,9 @@ def export(
     file = out or _file_of(source, task, f".{form or 'safetensors'}")
     if form is not None and file.suffix != f".{form}":
         raise ValueError(f"a file of format={form} must have the suffix .{form}, got {file.name!r}")
-    own = recipes.export_policy(source, file, run=index, task=task, best=best, card=card).info
-    touched = f" (reached at some step {own.reached:.0%})" if own.reached > own.success else ""
-    click.echo(f"seed {own.seed}, success {own.success:.0%}{touched} on {own.task}: {file}")
+    info = recipes.export_policy(source, file, run=index, task=task, best=best, card=card).info
+    touched = f" (reached at some step {info.reached:.0%})" if info.reached > info.success else ""
+    click.echo(f"seed {info.seed}, success {info.success:.0%}{touched} on {info.task}: {file}")
     return 0
 
 

@@ -35,9 +35,9 @@ def record(
     recorded = recipes.record_demonstrations(
         task, file, episodes=episodes, policy=policy, seed=seed, keep_all=keep_all, force=force
     )
-    own = recorded.demonstrations
+    demos = recorded.demonstrations
     click.echo(
-        f"{recorded.achieved} of {recorded.played} episodes achieved their goal; {len(own)} of them with "
-        f"{len(own.rows):,} transitions are in {file}"
+        f"{recorded.achieved} of {recorded.played} episodes achieved their goal; {len(demos)} of them with "
+        f"{len(demos.rows):,} transitions are in {file}"
     )
     return 0

@@ -53,18 +53,18 @@ def study(
         raise click.UsageError("--jobs and --ray cannot be given together")
     if gpus_per_job and ray is None:
         raise click.UsageError("--gpus-per-job needs --ray: on one machine, jobs share its GPUs as they are")
-    own = load_study(name, seeds=seeds, frames=frames, quick=quick)
-    home = folder or Path("runs") / (own.name + ("_quick" if quick else ""))
-    to_do = recipes.plan_study(own, home)
+    loaded = load_study(name, seeds=seeds, frames=frames, quick=quick)
+    home = folder or Path("runs") / (loaded.name + ("_quick" if quick else ""))
+    to_do = recipes.plan_study(loaded, home)
     workers: Any = recipes.make_workers(jobs=jobs, ray=ray, gpus_per_job=gpus_per_job)
     left = to_do.to_go
     steps = f"{to_do.steps_to_go(left):,} environment steps in all"
-    click.echo(f"{own.name}: {len(left)} batched runs to go, {steps}: {home}")
+    click.echo(f"{loaded.name}: {len(left)} batched runs to go, {steps}: {home}")
     click.echo("\n".join(to_do.table(workers.at_once)))
     if plan:
         workers.close()
         return 0
-    result = recipes.run_study(own, home, workers=workers)
+    result = recipes.run_study(loaded, home, workers=workers)
     say_result(result)
     if result.figure is not None:
         click.echo(result.figure)
@@ -101,14 +101,14 @@ def report(names: tuple[str, ...], folder: Path | None, out: Path | None, tidy: 
         return _report_runs([Path(name) for name in names], folder, out, tidy)
     if len(names) > 1:
         raise ValueError(f"a page is about one study or about folders of runs, got {', '.join(names)}")
-    own = load_study(names[0])
-    home = folder or Path("runs") / own.name
+    loaded = load_study(names[0])
+    home = folder or Path("runs") / loaded.name
     if not home.is_dir():
-        raise ValueError(f"there is no folder {home}; `torchrl-her study {own.name}` makes its runs")
+        raise ValueError(f"there is no folder {home}; `torchrl-her study {loaded.name}` makes its runs")
     if tidy is not None:
-        recipes.write_results(own, home, tidy)
+        recipes.write_results(loaded, home, tidy)
         click.echo(tidy)
-    click.echo(recipes.write_report(own, home, out or home / "report"))
+    click.echo(recipes.write_report(loaded, home, out or home / "report"))
     return 0
 
 

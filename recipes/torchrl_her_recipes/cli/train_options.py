@@ -84,13 +84,13 @@ def _pairs(options: tuple[str, ...]) -> list[tuple[str, str]]:
 
 
 def _recipe(values: Mapping[str, Any]) -> Recipe:
-    own = dict(values)
-    preset = own.pop("preset", None)
+    options = dict(values)
+    preset = options.pop("preset", None)
     base = load_preset(preset) if preset else None
     if not str(preset).endswith((".yaml", ".yml")):
-        return make_recipe(base, **own)
+        return make_recipe(base, **options)
     with naming(Path(str(preset)), "and the options beside it do not work"):
-        return make_recipe(base, **own)
+        return make_recipe(base, **options)
 
 
 def label(recipe: Recipe) -> str:
@@ -119,13 +119,16 @@ def _rows(group: str) -> Iterator[tuple[str, str]]:
         known = f"one of {', '.join(kind)}; `torchrl-her list` describes them"
         yield _written(group, "name", kind.default), known
     first, *_ = choices = choices_of(group)
-    plain = {_written(group, own.name, own.default): own.metadata["help"] for own in fields(choices[first])}
+    plain = {
+        _written(group, option.name, option.default): option.metadata["help"]
+        for option in fields(choices[first])
+    }
     yield from plain.items()
     others: dict[tuple[str, str], list[str]] = {}
     for name, choice in choices.items():
-        for own in fields(choice):
-            if (written := _written(group, own.name, own.default)) not in plain:
-                others.setdefault((written, own.metadata["help"]), []).append(name)
+        for option in fields(choice):
+            if (written := _written(group, option.name, option.default)) not in plain:
+                others.setdefault((written, option.metadata["help"]), []).append(name)
     for (written, help), names in others.items():
         yield written, f"{help} ({', '.join(names)})"
 
@@ -143,19 +146,21 @@ def complete(_context: click.Context, _parameter: click.Parameter, incomplete: s
     options = option_names()
     name, equals, begun = incomplete.partition("=")
     if equals:
-        return [CompletionItem(f"{name}={own}") for own in _values().get(name, []) if own.startswith(begun)]
+        return [
+            CompletionItem(f"{name}={value}") for value in _values().get(name, []) if value.startswith(begun)
+        ]
     short = {group: names for group, names in options.items() if group not in LONG_ONLY}
-    known = [own for names in short.values() for own in names if own != "name"]
+    known = [option for names in short.values() for option in names if option != "name"]
     names = ["task", "algo", "curriculum", *KINDS, *ARGUMENTS, *known]
     if "." in name:
-        names = [f"{group}.{own}" for group, own_names in options.items() for own in own_names]
-    return [CompletionItem(f"{own}=") for own in dict.fromkeys(names) if own.startswith(name)]
+        names = [f"{group}.{option}" for group, own_names in options.items() for option in own_names]
+    return [CompletionItem(f"{option}=") for option in dict.fromkeys(names) if option.startswith(name)]
 
 
 def _values() -> dict[str, list[str]]:
     """Returns the possible values of options that are names or one of a few choices."""
     classes = [kind for group in GROUPS for kind in reversed(choices_of(group).values())]
-    choices = {own.name: list(own.metadata["choices"]) for kind in classes for own in fields(kind)}
+    choices = {option.name: list(option.metadata["choices"]) for kind in classes for option in fields(kind)}
     return {**choices, **{group: list(kind) for group, kind in KINDS.items()}} | {
         "task": task_names(),
         "algo": list(ALGORITHMS),

@@ -179,12 +179,12 @@ def _networks(
             alone.append([single, *others])
         actor, critics = builder.networks(len(seeds))
     networks = [actor, *critics]
-    for network, own in zip(networks, zip(*alone, strict=True), strict=True):
-        network.load_state_dict(stack_runs([single.state_dict() for single in own]))
+    for network, singles in zip(networks, zip(*alone, strict=True), strict=True):
+        network.load_state_dict(stack_runs([single.state_dict() for single in singles]))
     if curriculum is not None:
         alphas = [options.alpha_actor, *[options.alpha_critic] * len(critics)]
         for network, alpha in zip(networks, alphas, strict=True):
-            first = next(own for own in network.modules() if isinstance(own, StackedLinear))
+            first = next(module for module in network.modules() if isinstance(module, StackedLinear))
             weight = first.weight.data
             weight.copy_(zero_unused_inputs(weight, curriculum.first_inputs, alpha=alpha))
     return actor, critics

@@ -51,8 +51,12 @@ def build(recipe: Recipe) -> Components:
     eval_env = played()
     devices = devices_of(recipe.learner, recipe.replay, recipe.run.num_runs)
     generators = make_generators(recipe.seeds, devices.replay)
-    own = generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
-    agent = make_agent(recipe, eval_env, own, rewards=bounds, state=state, device=devices.learner)
+    learner_generators = (
+        generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
+    )
+    agent = make_agent(
+        recipe, eval_env, learner_generators, rewards=bounds, state=state, device=devices.learner
+    )
     behavior = make_behavior(recipe, task, agent, rewards=rewards, state=state)
     progress = None if state is None else state.progress
     env = in_layers(
@@ -79,7 +83,7 @@ def build(recipe: Recipe) -> Components:
         collector=collector,
         buffer=replay(devices=devices),
         goal_target=space.target if isinstance(space, GoalSpace) else None,
-        generators=generators if own is generators else [*generators, *own],
+        generators=generators if learner_generators is generators else [*generators, *learner_generators],
         rewards=rewards,
         bounds=bounds,
         curriculum=state,

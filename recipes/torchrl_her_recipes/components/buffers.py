@@ -93,7 +93,7 @@ def make_buffer(
             redraw=recipe.hindsight.redraw,
             refill=recipe.hindsight.refill if recipe.filters else 1,
             achieved_reward=rewards[1],
-            weights=[own for own in weights if own is not None] or None,
+            weights=[weight for weight in weights if weight is not None] or None,
             exclude=_NOT_STORED,
             runs=runs,
             generators=generators,

@@ -29,9 +29,11 @@ def join(address: str) -> bool:
         ConnectionError: there is none, or this process is part of another one.
     """
     if ray.is_initialized():
-        own = ray.get_runtime_context().gcs_address
-        if address not in ("auto", own):
-            raise ConnectionError(f"this process is part of the Ray cluster at {own} already, not {address}")
+        current = ray.get_runtime_context().gcs_address
+        if address not in ("auto", current):
+            raise ConnectionError(
+                f"this process is part of the Ray cluster at {current} already, not {address}"
+            )
         return False
     try:
         if ":" in address:  # Ray itself would try for minutes

@@ -73,7 +73,7 @@ class SyncWorkers(MultiSyncCollector):
         if self._batch is not None:
             self._batch.result()
             self._batch = None
-        self.map_fn("begin", [(own,) for own in beginnings])
+        self.map_fn("begin", [(beginning,) for beginning in beginnings])
 
     def ahead(self, weights: TensorDictBase) -> None:
         """Lets them collect the next batch with these weights of the policy, unless they do already."""
@@ -108,7 +108,7 @@ class AsyncWorkers(MultiAsyncCollector):
             for _ in range(self.num_workers):
                 _get(self._get_from_queue, self.procs)
             self.running, self._iterator = False, None
-        self.map_fn("begin", [(own,) for own in beginnings])
+        self.map_fn("begin", [(beginning,) for beginning in beginnings])
 
     def ahead(self, weights: TensorDictBase) -> None:
         """Does nothing: the processes always collect ahead."""
@@ -188,7 +188,9 @@ class ProcessCollector(BaseCollector):
             if self._workers is None:
                 self._workers = self._start()
             self.resets += 1
-            self._workers.begin([self._beginning(own) for own in range(self.recipe.collection.processes)])
+            self._workers.begin(
+                [self._beginning(process) for process in range(self.recipe.collection.processes)]
+            )
 
     def shutdown(
         self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True
@@ -276,7 +278,7 @@ def _check_main_script(asked: str) -> None:
     path = getattr(sys.modules["__main__"], "__file__", None)
     if path is None or multiprocessing.get_start_method(allow_none=True) == "fork":
         return
-    guards = (own.test for own in ast.parse(Path(path).read_bytes()).body if isinstance(own, ast.If))
+    guards = (node.test for node in ast.parse(Path(path).read_bytes()).body if isinstance(node, ast.If))
     if not any("__name__" in ast.unparse(guard) for guard in guards):
         raise RuntimeError(
             f"{asked} starts processes that import {path}: put what trains there under "
@@ -348,8 +350,8 @@ def _end(workers: Workers) -> None:
 
 
 def _end_if_there(workers: weakref.ref[Any]) -> None:
-    if (own := workers()) is not None:
-        _end(own)
+    if (alive := workers()) is not None:
+        _end(alive)
 
 
 @contextmanager

@@ -58,7 +58,9 @@ class NodeWorkers(RayCollector):
         sync: bool,
     ) -> None:
         join(address)
-        free, cores = (int(own.get("CPU", 0)) for own in (ray.available_resources(), ray.cluster_resources()))
+        free, cores = (
+            int(resources.get("CPU", 0)) for resources in (ray.available_resources(), ray.cluster_resources())
+        )
         if free < processes:
             raise ValueError(
                 f"processes={processes} need a core each, but {free} of the cluster's {cores} are free"
@@ -104,7 +106,7 @@ class NodeWorkers(RayCollector):
             )  # the one first told, of several
             if not ready and resource("CPU") == 0:
                 raise RuntimeError("no node that could collect is left in the cluster")
-            for process in [own for own, order in self._orders.items() if order in ready]:
+            for process in [index for index, order in self._orders.items() if order in ready]:
                 batch = self._fetch(process)
                 if batch is not None:
                     batches[process] = batch

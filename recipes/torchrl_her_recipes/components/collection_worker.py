@@ -152,4 +152,4 @@ class NodeCollector(WorkerCollector):
 
 def _progress_of(env: TransformedEnv) -> CurriculumProgress:
     """The progress that an environment's transforms look at."""
-    return next(own.progress for own in env.transform if isinstance(own, StateToObs))
+    return next(transform.progress for transform in env.transform if isinstance(transform, StateToObs))

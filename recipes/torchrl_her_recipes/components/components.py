@@ -93,8 +93,8 @@ class Components(Agent):
     @property
     def player(self) -> TensorDictModuleBase:
         """The greedy policy where the environments are: a copy of it, if it learns elsewhere."""
-        own, place = self.greedy, self.eval_env.device or CPU
-        return own if place_of(own) == place else deepcopy(own).to(place)
+        policy, place = self.greedy, self.eval_env.device or CPU
+        return policy if place_of(policy) == place else deepcopy(policy).to(place)
 
     def learner(self) -> Learner:
         """Gradient steps on the loss: compiled where that is possible, through the loss module elsewhere.
@@ -150,7 +150,7 @@ class Components(Agent):
             learner=self.learner(),
             schedules=[
                 self.exploration,
-                *(own for own in weights if isinstance(own, InstructiveWeights)),
+                *(weight for weight in weights if isinstance(weight, InstructiveWeights)),
                 *rising_beta(self.buffer.sampler, replay.priority_beta_end, recipe.run.epochs),
             ],
             runs=recipe.run.num_runs,

@@ -77,11 +77,11 @@ def read_curriculum(layers: object, env: GoalEnv) -> Curriculum:
     if not isinstance(layers, Sequence) or isinstance(layers, str):
         raise ValueError(f"curriculum must be a list of layers, got {type(layers).__name__}")
     width = sum(env.observation_spec[key].shape[-1] for key in _STATE)
-    own = [_read_layer(layer, env, is_last=layer is layers[-1]) for layer in layers]
-    curriculum, goal = Curriculum(own, width, names=env.state_names()), env.state_names()["desired_goal"]
+    parsed = [_read_layer(layer, env, is_last=layer is layers[-1]) for layer in layers]
+    curriculum, goal = Curriculum(parsed, width, names=env.state_names()), env.state_names()["desired_goal"]
     if list(last := curriculum.layers[-1].desired_goal) != goal:
         raise ValueError(
-            f"layer {own[-1].name!r}: the last layer is the task itself, so its desired_goal must be "
+            f"layer {parsed[-1].name!r}: the last layer is the task itself, so its desired_goal must be "
             f"{goal}, got {list(last)}"
         )
     return curriculum

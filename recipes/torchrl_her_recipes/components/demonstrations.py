@@ -112,7 +112,7 @@ def load_demonstrations(
         ) from error
     _check(every, str(options.file), recipe.task.name, env)
     recorded = _scaled(every.first(options.episodes), env).to(getattr(torch, recipe.run.dtype))
-    own = RunDemonstrations(recorded, env, state)
+    demonstrations = RunDemonstrations(recorded, env, state)
     if options.as_starts:
         if recipe.behavior.maker:
             raise ValueError(
@@ -125,8 +125,8 @@ def load_demonstrations(
                 "environments cannot be started at given states: leave it out"
             )
         runs = recipe.run.num_runs
-        own.starts = DemonstrationStarts(
-            [own.shown(run) for run in range(runs)],
+        demonstrations.starts = DemonstrationStarts(
+            [demonstrations.shown(run) for run in range(runs)],
             share=options.starts_share,
             runs=runs,
             generators=generators_of(recipe.seeds, Stream.DEMONSTRATED_STARTS),
@@ -135,7 +135,7 @@ def load_demonstrations(
             threshold=options.starts_threshold,
             samples=options.starts_samples,
         )
-    return own
+    return demonstrations
 
 
 def _check(every: Demonstrations, file: str, task: str, env: EnvBase) -> None:
@@ -149,21 +149,23 @@ def _check(every: Demonstrations, file: str, task: str, env: EnvBase) -> None:
             "of them out"
         )
     for key in ("observation", "achieved_goal", "desired_goal"):
-        width, own = base.observation_spec[key].shape[-1], every.rows[key].shape[-1]
-        if width != own:
+        width, got = base.observation_spec[key].shape[-1], every.rows[key].shape[-1]
+        if width != got:
             raise ValueError(
-                f"{file} holds demonstrations of {task} with other options: {key!r} of width {own}, "
+                f"{file} holds demonstrations of {task} with other options: {key!r} of width {got}, "
                 f"not {width}"
             )
 
 
-def _scaled(own: Demonstrations, env: EnvBase) -> Demonstrations:
+def _scaled(recorded: Demonstrations, env: EnvBase) -> Demonstrations:
     """Demonstrations with actions from -1 to 1, as learners take them, instead of the task's own."""
     low, high = action_bounds(env)
     if low.eq(-1).all() and high.eq(1).all():
-        return own
-    action = (own.rows["action"] - low) / (high - low) * 2 - 1
-    return replace(own, rows=own.rows.copy().set("action", action.to(own.rows["action"].dtype)))
+        return recorded
+    action = (recorded.rows["action"] - low) / (high - low) * 2 - 1
+    return replace(
+        recorded, rows=recorded.rows.copy().set("action", action.to(recorded.rows["action"].dtype))
+    )
 
 
 def rows_needed(recipe: Recipe, own: RunDemonstrations) -> int:

@@ -148,12 +148,12 @@ def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SEC
         task, began = goal_env(env), time.perf_counter()
         played: list[TensorDictBase] = []
         while not played or (
-            sum(len(own) for own in played) < steps
+            sum(len(trajectory) for trajectory in played) < steps
             and (seconds is None or time.perf_counter() - began < seconds)
         ):
             rows = env.rollout(task.max_steps, break_when_any_done=False)
-            played += [episode for own in rows.unbind(0) for episode in _episodes(own)]
-        duration = (time.perf_counter() - began) / sum(len(own) for own in played)
+            played += [episode for env_rows in rows.unbind(0) for episode in _episodes(env_rows)]
+        duration = (time.perf_counter() - began) / sum(len(trajectory) for trajectory in played)
         low, high = (bound.tolist() for bound in action_bounds(env))
         discrete = env.action_spec.dtype == torch.int64
         return _facts(played, task, duration, None if discrete else list(zip(low, high, strict=True)))
@@ -181,15 +181,18 @@ def _facts(
         return ~missed(rule, achieved, desired, achieved_reward)
 
     moved, kept, achieved, fallen = [], [], [], []
-    for own in played:
-        goals = own["next", "achieved_goal"]
-        here, there = outcomes(rule, own["achieved_goal"], own), outcomes(rule, goals, own["next"])
+    for episode in played:
+        goals = episode["next", "achieved_goal"]
+        here, there = (
+            outcomes(rule, episode["achieved_goal"], episode),
+            outcomes(rule, goals, episode["next"]),
+        )
         kept.append(_kept(here, goals, meets))
-        if not own["next", "done"][-1]:
+        if not episode["next", "done"][-1]:
             continue  # it was cut off by the end of the look
         moved.append(not bool(meets(here[:1], goals).all()))
-        achieved.append(bool(meets(there, own["next", "desired_goal"]).any()))
-        last = own["next"][-1:]
+        achieved.append(bool(meets(there, episode["next", "desired_goal"]).any()))
+        last = episode["next"][-1:]
         fallen.append(bool(last["terminated"].all() and not is_achieved(last, **judged_by).all()))
     reached = outcomes(rule, rows["next", "achieved_goal"], rows["next"])
     computed, reward = ask_reward(rule, reached, rows["next", "desired_goal"])[0], rows["next", "reward"]

@@ -155,4 +155,4 @@ class LearnerBuilder(ABC):
     def action_noise(self) -> dict[str, float]:
         """How exploring actions are drawn, where that is an option of the learner."""
         names = {"noise": "action_noise", "uniform_share": "uniform_share"}
-        return {to: getattr(self.options, own) for to, own in names.items() if hasattr(self.options, own)}
+        return {to: getattr(self.options, name) for to, name in names.items() if hasattr(self.options, name)}

@@ -51,20 +51,20 @@ def draw_pictures(
     pictures: dict[str, list[Picture]] = {}
     palette = colors(list(dict.fromkeys(cell.algorithm for cell in cells)))
     for task in dict.fromkeys(cell.task for cell in cells):
-        own = [cell for cell in cells if cell.task == task]
+        task_cells = [cell for cell in cells if cell.task == task]
         for name in (*MEASURES, "q"):
-            curves = {cell.algorithm: cell.rows for cell in own if cell.has(name)}
+            curves = {cell.algorithm: cell.rows for cell in task_cells if cell.has(name)}
             if curves and name != "kl":
                 pictures.setdefault(name, []).append(_curve(task, name, curves, palette, figures))
         reached = {row.algorithm: row for row in finals if (row.measure, row.task) == ("success", task)}
         ends = {
             cell.algorithm: (values_of(cell, "success"), reached[cell.algorithm])
-            for cell in own
+            for cell in task_cells
             if cell.algorithm in reached
         }
         if ends:
             pictures.setdefault("finals", []).append(_final(task, ends, palette, figures))
-        pictures[f"goals_{task}"] = _goals(task, own, figures)
+        pictures[f"goals_{task}"] = _goals(task, task_cells, figures)
     return pictures
 
 

@@ -112,17 +112,17 @@ def _read(label: str, planned: Recipe, options: Mapping[str, Any], batches: Batc
 def read_single(label: str, batches: Batches) -> Combination:
     """Reads a single run as a combination, described by its options that differ from the defaults."""
     recipes = [home.recipe() for home in batches.homes]
-    made = recipes[0].replace(num_runs=sum(own.run.num_runs for own in recipes))
+    made = recipes[0].replace(num_runs=sum(recipe.run.num_runs for recipe in recipes))
     differs = [f"{name}={value}" for name, value, _ in _differences(made, Recipe())]
     return _combination(label, made, made, batches, options={}, algorithm=label, differs=differs)
 
 
 def _differences(made: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
     """Returns the options in which two recipes differ, and their values in both."""
-    ours, theirs = dict(_flat(made.to_dict())), dict(_flat(usual.to_dict()))
+    left, right = dict(_flat(made.to_dict())), dict(_flat(usual.to_dict()))
     changed = {*dict(_flat(made.changed())), *dict(_flat(usual.changed()))}
-    differ = [name for name, value in ours.items() if name in changed and value != theirs.get(name)]
-    return [(name, ours[name], theirs.get(name)) for name in differ]
+    differ = [name for name, value in left.items() if name in changed and value != right.get(name)]
+    return [(name, left[name], right.get(name)) for name in differ]
 
 
 def _combination(

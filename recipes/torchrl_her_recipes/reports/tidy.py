@@ -177,9 +177,9 @@ def _write_table(cells: Sequence[Combination], out: Path) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["label", "task", "algorithm", *options, *_KEYS, *metrics])
         for cell in cells:
-            own = [cell.label, cell.task, cell.algorithm, *(cell.options.get(name) for name in options)]
+            head = [cell.label, cell.task, cell.algorithm, *(cell.options.get(name) for name in options)]
             for row in sorted(cell.rows, key=lambda row: (row["seed"], row["epoch"])):
-                writer.writerow([*own, *(_number(row.get(name)) for name in (*_KEYS, *metrics))])
+                writer.writerow([*head, *(_number(row.get(name)) for name in (*_KEYS, *metrics))])
     packed.unlink(missing_ok=True)
     if plain.stat().st_size > _LARGE:
         # Without a time stamp: the same bytes every time.
@@ -261,14 +261,14 @@ def _origin(folders: Sequence[Path]) -> dict[str, Any]:
     times = [path.stat().st_mtime for home in homes if (path := home / "metrics.csv").is_file()]
     return {
         "date": datetime.fromtimestamp(max(times), UTC).date().isoformat(),
-        "versions": {name: " or ".join(sorted(own)) for name, own in versions.items()},
+        "versions": {name: " or ".join(sorted(found)) for name, found in versions.items()},
     }
 
 
 def _plain(value: Any) -> Any:
     """Converts values to types that YAML can store."""
     if isinstance(value, Mapping):
-        return {str(name): _plain(own) for name, own in value.items()}
+        return {str(name): _plain(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(own) for own in value]
+        return [_plain(entry) for entry in value]
     return value.item() if isinstance(value, np.generic) else value

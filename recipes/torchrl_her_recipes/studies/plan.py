@@ -36,8 +36,8 @@ def wall_clock(seconds: Iterable[float], at_once: int) -> float:
         4.0
     """
     ends = [0.0] * max(at_once, 1)
-    for own in seconds:
-        heapreplace(ends, ends[0] + own)
+    for job_seconds in seconds:
+        heapreplace(ends, ends[0] + job_seconds)
     return max(ends)
 
 

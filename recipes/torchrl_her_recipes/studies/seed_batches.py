@@ -36,7 +36,8 @@ class Batches:
         for path in paths:
             single = (path / "config.yaml").exists()
             found += [
-                RunFolder(own) for own in ([path] if single else sorted(path.glob("seeds_*"), key=_seeds_of))
+                RunFolder(folder)
+                for folder in ([path] if single else sorted(path.glob("seeds_*"), key=_seeds_of))
             ]
         self.homes = [home for home in found if home.config.exists()]
 
@@ -62,7 +63,7 @@ class Batches:
             ValueError: a configuration cannot be read.
         """
         recipes = [home.recipe() for home in self.shown]
-        return recipes[0].replace(num_runs=sum(own.run.num_runs for own in recipes)) if recipes else None
+        return recipes[0].replace(num_runs=sum(r.run.num_runs for r in recipes)) if recipes else None
 
     @property
     def seconds(self) -> float:
@@ -87,7 +88,7 @@ class Batches:
     def goal_map(self) -> GoalMap | None:
         """Reads the map of the runs' virtual goals; None if no run has written one."""
         maps = [GoalMap.load(home.goal_map) for home in self.shown if home.goal_map.is_file()]
-        return GoalMap(np.concatenate([own.counts for own in maps]), maps[0].target) if maps else None
+        return GoalMap(np.concatenate([part.counts for part in maps]), maps[0].target) if maps else None
 
 
 def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
@@ -95,7 +96,7 @@ def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
     home = folder / label
     if (home / "config.yaml").exists():
         raise ValueError(f"{home} is the folder of a single run; choose another folder for the study")
-    begun = [_seeds_of(own.path) for own in Batches(home).homes]
+    begun = [_seeds_of(batch.path) for batch in Batches(home).homes]
     missing = sorted(set(recipe.seeds).difference(*begun))
     batches = [*begun, *share_out(missing, most=max(_ROWS // recipe.replay.batch_size, 1))]
     return [

@@ -71,8 +71,8 @@ class RayWorkers:
     def _places_on_gpus(self) -> int:
         """Returns the number of jobs that fit on the GPUs at once."""
         if self._gpus > 1:
-            return sum(int(own // self._gpus) for own in gpus())
-        return sum(int(own) * int(1 / self._gpus) for own in gpus())
+            return sum(int(count // self._gpus) for count in gpus())
+        return sum(int(count) * int(1 / self._gpus) for count in gpus())
 
     def _leave(self) -> None:
         if self._joined:
@@ -137,12 +137,12 @@ def _work(values: dict[str, Any], files: dict[str, bytes], board: Any) -> tuple[
     """Runs a job on a node, from the files of an earlier attempt if there are any."""
     job = Job.from_plain(values)
     with TemporaryDirectory(prefix="torchrl-her-") as place:
-        own = replace(job, folder=Path(place) / job.label)
+        local_job = replace(job, folder=Path(place) / job.label)
         if files:
-            unpack(files, own.folder)
-        with _reporting(own, board):
-            outcome = run_job(own)
-        return outcome, pack(own.folder, checkpoints=outcome != Outcome())
+            unpack(files, local_job.folder)
+        with _reporting(local_job, board):
+            outcome = run_job(local_job)
+        return outcome, pack(local_job.folder, checkpoints=outcome != Outcome())
 
 
 @contextmanager

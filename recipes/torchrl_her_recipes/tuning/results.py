@@ -45,14 +45,18 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(["trial", "state", "score", "epochs", *names, "folder"])
-    for own in trials:
-        value = own.value if own.value is not None else own.intermediate_values.get(own.last_step or 0, "")
-        values = [_values(own).get(name, "") for name in names]
+    for trial in trials:
+        value = (
+            trial.value
+            if trial.value is not None
+            else trial.intermediate_values.get(trial.last_step or 0, "")
+        )
+        values = [_values(trial).get(name, "") for name in names]
         writer.writerow(
-            [own.number, own.state.name.lower(), value, own.last_step or 0, *values, folder_of(own)]
+            [trial.number, trial.state.name.lower(), value, trial.last_step or 0, *values, folder_of(trial)]
         )
     write_text(folder / "trials.csv", table.getvalue())
-    if any(own.state == TrialState.COMPLETE for own in trials):
+    if any(trial.state == TrialState.COMPLETE for trial in trials):
         best = study.best_trial
         recipe = search.space.recipe(search.recipe, best.params)
         about = f"# trial {best.number} of the search in {folder.name}: score {best.value:.3f}\n"
@@ -62,7 +66,7 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
 def importances(study: Study) -> dict[str, float]:
     """Computes each option's importance for the score (PED-ANOVA), as fractions; empty for too few trials."""
     done = _in_space(study)
-    if len(done.trials) < _FEWEST or len({own.value for own in done.trials}) < 2:
+    if len(done.trials) < _FEWEST or len({trial.value for trial in done.trials}) < 2:
         return {}
     return dict(get_param_importances(done))
 
@@ -70,9 +74,9 @@ def importances(study: Study) -> dict[str, float]:
 def _in_space(study: Study) -> Study:
     """Returns a study of the complete trials that have all options; the first trial may lack some."""
     done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    most = max((len(own.params) for own in done), default=0)
+    most = max((len(trial.params) for trial in done), default=0)
     inside = create_study(direction="maximize")
-    inside.add_trials([own for own in done if len(own.params) == most])
+    inside.add_trials([trial for trial in done if len(trial.params) == most])
     return inside
 
 
@@ -95,11 +99,11 @@ def write_pictures(study: Study, folder: Path) -> None:
 def search_summary(study: Study) -> list[str]:
     """Describes the best trials and the importance of each option, in lines of text."""
     done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    ranked = sorted(done, key=lambda own: (-(own.value or 0.0), own.number))[:_SHOWN]
+    ranked = sorted(done, key=lambda trial: (-(trial.value or 0.0), trial.number))[:_SHOWN]
     lines = [
-        f"trial {own.number}: score {own.value:.0%}  "
-        + " ".join(f"{name}={_short(value)}" for name, value in _values(own).items())
-        for own in ranked
+        f"trial {trial.number}: score {trial.value:.0%}  "
+        + " ".join(f"{name}={_short(value)}" for name, value in _values(trial).items())
+        for trial in ranked
     ]
     if weights := importances(study):
         guess = f" (a guess, from {len(done)} trials)" if len(done) < 20 else ""

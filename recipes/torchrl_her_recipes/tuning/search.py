@@ -204,7 +204,9 @@ def _make_pruner(name: str, epochs: int) -> optuna.pruners.BasePruner:
 def _counted(study: Study) -> list[FrozenTrial]:
     """Returns the trials that have begun, except interrupted ones that are repeated."""
     trials = study.get_trials(deepcopy=False)
-    return [own for own in trials if own.state != TrialState.WAITING and _REPEATED not in own.user_attrs]
+    return [
+        trial for trial in trials if trial.state != TrialState.WAITING and _REPEATED not in trial.user_attrs
+    ]
 
 
 def _repeat(study: Study, trial: FrozenTrial | Trial, *, attempt: int = 0) -> None:
