@@ -153,7 +153,7 @@ class BatchedEnv(GoalEnv):
     def _check_starts(self, states: Mapping[str, Tensor], which: Tensor, entries: Sequence[str]) -> None:
         """Raises a ValueError for states or environments that :meth:`start_at` cannot take."""
         chosen = which.tolist()
-        if len(set(chosen)) < len(chosen) or not all(0 <= own < self.batch_size[0] for own in chosen):
+        if len(set(chosen)) < len(chosen) or not all(0 <= index < self.batch_size[0] for index in chosen):
             raise ValueError(
                 f"which must be different environments from 0 to {self.batch_size[0] - 1}, got {chosen}"
             )
@@ -167,8 +167,8 @@ class BatchedEnv(GoalEnv):
 
     def _check_state(self, state: dict[str, Tensor]) -> None:
         """Raises a ValueError for a state whose entries are of other shapes than these environments'."""
-        own = {field.name: getattr(self.worlds, field.name).shape for field in fields(self.worlds)}
-        for name, shape in (own | {"key": torch.Size(self._keys.shape)}).items():
+        shapes = {field.name: getattr(self.worlds, field.name).shape for field in fields(self.worlds)}
+        for name, shape in (shapes | {"key": torch.Size(self._keys.shape)}).items():
             given = state[name].shape
             if given[:1] != shape[:1]:
                 count = given[0] if given else 0
@@ -247,16 +247,16 @@ class BatchedEnv(GoalEnv):
         end in nearly every step. This one writes the new rows and checks nothing: they are known to be right.
         """
         done = tensordict.get("done", None)
-        if done is None or not all(type(own) in (Tensor, TensorDict) for own in tensordict.values()):
+        if done is None or not all(type(entry) in (Tensor, TensorDict) for entry in tensordict.values()):
             return super().maybe_reset(tensordict)
         if not bool(done.any()):
             return tensordict
         entries: dict[str, Any] = self._begin(done.view(-1).nonzero().squeeze(-1))
-        for key, own in tensordict.items():
+        for key, entry in tensordict.items():
             if key in entries:
-                entries[key] = torch.where(done, entries[key], own)
+                entries[key] = torch.where(done, entries[key], entry)
             else:  # entries of the old episode: an action, the ends, or the memory of a policy
-                entries[key] = _cleared(own, done)
+                entries[key] = _cleared(entry, done)
         return self._pack(entries)
 
     def _make_specs(
@@ -291,4 +291,4 @@ def _cleared(entry: Tensor | TensorDictBase, rows: Tensor) -> Any:
     """Returns an entry [N, ...] with zeros in some rows [N, 1]."""
     if isinstance(entry, Tensor):
         return entry.masked_fill(rows.view(-1, *[1] * (entry.ndim - 1)), 0)
-    return entry.apply(lambda own: _cleared(own, rows))
+    return entry.apply(lambda part: _cleared(part, rows))

@@ -290,7 +290,7 @@ def info_rows(transitions: TensorDictBase, names: Iterable[str], shape: torch.Si
         torch.Size([2, 5, 3])
     """
     entries = {name: transitions.get((INFO, name)) for name in names}
-    return {name: own.expand(*shape, *own.shape[transitions.ndim :]) for name, own in entries.items()}
+    return {name: entry.expand(*shape, *entry.shape[transitions.ndim :]) for name, entry in entries.items()}
 
 
 def needs_info(env: GoalEnv) -> str:

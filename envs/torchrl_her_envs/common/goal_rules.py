@@ -100,7 +100,7 @@ class GoalEnds:
         lacks = {"success": not self.tells_success and "info['is_success']"}
         lacks["own"] = self.env_ends is None and "compute_terminated"
         if lack := lacks.get(termination):
-            others = ", ".join(own for own in ("success", "reward", "never") if not lacks.get(own))
+            others = ", ".join(choice for choice in ("success", "reward", "never") if not lacks.get(choice))
             raise ValueError(
                 f"task.options.termination={termination} needs {lack}, which {self.name} does not give; "
                 f"choose {others}"

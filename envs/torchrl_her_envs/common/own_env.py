@@ -101,8 +101,8 @@ def make_own_env(
         (seed,) = seed  # of a single run: what an environment of one's own expects
 
     def make_one(count: int, seed: int | Sequence[int]) -> EnvBase:
-        ours = {"num_envs": count, "seed": seed, "max_steps": max_steps}
-        given = {name: value for name, value in ours.items() if name in taken and value is not None}
+        offered = {"num_envs": count, "seed": seed, "max_steps": max_steps}
+        given = {name: value for name, value in offered.items() if name in taken and value is not None}
         env = make(**given, **options)
         _check_made(path, env, [count] if "num_envs" in taken else [])
         return env
@@ -118,7 +118,7 @@ def make_own_env(
         if callable(getattr(first, "set_seeds", None)):  # it takes several seeds
             first.close()
             return [make_one(count, seed)]
-        return [first, *(make_one(share, own) for own in seed[1:])]
+        return [first, *(make_one(share, run_seed) for run_seed in seed[1:])]
 
     envs = make_many(num_envs, seed)
     names = dict(zip(KEYS, (observation_key, achieved_goal_key, desired_goal_key), strict=True))
@@ -177,14 +177,14 @@ def _load(path: str) -> Callable[..., Any]:
 
 def _check_options(path: str, taken: Any, options: dict[str, Any]) -> None:
     kinds = inspect.Parameter
-    for name, own in taken.items():
-        needed = own.default is kinds.empty and own.kind not in (kinds.VAR_POSITIONAL, kinds.VAR_KEYWORD)
+    for name, param in taken.items():
+        needed = param.default is kinds.empty and param.kind not in (kinds.VAR_POSITIONAL, kinds.VAR_KEYWORD)
         if needed and name not in ("self", "num_envs", "seed", *options):
             raise ValueError(f"{path} needs the option {name!r}, as in task.options.{name}=...")
-    if any(own.kind is kinds.VAR_KEYWORD for own in taken.values()):
+    if any(param.kind is kinds.VAR_KEYWORD for param in taken.values()):
         return
-    own = [name for name in taken if name not in ("self", "num_envs", "seed")]
-    allowed = list(dict.fromkeys([*_OURS, *own]))
+    declared = [name for name in taken if name not in ("self", "num_envs", "seed")]
+    allowed = list(dict.fromkeys([*_OURS, *declared]))
     for option in options:
         if option not in allowed:
             raise ValueError(f"{path} takes no option {option!r}; its options are {', '.join(allowed)}")
@@ -303,8 +303,8 @@ class OwnGoalEnv(GoalEnv):
         return self.goal_ends.rule
 
     def layers(self) -> list[dict[str, Any]]:
-        own = getattr(self._envs[0], "layers", None)
-        return own() if callable(own) else super().layers()
+        layers = getattr(self._envs[0], "layers", None)
+        return layers() if callable(layers) else super().layers()
 
     def compute_reward(
         self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
@@ -333,8 +333,8 @@ class OwnGoalEnv(GoalEnv):
         keys = (block_keys(seeds, self.batch_size[0]) >> np.uint64(33)).tolist()
         # Many environments seed torch's own generator, which is that of the run.
         with torch.random.fork_rng(devices=[]):
-            if callable(own := getattr(self._envs[0], "set_seeds", None)) and self._whole:
-                own(seeds)
+            if callable(set_seeds := getattr(self._envs[0], "set_seeds", None)) and self._whole:
+                set_seeds(seeds)
             elif self._whole and len(self._envs) != len(seeds):
                 raise ValueError(f"{self._name} is seeded with {len(self._envs)} seeds, got {len(seeds)}")
             else:
@@ -371,7 +371,8 @@ class OwnGoalEnv(GoalEnv):
         elif self._whole:
             parts = zip(self._envs, self._latest, which.chunk(len(self._envs)), strict=True)
             self._latest = [
-                env.reset(latest.set("_reset", own)) if own.any() else latest for env, latest, own in parts
+                env.reset(latest.set("_reset", chunk)) if chunk.any() else latest
+                for env, latest, chunk in parts
             ]
         else:
             for index in which.flatten().nonzero().flatten().tolist():
@@ -406,7 +407,7 @@ class OwnGoalEnv(GoalEnv):
     # Helpers
 
     def _stack(self, each: list[TensorDictBase], key: str) -> Tensor:
-        entries = [own.get(key) for own in each]
+        entries = [part.get(key) for part in each]
         return torch.cat(entries) if self._whole else torch.stack(entries)
 
     def _entries(self, key: str) -> Sequence[str]:
@@ -458,7 +459,7 @@ class OwnGoalEnv(GoalEnv):
             if info is None:
                 raise ValueError(needs_info(self))
             given.append(info_rows(info, self._info, achieved.shape[:-1]))
-        pair = (self._named(*own) for own in zip(_GOALS, (achieved, desired), strict=True))
+        pair = (self._named(*entry) for entry in zip(_GOALS, (achieved, desired), strict=True))
         answer = getattr(self._envs[0], method)(*pair, *given)
         shape = (*achieved.shape[:-1], 1)
         if not isinstance(answer, Tensor) or answer.shape != shape:
@@ -472,7 +473,7 @@ class OwnGoalEnv(GoalEnv):
     def _check(self, env: EnvBase) -> None:
         """Raises a ValueError that names what the environment lacks."""
         shown = env.full_observation_spec
-        for key in [name for own in KEYS for name in self._entries(own)]:
+        for key in [name for role in KEYS for name in self._entries(role)]:
             if key not in shown:
                 raise ValueError(f"{self._name} lacks {key!r} in what it shows: {', '.join(map(str, shown))}")
             if len(shown[key].shape) != 1 + self._whole:
@@ -481,7 +482,7 @@ class OwnGoalEnv(GoalEnv):
         if achieved != desired:
             raise ValueError(
                 f"{self._name}'s achieved and desired goals must have one shape, got "
-                f"{' and '.join(', '.join(map(str, own)) for own in (achieved, desired))}"
+                f"{' and '.join(', '.join(map(str, shapes)) for shapes in (achieved, desired))}"
             )
         for name in self._info:
             if name not in shown:
@@ -511,11 +512,11 @@ class OwnGoalEnv(GoalEnv):
         if _SUCCESS in shown:
             self.observation_spec[_SUCCESS] = flag()
         if self._info:
-            own = {
+            info_specs = {
                 name: Unbounded((n, *shown[name].shape[self._whole :]), dtype=shown[name].dtype)
                 for name in self._info
             }
-            self.observation_spec[INFO] = Composite(own, shape=(n,))
+            self.observation_spec[INFO] = Composite(info_specs, shape=(n,))
         self.action_spec = self._action_spec(action)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
@@ -535,11 +536,11 @@ class OwnGoalEnv(GoalEnv):
 
     def _own_actions(self, actions: Tensor) -> Tensor:
         """Actions of all environments in the shape, bounds and type of their own specs."""
-        own = self._envs[0].action_spec_unbatched
-        if not isinstance(own, Bounded):
-            return actions.to(own.dtype)
-        rounded = actions if own.dtype.is_floating_point else actions.round()
-        return rounded.to(own.dtype).reshape(-1, *own.shape).clamp(own.space.low, own.space.high)
+        spec = self._envs[0].action_spec_unbatched
+        if not isinstance(spec, Bounded):
+            return actions.to(spec.dtype)
+        rounded = actions if spec.dtype.is_floating_point else actions.round()
+        return rounded.to(spec.dtype).reshape(-1, *spec.shape).clamp(spec.space.low, spec.space.high)
 
     def _try_out(self, termination: Termination, achieved_reward: float | None) -> GoalRules:
         """Finds out how the environment rewards and ends, with some steps of random actions."""
@@ -567,11 +568,11 @@ class OwnGoalEnv(GoalEnv):
         reached = computed >= met
         went_on = ~after["terminated"].flatten() | reached  # what a failure costs is kept
         warn_once(check_same_rewards(self._name, stepped[went_on].numpy(), computed[went_on].numpy()))
-        first, own = self._envs[0], None
+        first, env_ends = self._envs[0], None
         if callable(getattr(first, "compute_terminated", None)):
             pairs = torch.cat((one, other)).unsqueeze(1), torch.cat((one, other))
-            own = bool(self._ask("compute_terminated", *pairs, torch.cat((info, info))).any())
-        ends = GoalEnds(self._name, env_ends=own, tells_success=_SUCCESS in self.observation_spec)
+            env_ends = bool(self._ask("compute_terminated", *pairs, torch.cat((info, info))).any())
+        ends = GoalEnds(self._name, env_ends=env_ends, tells_success=_SUCCESS in self.observation_spec)
         if ends.tells_success:
             reached = after[_SUCCESS].flatten()
         ends.apply(reached, after["terminated"].flatten(), after["truncated"].flatten())

@@ -78,7 +78,7 @@ def as_seeds(seed: int | Sequence[int]) -> list[int]:
     if isinstance(seed, int | Integral):
         return [int(seed)]
     try:
-        return [operator.index(own) for own in seed]
+        return [operator.index(value) for value in seed]
     except TypeError:
         raise TypeError(f"a seed must be an integer, or several, got {seed!r}") from None
 

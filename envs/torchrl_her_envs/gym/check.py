@@ -91,7 +91,7 @@ def _wrong_options(id: str, options: dict[str, Any]) -> str:
         return ""
     entry = known.entry_point
     taken = inspect.signature(load_env_creator(entry) if isinstance(entry, str) else entry).parameters
-    if any(own.kind is inspect.Parameter.VAR_KEYWORD for own in taken.values()):
+    if any(param.kind is inspect.Parameter.VAR_KEYWORD for param in taken.values()):
         return ""
     allowed = [*_OUR_OPTIONS, *(name for name in taken if name not in known.kwargs)]
     wrong = [name for name in options if name not in (*allowed, *known.kwargs, "max_episode_steps")]
@@ -155,7 +155,7 @@ def check_methods(id: str, env: gymnasium.Env) -> None:
         reset, step = f"{id}: reset of {name} must", f"{id}: step of {name} must"
         taken = inspect.signature(layer.reset).parameters
         missing = [key for key in ("seed", "options") if key not in taken]
-        if missing and not any(own.kind is inspect.Parameter.VAR_KEYWORD for own in taken.values()):
+        if missing and not any(param.kind is inspect.Parameter.VAR_KEYWORD for param in taken.values()):
             raise ValueError(f"{reset} take seed and options, as in gymnasium; it lacks {missing[0]!r}")
         layer.action_space.seed(0)
         given = layer.reset(seed=0)
@@ -189,7 +189,7 @@ def has_compute_terminated(env: gymnasium.Env, achieved: Any, desired: Any) -> b
 def goals_to_try(env: gymnasium.Env, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Collects goals [M, g] of first states: equal pairs, then each achieved with the desired one."""
     shown = [env.reset(seed=seed)[0] for seed in range(EPISODES)]
-    achieved, desired = (np.stack([layout.flatten(own[key]) for own in shown]) for key in KEYS[1:])
+    achieved, desired = (np.stack([layout.flatten(obs[key]) for obs in shown]) for key in KEYS[1:])
     pairs = np.repeat(achieved, EPISODES, 0), np.tile(desired, (EPISODES, 1))
     # M must be no dimension of a goal, see GoalFunction.
     last = max(m for m in range(EPISODES * (EPISODES + 1) + 1) if m not in layout.sizes)
@@ -271,14 +271,14 @@ def find_achieved_reward(
     """
     if not env.has_wrapper_attr("_is_success"):
         return None
-    own = env.get_wrapper_attr("_is_success")
+    is_success = env.get_wrapper_attr("_is_success")
 
     def goals(share: np.ndarray) -> np.ndarray:
         return (desired + share[:, None] * (achieved - desired)).astype(desired.dtype)
 
     def met(share: np.ndarray) -> np.ndarray:
         pairs = zip(goals(share), desired, strict=True)
-        return np.array([bool(own(*map(layout.unflatten, pair))) for pair in pairs])
+        return np.array([bool(is_success(*map(layout.unflatten, pair))) for pair in pairs])
 
     missed = ~met(np.ones(len(desired)))
     achieved, desired = achieved[missed], desired[missed]
@@ -306,13 +306,13 @@ def try_steps(env: gymnasium.Env, layout: Layout) -> Trial:
         goals = (layout.flatten(shown[key]) for key in KEYS[1:])
         rows.append((*goals, float(reward), bool(terminated), bool(truncated), info.get(SUCCESS), info))
     achieved, desired, rewards, terminations, truncations, success, infos = zip(*rows, strict=True)
-    known = any(own is not None for own in success)
+    known = any(flag is not None for flag in success)
     return Trial(
         achieved=np.stack(achieved),
         desired=np.stack(desired),
         reward=np.array(rewards),
         terminated=np.array(terminations),
         truncated=np.array(truncations),
-        success=np.array([bool(own) for own in success]) if known else None,
+        success=np.array([bool(flag) for flag in success]) if known else None,
         infos=list(infos),
     )

@@ -118,8 +118,8 @@ def make_gym_env(
     if max_steps is not None:
         options["max_episode_steps"] = max_steps
     check_termination(termination)
-    own = dict(zip(KEYS, (observation_key, achieved_goal_key, desired_goal_key), strict=True))
-    names = None if all(key == name for key, name in own.items()) else own
+    keys = dict(zip(KEYS, (observation_key, achieved_goal_key, desired_goal_key), strict=True))
+    names = None if all(key == name for key, name in keys.items()) else keys
     with ExitStack() as opened:
         reference_env = opened.enter_context(closing(make_one(id, names, options)))
         check_goal_env(id, reference_env)
@@ -264,13 +264,13 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         warn_once(
             self._reward_of.hint(info) or check_same_rewards(id, trial.reward[went_on], computed[went_on])
         )
-        own = None
+        env_ends = None
         if termination in ("auto", "own", "watch") and has_compute_terminated(
             env, *(layout.unflatten(goal[0]) for goal in goals)
         ):
             self._terminated_of = self._function(TERMINATED, goals, info)
-            own = bool(self._terminated_of.tried.any())
-        self.goal_ends = GoalEnds(id, env_ends=own, tells_success=trial.success is not None)
+            env_ends = bool(self._terminated_of.tried.any())
+        self.goal_ends = GoalEnds(id, env_ends=env_ends, tells_success=trial.success is not None)
         self.goal_ends.apply(
             met if trial.success is None else trial.success, trial.terminated, trial.truncated
         )
@@ -295,10 +295,10 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         self, name: str, goals: tuple[np.ndarray, np.ndarray], info: dict[str, np.ndarray]
     ) -> GoalFunction:
         """A function of the environment, for goals [B, g] that it gets in their original form."""
-        own, layout = self._reference_env.get_wrapper_attr(name), self._layouts["achieved_goal"]
+        method, layout = self._reference_env.get_wrapper_attr(name), self._layouts["achieved_goal"]
 
         def function(achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
-            return own(layout.unflatten(achieved), layout.unflatten(desired), info)
+            return method(layout.unflatten(achieved), layout.unflatten(desired), info)
 
         return GoalFunction(function, *goals, name=f"{spec_of(self._reference_env).id}'s {name}", info=info)
 
@@ -324,7 +324,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         names, first = super().state_names() | fetch_names(spec_of(self._reference_env).id), 0
         for key in ("observation", "desired_goal"):
             layout = self._layouts[key]
-            inner = {f"{key}.{name}": [first + at for at in own] for name, own in layout.places.items()}
+            inner = {f"{key}.{name}": [first + at for at in places] for name, places in layout.places.items()}
             names, first = names | inner, first + layout.width
         return names
 

@@ -123,8 +123,8 @@ class GoalFunction:
         """Calls the function for one pair of goals."""
         try:
             if self.form == "pair":
-                own = self._function(achieved[row], desired[row], self._one(info, row))
-                answer = np.asarray(own, np.float64)
+                result = self._function(achieved[row], desired[row], self._one(info, row))
+                answer = np.asarray(result, np.float64)
             else:
                 at = slice(row, row + 1)
                 own_info = {key: entries[at] for key, entries in info.items()}

@@ -74,7 +74,7 @@ class Infos:
 
     def stack(self, infos: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
         """Stacks the infos of single environments to entries [n, ...]."""
-        return {name: np.array([info[name] for info in infos], own[1]) for name, own in self._kinds.items()}
+        return {name: np.array([info[name] for info in infos], kind[1]) for name, kind in self._kinds.items()}
 
     def of_batch(self, infos: Mapping[str, Any], count: int, *, reset: bool = False) -> dict[str, np.ndarray]:
         """Returns the entries [count, ...] of a vector environment's info; 0 where a reset gives none.
@@ -95,13 +95,15 @@ class Infos:
     def rows(self, entries: Mapping[str, np.ndarray]) -> TensorDict:
         """Converts entries [n, ...] of :meth:`of_batch` for transitions, [n, 1] for single numbers."""
         count = len(next(iter(entries.values())))
-        own = {
+        tensors = {
             name: torch.from_numpy(value).view(count, *(self._kinds[name][0] or (1,)))
             for name, value in entries.items()
         }
-        return TensorDict(own, [count])
+        return TensorDict(tensors, [count])
 
     def read(self, transitions: TensorDictBase, shape: torch.Size) -> dict[str, np.ndarray]:
         """Reads the entries of transitions, broadcast to a shape [...], as rows [B, ...]."""
-        own = info_rows(transitions, self._kinds, shape)
-        return {name: entry.reshape(-1, *self._kinds[name][0]).cpu().numpy() for name, entry in own.items()}
+        entries = info_rows(transitions, self._kinds, shape)
+        return {
+            name: entry.reshape(-1, *self._kinds[name][0]).cpu().numpy() for name, entry in entries.items()
+        }

@@ -89,11 +89,11 @@ class Layout:
         """
         arrays = []
         for leaf in self._leaves:
-            own = values
+            value = values
             for key in leaf.path:
-                own = own[key]
-            own = np.asarray(own)
-            rows = own.reshape(*own.shape[: own.ndim - len(leaf.shape)], leaf.width)
+                value = value[key]
+            value = np.asarray(value)
+            rows = value.reshape(*value.shape[: value.ndim - len(leaf.shape)], leaf.width)
             finite = np.abs(rows) <= _LARGEST
             if not finite.all():
                 name, at = ".".join([self._name, *leaf.path]), np.argwhere(~finite)[0]
@@ -106,16 +106,16 @@ class Layout:
         nested: Any = {}
         first = 0
         for leaf in self._leaves:
-            own = rows[..., first : first + leaf.width]
-            own = (own if leaf.dtype.kind == "f" else np.rint(own)).astype(leaf.dtype)
-            own = own.reshape((*rows.shape[:-1], *leaf.shape))
+            part = rows[..., first : first + leaf.width]
+            part = (part if leaf.dtype.kind == "f" else np.rint(part)).astype(leaf.dtype)
+            part = part.reshape((*rows.shape[:-1], *leaf.shape))
             first += leaf.width
             if not leaf.path:
-                return own
+                return part
             inner = nested
             for key in leaf.path[:-1]:
                 inner = inner.setdefault(key, {})
-            inner[leaf.path[-1]] = own
+            inner[leaf.path[-1]] = part
         return nested
 
 
@@ -124,7 +124,7 @@ def _leaves(space: spaces.Space, path: tuple[str, ...], name: str) -> list[_Leaf
         parts = sorted(space.spaces.items())
         if not parts:
             raise ValueError(f"{name} has an empty dictionary")
-        return [leaf for key, own in parts for leaf in _leaves(own, (*path, key), name)]
+        return [leaf for key, part in parts for leaf in _leaves(part, (*path, key), name)]
     if space.shape is None or space.dtype is None or space.dtype.kind not in "fiub":
         where = f" in {'.'.join(path)}" if path else ""
         raise ValueError(f"{name} as numbers or a dictionary of arrays, got {space}{where}")

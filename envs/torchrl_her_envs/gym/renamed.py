@@ -31,14 +31,16 @@ class RenamedKeys(gymnasium.ObservationWrapper):
         super().__init__(env)
         self._names = names
         known = list(env.observation_space) if isinstance(env.observation_space, spaces.Dict) else []
-        for own in names.values():
-            for name in [own] if isinstance(own, str) else own:
+        for wanted in names.values():
+            for name in [wanted] if isinstance(wanted, str) else wanted:
                 if name not in known:
                     env.close()
                     id = env.spec.id if env.spec else type(env).__name__
                     raise ValueError(f"{id} lacks {name!r} in what it shows: {', '.join(known) or 'no dict'}")
         taken = self.observation(env.observation_space)
-        inner = {key: spaces.Dict(own) if isinstance(own, dict) else own for key, own in taken.items()}
+        inner = {
+            key: spaces.Dict(entry) if isinstance(entry, dict) else entry for key, entry in taken.items()
+        }
         self.observation_space = spaces.Dict(inner)
         for method in ("compute_reward", "compute_terminated", "_is_success"):
             if env.has_wrapper_attr(method):
@@ -46,15 +48,15 @@ class RenamedKeys(gymnasium.ObservationWrapper):
 
     def observation(self, observation: Any) -> dict[str, Any]:
         return {
-            key: observation[own]
-            if isinstance(own, str)
-            else {f"{place:03}": observation[name] for place, name in enumerate(own)}
-            for key, own in self._names.items()
+            key: observation[names]
+            if isinstance(names, str)
+            else {f"{place:03}": observation[name] for place, name in enumerate(names)}
+            for key, names in self._names.items()
         }
 
     def _ask(self, function: Any, achieved: Any, desired: Any, *info: Any) -> Any:
         return function(self._named("achieved_goal", achieved), self._named("desired_goal", desired), *info)
 
     def _named(self, key: str, goal: Any) -> Any:
-        own = self._names[key]
-        return goal if isinstance(own, str) else dict(zip(own, goal.values(), strict=True))
+        names = self._names[key]
+        return goal if isinstance(names, str) else dict(zip(names, goal.values(), strict=True))

@@ -160,7 +160,7 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
                 raise ValueError(
                     f"{len(seed)} seeds for {self.num_envs} environments: give one, or one for each"
                 )
-            seeds = [self._drawn_seed() if own is None else operator.index(own) for own in seed]
+            seeds = [self._drawn_seed() if value is None else operator.index(value) for value in seed]
         self._core.set_seeds(seeds)
         self._seeded = True
 

@@ -48,8 +48,8 @@ def confined(value: Any, low: Any, high: Any) -> Any:
     """
     if isinstance(value, float):
         return low if value < low else high if value > high else value
-    own = functions_of(value)
-    return own.minimum(own.maximum(value, low), high)
+    xp = functions_of(value)
+    return xp.minimum(xp.maximum(value, low), high)
 
 
 def within(dx: Any, dy: Any, distance: float) -> Any:

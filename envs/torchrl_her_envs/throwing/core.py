@@ -110,8 +110,8 @@ class ThrowingCore:
         if task.wall:
             self.world.check_wall(self.fastest_ball)
         self.observation_size = self.effector.observation_size + (4 if task.throws else 0)
-        own = self.world.hole_radius if task.throws else self.world.ball_radius
-        self.threshold = self.world.shown(own) if threshold is None else threshold
+        radius = self.world.hole_radius if task.throws else self.world.ball_radius
+        self.threshold = self.world.shown(radius) if threshold is None else threshold
         self.dtype = np.dtype(dtype)
         self.ball_starts = self._make_ball_starts()
         self.goal_distribution = self._make_goals()
@@ -155,12 +155,12 @@ class ThrowingCore:
         self._matrix = np.zeros((end, self.num_envs))
         self._seen = self._matrix[: rows["goal"].stop]
         heights, *scaling = zip(*(quantities[name] for name in seen), strict=True)
-        self._scale, self._shift = (np.repeat(own, heights)[:, None] for own in scaling)
+        self._scale, self._shift = (np.repeat(values, heights)[:, None] for values in scaling)
         if task.effector == "hand":
             rows |= {"joints": rows["grip"], "joint_velocity": rows["grip_velocity"]}
         self._rows = rows
         self._body_rows = [rows[name] for name in _BODIES]
-        self._bodies = [self._matrix[own] for own in self._body_rows]
+        self._bodies = [self._matrix[body_rows] for body_rows in self._body_rows]
         self._bodies_of = itemgetter(*self._body_rows)  # ... of a column, as a list
         self._joints, self._joint_velocity, self._grip, self._grip_velocity, *balls = self._bodies
         self._ball, self._ball_velocity = balls
@@ -172,8 +172,8 @@ class ThrowingCore:
         self._action_shape = (self.num_envs, joints + 1)
         self.achieved_index = rows["ball" if task.throws else "grip"]
         self.worlds = WorldState(
-            *(torch.from_numpy(own.T) for own in (*self._bodies, self._goal)),
-            *(torch.from_numpy(own) for own in (*self._flags, self._step, self._episode)),
+            *(torch.from_numpy(array.T) for array in (*self._bodies, self._goal)),
+            *(torch.from_numpy(array) for array in (*self._flags, self._step, self._episode)),
         )
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
@@ -245,8 +245,8 @@ class ThrowingCore:
         *action, closing = command
         now = [*self._bodies_of(column), False, self._held.item(k), self._free.item(k)]
         after = take_step(Bodies(*now), action, closing > 0.0, numbers, catch=self._catch)
-        for own, value in zip(self._body_rows, after, strict=False):
-            column[own] = value
+        for body_rows, value in zip(self._body_rows, after, strict=False):
+            column[body_rows] = value
         self._matrix[:, k] = column
         *_, self._closed[k], self._held[k], self._free[k] = after
         self._step[k] += 1
@@ -259,8 +259,8 @@ class ThrowingCore:
             self._arrays,
             catch=self._catch,
         )
-        for own, value in zip(self._bodies, after[:6], strict=True):
-            own[:] = value
+        for body, value in zip(self._bodies, after[:6], strict=True):
+            body[:] = value
         self._flags[:] = after[6:]
         self._step += 1
 

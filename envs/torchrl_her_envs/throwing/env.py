@@ -180,11 +180,11 @@ class ThrowingEnv(BatchedEnv):
         it is thrown, ``ball_speed`` and ``hole``; besides ``observation`` and ``desired_goal``.
         """
         seen = self.effector.observation_size
-        own = {self.task.effector: list(range(seen)), "grip": list(self.effector.grip_index)}
+        names = {self.task.effector: list(range(seen)), "grip": list(self.effector.grip_index)}
         pairs = ("ball", "ball_speed", "hole") if self.task.throws else ("ball",)
         for place, name in enumerate(pairs):
-            own[name] = [seen + 2 * place, seen + 2 * place + 1]
-        return own | super().state_names()
+            names[name] = [seen + 2 * place, seen + 2 * place + 1]
+        return names | super().state_names()
 
     def goal_box(self) -> Box:
         """Returns the box of goals: the screen. A stretched arm reaches up to 0.01 beyond its left side."""
@@ -256,8 +256,8 @@ class ThrowingEnv(BatchedEnv):
         self._core.draw_starts(which.numpy())
 
     def _advance(self, action: Tensor) -> None:
-        own = action.detach() if action.dtype in _OF_NUMPY else action.detach().double()
-        self._core.advance(own.numpy())
+        command = action.detach() if action.dtype in _OF_NUMPY else action.detach().double()
+        self._core.advance(command.numpy())
 
     def _show(self) -> dict[str, Tensor]:
         return self._tensors(**self._core.show()._asdict())
@@ -277,13 +277,13 @@ class ThrowingEnv(BatchedEnv):
         return {
             **shown,
             **self._tensors(reward=reward_of(achieved).astype(core.dtype)),
-            **{key: torch.from_numpy(own) for key, own in ends.items()},
+            **{key: torch.from_numpy(end) for key, end in ends.items()},
         }
 
     def _tensors(self, **arrays: np.ndarray) -> dict[str, Tensor]:
         """Converts arrays to tensors of the observations' type."""
-        tensors = {key: torch.from_numpy(own) for key, own in arrays.items()}
-        return tensors if self._native else {key: own.to(self.dtype_shown) for key, own in tensors.items()}
+        tensors = {key: torch.from_numpy(array) for key, array in arrays.items()}
+        return tensors if self._native else {key: t.to(self.dtype_shown) for key, t in tensors.items()}
 
 
 def base_env(env: EnvBase) -> ThrowingEnv:

@@ -103,9 +103,9 @@ class SectorGoals(_Sampled):
         return self._point(angle, self.radius[0] + u[..., 1:] * (self.radius[1] - self.radius[0]))
 
     def _point(self, angle: Array, radius: Array) -> Array:
-        own = functions_of(angle)
-        turn = own.deg2rad(angle)
-        return _beside(angle, self.center) + radius * own.concatenate((own.cos(turn), own.sin(turn)), -1)
+        xp = functions_of(angle)
+        turn = xp.deg2rad(angle)
+        return _beside(angle, self.center) + radius * xp.concatenate((xp.cos(turn), xp.sin(turn)), -1)
 
     def scaled(self, factor: float, shift: float) -> SectorGoals:
         x, y = (self.center * factor + shift).tolist()

@@ -27,10 +27,10 @@ def walk(angles: Sequence[Any], base: Sequence[Any], link: float) -> Iterator[tu
     """
     x, y = base
     heading: Any = 0.0
-    own = functions_of(angles[0])
+    xp = functions_of(angles[0])
     for angle in angles:
         heading = heading + angle
-        x, y = x + own.cos(heading) * link, y + own.sin(heading) * link
+        x, y = x + xp.cos(heading) * link, y + xp.sin(heading) * link
         yield x, y
 
 
@@ -52,9 +52,9 @@ def chain(angles: Array, base: Array, length: float) -> Array:
         >>> chain(angles, torch.zeros(2), 2.0).round(decimals=4).tolist()
         [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]
     """
-    own, parts = functions_of(angles), _parts(angles)
-    ends: list[Array] = [own.stack(end, -1) for end in walk(parts, _parts(base), length / len(parts))]
-    return own.stack([own.broadcast_to(base, ends[0].shape), *ends], -2)
+    xp, parts = functions_of(angles), _parts(angles)
+    ends: list[Array] = [xp.stack(end, -1) for end in walk(parts, _parts(base), length / len(parts))]
+    return xp.stack([xp.broadcast_to(base, ends[0].shape), *ends], -2)
 
 
 def chain_end(angles: Array, base: Array, length: float) -> Array:

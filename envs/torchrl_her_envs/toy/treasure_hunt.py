@@ -72,7 +72,7 @@ class TreasureHunt(ToyEnv):
         )
 
     def _draw(self, sheet: Sheet, world: int) -> None:
-        pirate, treasure = (int(own[world, 0]) for own in (self.worlds.place, self.worlds.goal))
+        pirate, treasure = (int(cells[world, 0]) for cells in (self.worlds.place, self.worlds.goal))
         draw_treasure(sheet, pirate / self._last, treasure / self._last)
 
     def _start(self, which: Tensor) -> tuple[Tensor, Tensor]:
