@@ -37,7 +37,7 @@ def draw_goals(
 ) -> tuple[Tensor, Tensor]:
     """Draws k virtual goals for each transition, or each episode, by strategy times weights times filter.
 
-    This is for goals of the own episode; see :class:`~torchrl_her.HindsightOptions` for those of others.
+    This is for goals of the same episode; see :class:`~torchrl_her.HindsightOptions` for those of others.
 
     Args:
         before: [n, g], the goals that were achieved before the actions.
@@ -108,7 +108,7 @@ def draw_for_runs(
     """Draws the virtual goals of episodes of several runs, each run with its own weights and generator.
 
     Each source is a factor of its own: its goals are drawn by candidate times weight times filter, where
-    its candidates are goals of the own episode, or those that the run remembers of recent episodes.
+    its candidates are goals of the same episode, or those that the run remembers of recent episodes.
 
     Args:
         chunk: Episodes of m runs.
@@ -117,7 +117,7 @@ def draw_for_runs(
         weights: weights of all runs; None for all goals alike.
         generators: m of them.
         recent: the goals of recent episodes of all runs, those of these episodes among them.
-        times: factor for the number of goals drawn in the own episode, relative to the options.
+        times: factor for the number of goals drawn in the same episode, relative to the options.
     """
     rows, piece, reward_fn, options = chunk.rows, chunk.piece, chunk.reward_fn, chunk.options
     episodes = piece.episodes

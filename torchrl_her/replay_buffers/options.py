@@ -39,7 +39,7 @@ class HindsightOptions:
             given to :func:`~torchrl_her.register_strategy`, or a function as described there.
         goal_sources: number of virtual goals by source, in place of ``k`` and ``strategy``, which are short
             for a single source: ``k=4, strategy="future"`` is ``{"future": 4}``. Besides strategies there are
-            two sources that look beyond the own episode: ``"actual"``, goals that were really wanted in
+            two sources that look beyond the episode: ``"actual"``, goals that were really wanted in
             recent episodes, and ``"achieved"``, goals that were achieved in them. ``weights`` and filter act
             on the goals of all sources. None: ``k`` and ``strategy`` count.
         recent_actual, recent_achieved: number of the newest goals that these two sources remember: one that

@@ -167,7 +167,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         >>> buffer[:]["next", "reward"].flatten().tolist()
         [-1.0, -1.0, 0.0, -1.0, -1.0, -1.0]
 
-        One goal of the own future, and one that was really wanted in a recent episode:
+        One goal from the future of the same episode, and one that was really wanted in a recent episode:
 
         >>> writer = HERWriter(GoalReward(0.5), goal_sources={"future": 1, "actual": 1})
         >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), writer=writer, batch_size=4)

@@ -132,7 +132,7 @@ def check_strategy(name: str) -> None:
     if name not in known:
         hint = what_there_is(name, known, "strategies") + REGISTERED
         if name in RECENT:
-            hint = f", which looks beyond the own episode: write goal_sources='{{{name}: 4}}'"
+            hint = f", which looks beyond the episode: write goal_sources='{{{name}: 4}}'"
         raise ValueError(f"unknown goal strategy {name!r}{hint}")
 
 
