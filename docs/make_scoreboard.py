@@ -83,8 +83,11 @@ def boards() -> dict[str, list[Curves]]:
             theirs("DDPG+HER", "FetchPush", "DDPG and HER, by Relay-HER's authors"),
         ],
         "FetchPickAndPlace": [
-            ours("both stages with each transition on FetchPickAndPlace", "default agent"),
-            ours("default agent on FetchPickAndPlace", "one stage after the other, seeds 0 to 2"),
+            ours("default agent on FetchPickAndPlace", "default agent"),
+            ours(
+                "default agent, one stage after the other, on FetchPickAndPlace",
+                "one stage after the other, seeds 0 to 2",
+            ),
             theirs("RHER", "FetchPickAndPlace", "Relay-HER"),
             theirs("DDPG+HER", "FetchPickAndPlace", "DDPG and HER, by Relay-HER's authors"),
         ],
