@@ -166,6 +166,7 @@ def test_goals_that_pass_the_filter_are_drawn_in_proportion(weighted: bool, rela
     for t, kept in enumerate([[1.0, 3.0], [1.0, 3.0], [3.0, 0.0], [0.0]]):  # the goal 0 is achieved at first
         drawn, total = goal[time == t], sum(kept) if weighted else len(kept)
         assert (len(drawn) > 3_000) == bool(total)
+        assert relabel is not written or len(drawn) in (0, 6_000)  # k of each episode
         for value in (0.0, 1.0, 3.0) if total else ():
             expected = (value if weighted else 1) / total if value in kept else 0.0
             assert (drawn == value).float().mean().item() == pytest.approx(expected, abs=0.05)  # 5 deviations
@@ -297,7 +298,7 @@ def test_keys_of_ones_own(relabel: Relabel) -> None:
     rows = relabel(batch, virtual_key=None, reward_key="cost", **goals)
     assert "virtual" not in rows.keys()
     is_virtual = rows["goals", "wanted"][:, 0] != WANTED
-    assert is_virtual.float().mean().item() == pytest.approx(0.8, abs=0.02)
+    assert is_virtual.float().mean().item() == pytest.approx(0.8, abs=1e-6 if relabel is written else 0.02)
     assert torch.equal(rows["goals", "wanted"], rows["next", "goals", "wanted"])
     assert (rows["next", "cost"][is_virtual] == 0).any()
 
