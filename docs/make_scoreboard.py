@@ -157,4 +157,6 @@ if __name__ == "__main__":
         read_curves("staying", {"case": case}, case, window=1, episodes=100)
         for case in ("default agent", "default agent, one stage after the other")
     ]
-    plot_comparison({"FetchPush, at the last step": {own.method: own.rows for own in cases}}, STAYING)
+    plot_comparison(
+        {"FetchPush, at the last step": {curves.method: curves.rows for curves in cases}}, STAYING
+    )

@@ -7,7 +7,6 @@ import inspect
 import json
 import re
 import sys
-from itertools import groupby
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -73,16 +72,12 @@ def test_a_film_is_made_of_a_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def shown(notebook: dict[str, Any]) -> list[list[str]]:
-    """What each cell of code shows: kinds of outputs, "image/png" for a picture.
-
-    What a cell prints comes in several outputs where the machine is busy.
-    """
+    """What each cell of code shows: kinds of outputs, "image/png" for a picture."""
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
-    kinds = [
+    return [
         [next(iter(output.get("data", {output.get("name"): ""}))) for output in cell["outputs"]]
         for cell in cells
     ]
-    return [[kind for kind, _ in groupby(outputs)] for outputs in kinds]
 
 
 @pytest.mark.long

@@ -18,6 +18,7 @@ from torchrl_her.goals.factors import draw
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights, weights_by_run
+from torchrl_her.modules.noise import generator_states, set_generator_states
 from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
 
 UpdateOn = Literal["achieved", "proposed"]
@@ -185,9 +186,7 @@ class BehaviorGoals(Transform):
             "memory": self.memory.state_dict(),
             "weights": [weights.state_dict() for weights in self.weights],
             "factors": [factor.state_dict() for factor in self.factors],
-            "generators": [
-                None if generator is None else generator.get_state() for generator in self.generators
-            ],
+            "generators": generator_states(self.generators),
             "ended": self.ended,
             "achieved": self.achieved,
             "active": list(self._active),
@@ -207,9 +206,7 @@ class BehaviorGoals(Transform):
                 raise ValueError(f"the state has {len(state[name])} {name}, not {len(each)}")
             for part, was in zip(each, state[name], strict=True):
                 part.load_state_dict(was)
-        for generator, generator_state in zip(self.generators, state["generators"], strict=True):
-            if generator is not None and generator_state is not None:
-                generator.set_state(generator_state)
+        set_generator_states(self.generators, state["generators"])
         self.ended, self.achieved = state["ended"].clone(), state["achieved"].clone()
         self._active = list(state["active"])
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_her.curriculum.layers import Curriculum, CurriculumProgress
+from torchrl_her.modules.noise import generator_states, set_generator_states
 from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
 
 
@@ -104,14 +105,11 @@ class EpisodeLayers(CurriculumProgress):
         raise ValueError(f"run {run} cannot be moved to layer {layer}: each episode has a layer of its own")
 
     def state_dict(self) -> dict[str, Any]:
-        states = [None if generator is None else generator.get_state() for generator in self.generators]
-        return {**super().state_dict(), "generators": states}
+        return {**super().state_dict(), "generators": generator_states(self.generators)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
-        for generator, generator_state in zip(self.generators, state["generators"], strict=True):
-            if generator is not None and generator_state is not None:
-                generator.set_state(generator_state)
+        set_generator_states(self.generators, state["generators"])
 
 
 class TeacherStudent(EpisodeLayers):

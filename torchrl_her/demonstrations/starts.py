@@ -12,6 +12,7 @@ from torchrl.envs import Transform
 
 from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.demonstrations.walk import WalkBack
+from torchrl_her.modules.noise import generator_states, set_generator_states
 
 
 class DemonstrationStarts(Transform):
@@ -189,18 +190,14 @@ class DemonstrationStarts(Transform):
         return {
             "walk": self.walk.state_dict(),
             "back": None if self._back is None else self._back.clone(),
-            "generators": [
-                None if generator is None else generator.get_state() for generator in self._generators
-            ],
+            "generators": generator_states(self._generators),
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restores the state that :meth:`get_extra_state` returned."""
         self.walk.load_state_dict(state["walk"])
         self._back = None if state["back"] is None else state["back"].clone()
-        for generator, generator_state in zip(self._generators, state["generators"], strict=True):
-            if generator is not None and generator_state is not None:
-                generator.set_state(generator_state)
+        set_generator_states(self._generators, state["generators"])
 
 
 class _Outcomes(Transform):

@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+
+
+def generator_states(generators: Iterable[torch.Generator | None]) -> list[Tensor | None]:
+    """Returns the states of generators; None for torch's own, which a checkpoint does not hold."""
+    return [None if generator is None else generator.get_state() for generator in generators]
+
+
+def set_generator_states(
+    generators: Iterable[torch.Generator | None], states: Iterable[Tensor | None]
+) -> None:
+    """Puts back what :func:`generator_states` returned for as many generators."""
+    for generator, state in zip(generators, states, strict=True):
+        if generator is not None and state is not None:
+            generator.set_state(state)
 
 
 class RunNoise:

@@ -24,9 +24,8 @@ def listing() -> int:
         **{f"choices of {group}": kind.summaries() for group, kind in KINDS.items()},
         "studies": {name: load_study(name).summary for name in study_names()},
         "trained policies": {
-            name: f"{info['success']:.0%} success on {info['task']}"
+            name: "{success:.0%} success on {task}".format_map(read_header(path)["info"])
             for name, path in policy_files().items()
-            if (info := read_header(path)["info"])
         },
         "spaces": {name: space_summary(name) for name in space_names()},
         "presets": {name: preset_summary(name) for name in preset_names()},

@@ -183,10 +183,8 @@ def _facts(
     moved, kept, achieved, fallen = [], [], [], []
     for episode in played:
         goals = episode["next", "achieved_goal"]
-        here, there = (
-            outcomes(rule, episode["achieved_goal"], episode),
-            outcomes(rule, goals, episode["next"]),
-        )
+        here = outcomes(rule, episode["achieved_goal"], episode)
+        there = outcomes(rule, goals, episode["next"])
         kept.append(_kept(here, goals, meets))
         if not episode["next", "done"][-1]:
             continue  # it was cut off by the end of the look
@@ -271,15 +269,15 @@ def propose_layers(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
     moving = step > 0.1 * step.max()
     if not place or not bool(step.max() > 0) or bool(moving.all()) or wide < 2 * width:
         return []
-    near: dict[int, tuple[float, float]] = {}
+    gaps: dict[int, Tensor] = {}
     for first in range(wide - width + 1):
         entries = seen[:, first : first + width]
         if set(range(first, first + width)) & set(place) or bool((entries.std(0) == 0).any()):
             continue
-        gap = (entries - goal).norm(dim=-1)
-        near[first] = (float(gap[moving].quantile(_TOUCH)), float(gap[~moving].median()))
-    best = min(near, key=lambda first: near[first][0], default=None)
-    if best is None or near[best][0] > _NEAR * near[best][1]:
+        gaps[first] = (entries - goal).norm(dim=-1)
+    touch = {first: float(gap[moving].quantile(_TOUCH)) for first, gap in gaps.items()}
+    best = min(touch, key=touch.__getitem__, default=None)
+    if best is None or touch[best] > _NEAR * float(gaps[best][~moving].median()):
         return []
     if (radius := _radius(rows, meets)) is None:
         return []
@@ -292,9 +290,8 @@ def propose_layers(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
         "desired_goal": list(place),
     }
     task = {"observation": others + place, "achieved_goal": list(place), "desired_goal": "desired_goal"}
-    closest = float((seen[:, best : best + width] - goal).norm(dim=-1).min())
-    around = closest < radius / 2
-    threshold = float(f"{radius / 2 if around else max(near[best][0], radius):.2g}")
+    around = float(gaps[best].min()) < radius / 2
+    threshold = float(f"{radius / 2 if around else max(touch[best], radius):.2g}")
     return [{"name": "reach", **reach, "threshold": threshold}, {"name": "task", **task}]
 
 

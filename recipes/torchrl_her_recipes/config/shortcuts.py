@@ -33,8 +33,9 @@ GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
     "run": groups.RunConfig,
 }
 KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)}
-# groups that had options before, and the groups that have them now
+# options that had another name before
 FORMER_NAMES = {"products": "matmul_dtype", "average_decay": "ema_decay"}
+# groups that had options before, and the groups that have them now
 FORMER = {"ibs": ("weights", "behavior"), "novelty": ("weights",), "curriculum": ("order",)}
 # groups whose options are always named with them: ``file`` alone would be unclear
 LONG_ONLY = ("demonstrations",)

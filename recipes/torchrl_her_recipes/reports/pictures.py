@@ -130,10 +130,10 @@ def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Pictu
     env = make_env(task)
     env.reset()
     target = next(iter(maps.values())).target
-    limit, pictures = max(float(target.max()), 1e-9), []
-    for label, share in (
-        {label: goals.share for label, goals in maps.items()} | {"target q*": target}
-    ).items():
+    limit = max(float(target.max()), 1e-9)
+    shares = {label: goals.share for label, goals in maps.items()} | {"target q*": target}
+    pictures = []
+    for label, share in shares.items():
         figure = Figure(figsize=(2.5, 2.7), layout="constrained")
         axes = figure.subplots()
         draw_goals(axes, share, env, limit=limit)

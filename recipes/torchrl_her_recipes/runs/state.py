@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl_her.curriculum.switch import set_layer_goals
 from torchrl_her.goals.sources import sources_name
 from torchrl_her.goals.strategies import strategy_name
+from torchrl_her.modules.noise import generator_states, set_generator_states
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.checkpoint import (
     buffer_state_dict,
@@ -73,12 +74,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
         "buffer": Part(
             partial(buffer_state_dict, buffer, copy=False), partial(load_buffer_state_dict, buffer)
         ),
-        "generators": Part(
-            lambda: [generator.get_state() for generator in generators],
-            lambda states: [
-                generator.set_state(state) for generator, state in zip(generators, states, strict=True)
-            ],
-        ),
+        "generators": Part(partial(generator_states, generators), partial(set_generator_states, generators)),
         # For losses that draw random numbers, as SAC's.
         "torch_generator": Part(torch.get_rng_state, torch.set_rng_state),
         "cuda_generator": None

@@ -124,7 +124,7 @@ def test_mappings_are_named_by_what_differs() -> None:
         ({"cases": {"few": {"kk": 3}}}, "no option 'kk'"),
         (
             {"cases": {"few": {"k": 3}}, "vary": {"k": [1, 2]}},
-            "cases of own must not set k in few",
+            "cases of own must not set k in few, since it varies",
         ),
         (
             {"cases": {"long": {"run": {"epochs": 3}}}},
