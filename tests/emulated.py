@@ -121,7 +121,7 @@ class _Emulation(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         options = dict(kwargs or {})
-        tensors = [leaf for leaf in tree_leaves((args, options)) if isinstance(leaf, Tensor)]
+        tensors = tensors_in((args, options))
         there = [isinstance(leaf, OnDevice) for leaf in tensors]
         if func is torch._has_compatible_shallow_copy_type:
             return there[0] == there[1]  # if not, modules make their parameters anew
@@ -136,14 +136,16 @@ class _Emulation(TorchFunctionMode):
         out = func(*args, **options)
         if self._within_vmap or isinstance(out, torch.Size):
             return out
-        return tree_map(partial(_put, there=after), out)
+        return (
+            _put(out, there=after) if isinstance(out, Tensor) else tree_map(partial(_put, there=after), out)
+        )
 
     def vmap(self, func: Callable[..., Any], *args: Any, **options: Any) -> Callable[..., Any]:
         """What is mapped sees other tensors, which cannot be marked: only what goes in and out is checked."""
         mapped = torch.vmap(func, *args, **options)
 
         def call(*given: Any, **named: Any) -> Any:
-            there = {isinstance(leaf, OnDevice) for leaf in _tensors_in((given, named))}
+            there = {isinstance(leaf, OnDevice) for leaf in tensors_in((given, named))}
             if len(there) > 1:
                 raise PlacementError("vmap got tensors on the CPU and on the device")
             before, self._within_vmap = self._within_vmap, True
@@ -156,14 +158,15 @@ class _Emulation(TorchFunctionMode):
         return call
 
 
-def _tensors_in(value: Any) -> list[Tensor]:
+def tensors_in(value: Any) -> list[Tensor]:
+    """Tensors of nested containers. Torch's own function for that takes longer than what is emulated."""
+    if isinstance(value, Tensor):
+        return [value]
+    if isinstance(value, list | tuple):
+        return [leaf for own in value for leaf in tensors_in(own)]
     if isinstance(value, TensorDictBase):
         return list(value.values(True, True))
-    if isinstance(value, dict):
-        return _tensors_in(list(value.values()))
-    if isinstance(value, list | tuple):
-        return [leaf for own in value for leaf in _tensors_in(own)]
-    return [value] if isinstance(value, Tensor) else []
+    return tensors_in(list(value.values())) if isinstance(value, dict) else []
 
 
 def _put(value: Any, *, there: bool) -> Any:

@@ -16,9 +16,8 @@ from unittest.mock import Mock, patch
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
-from .emulated import DeviceGenerator
+from .emulated import DeviceGenerator, tensors_in
 
 
 class CapturingError(RuntimeError):
@@ -49,7 +48,7 @@ class Graph:
         with torch._C.DisableTorchFunction():  # where tensors are was checked when they were recorded
             for kernel, args, options, before in self.kernels:
                 again = kernel(*args, **options)
-                for own, new in zip(_tensors(before), _tensors(again), strict=True):
+                for own, new in zip(tensors_in(before), tensors_in(again), strict=True):
                     if own.data_ptr() != new.data_ptr():
                         own.copy_(new)
 
@@ -61,6 +60,7 @@ class _Recording(TorchDispatchMode):
         super().__init__()
         self.graph = graph
         self._own: list[Tensor] = []  # made meanwhile, and kept, so that no other tensor has their memory
+        self._made: set[int] = set()  # their memory
         self._before: dict[int, tuple[Tensor, Tensor]] = {}  # bytes of memory, and what was there
         self._states: list[Tensor] = []
 
@@ -77,17 +77,18 @@ class _Recording(TorchDispatchMode):
             if own.alias_info is not None and own.alias_info.is_write:
                 self._keep(args[place] if place < len(args) else options.get(own.name))
         out = func(*args, **options)
-        known = {own.untyped_storage().data_ptr() for own in _tensors((args, options))}
-        self._own += [own for own in _tensors(out) if own.untyped_storage().data_ptr() not in known]
+        known = {own.untyped_storage().data_ptr() for own in tensors_in((args, options))}
+        new = [own for own in tensors_in(out) if own.untyped_storage().data_ptr() not in known]
+        self._own += new
+        self._made |= {own.untyped_storage().data_ptr() for own in new}
         self.graph.kernels.append((func, args, options, out))
         return out
 
     def _keep(self, written: Any) -> None:
         """Notes what is in tensors before they are written to."""
-        made = {own.untyped_storage().data_ptr() for own in self._own}
-        for own in _tensors(written):
+        for own in tensors_in(written):
             storage = own.untyped_storage()
-            if storage.data_ptr() not in made and storage.data_ptr() not in self._before:
+            if storage.data_ptr() not in self._made and storage.data_ptr() not in self._before:
                 memory = torch.empty(0, dtype=torch.uint8).set_(storage)
                 self._before[storage.data_ptr()] = (memory, memory.clone())
 
@@ -125,7 +126,3 @@ def emulated_graphs() -> Iterator[type[Graph]]:
         }.items():
             stack.enter_context(patch.object(torch.cuda, name, own))
         yield Graph
-
-
-def _tensors(value: Any) -> list[Tensor]:
-    return [leaf for leaf in tree_leaves(value) if isinstance(leaf, Tensor)]

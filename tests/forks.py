@@ -24,6 +24,7 @@ _IMPORTED = [
     "torchrl_her_recipes.components",
     "torchrl_her_recipes.runs.run",
     "torchrl_her_recipes.studies.study",
+    "tests.frozen",
 ]
 
 

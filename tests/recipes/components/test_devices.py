@@ -31,6 +31,10 @@ CURRICULUM = {
     "success_threshold": 0.01,
 }
 SHORT = {"epoch_frames": 320, "warmup_frames": 80}
+# On the CPU the other tests of runs show the same.
+ELSEWHERE = pytest.mark.parametrize(
+    "device", ["emulated", "cuda", pytest.param("cpu", marks=pytest.mark.full)], indirect=True
+)
 
 
 @pytest.fixture
@@ -49,6 +53,7 @@ def places(components: Components) -> tuple[set[str], set[str]]:
     return {own.device.type for own in learner}, replay | {components.buffer.sampler.device.type}
 
 
+@ELSEWHERE
 @pytest.mark.parametrize("options", [{}, CURRICULUM], ids=["filtered_her", "curriculum"])
 @pytest.mark.parametrize("learner", ["here", "there"])
 @pytest.mark.parametrize("replay", ["here", "there"])
@@ -65,6 +70,7 @@ def test_each_part_is_where_it_should_be(
     assert components.eval_env.reset()["observation"].device.type == "cpu"
 
 
+@ELSEWHERE
 @pytest.mark.parametrize("learner", ["td3", "sac", "redq", "tqc"])
 def test_every_learner(learner: str, name: str) -> None:
     components = build(small(learner=learner, epochs=1, **SHORT, **{"learner.device": name}))
@@ -72,6 +78,7 @@ def test_every_learner(learner: str, name: str) -> None:
     assert places(components) == ({name}, {name})
 
 
+@ELSEWHERE
 @pytest.mark.parametrize(
     "options",
     [{"task": "bit_flip", "task.options": {"bits": 4, "useless_action": True}}, {"task": "treasure_hunt"}],
@@ -84,11 +91,6 @@ def test_dqn(name: str, options: dict[str, Any]) -> None:
 
 
 TWO = {"num_runs": 2, "compile": "never"}
-
-# On the CPU the tests of resumption show the same.
-ELSEWHERE = pytest.mark.parametrize(
-    "device", ["emulated", "cuda", pytest.param("cpu", marks=pytest.mark.full)], indirect=True
-)
 
 
 @ELSEWHERE
@@ -118,6 +120,7 @@ def test_a_run_goes_on_in_the_middle_of_an_epoch(name: str, tmp_path: Path) -> N
     assert_same(*ends)
 
 
+@ELSEWHERE
 def test_policies_are_played_without_the_device(name: str, tmp_path: Path) -> None:
     run(build(small(epochs=1, **{"learner.device": name})), tmp_path / "run", progress=False)
     assert {own.device.type for own in load_policy(tmp_path / "run").parameters()} == {"cpu"}

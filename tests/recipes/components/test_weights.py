@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import pytest
 import torch
 
-from torchrl_her import Instructiveness, load_checkpoint
+from torchrl_her import Instructiveness
 from torchrl_her.goals import KernelInstructiveness, NetworkNovelty, RareGoals
 from torchrl_her.replay_buffers.runs import rows_of_run
 from torchrl_her_envs import make_env
-from torchrl_her_recipes import build, resume, run
+from torchrl_her_recipes import Components, Recipe, build, resume, run
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.goal_space import KernelSpace, goal_space
 from torchrl_her_recipes.config.choices.weights import IBS
 
-from ..small import assert_same, small, stop_after
+from ..small import assert_same_runs, small, stop_after
 
 CASES: dict[str, dict[str, Any]] = {
     "rare": {"algo": "filtered_her_rare"},
@@ -38,12 +39,29 @@ KINDS = {
 }
 
 
+def recipe(case: str, **options: Any) -> Recipe:
+    return small(**{**CASES[case], "epoch_frames": 480, "frames_per_update": 50.0, **options})
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Components, Path]]:
+    """Trains two runs of each case once."""
+
+    @cache
+    def train(case: str) -> tuple[Components, Path]:
+        components, folder = build(recipe(case, num_runs=2, seed=5)), tmp_path_factory.mktemp("whole")
+        run(components, folder, progress=False)
+        return components, folder
+
+    return train
+
+
 @pytest.mark.parametrize("case", CASES)
-def test_runs_side_by_side_are_the_runs_that_they_would_be_alone(case: str) -> None:
-    options = {**CASES[case], "epoch_frames": 800, "frames_per_update": 50.0}
-    together = build(small(num_runs=2, seed=5, **options))
-    run(together, progress=False)
-    alone = build(small(seed=6, **options))
+def test_runs_side_by_side_are_the_runs_that_they_would_be_alone(
+    case: str, whole: Callable[[str], tuple[Components, Path]]
+) -> None:
+    together, _ = whole(case)
+    alone = build(recipe(case, seed=6))
     run(alone, progress=False)
     weights = together.buffer.writer.goal_weights
     assert [type(own) for own in weights] == [KINDS[case.split()[-1]]] * 2
@@ -56,17 +74,14 @@ def test_runs_side_by_side_are_the_runs_that_they_would_be_alone(case: str) -> N
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(case: str, tmp_path: Path) -> None:
-    recipe = small(**{**CASES[case], "epoch_frames": 480, "frames_per_update": 60.0, "num_runs": 2})
-    run(build(recipe), tmp_path / "whole", progress=False)
-    stopped = build(recipe)
+def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
+    case: str, whole: Callable[[str], tuple[Components, Path]], tmp_path: Path
+) -> None:
+    stopped = build(recipe(case, num_runs=2, seed=5))
     stop_after(stopped, 8)
-    run(stopped, tmp_path / "stopped", progress=False)
-    resume(tmp_path / "stopped", progress=False)
-    first, second = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("whole", "stopped"))
-    assert_same(first, second)
-    tables = [pd.read_csv(tmp_path / name / "metrics.csv") for name in ("whole", "stopped")]
-    pd.testing.assert_frame_equal(*(table.drop(columns="seconds") for table in tables), check_exact=True)
+    run(stopped, tmp_path, progress=False)
+    resume(tmp_path, progress=False)
+    assert_same_runs(whole(case)[1], tmp_path)
 
 
 def test_only_runs_with_ibs_tell_a_divergence(tmp_path: Path) -> None:
@@ -101,11 +116,11 @@ def test_the_kernel_s_sigma_is_the_grid_s_and_grows_with_the_root_of_the_numbers
     assert space.sigma == pytest.approx(grid.sigma) == pytest.approx(0.4)
     assert space.goals.shape[1] == 2
     env = make_env("bit_flip", bits=12)
-    recipe = small(**{"task": "bit_flip", "task.options.bits": 12})
-    many = goal_space(recipe, env, IBS())
+    bits = small(**{"task": "bit_flip", "task.options.bits": 12})
+    many = goal_space(bits, env, IBS())
     assert isinstance(many, KernelSpace)
     assert many.sigma == pytest.approx(0.2 * math.sqrt(12 / 3))
-    given = goal_space(recipe, env, IBS(sigma=0.3))
+    given = goal_space(bits, env, IBS(sigma=0.3))
     assert given is not None
     assert given.sigma == pytest.approx(0.3)
 

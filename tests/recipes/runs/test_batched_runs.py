@@ -102,30 +102,43 @@ class Emptying(Callback):
         self.idle.append([size == 0 for size in sizes_of(run.components.buffer)])
 
 
-def check_like_alone(options: dict[str, Any], *, tolerance: float = 1e-6) -> list[dict[str, float]]:
+Trained = tuple[Components, list[dict[str, float]]]
+
+
+def train_alone(options: dict[str, Any]) -> list[Trained]:
+    """Trains the runs one by one."""
+    trained = []
+    for index in range(RUNS):
+        alone = build(small(**{**options, "seed": options["seed"] + index}))
+        trained.append((alone, run(alone, callbacks=[Emptying()], progress=False).rows))
+    return trained
+
+
+def check_like_alone(
+    options: dict[str, Any], *, alone: list[Trained] | None = None, tolerance: float = 1e-6
+) -> list[dict[str, float]]:
     """Trains runs side by side and alone, compares their metrics and weights, and returns the metrics."""
     together, emptying = build(small(num_runs=RUNS, **options)), Emptying()
     rows = run(together, callbacks=[emptying], progress=False).rows
     assert any(any(own) and not all(own) for own in emptying.idle)
-    for index in range(RUNS):
-        alone = build(small(**{**options, "seed": options["seed"] + index}))
-        single = run(alone, callbacks=[Emptying()], progress=False).rows
-        for own, other in zip(rows[index::RUNS], single, strict=True):
+    for index, (single, expected_rows) in enumerate(alone or train_alone(options)):
+        for own, other in zip(rows[index::RUNS], expected_rows, strict=True):
             names = [name for name in own if name not in ("seconds", "run", "updates")]
             expected = {name: pytest.approx(other[name], rel=tolerance, nan_ok=True) for name in names}
             assert {name: own[name] for name in names} == expected
         torch.testing.assert_close(
-            weights(together, index), weights(alone, 0), rtol=tolerance, atol=tolerance
+            weights(together, index), weights(single, 0), rtol=tolerance, atol=tolerance
         )
     return rows
 
 
-@pytest.mark.parametrize("compile", ["auto", "never"])
 @pytest.mark.parametrize("options", LEARNERS, ids=lambda own: "_".join(map(str, own.values())))
-def test_a_run_that_learns_later_than_others_is_what_it_is_alone(
-    options: dict[str, Any], compile: str
-) -> None:
-    check_like_alone({**LATER, "task": "hand_v2", "compile": compile, "dtype": "float64", **options})
+def test_a_run_that_learns_later_than_others_is_what_it_is_alone(options: dict[str, Any]) -> None:
+    """By compiled steps and without, which learn the same."""
+    shared = {**LATER, "task": "hand_v2", "dtype": "float64", **options}
+    alone = train_alone(shared)
+    for compile in ("auto", "never"):
+        check_like_alone({**shared, "compile": compile}, alone=alone)
 
 
 def test_a_run_with_discrete_actions_that_learns_later_is_what_it_is_alone() -> None:

@@ -52,6 +52,40 @@ ALL: dict[str, Any] = {
 }
 
 
+SHORT = small(algo="filtered_her", epochs=2, epoch_frames=480)
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of two epochs."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    run(build(SHORT), folder, progress=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def _stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stopped") / "run"
+    run(build(SHORT), folder, callbacks=[Stop(1)], progress=False)
+    return folder
+
+
+@pytest.fixture
+def stopped(_stopped: Path, tmp_path: Path) -> Path:
+    """The folder of the same run, which was stopped after its first epoch, for one test."""
+    return copytree(_stopped, tmp_path / "run")
+
+
+class Stop(Callback):
+    """Stops a run after some epochs."""
+
+    def __init__(self, epochs: int) -> None:
+        self.epochs = epochs
+
+    def on_epoch(self, run: RunView) -> bool:
+        return run.trainer.epochs == self.epochs
+
+
 def press_ctrl_c(components: Components, batch: int) -> Components:
     """Components whose run is interrupted after a number of batches."""
     collect, count = components.collector.next, iter(range(10**6))
@@ -184,7 +218,7 @@ def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
 def test_environments_that_cannot_be_saved_go_on_bit_for_bit_between_epochs(
     task: str, tmp_path: Path
 ) -> None:
-    recipe = small(task=task, algo="filtered_her", num_runs=2, epochs=3, epoch_frames=400)
+    recipe = small(task=task, algo="filtered_her", num_runs=2, epochs=2, epoch_frames=400)
     run(build(recipe), tmp_path / "whole", progress=False)
     early = EarlyStopping("epoch", at_least=1)
     assert run(build(recipe), tmp_path / "part", callbacks=[early], progress=False).stopped
@@ -210,11 +244,11 @@ def test_a_finished_run_that_is_given_more_epochs(options: dict[str, Any], tmp_p
 
 
 def test_epochs_extend_a_finished_run_and_an_interrupted_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ended: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recipe, whole = small(algo="filtered_her", epochs=2, epoch_frames=480), tmp_path / "whole"
+    recipe, whole = SHORT, tmp_path / "whole"
     run(build(recipe.replace(epochs=4)), whole, progress=False)
-    run(build(recipe), tmp_path / "ended", progress=False)
+    copytree(ended, tmp_path / "ended")
     run(press_ctrl_c(build(recipe), 8), tmp_path / "stopped", progress=False)
     for name, folder in (("epochs", tmp_path / "ended"), ("run.epochs", tmp_path / "stopped")):
         assert cli.main(["train", "--resume", str(folder), f"{name}=4"]) == 0
@@ -261,14 +295,6 @@ def test_what_cannot_extend_a_run_is_named_and_changes_nothing(
     assert {path: path.stat().st_mtime_ns for path in ended.rglob("*")} == before
 
 
-@pytest.fixture(scope="module")
-def ended(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run of two epochs."""
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    run(build(small(epochs=2, epoch_frames=480)), folder, progress=False)
-    return folder
-
-
 def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -309,11 +335,11 @@ def test_a_finished_run_draws_its_pictures_again_without_its_buffer(tmp_path: Pa
     assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is None
 
 
-def test_a_buffer_that_was_kept_goes_when_it_is_not_wanted_any_more(tmp_path: Path) -> None:
-    run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
-    assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is not None
-    resume(tmp_path, options={"epochs": 2, "keep_buffer": False}, progress=False)
-    assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is None
+def test_a_buffer_that_was_kept_goes_when_it_is_not_wanted_any_more(ended: Path, tmp_path: Path) -> None:
+    folder = copytree(ended, tmp_path / "run")
+    assert load_checkpoint(folder / "checkpoint.pt")["buffer"] is not None
+    resume(folder, options={"epochs": 3, "keep_buffer": False}, progress=False)
+    assert load_checkpoint(folder / "checkpoint.pt")["buffer"] is None
 
 
 def test_a_default_run_is_small_when_it_has_finished_and_ends_as_one_that_keeps_its_buffer(
@@ -331,11 +357,13 @@ def test_a_default_run_is_small_when_it_has_finished_and_ends_as_one_that_keeps_
     assert (tmp_path / "small" / "checkpoint.pt").stat().st_size < 2_000_000
 
 
-def test_without_a_checkpoint_a_run_cannot_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
-    (tmp_path / "checkpoint.pt").unlink()
-    assert cli.main(["train", "--resume", str(tmp_path), "epochs=3"]) == 2
-    said = f"torchrl-her: the run in {tmp_path} cannot be resumed: checkpoint.pt is missing\n"
+def test_without_a_checkpoint_a_run_cannot_go_on(
+    ended: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = copytree(ended, tmp_path / "run")
+    (folder / "checkpoint.pt").unlink()
+    assert cli.main(["train", "--resume", str(folder), "epochs=3"]) == 2
+    said = f"torchrl-her: the run in {folder} cannot be resumed: checkpoint.pt is missing\n"
     assert capsys.readouterr().err == said
 
 
@@ -344,16 +372,6 @@ def test_options_and_components_are_not_given_together(ended: Path) -> None:
         ValueError, match="give resume.. either options or components that were made with them"
     ):
         resume(ended, components=build(small()), options={"epochs": 3})
-
-
-class Stop(Callback):
-    """Stops a run after some epochs."""
-
-    def __init__(self, epochs: int) -> None:
-        self.epochs = epochs
-
-    def on_epoch(self, run: RunView) -> bool:
-        return run.trainer.epochs == self.epochs
 
 
 def test_the_last_checkpoints_are_kept_until_the_run_has_finished(tmp_path: Path) -> None:
@@ -366,57 +384,45 @@ def test_the_last_checkpoints_are_kept_until_the_run_has_finished(tmp_path: Path
     assert load_checkpoint(tmp_path / "checkpoint.pt")["trainer"]["epochs"] == 5
 
 
-def test_what_a_killed_run_left_half_written_is_removed(tmp_path: Path) -> None:
-    run(build(small(epochs=2, epoch_frames=400)), tmp_path, callbacks=[Stop(1)], progress=False)
-    killed, mine = tmp_path / "checkpoint.part.pt", tmp_path / "mine.part.pt"
+def test_what_a_killed_run_left_half_written_is_removed(stopped: Path) -> None:
+    killed, mine = stopped / "checkpoint.part.pt", stopped / "mine.part.pt"
     killed.write_bytes(b"half of it")
     mine.touch()
-    resume(tmp_path, progress=False)
+    resume(stopped, progress=False)
     assert mine.exists()
     assert not killed.exists()
 
 
 @pytest.mark.filterwarnings("always")
-def test_on_the_command_line_a_warning_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run(build(small(epochs=3, epoch_frames=480)), tmp_path, callbacks=[Stop(2)], progress=False)
-    damage(tmp_path / "checkpoint.pt")
-    assert cli.main(["train", "--resume", str(tmp_path)]) == 0
+def test_on_the_command_line_a_warning_is_one_line(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damage(stopped / "checkpoint.pt")
+    assert cli.main(["train", "--resume", str(stopped)]) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "damaged" in line]
-    assert line.strip().startswith(f"torchrl-her: warning: {tmp_path / 'checkpoint.pt'} is damaged: ")
+    assert line.strip().startswith(f"torchrl-her: warning: {stopped / 'checkpoint.pt'} is damaged: ")
 
 
-def test_the_one_before_a_damaged_checkpoint_is_used(tmp_path: Path) -> None:
-    recipe = small(epochs=3, epoch_frames=480)
-    for name, callbacks in (("whole", []), ("part", [Stop(2)])):
-        run(build(recipe), tmp_path / name, callbacks=callbacks, progress=False)
-    damage(tmp_path / "part" / "checkpoint.pt")
-    said = (
-        r"part/checkpoint\.pt is damaged: its checksum does not match; checkpoint\.1\.pt, the one before, is"
-    )
+def test_the_one_before_a_damaged_checkpoint_is_used(ended: Path, stopped: Path) -> None:
+    damage(stopped / "checkpoint.pt")
+    said = r"checkpoint\.pt is damaged: its checksum does not match; checkpoint\.1\.pt, the one before, is"
     with pytest.warns(UserWarning, match=said):
-        assert len(resume(tmp_path / "part", progress=False).rows) == 3
-    assert_same_runs(tmp_path / "whole", tmp_path / "part")
+        assert len(resume(stopped, progress=False).rows) == 2
+    assert_same_runs(ended, stopped)
 
 
-def test_damaged_checkpoints_alone_are_refused(tmp_path: Path) -> None:
-    run(build(small(epochs=2, epoch_frames=480)), tmp_path, callbacks=[Stop(1)], progress=False)
-    for path in tmp_path.glob("checkpoint*.pt"):
+def test_damaged_checkpoints_alone_are_refused(stopped: Path) -> None:
+    for path in stopped.glob("checkpoint*.pt"):
         damage(path)
     with pytest.raises(
         ValueError, match=r"^[^\n]*checkpoint\.pt is damaged[^\n]*checkpoint\.1\.pt is damaged"
     ):
-        resume(tmp_path, progress=False)
+        resume(stopped, progress=False)
 
 
-def test_a_run_before_its_first_epoch_can_be_resumed(tmp_path: Path) -> None:
-    recipe = small(epochs=1, epoch_frames=480)
-    run(build(recipe), tmp_path / "whole", progress=False)
-    assert run(press_ctrl_c(build(recipe), 0), tmp_path / "part", progress=False).interrupted
+def test_a_run_before_its_first_epoch_can_be_resumed(ended: Path, tmp_path: Path) -> None:
+    assert run(press_ctrl_c(build(SHORT), 0), tmp_path / "part", progress=False).interrupted
     (tmp_path / "part" / "checkpoint.1.pt").replace(tmp_path / "part" / "checkpoint.pt")
     resume(tmp_path / "part", progress=False)
-    assert_same_runs(tmp_path / "whole", tmp_path / "part")
+    assert_same_runs(ended, tmp_path / "part")
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no disk that is always full")
