@@ -24,7 +24,7 @@ _RANDOM = 0.5  # p of the thesis: one of two actions goes forward
 _SOLVED = 0.9  # success of the greedy policy
 
 
-def learning_steps(length: int, layers: int, algo: str) -> list[int]:
+def learning_steps(length: int, stages: int, algo: str) -> list[int]:
     """The stretches of a chain that an ideal learner has to walk at random without a mistake.
 
     Without hindsight that is all of it; with hindsight, all up to the first link that counts as achieved,
@@ -32,7 +32,7 @@ def learning_steps(length: int, layers: int, algo: str) -> list[int]:
 
     Args:
         length: n, the number of steps to the goal.
-        layers: parts of the chain, of which only the last is achieved.
+        stages: parts of the chain, of which only the last is achieved.
         algo: name of an algorithm.
 
     Returns:
@@ -45,7 +45,7 @@ def learning_steps(length: int, layers: int, algo: str) -> list[int]:
     algorithm = get_algorithm(algo)
     if not algorithm.virtual:
         return [length]
-    hidden = 0 if algorithm.curriculum else length - length // layers
+    hidden = 0 if algorithm.curriculum else length - length // stages
     return [hidden + 1] + [1] * (length - hidden - 1)
 
 
@@ -95,21 +95,21 @@ def plot_times(runs: Sequence[tuple[Recipe, Rows]], path: Path) -> None:
         path: of the picture.
 
     Raises:
-        ValueError: runs of another task, or of chains of different numbers of layers.
+        ValueError: runs of another task, or of chains of different numbers of stages.
     """
     tasks = {recipe.task.name for recipe, _ in runs}
     if tasks != {"chain"}:
         raise ValueError(f"times are drawn of runs of chain, got {sorted(tasks)}")
-    layers = {_option(recipe, "layers", 1) for recipe, _ in runs}
-    if len(layers) != 1:
-        raise ValueError(f"times are drawn of chains of one number of layers, got {sorted(layers)}")
+    stages = {_option(recipe, "stages", 1) for recipe, _ in runs}
+    if len(stages) != 1:
+        raise ValueError(f"times are drawn of chains of one number of stages, got {sorted(stages)}")
     figure = Figure(figsize=(7.0, 4.6), layout="constrained")
     axes = figure.subplots()
     by_algo: dict[str, dict[int, tuple[Recipe, Rows]]] = {}
     for recipe, rows in runs:
         by_algo.setdefault(recipe.hindsight.algo, {})[_option(recipe, "length", 10)] = recipe, rows
     lengths = sorted({length for cells in by_algo.values() for length in cells})
-    (parts,) = layers
+    (parts,) = stages
     _draw_theory(axes, lengths)
     drawn: list[list[float]] = []  # the filter makes no difference to an ideal learner
     for index, (algo, cells) in enumerate(by_algo.items()):

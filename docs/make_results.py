@@ -144,7 +144,7 @@ def print_from_change(cells: Sequence[Combination], every: Sequence[int], within
         changes, later = [], []
         for run in sorted({row["run"] for row in cell.rows}):
             rows = [row for row in cell.rows if row["run"] == run]
-            changes.append(next(row["frames"] for row in rows if row["layer"] > 0))
+            changes.append(next(row["frames"] for row in rows if row["stage"] > 0))
             since = [(row["frames"] - changes[-1], row["success"]) for row in rows]
             later.append(
                 [np.mean([own for frames, own in since if end - within < frames <= end]) for end in every]

@@ -27,15 +27,15 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from torchrl_her import (
     Curriculum,
-    CurriculumLayer,
     CurriculumProgress,
+    CurriculumStage,
     DecayingEpsilon,
     FusedLearner,
     GoalReward,
     HERWriter,
     StateToObs,
     ZeroPad,
-    enter_layer,
+    enter_stage,
     evaluate,
     make_actor,
     make_critic,
@@ -95,8 +95,8 @@ def make_stages() -> CurriculumProgress:
     """Returns the stages of ``hand_v1``, reach and throw, and the record of successes that ends a stage."""
     task = make_env("hand_v1")
     width = task.observation_spec["state"].shape[-1]
-    layers = [CurriculumLayer(**layer) for layer in task.layers()]
-    return CurriculumProgress(Curriculum(layers, width, names=task.state_names()))
+    stages = [CurriculumStage(**stage) for stage in task.stages()]
+    return CurriculumProgress(Curriculum(stages, width, names=task.state_names()))
 
 
 def make_staged_env(progress: CurriculumProgress, num_envs: int, seed: int) -> EnvBase:
@@ -127,7 +127,7 @@ def make_buffer(options: Options, progress: CurriculumProgress) -> TensorDictRep
             options.capacity, alpha=options.priority_alpha, beta=options.priority_beta
         ),
         writer=HERWriter(
-            progress.layer_of(0).reward_fn or GoalReward(0.1),
+            progress.stage_of(0).reward_fn or GoalReward(0.1),
             k=options.k,
             strategy="future",
             filter_achieved=True,  # no goals that were achieved before the action
@@ -190,11 +190,11 @@ def train(options: Options) -> Iterator[Evaluation]:
             updates += steps
         exploration.step()
         achieved = success(evaluate(test_env, average.module, max_steps=max_steps)).float()
-        yield Evaluation(frames, progress.layer_of(0).name, float(achieved.mean()))
+        yield Evaluation(frames, progress.stage_of(0).name, float(achieved.mean()))
         if progress.record(achieved.view(1, -1))[
             0
         ]:  # the window's mean is high enough: the next stage begins
-            enter_layer(buffer, progress.layer_of(0), exploration)
+            enter_stage(buffer, progress.stage_of(0), exploration)
             collector.reset()
             buffer.writer.end_episodes()
     collector.shutdown()

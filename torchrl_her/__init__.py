@@ -10,8 +10,8 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 from torchrl_her.curriculum.guide import GuidedExploration
-from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
-from torchrl_her.curriculum.switch import enter_layer
+from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress, CurriculumStage
+from torchrl_her.curriculum.switch import enter_stage
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
 from torchrl_her.goals.grid import GoalGrid, box_target
 from torchrl_her.goals.ibs import Instructiveness
@@ -34,8 +34,8 @@ from torchrl_her.trainers.trainer import Trainer, evaluate
 
 __all__ = [
     "Curriculum",
-    "CurriculumLayer",
     "CurriculumProgress",
+    "CurriculumStage",
     "DecayingEpsilon",
     "EnvIds",
     "EnvReward",
@@ -53,7 +53,7 @@ __all__ = [
     "Trainer",
     "ZeroPad",
     "box_target",
-    "enter_layer",
+    "enter_stage",
     "evaluate",
     "load_checkpoint",
     "make_actor",

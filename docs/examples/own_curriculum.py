@@ -1,6 +1,6 @@
 """A curriculum for an environment from elsewhere: gymnasium's mountain car fetches a parcel.
 
-Run it with ``python docs/examples/own_curriculum.py``; ``--direct`` leaves out the first layer.
+Run it with ``python docs/examples/own_curriculum.py``; ``--direct`` leaves out the first stage.
 ``docs/curriculum.md`` explains it.
 """
 
@@ -21,8 +21,8 @@ from torchrl.envs import Compose, EnvBase, GymWrapper, RenameTransform, SerialEn
 
 from torchrl_her import (
     Curriculum,
-    CurriculumLayer,
     CurriculumProgress,
+    CurriculumStage,
     DecayingEpsilon,
     FusedLearner,
     GoalReward,
@@ -30,7 +30,7 @@ from torchrl_her import (
     StateToObs,
     Trainer,
     ZeroPad,
-    enter_layer,
+    enter_stage,
     evaluate,
     make_actor,
     make_critic,
@@ -44,10 +44,10 @@ from torchrl_her.replay_buffers import PackedStorage, RunsSampler
 
 STEPS = 75  # of an episode
 NAMES = {"car": [0, 1], "position": [0], "parcel": [2], "place": [3]}  # [position, speed | parcel | place]
-DRIVE = CurriculumLayer(
+DRIVE = CurriculumStage(
     name="drive", observation="car", achieved_goal="position", desired_goal="parcel", threshold=0.1
 )
-DELIVER = CurriculumLayer(
+DELIVER = CurriculumStage(
     name="deliver", observation=["car", "parcel"], achieved_goal="parcel", desired_goal="place", threshold=0.1
 )
 
@@ -70,7 +70,7 @@ class FetchParcel(gymnasium.Wrapper):
             car, _, _, _, info = self.env.step(action)
             state = self._state(car)
         there = bool(abs(state[2] - state[3]) < DELIVER.threshold)
-        return state, float(there) - 1.0, there, False, info  # of the last layer; TimeLimit sets truncated
+        return state, float(there) - 1.0, there, False, info  # of the last stage; TimeLimit sets truncated
 
     def _state(self, car: np.ndarray) -> np.ndarray:
         position, speed = (car[0] + 0.3) / 0.9, car[1] / 0.07  # both in [-1, 1]
@@ -86,10 +86,10 @@ def make_single_env() -> EnvBase:
 
 
 def make_env(num_envs: int, progress: CurriculumProgress, *, seed: int) -> EnvBase:
-    """``num_envs`` environments for each run, one run after the other, each as its run's layer sees it."""
-    layers = StateToObs(progress.curriculum, progress), ZeroPad(progress.curriculum, progress)
+    """``num_envs`` environments for each run, one run after the other, each as its run's stage sees it."""
+    stages = StateToObs(progress.curriculum, progress), ZeroPad(progress.curriculum, progress)
     env = SerialEnv(num_envs * progress.runs, make_single_env)
-    env = TransformedEnv(env, Compose(RenameTransform(["observation"], ["state"]), *layers))
+    env = TransformedEnv(env, Compose(RenameTransform(["observation"], ["state"]), *stages))
     env.set_seed(seed)
     return env
 
@@ -97,7 +97,7 @@ def make_env(num_envs: int, progress: CurriculumProgress, *, seed: int) -> EnvBa
 def make_network(
     make: Callable[..., TensorDictModule], curriculum: Curriculum, runs: int
 ) -> TensorDictModule:
-    """A network with all inputs; the weights of those that the first layer does not use start at 0."""
+    """A network with all inputs; the weights of those that the first stage does not use start at 0."""
     network = make([curriculum.input_width], 1, runs=runs, in_keys=["input"])
     first = next(module for module in network.modules() if isinstance(module, StackedLinear))
     first.weight.data = zero_unused_inputs(first.weight.data, curriculum.first_inputs, alpha=0.0)
@@ -112,7 +112,7 @@ def make_buffer(
     buffer = TensorDictReplayBuffer(
         storage=PackedStorage(len(generators) * capacity),  # a block of rows for each run
         writer=HERWriter(
-            GoalReward(progress.layer_of(0).threshold),  # all runs begin in the first layer
+            GoalReward(progress.stage_of(0).threshold),  # all runs begin in the first stage
             filter_achieved=True,
             exclude=("state", "input"),
             **runs,
@@ -124,7 +124,7 @@ def make_buffer(
 
 
 def train(
-    layers: Sequence[CurriculumLayer] = (DRIVE, DELIVER),
+    stages: Sequence[CurriculumStage] = (DRIVE, DELIVER),
     *,
     epochs: int = 14,
     epoch_frames: int = 2_000,
@@ -134,10 +134,10 @@ def train(
     success_threshold: float = 0.9,
     seed: int = 0,
 ) -> Iterator[tuple[int, list[str], list[float]]]:
-    """Trains, and yields after each epoch the frames so far, and the layer and the success of each run."""
+    """Trains, and yields after each epoch the frames so far, and the stage and the success of each run."""
     torch.manual_seed(seed)
     generators = [torch.Generator().manual_seed(seed + run) for run in range(runs)]
-    curriculum = Curriculum(layers, 4, names=NAMES)
+    curriculum = Curriculum(stages, 4, names=NAMES)
     progress = CurriculumProgress(curriculum, runs=runs, window=window, success_threshold=success_threshold)
     env = make_env(num_envs, progress, seed=seed)
     eval_env = make_env(window, progress, seed=seed + 1_000_000)  # as many episodes as the window holds
@@ -169,10 +169,10 @@ def train(
     for _ in range(epochs):
         trainer.epoch()
         samples = success(evaluate(eval_env, policy, max_steps=STEPS)).float().view(runs, window)
-        names = [progress.layer_of(run).name for run in range(runs)]
+        names = [progress.stage_of(run).name for run in range(runs)]
         yield trainer.frames, names, samples.mean(1).tolist()
         for run in progress.record(samples).nonzero().flatten().tolist():
-            enter_layer(buffer, progress.layer_of(run), exploration, run=run)
+            enter_stage(buffer, progress.stage_of(run), exploration, run=run)
     trainer.collector.shutdown()
     eval_env.close()
 

@@ -258,7 +258,7 @@ for _spec in (
         options={
             "length": 10,
             "forward_probability": 1.0,
-            "layers": 1,
+            "stages": 1,
             "alternating": False,
             "reset_state": False,
             "max_steps": None,

@@ -108,8 +108,8 @@ def test_options_reach_the_environment() -> None:
     assert make_env("bit_flip").bits == 15
     assert make_env("bit_flip", bits=4, useless_action=True).num_actions == 5
     assert make_env("treasure_hunt", step=20).max_steps == 5
-    chain = make_env("chain", length=6, layers=3)
-    assert (chain.length, chain.forward_probability, len(chain.layers())) == (6, 1.0, 3)
+    chain = make_env("chain", length=6, stages=3)
+    assert (chain.length, chain.forward_probability, len(chain.stages())) == (6, 1.0, 3)
     assert make_env("robot_v0", num_links=3, threshold=0.2, dtype="float64").action_spec.shape == (1, 4)
     walk = make_env(f"gym:{WALK}", max_steps=3, ends=False)
     assert walk.max_steps == 3
@@ -122,7 +122,7 @@ def test_options_reach_the_environment() -> None:
         ("hand_v0", "task", "world, num_links, threshold, dtype"),
         ("bit_flip", "bit", "bits, useless_action, max_steps"),
         ("treasure_hunt", "threshold", "step, max_steps"),
-        ("chain", "p", "length, forward_probability, layers, alternating, reset_state, max_steps"),
+        ("chain", "p", "length, forward_probability, stages, alternating, reset_state, max_steps"),
         (
             f"gym:{WALK}",
             "speed",

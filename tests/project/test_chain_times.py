@@ -21,13 +21,13 @@ episodes_to_solve, plot_times = chain_times.episodes_to_solve, chain_times.plot_
 ideal_episodes, learning_steps = chain_times.ideal_episodes, chain_times.learning_steps
 
 
-def played_out(length: int, layers: int, algo: str, p: float, learners: int) -> float:
+def played_out(length: int, stages: int, algo: str, p: float, learners: int) -> float:
     """Mean episodes of learners that know their way to a place of the chain, and go on at random."""
-    env = Chain(length, 1.0, layers=layers, alternating=True, reset_state=True, num_envs=learners)
+    env = Chain(length, 1.0, stages=stages, alternating=True, reset_state=True, num_envs=learners)
     generator = torch.Generator().manual_seed(0)
     known = torch.zeros(learners, dtype=torch.int64)
     episodes = torch.zeros(learners)
-    hidden = {"no_hindsight": length - 1, "her": length - length // layers, "cher": 0}[algo]
+    hidden = {"no_hindsight": length - 1, "her": length - length // stages, "cher": 0}[algo]
     while bool((known < length).any()):
         episodes += known < length
         shown = env.reset()
@@ -53,11 +53,11 @@ def test_ideal_learners_in_the_chain_itself_take_as_long_as_the_formula_says(alg
 @given(st.integers(1, 12), st.integers(1, 6), st.floats(0.1, 1.0))
 @settings(deadline=None)
 def test_curricula_take_polynomial_and_hindsight_over_sub_tasks_exponential_time(
-    part: int, layers: int, p: float
+    part: int, stages: int, p: float
 ) -> None:
-    n = part * layers
+    n = part * stages
     alone, her, cher = (
-        ideal_episodes(learning_steps(n, layers, algo), p) for algo in ("no_hindsight", "her", "cher")
+        ideal_episodes(learning_steps(n, stages, algo), p) for algo in ("no_hindsight", "her", "cher")
     )
     assert alone == pytest.approx(p**-n)
     assert cher == pytest.approx(1 + n * (1 / p - 1))
@@ -65,7 +65,7 @@ def test_curricula_take_polynomial_and_hindsight_over_sub_tasks_exponential_time
     assert cher <= her + 1e-6 * her
     assert her <= alone * (1 + 1e-6)
     assert her >= p ** -(n - part + 1) * (1 - 1e-9)
-    assert all(sum(learning_steps(n, layers, algo)) == n for algo in ("no_hindsight", "her", "cher"))
+    assert all(sum(learning_steps(n, stages, algo)) == n for algo in ("no_hindsight", "her", "cher"))
 
 
 def test_the_first_success_of_each_run_counts() -> None:
@@ -84,7 +84,7 @@ def chain(**options: object) -> Recipe:
 def test_times_are_drawn_whether_chains_were_solved_or_not(tmp_path: Path) -> None:
     cells = [
         (
-            chain(length=n, layers=2),
+            chain(length=n, stages=2),
             [{"run": run, "frames": 640, "success": float(n < 8)} for run in range(3)],
         )
         for n in (4, 8)
@@ -97,5 +97,5 @@ def test_times_are_drawn_whether_chains_were_solved_or_not(tmp_path: Path) -> No
 def test_times_of_other_runs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"times are drawn of runs of chain, got \['hand_v0'\]"):
         plot_times([(make_recipe(), [])], tmp_path / "times.png")
-    with pytest.raises(ValueError, match=r"of one number of layers, got \[1, 2\]"):
-        plot_times([(chain(length=4), []), (chain(length=4, layers=2), [])], tmp_path / "times.png")
+    with pytest.raises(ValueError, match=r"of one number of stages, got \[1, 2\]"):
+        plot_times([(chain(length=4), []), (chain(length=4, stages=2), [])], tmp_path / "times.png")

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 from torchrl.envs import SerialEnv, TransformedEnv
 
-from torchrl_her import Curriculum, CurriculumLayer, CurriculumProgress, StateToObs, ZeroPad, make_actor
+from torchrl_her import Curriculum, CurriculumProgress, CurriculumStage, StateToObs, ZeroPad, make_actor
 from torchrl_her.replay_buffers import rows_of_run, sizes_of
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -57,14 +57,14 @@ def test_the_guide_s_python_runs_from_top_to_bottom() -> None:
         exec(compile(block, "curriculum.md", "exec"), names)
 
 
-def test_the_guide_s_layers_are_the_example_s(example: ModuleType) -> None:
+def test_the_guide_s_stages_are_the_example_s(example: ModuleType) -> None:
     names: dict[str, object] = {}
     exec(re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)[0], names)
     assert (names["drive"], names["deliver"]) == (example.DRIVE, example.DELIVER)
     assert names["names"] == example.NAMES
 
 
-def test_the_example_s_episodes_end_at_the_layer_s_goal_and_at_the_time_limit_only(
+def test_the_example_s_episodes_end_at_the_stage_s_goal_and_at_the_time_limit_only(
     example: ModuleType,
 ) -> None:
     progress = CurriculumProgress(Curriculum([example.DRIVE, example.DELIVER], 4, names=example.NAMES))
@@ -87,27 +87,27 @@ def test_the_example_s_episodes_end_at_the_layer_s_goal_and_at_the_time_limit_on
         assert there["terminated"][lane, step]
         assert not there["truncated"][lane, step]
         assert there["reward"][lane, : step + 1].flatten().tolist() == [-1.0] * step + [0.0]
-    progress.set_layer(0, 1)
+    progress.set_stage(0, 1)
     carried = env.rollout(example.STEPS, swing)["next"]
     assert torch.equal(carried["desired_goal"], carried["state"][..., 3:4])
     assert torch.equal(carried["achieved_goal"], carried["state"][..., 2:3])
     assert carried["terminated"][:, -1].any()  # the car carried the parcel to its place
 
 
-def test_the_example_trains_each_run_in_its_layer_and_moves_on(
+def test_the_example_trains_each_run_in_its_stage_and_moves_on(
     example: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ended: list[tuple[TensorDict, CurriculumLayer]] = []  # stored transitions, and the next layer
-    moved: list[tuple[ReplayBuffer, int]] = []  # the buffer of all runs, and a run that began a layer
-    enter_layer = example.enter_layer
+    ended: list[tuple[TensorDict, CurriculumStage]] = []  # stored transitions, and the next stage
+    moved: list[tuple[ReplayBuffer, int]] = []  # the buffer of all runs, and a run that began a stage
+    enter_stage = example.enter_stage
 
-    def spy(buffer: ReplayBuffer, layer: CurriculumLayer, *args: object, run: int) -> None:
-        ended.append((rows_of_run(buffer, run).clone(), layer))
-        enter_layer(buffer, layer, *args, run=run)
+    def spy(buffer: ReplayBuffer, stage: CurriculumStage, *args: object, run: int) -> None:
+        ended.append((rows_of_run(buffer, run).clone(), stage))
+        enter_stage(buffer, stage, *args, run=run)
         assert sizes_of(buffer)[run] == 0
         moved.append((buffer, run))
 
-    monkeypatch.setattr(example, "enter_layer", spy)
+    monkeypatch.setattr(example, "enter_stage", spy)
     easy = replace(example.DRIVE, threshold=0.6)  # the parcel is 0.27 to 0.84 away
     small = {"epochs": 3, "epoch_frames": 300, "num_envs": 2, "runs": 2, "window": 2}
     rows = list(example.train([easy, example.DELIVER], success_threshold=0.5, **small))
@@ -117,18 +117,18 @@ def test_the_example_trains_each_run_in_its_layer_and_moves_on(
     assert [names[0] for names in first.values()] == ["drive", "drive"]
     assert "deliver" in [names[-1] for names in first.values()]
     assert len(ended) == len(moved) >= 1
-    for stored, layer in ended:
-        assert layer.name == "deliver"
+    for stored, stage in ended:
+        assert stage.name == "deliver"
         check_rows(stored, easy.threshold, low=-0.95, high=-0.6)
-    # The others changed layer after the last epoch.
+    # The others changed stage after the last epoch.
     begun = [rows_of_run(buffer, run) for buffer, run in moved if sizes_of(buffer)[run] > 0]
     assert begun
-    for rows_of_layer in begun:
-        check_rows(rows_of_layer, example.DELIVER.threshold, low=0.4, high=0.8)
+    for rows_of_stage in begun:
+        check_rows(rows_of_stage, example.DELIVER.threshold, low=0.4, high=0.8)
 
 
 def check_rows(rows: TensorDict, threshold: float, *, low: float, high: float) -> None:
-    """Real rows want the layer's goals, virtual ones what was achieved; rewards fit its threshold."""
+    """Real rows want the stage's goals, virtual ones what was achieved; rewards fit its threshold."""
     assert "state" not in rows.keys()
     virtual = rows["virtual"].squeeze(-1)
     wanted, got = rows["next", "desired_goal"], rows["next", "achieved_goal"]
@@ -152,7 +152,7 @@ def stored_without_input() -> ReplayBuffer:
 MISTAKES: dict[str, tuple[type[Exception], Callable[[ModuleType, Curriculum], object]]] = {
     "desired_goal must share no index": (
         ValueError,
-        lambda own, _: CurriculumLayer(
+        lambda own, _: CurriculumStage(
             name="drive", observation=[0, 1, 2], achieved_goal=[0], desired_goal=[2], threshold=0.1
         ),
     ),

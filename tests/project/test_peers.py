@@ -92,7 +92,7 @@ peer = SBXTD3(Recipe.from_dict(json.loads(recipe)))
 peer.fill(240)
 done = [peer.updates, peer.gradient_steps(10), peer.loop(80), peer.updates]
 layers = peer.model.policy.actor_state.params["params"].values()
-print(json.dumps({"done": done, "shapes": [own.shape for layer in layers for own in layer.values()]}))
+print(json.dumps({"done": done, "shapes": [own.shape for stage in stages for own in stage.values()]}))
 """
 
 

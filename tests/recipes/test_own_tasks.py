@@ -180,15 +180,15 @@ def test_a_torchrl_environment_of_one_s_own_trains_by_its_name(tmp_path: Path) -
     "task", ["gym:torchrl_her_envs:torchrl_her/HandReach-v0", "tests.envs.common.own_point:Point"]
 )
 def test_environments_that_end_by_themselves_work_with_a_curriculum(task: str) -> None:
-    """Their own goals are easy to meet by chance, and those of the first layer are not."""
+    """Their own goals are easy to meet by chance, and those of the first stage are not."""
     width = 2 if "Point" in task else 5
     seen = {"observation": list(range(width)), "achieved_goal": [0, 1], "desired_goal": [width, width + 1]}
-    layers = [{**seen, "name": "near", "threshold": 1e-6}, {**seen, "name": "task"}]
+    stages = [{**seen, "name": "near", "threshold": 1e-6}, {**seen, "name": "task"}]
     easy: dict[str, Any] = {} if "Point" in task else {"task.options": {"threshold": 0.5}}
-    recipe = make_recipe(small(**TINY).to_dict(), task=task, algo="cher", curriculum=layers, **easy)
+    recipe = make_recipe(small(**TINY).to_dict(), task=task, algo="cher", curriculum=stages, **easy)
     components = build(recipe)
     rows = run(components, progress=False).rows
-    assert rows[-1]["layer_success"] == 0.0
+    assert rows[-1]["stage_success"] == 0.0
     lengths = components.env.rollout(30, break_when_any_done=False)["next"]
     ended = lengths["truncated"] & ~lengths["terminated"]
     assert ended.any()

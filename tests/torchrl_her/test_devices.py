@@ -17,8 +17,8 @@ from torchrl.objectives import LossModule
 
 from torchrl_her import (
     Curriculum,
-    CurriculumLayer,
     CurriculumProgress,
+    CurriculumStage,
     DecayingEpsilon,
     GoalGrid,
     GoalReward,
@@ -245,16 +245,16 @@ def test_weights_follow_the_goals(name: str, device: torch.device) -> None:
     torch.testing.assert_close(again(goals), elsewhere(goals), **close)
 
 
-REACH = CurriculumLayer(name="reach", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.5)
-MOVE = CurriculumLayer(name="move", observation=[0, 1], achieved_goal=[1], desired_goal=[2], threshold=0.5)
+REACH = CurriculumStage(name="reach", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.5)
+MOVE = CurriculumStage(name="move", observation=[0, 1], achieved_goal=[1], desired_goal=[2], threshold=0.5)
 
 
-def test_layers_of_several_runs(device: torch.device, make_generator: Generators) -> None:
+def test_stages_of_several_runs(device: torch.device, make_generator: Generators) -> None:
     curriculum = Curriculum([REACH, MOVE], 3)
     progress = CurriculumProgress(curriculum, runs=2)
     rows = TensorDict({"observation": torch.rand(4, 2), "desired_goal": torch.rand(4, 1)}, [4])
-    for layer in range(2):  # of the second run: the same as the first one's, and another
-        progress.set_layer(1, layer)
+    for stage in range(2):  # of the second run: the same as the first one's, and another
+        progress.set_stage(1, stage)
         pad = ZeroPad(curriculum, progress)
         seen = pad(rows.to(device))["input"]
         check(seen, device)

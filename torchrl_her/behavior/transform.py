@@ -44,7 +44,7 @@ class BehaviorGoals(Transform):
     | DISCOVER | none | | ``DiscoverScore``; with a single critic ``InverseDensity``, too | True |
 
     In a curriculum, put it behind :class:`~torchrl_her.StateToObs` and before :class:`~torchrl_her.ZeroPad`.
-    It acts in the last layer, which is the full task, if ``layer_key`` is given or :meth:`set_active` is
+    It acts in the last stage, which is the full task, if ``stage_key`` is given or :meth:`set_active` is
     called.
 
     The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
@@ -75,8 +75,8 @@ class BehaviorGoals(Transform):
         proposed_key: key under which a bool [..., 1] is written: whether the goal is a proposed one.
         reached_key: key under which a bool [..., 1] is written: whether
             a proposed goal was achieved in the episode.
-        layer_key: key of the layer [..., 1] that an episode is played in, if it has one.
-        layer: the one in which goals are proposed.
+        stage_key: key of the stage [..., 1] that an episode is played in, if it has one.
+        stage: the one in which goals are proposed.
 
     Attributes:
         memory: the achieved goals of each run, :class:`~torchrl_her.behavior.AchievedGoals`.
@@ -128,8 +128,8 @@ class BehaviorGoals(Transform):
         real_goal_key: NestedKey = "real_desired_goal",
         proposed_key: NestedKey = "proposed",
         reached_key: NestedKey = "proposed_reached",
-        layer_key: NestedKey | None = None,
-        layer: int = 0,
+        stage_key: NestedKey | None = None,
+        stage: int = 0,
     ) -> None:
         if not 0.0 <= real_share <= 1.0:
             raise ValueError(f"real_share must be in [0, 1], got {real_share}")
@@ -161,7 +161,7 @@ class BehaviorGoals(Transform):
         self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
         self.truncated_key = None if truncated_key is None else unravel_key(truncated_key)
         self.done_key = unravel_key(done_key)
-        self.layer_key, self.layer = layer_key, layer
+        self.stage_key, self.stage = stage_key, stage
         self.ended = torch.zeros(runs, dtype=torch.int64)
         self.achieved = torch.zeros(runs, dtype=torch.int64)
         self._active = [True] * runs
@@ -291,9 +291,9 @@ class BehaviorGoals(Transform):
         if not all(self._active):
             active = torch.tensor(self._active, device=goals.device)
             part = active.repeat_interleave(len(goals) // self.runs)
-        if self.layer_key is not None:
-            in_layer = self._get(tensordict, self.layer_key).reshape(-1) == self.layer
-            part = in_layer if part is None else part & in_layer
+        if self.stage_key is not None:
+            in_stage = self._get(tensordict, self.stage_key).reshape(-1) == self.stage
+            part = in_stage if part is None else part & in_stage
         return part
 
     def _remember(self, before: TensorDictBase, after: TensorDictBase, achieved: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""Curricula whose layers are trained at the same time: each episode is played in a layer of its own."""
+"""Curricula whose stages are trained at the same time: each episode is played in a stage of its own."""
 
 from __future__ import annotations
 
@@ -8,49 +8,49 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_her.curriculum.layers import Curriculum, CurriculumProgress
+from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress
 from torchrl_her.modules.noise import generator_states, set_generator_states
 from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
 
 
-class EpisodeLayers(CurriculumProgress):
-    """Draws the layer of each episode when it begins, so that all layers are trained at once.
+class EpisodeStages(CurriculumProgress):
+    """Draws the stage of each episode when it begins, so that all stages are trained at once.
 
-    Runs are always in the last layer, which is the full task; it is their episodes that are in layers.
-    :class:`~torchrl_her.StateToObs` draws them, and writes each row's layer, so that one buffer holds rows
-    of all layers and :class:`~torchrl_her.ZeroPad` pads each by its own.
-    :class:`~torchrl_her.curriculum.LayerOutcomes` tells how episodes ended. Random numbers are drawn on the
+    Runs are always in the last stage, which is the full task; it is their episodes that are in stages.
+    :class:`~torchrl_her.StateToObs` draws them, and writes each row's stage, so that one buffer holds rows
+    of all stages and :class:`~torchrl_her.ZeroPad` pads each by its own.
+    :class:`~torchrl_her.curriculum.StageOutcomes` tells how episodes ended. Random numbers are drawn on the
     CPU. After Luo et al., Relay Hindsight Experience Replay, 2022 (arXiv 2208.00843).
 
     Args:
-        curriculum: the layers.
+        curriculum: the stages.
 
     Keyword Args:
         runs: R.
         generators: generators, one for each run; None for torch's own, with one run only.
-        task_share: share of the episodes that are played in the last layer, the full task; the others are
-            drawn evenly from the layers below. None for all layers alike.
+        task_share: share of the episodes that are played in the last stage, the full task; the others are
+            drawn evenly from the stages below. None for all stages alike.
 
     Raises:
         ValueError: ``runs`` is below 1, several runs have no generators, or the share is outside of [0, 1].
 
     Example:
-        >>> from torchrl_her import CurriculumLayer
+        >>> from torchrl_her import CurriculumStage
         >>> near, far = (
-        ...     CurriculumLayer(
+        ...     CurriculumStage(
         ...         name=name, observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
         ...     )
         ...     for name in ("near", "far")
         ... )
-        >>> layers = EpisodeLayers(Curriculum([near, far], 2))
-        >>> layers.shares.tolist()
+        >>> stages = EpisodeStages(Curriculum([near, far], 2))
+        >>> stages.shares.tolist()
         [[0.5, 0.5]]
-        >>> set(layers.draw([100]).tolist())
+        >>> set(stages.draw([100]).tolist())
         {0, 1}
     """
 
     by_episode = True
-    # Whether layers depend on how episodes have ended: all of them must then be played in one process.
+    # Whether stages depend on how episodes have ended: all of them must then be played in one process.
     adapts = False
 
     def __init__(
@@ -66,21 +66,21 @@ class EpisodeLayers(CurriculumProgress):
         share = 1 / (below + 1) if task_share is None else task_share
         if not 0 <= share <= 1:
             raise ValueError(f"task_share must be in [0, 1], got {task_share}")
-        self.layers = (below,) * runs
+        self.stages = (below,) * runs
         self.generators: Generators = check_generators(runs, generators) or [None]
         each = [(1 - share) / below] * below if below else []
         self._shares = torch.tensor([[*each, share if below else 1.0]] * runs, dtype=torch.float64)
 
     @property
     def shares(self) -> Tensor:
-        """Returns the probability of each layer for the next episode of each run, [R, L] of float64."""
+        """Returns the probability of each stage for the next episode of each run, [R, L] of float64."""
         return self._shares
 
-    def mean_layer(self, run: int) -> float:
+    def mean_stage(self, run: int) -> float:
         return float(self.shares[self._check_run(run)] @ torch.arange(len(self.curriculum)).double())
 
     def draw(self, counts: Sequence[int]) -> Tensor:
-        """Draws the layers of episodes that begin.
+        """Draws the stages of episodes that begin.
 
         Args:
             counts: R numbers of episodes.
@@ -93,16 +93,16 @@ class EpisodeLayers(CurriculumProgress):
         return (numbers >= below[:, :-1]).sum(1)
 
     def record_episodes(self, ended: Tensor, achieved: Tensor) -> None:
-        """Records how many episodes of each run and layer have ended, and in how many the goal was achieved.
+        """Records how many episodes of each run and stage have ended, and in how many the goal was achieved.
 
         Args:
             ended: [R, L] int64.
             achieved: [R, L] int64.
         """
 
-    def set_layer(self, run: int, layer: int) -> None:
-        """Raises a ValueError: episodes have layers here, not runs."""
-        raise ValueError(f"run {run} cannot be moved to layer {layer}: each episode has a layer of its own")
+    def set_stage(self, run: int, stage: int) -> None:
+        """Raises a ValueError: episodes have stages here, not runs."""
+        raise ValueError(f"run {run} cannot be moved to stage {stage}: each episode has a stage of its own")
 
     def state_dict(self) -> dict[str, Any]:
         return {**super().state_dict(), "generators": generator_states(self.generators)}
@@ -112,23 +112,23 @@ class EpisodeLayers(CurriculumProgress):
         set_generator_states(self.generators, state["generators"])
 
 
-class TeacherStudent(EpisodeLayers):
-    """Prefers layers whose success rate changes, in proportion to the absolute change.
+class TeacherStudent(EpisodeStages):
+    """Prefers stages whose success rate changes, in proportion to the absolute change.
 
-    Each layer's success is averaged over its recent episodes, and over the half as many newest ones; the
-    distance between the two is its progress. A share of the episodes is drawn from all layers alike, so that
-    a layer that stood still is noticed when it moves. After Matiisen et al., Teacher-Student Curriculum
+    Each stage's success is averaged over its recent episodes, and over the half as many newest ones; the
+    distance between the two is its progress. A share of the episodes is drawn from all stages alike, so that
+    a stage that stood still is noticed when it moves. After Matiisen et al., Teacher-Student Curriculum
     Learning, 2017 (arXiv 1707.00183), here with averages that forget in place of windows.
 
     Args:
-        curriculum: the layers.
+        curriculum: the stages.
 
     Keyword Args:
         runs: R.
         generators: generators, one for each run; None for torch's own, with one run only.
-        memory: episodes of a layer after which an episode counts 1 / e of what it counted first.
-        uniform_share: share of the episodes that are drawn from all layers alike.
-        still: progress that counts as standing still: it is added to that of all layers, so that chance alone
+        memory: episodes of a stage after which an episode counts 1 / e of what it counted first.
+        uniform_share: share of the episodes that are drawn from all stages alike.
+        still: progress that counts as standing still: it is added to that of all stages, so that chance alone
             prefers none.
 
     Attributes:
@@ -138,9 +138,9 @@ class TeacherStudent(EpisodeLayers):
         ValueError: an option is out of its range.
 
     Example:
-        >>> from torchrl_her import CurriculumLayer
+        >>> from torchrl_her import CurriculumStage
         >>> near, far = (
-        ...     CurriculumLayer(
+        ...     CurriculumStage(
         ...         name=name, observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
         ...     )
         ...     for name in ("near", "far")

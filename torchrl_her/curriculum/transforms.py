@@ -1,4 +1,4 @@
-"""CHER as TorchRL transforms: a layer's view of an environment, and the network's input."""
+"""CHER as TorchRL transforms: a stage's view of an environment, and the network's input."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from torchrl_her.curriculum.layers import Curriculum, CurriculumProgress
-from torchrl_her.curriculum.orders import EpisodeLayers
+from torchrl_her.curriculum.orders import EpisodeStages
+from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress
 from torchrl_her.goals.rewards import RewardFunction, is_achieved
 from torchrl_her.replay_buffers.keys import device_of
 
@@ -38,8 +38,8 @@ def take_columns(rows: Tensor, index: Tensor) -> Tensor:
     return taken.view(*rows.shape[:-1], index.shape[-1])
 
 
-class _LayerTransform(Transform):
-    """Transform that depends on the layers that the runs are in at present."""
+class _StageTransform(Transform):
+    """Transform that depends on the stages that the runs are in at present."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class _LayerTransform(Transform):
         run: int | None,
         in_keys: list[NestedKey],
         out_keys: list[NestedKey],
-        layer_key: NestedKey,
+        stage_key: NestedKey,
     ) -> None:
         if progress.curriculum is not curriculum:
             raise ValueError("progress must be made of the same curriculum, got one of another")
@@ -56,22 +56,22 @@ class _LayerTransform(Transform):
             raise ValueError(f"run must be None or in [0, {progress.runs - 1}], got {run}")
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.curriculum, self.progress, self.run = curriculum, progress, run
-        self.layer_key = unravel_key(layer_key)
+        self.stage_key = unravel_key(stage_key)
         self._tables: tuple[Any, Any] = (None, None)  # what the tables were made for, and the tables
-        self._shown_in: tuple[int, ...] | None = None  # the layers that the last states were shown in
+        self._shown_in: tuple[int, ...] | None = None  # the stages that the last states were shown in
 
-    def _layers(self) -> tuple[int, ...]:
-        """Returns the layer of each block of rows; a single one if all runs are in the same layer."""
-        layers = self.progress.layers
+    def _stages(self) -> tuple[int, ...]:
+        """Returns the stage of each block of rows; a single one if all runs are in the same stage."""
+        stages = self.progress.stages
         if self.run is not None:
-            return layers[self.run : self.run + 1]
-        return layers[:1] if layers.count(layers[0]) == len(layers) else layers
+            return stages[self.run : self.run + 1]
+        return stages[:1] if stages.count(stages[0]) == len(stages) else stages
 
-    def _rows_layers(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Returns the layer [...] that each row carries; None if layers are those of runs."""
+    def _rows_stages(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Returns the stage [...] that each row carries; None if stages are those of runs."""
         if not self.progress.by_episode:
             return None
-        return self._get(tensordict, self.layer_key, 1).squeeze(-1)
+        return self._get(tensordict, self.stage_key, 1).squeeze(-1)
 
     def _check_blocks(self, shape: torch.Size) -> None:
         """Raises if a batch of ``shape`` [..., width] is not one equal block for each run."""
@@ -84,17 +84,17 @@ class _LayerTransform(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if self._shown_in is None:  # later resets may be partial: the other rows stay as they were shown
-            self._shown_in = self.progress.layers
+            self._shown_in = self.progress.stages
         return self._call(tensordict_reset)
 
     def _show_again(self, root: TensorDictBase) -> Tensor | None:
-        """Recomputes the observations before a step if layers have changed since the last one.
+        """Recomputes the observations before a step if stages have changed since the last one.
 
         Returns:
-            [...] of bool, which rows were shown in another layer; None if layers are as they were.
+            [...] of bool, which rows were shown in another stage; None if stages are as they were.
         """
-        layers = self.progress.layers
-        changed, self._shown_in = self._shown_in not in (None, layers), layers
+        stages = self.progress.stages
+        changed, self._shown_in = self._shown_in not in (None, stages), stages
         if not changed or any(root.get(key, None) is None for key in self.out_keys):
             return None
         again = self._call(root.select(*self.in_keys, strict=False))
@@ -126,28 +126,28 @@ class _LayerTransform(Transform):
         return spec[key]
 
 
-class StateToObs(_LayerTransform):
-    """Shows an environment as each run's layer sees it: observation, goals, reward and ends.
+class StateToObs(_StageTransform):
+    """Shows an environment as each run's stage sees it: observation, goals, reward and ends.
 
-    ``observation`` always has the width of the last layer: the entries of the present layer, then zeros.
+    ``observation`` always has the width of the last stage: the entries of the present stage, then zeros.
 
-    The last layer is the environment's own task: its reward and its ends stay as they are. In the layers
-    below, ``next`` gets the reward and ``terminated`` of the layer's ``reward_fn`` (0 and an end where the
-    goal is nearer than the layer's threshold, -1 elsewhere), and ``done``, which is
+    The last stage is the environment's own task: its reward and its ends stay as they are. In the stages
+    below, ``next`` gets the reward and ``terminated`` of the stage's ``reward_fn`` (0 and an end where the
+    goal is nearer than the stage's threshold, -1 elsewhere), and ``done``, which is
     ``terminated | truncated``. ``truncated`` stays as it was, so the environment must set it at its time
     limit even if its own goal is achieved. Where the environment terminates an episode by itself, the
-    layer's episode continues if the environment can be stepped further. If it cannot
-    (``continues_after_termination=False``, as with gymnasium's environments), the layer's episode ends
-    there, too: it is ``truncated`` unless the layer's goal was achieved in that step, so that the critic goes
-    on to estimate what would have come. The end says nothing about the layer's goal.
+    stage's episode continues if the environment can be stepped further. If it cannot
+    (``continues_after_termination=False``, as with gymnasium's environments), the stage's episode ends
+    there, too: it is ``truncated`` unless the stage's goal was achieved in that step, so that the critic goes
+    on to estimate what would have come. The end says nothing about the stage's goal.
 
     The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
     Put the transform around a ParallelEnv and not inside of its workers: they hold copies of ``progress`` and
-    would stay in the layers in which they were started.
+    would stay in the stages in which they were started.
 
-    Change layers between episodes, and reset the collector. If a layer changes in mid-episode, the next step
-    is still shown as a whole in the new layer, and the episode is truncated there (done, without a
-    ``truncated_key``). The action of that step was chosen in the old layer. For this the environment must
+    Change stages between episodes, and reset the collector. If a stage changes in mid-episode, the next step
+    is still shown as a whole in the new stage, and the episode is truncated there (done, without a
+    ``truncated_key``). The action of that step was chosen in the old stage. For this the environment must
     work on the tensors that the collector keeps, so on the policy's device.
 
     GymWrapper shows an entry ``state`` of a dict as ``observation``: put a RenameTransform before this one.
@@ -156,15 +156,15 @@ class StateToObs(_LayerTransform):
     transitions that were relabeled.
 
     Args:
-        curriculum: the layers.
-        progress: the layer of each run; looked up in every call.
+        curriculum: the stages.
+        progress: the stage of each run; looked up in every call.
 
     Keyword Args:
         state_key: the state vector, which is read.
         observation_key, achieved_goal_key, desired_goal_key, reward_key, terminated_key, done_key: what is
             written.
-        layer_key: key under which the layer of each row is written, [..., 1] of int64, if episodes have
-            layers of their own (:class:`~torchrl_her.curriculum.EpisodeLayers`).
+        stage_key: key under which the stage of each row is written, [..., 1] of int64, if episodes have
+            stages of their own (:class:`~torchrl_her.curriculum.EpisodeStages`).
         truncated_key: read; None if the environment below has no time limit (a StepCounter after this
             transform may add one).
         continues_after_termination: whether the environment can be stepped further after it terminated an
@@ -178,19 +178,19 @@ class StateToObs(_LayerTransform):
 
     Example:
         >>> from torchrl.envs import TransformedEnv
-        >>> from torchrl_her import CurriculumLayer
+        >>> from torchrl_her import CurriculumStage
         >>> from torchrl_her_envs import make_env
         >>> hand, ball = [0, 1, 2, 3, 4], [5, 6]
-        >>> reach = CurriculumLayer(
+        >>> reach = CurriculumStage(
         ...     name="reach", observation=hand, achieved_goal=[0, 1], desired_goal=ball, threshold=0.06
         ... )
-        >>> throw = CurriculumLayer(
+        >>> throw = CurriculumStage(
         ...     name="throw", observation=range(9), achieved_goal=ball, desired_goal=[9, 10], threshold=0.1
         ... )
         >>> curriculum = Curriculum([reach, throw], 11)
         >>> progress = CurriculumProgress(curriculum, runs=2)
         >>> env = TransformedEnv(make_env("hand_v1", num_envs=4), StateToObs(curriculum, progress))
-        >>> progress.set_layer(1, 1)
+        >>> progress.set_stage(1, 1)
         >>> (env.reset()["observation"][:, 5:7] != 0).any(-1).tolist()  # who sees the ball
         [False, False, True, True]
     """
@@ -208,7 +208,7 @@ class StateToObs(_LayerTransform):
         terminated_key: NestedKey = "terminated",
         truncated_key: NestedKey | None = "truncated",
         done_key: NestedKey = "done",
-        layer_key: NestedKey = "layer",
+        stage_key: NestedKey = "stage",
         continues_after_termination: bool = True,
     ) -> None:
         if not continues_after_termination and truncated_key is None:
@@ -216,7 +216,7 @@ class StateToObs(_LayerTransform):
                 "continues_after_termination=False needs a truncated_key, to say where the environment ended"
             )
         shown = [observation_key, achieved_goal_key, desired_goal_key]
-        super().__init__(curriculum, progress, None, [state_key], shown, layer_key)
+        super().__init__(curriculum, progress, None, [state_key], shown, stage_key)
         self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
         self.truncated_key = None if truncated_key is None else unravel_key(truncated_key)
         self.done_key, self.continues_after_termination = unravel_key(done_key), continues_after_termination
@@ -229,12 +229,12 @@ class StateToObs(_LayerTransform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if self.progress.by_episode:
-            tensordict_reset.set(self.layer_key, self._draw(tensordict, tensordict_reset))
+            tensordict_reset.set(self.stage_key, self._draw(tensordict, tensordict_reset))
         return super()._reset(tensordict, tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self.progress.by_episode:
-            next_tensordict.set(self.layer_key, self._get(tensordict, self.layer_key, 1))
+            next_tensordict.set(self.stage_key, self._get(tensordict, self.stage_key, 1))
         cut = self._show_again(tensordict)
         self._observe(next_tensordict)
         self._judge(next_tensordict)
@@ -247,10 +247,10 @@ class StateToObs(_LayerTransform):
         return next_tensordict
 
     def _judge(self, tensordict: TensorDictBase) -> None:
-        """Sets the rewards and ends of rows in layers below the last, by the rules of their layers."""
+        """Sets the rewards and ends of rows in stages below the last, by the rules of their stages."""
         *below, last = range(len(self.curriculum))
-        present, achieved = self._layers(), tensordict.get(self.out_keys[1])
-        rows = self._rows_layers(tensordict)
+        present, achieved = self._stages(), tensordict.get(self.out_keys[1])
+        rows = self._rows_stages(tensordict)
         if rows is None:
             below = sorted(set(present) - {last})
             if len(present) > 1 and below:
@@ -261,13 +261,13 @@ class StateToObs(_LayerTransform):
             return
         reward, ended = tensordict.get(self.reward_key), tensordict.get(self.terminated_key)
         terminated = ended
-        for layer in below:
-            rule = cast(RewardFunction, self.curriculum.layers[layer].reward_fn)
+        for stage in below:
+            rule = cast(RewardFunction, self.curriculum.stages[stage].reward_fn)
             result = rule(achieved, tensordict.get(self.out_keys[2]))
             if rows is None:
                 reward, terminated = result[0].to(reward.dtype), result[1]
             else:
-                here = (rows == layer).unsqueeze(-1)
+                here = (rows == stage).unsqueeze(-1)
                 reward = torch.where(here, result[0].to(reward.dtype), reward)
                 terminated = torch.where(here, result[1], terminated)
         done = terminated.clone()
@@ -293,7 +293,7 @@ class StateToObs(_LayerTransform):
             shape = (*seen.shape[:-1], width)
             observation_spec[key] = Unbounded(shape=shape, dtype=seen.dtype, device=seen.device)
         if self.progress.by_episode:
-            observation_spec[self.layer_key] = Bounded(
+            observation_spec[self.stage_key] = Bounded(
                 low=0,
                 high=len(self.curriculum) - 1,
                 shape=(*seen.shape[:-1], 1),
@@ -310,8 +310,8 @@ class StateToObs(_LayerTransform):
         return done_spec
 
     def _draw(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
-        """Draws the layers [..., 1] of rows whose episode begins; TorchRL keeps the other rows."""
-        assert isinstance(self.progress, EpisodeLayers)
+        """Draws the stages [..., 1] of rows whose episode begins; TorchRL keeps the other rows."""
+        assert isinstance(self.progress, EpisodeStages)
         state, mask = tensordict_reset.get(self.in_keys[0]), tensordict.get("_reset", None)
         self._check_blocks(state.shape)
         shape = (*state.shape[:-1], 1)
@@ -319,54 +319,54 @@ class StateToObs(_LayerTransform):
             torch.ones(shape, dtype=torch.bool, device=state.device) if mask is None else mask.view(shape)
         )
         drawn = self.progress.draw(begins.reshape(self.progress.runs, -1).sum(1).tolist())
-        layers = torch.zeros(shape, dtype=torch.int64, device=state.device)
-        return layers.masked_scatter(begins, drawn.to(state.device))
+        stages = torch.zeros(shape, dtype=torch.int64, device=state.device)
+        return stages.masked_scatter(begins, drawn.to(state.device))
 
     def _observe(self, tensordict: TensorDictBase) -> None:
-        """Sets the observations and goals of each row's layer."""
+        """Sets the observations and goals of each row's stage."""
         state = self._get(tensordict, self.in_keys[0], self.curriculum.state_width)
-        index = self._lookup(state, self._rows_layers(tensordict))
+        index = self._lookup(state, self._rows_stages(tensordict))
         entries = take_columns(self.curriculum.extend(state), index).split(self._widths, -1)
         for key, entry in zip(self.out_keys, entries, strict=True):
             tensordict.set(key, entry)
 
     def _lookup(self, state: Tensor, rows: Tensor | None) -> Tensor:
-        """Returns the columns [B, n] of the state for the layers of blocks or rows."""
-        layers = self._layers() if rows is None else tuple(range(len(self.curriculum)))
-        made_for = layers, state.device
+        """Returns the columns [B, n] of the state for the stages of blocks or rows."""
+        stages = self._stages() if rows is None else tuple(range(len(self.curriculum)))
+        made_for = stages, state.device
         if self._tables[0] != made_for:
-            self._tables = made_for, self.curriculum.state_index[list(layers)].to(state.device)
+            self._tables = made_for, self.curriculum.state_index[list(stages)].to(state.device)
         return self._tables[1] if rows is None else self._tables[1][rows.flatten()]
 
 
-class LayerOutcomes(Transform):
-    """Counts successes by layer for :class:`~torchrl_her.curriculum.EpisodeLayers`, as episodes end.
+class StageOutcomes(Transform):
+    """Counts successes by stage for :class:`~torchrl_her.curriculum.EpisodeStages`, as episodes end.
 
     Put it behind all transforms that decide where episodes end. Episodes whose goal was proposed
-    (:class:`~torchrl_her.behavior.BehaviorGoals`) do not count: they say little of the layer's own goals.
+    (:class:`~torchrl_her.behavior.BehaviorGoals`) do not count: they say little of the stage's own goals.
 
     Args:
         progress: progress that counts the outcomes.
 
     Keyword Args:
-        reward_fn, achieved_reward: tell which goals are achieved in the last layer, where achieving a goal
+        reward_fn, achieved_reward: tell which goals are achieved in the last stage, where achieving a goal
             need not terminate; see :func:`~torchrl_her.goals.is_achieved`.
-        layer_key, proposed_key, terminated_key, done_key: read; there need not be a ``proposed_key``.
+        stage_key, proposed_key, terminated_key, done_key: read; there need not be a ``proposed_key``.
     """
 
     def __init__(
         self,
-        progress: EpisodeLayers,
+        progress: EpisodeStages,
         *,
         reward_fn: RewardFunction | None = None,
         achieved_reward: float = 0.0,
-        layer_key: NestedKey = "layer",
+        stage_key: NestedKey = "stage",
         proposed_key: NestedKey = "proposed",
         terminated_key: NestedKey = "terminated",
         done_key: NestedKey = "done",
     ) -> None:
         super().__init__()
-        self.progress, self.layer_key, self.proposed_key = progress, layer_key, proposed_key
+        self.progress, self.stage_key, self.proposed_key = progress, stage_key, proposed_key
         self.reward_fn, self.achieved_reward = reward_fn, achieved_reward
         self.terminated_key, self.done_key = terminated_key, done_key
 
@@ -374,24 +374,24 @@ class LayerOutcomes(Transform):
         done, proposed = next_tensordict.get(self.done_key), tensordict.get(self.proposed_key, None)
         ended = done if proposed is None else done & ~proposed
         if bool(ended.any()):
-            layer, runs = tensordict.get(self.layer_key), self.progress.runs
-            layers = len(self.progress.curriculum)
+            stage, runs = tensordict.get(self.stage_key), self.progress.runs
+            stages = len(self.progress.curriculum)
             met = is_achieved(next_tensordict, self.reward_fn, achieved_reward=self.achieved_reward)
             met = torch.where(
-                layer == layers - 1, met.view_as(layer), next_tensordict.get(self.terminated_key)
+                stage == stages - 1, met.view_as(stage), next_tensordict.get(self.terminated_key)
             )
             achieved = ended & met
-            place = layer.reshape(runs, -1) + layers * torch.arange(runs, device=layer.device).unsqueeze(1)
+            place = stage.reshape(runs, -1) + stages * torch.arange(runs, device=stage.device).unsqueeze(1)
             counts = [
-                place[flags.reshape(runs, -1)].bincount(minlength=layers * runs).view(runs, layers)
+                place[flags.reshape(runs, -1)].bincount(minlength=stages * runs).view(runs, stages)
                 for flags in (ended, achieved)
             ]
             self.progress.record_episodes(*(count.cpu() for count in counts))
         return next_tensordict
 
 
-class ZeroPad(_LayerTransform):
-    """The network's input: [n entries of the observation | desired goal | zeros], n of the run's layer.
+class ZeroPad(_StageTransform):
+    """The network's input: [n entries of the observation | desired goal | zeros], n of the run's stage.
 
     Put it where the goal is final: for acting, after :class:`~torchrl_her.StateToObs` in the environment; for
     learning, in the replay buffer, where it works on sampled transitions after they were relabeled. The input
@@ -401,16 +401,16 @@ class ZeroPad(_LayerTransform):
     It works on the root and, as a module or in a replay buffer, also on ``next`` if there is one.
 
     Args:
-        curriculum: the layers.
-        progress: the layer of each run; looked up in every call.
+        curriculum: the stages.
+        progress: the stage of each run; looked up in every call.
 
     Keyword Args:
         run: the run that all transitions belong to, in batches of any shape; None if the first
             dimension is R equal blocks, in the order of the runs.
         observation_key, desired_goal_key: read.
         input_key: written.
-        layer_key: key of the layer [..., 1] that each row carries, if episodes have layers of their own
-            (:class:`~torchrl_her.curriculum.EpisodeLayers`).
+        stage_key: key of the stage [..., 1] that each row carries, if episodes have stages of their own
+            (:class:`~torchrl_her.curriculum.EpisodeStages`).
 
     Raises:
         ValueError: ``progress`` belongs to another curriculum, or there is no such run; when used, an entry
@@ -419,16 +419,16 @@ class ZeroPad(_LayerTransform):
 
     Example:
         >>> from tensordict import TensorDict
-        >>> from torchrl_her import CurriculumLayer
-        >>> layers = [
-        ...     CurriculumLayer(
+        >>> from torchrl_her import CurriculumStage
+        >>> stages = [
+        ...     CurriculumStage(
         ...         name="one", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=1.0
         ...     ),
-        ...     CurriculumLayer(
+        ...     CurriculumStage(
         ...         name="two", observation=[0, 1], achieved_goal=[1], desired_goal=[2], threshold=1.0
         ...     ),
         ... ]
-        >>> curriculum = Curriculum(layers, 3)
+        >>> curriculum = Curriculum(stages, 3)
         >>> pad = ZeroPad(curriculum, CurriculumProgress(curriculum))
         >>> rows = TensorDict(
         ...     {"observation": torch.tensor([[5.0, 0.0]]), "desired_goal": torch.tensor([[7.0]])}, [1]
@@ -446,21 +446,21 @@ class ZeroPad(_LayerTransform):
         observation_key: NestedKey = "observation",
         desired_goal_key: NestedKey = "desired_goal",
         input_key: NestedKey = "input",
-        layer_key: NestedKey = "layer",
+        stage_key: NestedKey = "stage",
     ) -> None:
         in_keys: list[NestedKey] = [observation_key, desired_goal_key]
         if progress.by_episode:
-            in_keys.append(layer_key)
-        super().__init__(curriculum, progress, run, in_keys, [input_key], layer_key)
-        self._sizes = [len(layer.observation) for layer in curriculum.layers]
+            in_keys.append(stage_key)
+        super().__init__(curriculum, progress, run, in_keys, [input_key], stage_key)
+        self._sizes = [len(stage.observation) for stage in curriculum.stages]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._set_input(next_tensordict, self._rows_layers(next_tensordict))
+        return self._set_input(next_tensordict, self._rows_stages(next_tensordict))
 
-    def _set_input(self, tensordict: TensorDictBase, layer: Tensor | None) -> TensorDictBase:
+    def _set_input(self, tensordict: TensorDictBase, stage: Tensor | None) -> TensorDictBase:
         observation = self._get(tensordict, self.in_keys[0], self.curriculum.observation_width)
         goal = self._get(tensordict, self.in_keys[1], self.curriculum.goal_width)
-        return tensordict.set(self.out_keys[0], self._pad(observation, goal, layer))
+        return tensordict.set(self.out_keys[0], self._pad(observation, goal, stage))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._show_again(tensordict)
@@ -469,11 +469,11 @@ class ZeroPad(_LayerTransform):
     @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Sets the input in the root and, where there is one, in ``next``."""
-        layer = self._rows_layers(tensordict)  # an episode stays in its layer, so next has the same
-        self._set_input(tensordict, layer)
+        stage = self._rows_stages(tensordict)  # an episode stays in its stage, so next has the same
+        self._set_input(tensordict, stage)
         after = tensordict.get("next", None)
         if after is not None:
-            self._set_input(after, layer)
+            self._set_input(after, stage)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -484,19 +484,19 @@ class ZeroPad(_LayerTransform):
         observation_spec[self.out_keys[0]] = Unbounded(shape=shape, dtype=seen.dtype, device=seen.device)
         return observation_spec
 
-    def _pad(self, observation: Tensor, goal: Tensor, layer: Tensor | None) -> Tensor:
-        if layer is not None:
-            index = self.curriculum.input_index.to(observation.device)[layer]
+    def _pad(self, observation: Tensor, goal: Tensor, stage: Tensor | None) -> Tensor:
+        if stage is not None:
+            index = self.curriculum.input_index.to(observation.device)[stage]
             zero = observation.new_zeros(*observation.shape[:-1], 1)
             return torch.cat((observation, goal, zero), -1).gather(-1, index)
         self._check_blocks(observation.shape)
-        layers = self._layers()
-        if len(layers) == 1:
-            size = self._sizes[layers[0]]
+        stages = self._stages()
+        if len(stages) == 1:
+            size = self._sizes[stages[0]]
             unused = observation.new_zeros(*observation.shape[:-1], observation.shape[-1] - size)
             return torch.cat((observation[..., :size], goal, unused), -1)
-        made_for = (layers, observation.device)
+        made_for = (stages, observation.device)
         if self._tables[0] != made_for:
-            self._tables = made_for, self.curriculum.input_index[list(layers)].to(observation.device)
+            self._tables = made_for, self.curriculum.input_index[list(stages)].to(observation.device)
         zero = observation.new_zeros(*observation.shape[:-1], 1)
         return take_columns(torch.cat((observation, goal, zero), -1), self._tables[1])

@@ -3,7 +3,7 @@
 from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.demonstrations.play import demonstrate
 from torchrl_her.demonstrations.replay import MixedReplay, demonstration_rows, write_demonstrations
-from torchrl_her.demonstrations.shown import in_layer, with_reward
+from torchrl_her.demonstrations.shown import in_stage, with_reward
 from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her.demonstrations.walk import WalkBack, step_back
 
@@ -14,7 +14,7 @@ __all__ = [
     "WalkBack",
     "demonstrate",
     "demonstration_rows",
-    "in_layer",
+    "in_stage",
     "step_back",
     "with_reward",
     "write_demonstrations",

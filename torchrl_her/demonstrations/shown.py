@@ -1,4 +1,4 @@
-"""Demonstrations converted for a run: to its reward, and to the view of its layer of a curriculum."""
+"""Demonstrations converted for a run: to its reward, and to the view of its stage of a curriculum."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchrl_her.curriculum.layers import Curriculum
+from torchrl_her.curriculum.stages import Curriculum
 from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
 
@@ -55,22 +55,22 @@ def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> De
     return demonstrations.take(kept, lengths, rows=rows)
 
 
-def in_layer(
+def in_stage(
     demonstrations: Demonstrations,
     curriculum: Curriculum,
-    layer: int,
+    stage: int,
     task_reward: RewardFunction | None = None,
 ) -> Demonstrations:
-    """Converts demonstrations of the full task to the view of a layer, like :class:`~torchrl_her.StateToObs`.
+    """Converts demonstrations of the full task to the view of a stage, like :class:`~torchrl_her.StateToObs`.
 
-    In layers below the last, they end where the layer's goal is achieved. What the environment terminated
+    In stages below the last, they end where the stage's goal is achieved. What the environment terminated
     says nothing about that goal, so others are truncated at their end.
 
     Args:
         demonstrations: whose observation with the desired goal behind it is the state of the curriculum.
-        curriculum: its layers.
-        layer: index of the layer, from 0.
-        task_reward: reward of the last layer, the full task, if the curriculum has none for it; as recorded
+        curriculum: its stages.
+        stage: index of the stage, from 0.
+        task_reward: reward of the last stage, the full task, if the curriculum has none for it; as recorded
             if None.
 
     Raises:
@@ -85,12 +85,12 @@ def in_layer(
                 f"the curriculum needs states of width {curriculum.state_width}, demonstrations of "
                 f"{demonstrations.task} have {state.shape[-1]}"
             )
-        shown = curriculum.show(state, layer)
+        shown = curriculum.show(state, stage)
         tensordict.update(dict(zip(("observation", "achieved_goal", "desired_goal"), shown, strict=True)))
-    if layer < len(curriculum) - 1:
+    if stage < len(curriculum) - 1:
         after["terminated"] = torch.zeros_like(after["terminated"])
     rows.set("next", after)
-    seen, rule = replace(demonstrations, rows=rows), curriculum.layers[layer].reward_fn or task_reward
+    seen, rule = replace(demonstrations, rows=rows), curriculum.stages[stage].reward_fn or task_reward
     return seen if rule is None else with_reward(seen, rule)
 
 

@@ -93,7 +93,7 @@ class DemonstrationStarts(Transform):
         self._asks_elsewhere = False
 
     def show(self, demonstrations: Demonstrations, *, run: int = 0) -> None:
-        """Replaces the demonstrations of a run, as by those of its next layer, and restarts its walk."""
+        """Replaces the demonstrations of a run, as by those of its next stage, and restarts its walk."""
         self._shown[run] = usable(demonstrations)
         self.walk.restart(run, int(self._shown[run].lengths.max()))
 

@@ -127,7 +127,7 @@ def box_target(grid: GoalGrid, low: Numbers, high: Numbers, sigma: Numbers, *, n
         sigma: standard deviation of the Gaussian kernel, in the unit of the goals; or d of them.
 
     Keyword Args:
-        name: name of the task or layer; error messages begin with it.
+        name: name of the task or stage; error messages begin with it.
 
     Returns:
         [cells] of float64, sums to 1.

@@ -134,7 +134,7 @@ class KernelInstructiveness(InstructiveWeights):
         moment.
         """
         if self.alike and goals.shape[-1] != self._real.shape[1]:
-            return  # goals of a curriculum's layer, which are not weighed
+            return  # goals of a curriculum's stage, which are not weighed
         self._check(goals)
         goals = goals.detach().reshape(-1, goals.shape[-1])
         goals = goals[goals.isfinite().all(-1)]

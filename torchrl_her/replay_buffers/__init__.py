@@ -5,7 +5,6 @@ from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
 from torchrl_her.replay_buffers.episodes import Episodes, find_episodes
 from torchrl_her.replay_buffers.keys import TransitionKeys
-from torchrl_her.replay_buffers.layer_rules import LayerRule
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.runs import (
     PackedStorage,
@@ -18,6 +17,7 @@ from torchrl_her.replay_buffers.runs import (
 )
 from torchrl_her.replay_buffers.runs.counts import WriterCounts
 from torchrl_her.replay_buffers.sample_unit import HERSampleUnit
+from torchrl_her.replay_buffers.stage_rules import StageRule
 from torchrl_her.replay_buffers.writer import HERWriter
 
 __all__ = [
@@ -28,10 +28,10 @@ __all__ = [
     "HERWriter",
     "HindsightBase",
     "HindsightOptions",
-    "LayerRule",
     "PackedStorage",
     "RunsPrioritizedSampler",
     "RunsSampler",
+    "StageRule",
     "TransitionKeys",
     "WriterCounts",
     "draw_goals",

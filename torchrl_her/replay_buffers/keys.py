@@ -25,7 +25,7 @@ class TransitionKeys:
         reward, terminated, truncated, done: under ``next``.
         trajectory, env_ids: ids.
         real_goal: the goal that the task itself asked for, where another one was proposed in its place.
-        layer: the layer of a curriculum that an episode is played in.
+        stage: the stage of a curriculum that an episode is played in.
     """
 
     achieved: NestedKey
@@ -38,7 +38,7 @@ class TransitionKeys:
     trajectory: NestedKey
     env_ids: NestedKey
     real_goal: NestedKey
-    layer: NestedKey
+    stage: NestedKey
 
     def asked_for(self, rows: TensorDictBase) -> Tensor:
         """Returns the goals [..., g] that the task itself has set."""

@@ -108,16 +108,16 @@ def refuse_padded(name: str, transitions: TensorDictBase) -> None:
         )
 
 
-def refuse_layers(name: str, transitions: TensorDictBase, options: HindsightOptions) -> None:
-    """Raises an error if transitions carry a layer although one reward relabels those of all layers.
+def refuse_stages(name: str, transitions: TensorDictBase, options: HindsightOptions) -> None:
+    """Raises an error if transitions carry a stage although one reward relabels those of all stages.
 
     Raises:
         ValueError: they do.
     """
-    if options.k > 0 and options.layer_key in transitions.keys(True):
+    if options.k > 0 and options.stage_key in transitions.keys(True):
         raise ValueError(
-            f"{name} got transitions that carry their layer ({options.layer_key!r}), and has one reward for "
-            "all of them: use HERWriter(layers=[...]), or another layer_key if that entry is something else"
+            f"{name} got transitions that carry their stage ({options.stage_key!r}), and has one reward for "
+            "all of them: use HERWriter(stages=[...]), or another stage_key if that entry is something else"
         )
 
 

@@ -76,7 +76,7 @@ class HindsightOptions:
         real_goal_key: the goal that the task itself asked for, where another one was proposed in its place
             (:class:`~torchrl_her.behavior.BehaviorGoals`); the entry may be missing, and is left out like
             those of ``exclude``. The source ``"actual"`` takes these.
-        layer_key: key of the layer [..., 1] that an episode was played in, for writers with ``layers``.
+        stage_key: key of the stage [..., 1] that an episode was played in, for writers with ``stages``.
         virtual_key: key of a bool [..., 1] that marks virtual transitions; None for no mark.
 
     Raises:
@@ -115,7 +115,7 @@ class HindsightOptions:
     trajectory_key: NestedKey = ("collector", "traj_ids")
     env_ids_key: NestedKey = "env_ids"
     real_goal_key: NestedKey = "real_desired_goal"
-    layer_key: NestedKey = "layer"
+    stage_key: NestedKey = "stage"
     virtual_key: NestedKey | None = "virtual"
 
     def __post_init__(self) -> None:
@@ -200,7 +200,7 @@ class HindsightOptions:
             trajectory=unravel_key(self.trajectory_key),
             env_ids=unravel_key(self.env_ids_key),
             real_goal=unravel_key(self.real_goal_key),
-            layer=unravel_key(self.layer_key),
+            stage=unravel_key(self.stage_key),
         )
 
 

@@ -39,11 +39,11 @@ from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_re
 from torchrl_her.replay_buffers.neighbors import (
     MASK,
     refuse_consuming,
-    refuse_layers,
     refuse_n_steps,
     refuse_padded,
     refuse_shared,
     refuse_slices,
+    refuse_stages,
     refuse_unordered,
 )
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
@@ -424,7 +424,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
                 )
             refuse_n_steps("HERSampleUnit", rows)
             refuse_padded("HERSampleUnit", rows)
-            refuse_layers("HERSampleUnit", rows, self.options)
+            refuse_stages("HERSampleUnit", rows, self.options)
             dims, shape = storage.ndim, rows.shape[: storage.ndim]
             grid = shape if dims == 1 else torch.Size([shape[0], shape[1:].numel()])
             ids, done = rows.get(self._keys.trajectory, None), entry_of(rows, self._keys.done)

@@ -23,8 +23,7 @@ from torchrl_her.replay_buffers.draw import draw_for_runs
 from torchrl_her.replay_buffers.episodes import Episodes, find_episodes, time_order
 from torchrl_her.replay_buffers.keys import device_of, entry_of, in_root_and_next
 from torchrl_her.replay_buffers.lanes import broken, ends_of_held
-from torchrl_her.replay_buffers.layer_rules import LayerRule, check_layers, split_layers
-from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer, refuse_layers
+from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer, refuse_stages
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.runs.batches import Batch
 from torchrl_her.replay_buffers.runs.chunk import Chunk
@@ -41,6 +40,7 @@ from torchrl_her.replay_buffers.runs.rows import join_rows
 from torchrl_her.replay_buffers.runs.storage import PackedStorage, write_slices
 from torchrl_her.replay_buffers.runs.streams import check_generators
 from torchrl_her.replay_buffers.runs.written import WrittenRows, real_rows, virtual_rows
+from torchrl_her.replay_buffers.stage_rules import StageRule, check_stages, split_stages
 
 # Transitions written at once: larger pieces touch fresh memory each time, smaller ones need more calls.
 _ROWS = 1 << 17
@@ -52,7 +52,7 @@ OnWrite = Callable[[TensorDictBase, list[int], list[int]], Callable[[], None] | 
 class _Draft(NamedTuple):
     """Real and virtual transitions of some episodes before they are written."""
 
-    rows: TensorDictBase  # those that were collected, as the layer shows them
+    rows: TensorDictBase  # those that were collected, as the stage shows them
     runs: list[int]
     real: WrittenRows
     virtual: WrittenRows | None
@@ -111,9 +111,9 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             alike. For several runs a list, one of each run (``goal_weights``).
         runs: R.
         generators: R sources of random numbers; None for the buffer's, with one run only.
-        layers: for episodes that carry the layer of a curriculum in which they were played, one rule for each
-            layer; they take the place of ``reward_fn``. A rule may have all episodes written for its layer,
-            whatever layer they were played in. None if episodes have no layers.
+        stages: for episodes that carry the stage of a curriculum in which they were played, one rule for each
+            stage; they take the place of ``reward_fn``. A rule may have all episodes written for its stage,
+            whatever stage they were played in. None if episodes have no stages.
         refill: where the filter leaves transitions without goals, the others get more goals of their episode,
             so that there are about as many in all: up to this many times as many; 1: no more. It goes by the
             share of transitions that got goals so far, of each run.
@@ -186,13 +186,13 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         weights: GoalWeights | Sequence[GoalWeights] | None = None,
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
-        layers: Sequence[LayerRule] | None = None,
+        stages: Sequence[StageRule] | None = None,
         refill: int = 1,
         on_write: OnWrite | None = None,
         **changes: Any,
     ) -> None:
         self.generators, self.on_write = check_generators(runs, generators), on_write
-        self.layers = check_layers(layers)
+        self.stages = check_stages(stages)
         check_whole(refill=refill, least=1)
         self.refill = refill
         run_weights = weights_by_run(weights, runs)
@@ -261,10 +261,10 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         """Sets the reward function that relabels the next episodes of a run; None for the writer's.
 
         Raises:
-            ValueError: layers have rewards here, not runs.
+            ValueError: stages have rewards here, not runs.
         """
-        if self.layers:
-            raise ValueError(f"run {run} has no reward of its own: episodes are relabeled by their layers")
+        if self.stages:
+            raise ValueError(f"run {run} has no reward of its own: episodes are relabeled by their stages")
         self._own_rewards[run] = reward_fn or self.reward_fn
 
     # TorchRL's hooks
@@ -300,7 +300,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         # Last of all, so that a batch that cannot be written does not lose rows that were held back before.
         self._held, self._recent = batch.take(left), recent
         self._loaded = self._all_over = False
-        if not self.layers and not self._own_rewards:
+        if not self.stages and not self._own_rewards:
             self._compare_rewards(batch.rows)
         if self.held_back > self._storage.max_size and not self._overfull:
             self._overfull = True
@@ -373,8 +373,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._rings.cursors, self._rings.sizes = list(state_dict["cursors"]), list(state_dict["sizes"])
         self._held = Batch.from_state(state_dict, runs=self.runs)
         recent = state_dict["recent"]
-        if len(recent) != max(1, len(self.layers)):
-            raise ValueError(f"the state is that of {len(recent)} layers, not of {max(1, len(self.layers))}")
+        if len(recent) != max(1, len(self.stages)):
+            raise ValueError(f"the state is that of {len(recent)} stages, not of {max(1, len(self.stages))}")
         self._recent = [RecentGoals.from_state(saved) for saved in recent]
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
@@ -425,8 +425,8 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             raise RuntimeError(f"HERWriter writes only in the process that made its buffer: {SHARED}")
         refuse_beside_writer("HERWriter", self._storage, data, self.options, runs=self.runs)
         self._keys.check(data, "collected", k=self.k)
-        if not self.layers:
-            refuse_layers("HERWriter", data, self.options)
+        if not self.stages:
+            refuse_stages("HERWriter", data, self.options)
 
     def _write_episodes(self, batch: Batch, held: int) -> tuple[Tensor, Tensor, list[RecentGoals]]:
         """Writes all episodes that end in a batch.
@@ -457,11 +457,11 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         entries = max(1, min(_ROWS, self.capacity) // most), _ROWS // most
         episode_runs = None if run is None else run[episodes.rows[:, :1]].flatten()
         recent, settings, drafts, first_id = list(self._recent), self._settings(), [], self._episodes
-        for layer, shown, part, run_of in self._by_layer(rows, episodes, episode_runs):
-            lately = recent[layer].after(shown, part, run_of, self._keys, sizes=self.options.remembered)
-            recent[layer] = lately
+        for stage, shown, part, run_of in self._by_stage(rows, episodes, episode_runs):
+            lately = recent[stage].after(shown, part, run_of, self._keys, sizes=self.options.remembered)
+            recent[stage] = lately
             for piece in split_runs(part, run_of, settings, each=entries[0], together=entries[1]):
-                rule = self._rule(layer, piece.runs[0])
+                rule = self._rule(stage, piece.runs[0])
                 chunk = Chunk(shown, run, piece, rule.reward_fn, self.options, self._keys)
                 drafts.append(self._draft(chunk, lately, weighted=rule.weighted, first_id=first_id))
                 first_id += drafts[-1].ids
@@ -470,20 +470,20 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         return places.rows(self._rings.cursors, self.capacity)[held:], left, recent
 
     def _no_goals(self, runs: int) -> list[RecentGoals]:
-        """Returns an empty memory of goals for each layer."""
-        return [RecentGoals.none(runs) for _ in range(max(1, len(self.layers)))]
+        """Returns an empty memory of goals for each stage."""
+        return [RecentGoals.none(runs) for _ in range(max(1, len(self.stages)))]
 
-    def _by_layer(
+    def _by_stage(
         self, rows: TensorDictBase, episodes: Episodes, run: Tensor | None
     ) -> Iterable[tuple[int, TensorDictBase, Episodes, Tensor | None]]:
-        """Yields transitions and episodes of each layer; all of them if episodes have no layers."""
-        if not self.layers:
+        """Yields transitions and episodes of each stage; all of them if episodes have no stages."""
+        if not self.stages:
             return [(0, rows, episodes, run)]
-        return split_layers(rows, episodes, run, self._keys.layer, self.layers)
+        return split_stages(rows, episodes, run, self._keys.stage, self.stages)
 
-    def _rule(self, layer: int, run: int) -> LayerRule:
-        """Returns the rule for relabeling episodes of a layer, or of a run without layers."""
-        return self.layers[layer] if self.layers else LayerRule(self.reward_of(run))
+    def _rule(self, stage: int, run: int) -> StageRule:
+        """Returns the rule for relabeling episodes of a stage, or of a run without stages."""
+        return self.stages[stage] if self.stages else StageRule(self.reward_of(run))
 
     def _settings(self) -> list[Hashable]:
         """Returns settings of each run that must be equal in runs that are written at once."""

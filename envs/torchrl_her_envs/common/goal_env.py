@@ -90,7 +90,7 @@ class GoalEnv(EnvBase):
     def continues_after_termination(self) -> bool:
         """Whether it can be stepped further after it terminated an episode.
 
-        Layers of a curriculum have goals of their own, so their episodes then go on as well.
+        Stages of a curriculum have goals of their own, so their episodes then go on as well.
         """
         return False
 
@@ -99,13 +99,13 @@ class GoalEnv(EnvBase):
         """Whether a batch is stepped as a whole, at little cost for each of its environments."""
         return False
 
-    def layers(self) -> list[dict[str, Any]]:
-        """The layers of the task's curriculum, in the order of training; the last one is the full task.
+    def stages(self) -> list[dict[str, Any]]:
+        """The stages of the task's curriculum, in the order of training; the last one is the full task.
 
         Returns:
-            For each layer its ``name``; ``observation``, ``achieved_goal`` and ``desired_goal``, which are
+            For each stage its ``name``; ``observation``, ``achieved_goal`` and ``desired_goal``, which are
             lists of indices into the state; ``threshold``, how near to the goal is achieved (not in the last
-            layer, whose goals the task judges); and ``instructive``, whether IBS weights apply in it. The
+            stage, whose goals the task judges); and ``instructive``, whether IBS weights apply in it. The
             state is the observation with the desired goal behind it.
 
         Raises:
@@ -113,16 +113,16 @@ class GoalEnv(EnvBase):
 
         Example:
             >>> from torchrl_her_envs import make_env
-            >>> reach, throw = make_env("hand_v1").layers()
+            >>> reach, throw = make_env("hand_v1").stages()
             >>> reach["name"], reach["achieved_goal"], reach["desired_goal"]
             ('reach', [0, 1], [5, 6])
         """
-        raise ValueError(f"{self.task_name} has no curriculum: give its layers as curriculum=FILE.yaml")
+        raise ValueError(f"{self.task_name} has no curriculum: give its stages as curriculum=FILE.yaml")
 
     def state_names(self) -> dict[str, list[int]]:
         """Names for entries of the state, which is the observation with the desired goal behind it.
 
-        The layers of a curriculum may use them in place of indices.
+        The stages of a curriculum may use them in place of indices.
 
         Example:
             >>> from torchrl_her_envs import make_env

@@ -221,7 +221,7 @@ class OwnGoalEnv(GoalEnv):
       argument, a dictionary of these entries [..., w] of the same step; for a virtual goal, too. Transitions
       have them as ``("info", KEY)``.
     - ``max_steps``, the length of an episode; the option of that name is needed if it is missing.
-    - ``layers()``, see :class:`~torchrl_her_envs.GoalEnv`.
+    - ``stages()``, see :class:`~torchrl_her_envs.GoalEnv`.
     - ``render()``, a picture [height, width, 3] of uint8, or [N, height, width, 3] of a batch.
     - ``set_seeds(seeds)`` of a batch, for R equal blocks; a batch without it has one seed.
 
@@ -302,9 +302,9 @@ class OwnGoalEnv(GoalEnv):
         """Rule for the ends of episodes, see :class:`~torchrl_her_envs.common.goal_rules.GoalEnds`."""
         return self.goal_ends.rule
 
-    def layers(self) -> list[dict[str, Any]]:
-        layers = getattr(self._envs[0], "layers", None)
-        return layers() if callable(layers) else super().layers()
+    def stages(self) -> list[dict[str, Any]]:
+        stages = getattr(self._envs[0], "stages", None)
+        return stages() if callable(stages) else super().stages()
 
     def compute_reward(
         self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None

@@ -147,21 +147,21 @@ def _check_shown(id: str, shown: spaces.Space) -> None:
 
 def check_methods(id: str, env: gymnasium.Env) -> None:
     """Raises a ValueError if ``reset`` or ``step`` of an environment or its wrappers are those of old gym."""
-    layers = [env]
-    while isinstance(layers[-1], gymnasium.Wrapper):
-        layers.append(layers[-1].env)
-    for layer in reversed(layers):  # the innermost first: those around it fail, too
-        name = type(layer).__name__
+    stages = [env]
+    while isinstance(stages[-1], gymnasium.Wrapper):
+        stages.append(stages[-1].env)
+    for stage in reversed(stages):  # the innermost first: those around it fail, too
+        name = type(stage).__name__
         reset, step = f"{id}: reset of {name} must", f"{id}: step of {name} must"
-        taken = inspect.signature(layer.reset).parameters
+        taken = inspect.signature(stage.reset).parameters
         missing = [key for key in ("seed", "options") if key not in taken]
         if missing and not any(param.kind is inspect.Parameter.VAR_KEYWORD for param in taken.values()):
             raise ValueError(f"{reset} take seed and options, as in gymnasium; it lacks {missing[0]!r}")
-        layer.action_space.seed(0)
-        given = layer.reset(seed=0)
+        stage.action_space.seed(0)
+        given = stage.reset(seed=0)
         if not isinstance(given, tuple) or len(given) != 2:
             raise ValueError(f"{reset} give (observation, info), as in gymnasium, got {_form(given)}")
-        given = layer.step(layer.action_space.sample())
+        given = stage.step(stage.action_space.sample())
         if not isinstance(given, tuple) or len(given) != 5:
             raise ValueError(
                 f"{step} give (observation, reward, terminated, truncated, info), as in gymnasium, got "

@@ -1,4 +1,4 @@
-"""The Fetch tasks of gymnasium-robotics: names for entries of their states, and layers of a curriculum.
+"""The Fetch tasks of gymnasium-robotics: names for entries of their states, and stages of a curriculum.
 
 A Fetch robot's gripper has to be brought to a point, or an object, which the gripper pushes, slides or
 carries: Plappert et al., Multi-goal reinforcement learning, 2018.
@@ -50,17 +50,17 @@ def fetch_names(id: str) -> dict[str, list[int]]:
     return names
 
 
-def fetch_layers(id: str) -> list[dict[str, Any]]:
-    """Returns the layers of a Fetch task: reach the object, then move it; none for another environment.
+def fetch_stages(id: str) -> list[dict[str, Any]]:
+    """Returns the stages of a Fetch task: reach the object, then move it; none for another environment.
 
-    What the first layer wants, the place of the object, is what the second one observes at the same inputs.
-    To reach a point is a single layer. A block that is to be picked up has to be between the fingers.
+    What the first stage wants, the place of the object, is what the second one observes at the same inputs.
+    To reach a point is a single stage. A block that is to be picked up has to be between the fingers.
 
     Args:
         id: gymnasium's.
 
     Example:
-        >>> [layer["name"] for layer in fetch_layers("FetchPush-v4")]
+        >>> [stage["name"] for stage in fetch_stages("FetchPush-v4")]
         ['reach', 'move']
     """
     shown = _shown(id)

@@ -58,7 +58,7 @@ from torchrl_her_envs.gym.check import (
     try_steps,
 )
 from torchrl_her_envs.gym.drawing import PICTURES, cannot_draw, choose_renderer, draws
-from torchrl_her_envs.gym.fetch import fetch_layers, fetch_names
+from torchrl_her_envs.gym.fetch import fetch_names, fetch_stages
 from torchrl_her_envs.gym.goal_functions import GoalFunction
 from torchrl_her_envs.gym.infos import Infos
 from torchrl_her_envs.gym.layout import Layout
@@ -311,9 +311,9 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         """Whether it was made with ``render_mode="rgb_array"``."""
         return self._reference_env.render_mode == PICTURES
 
-    def layers(self) -> list[dict[str, Any]]:
-        """The layers of the Fetch tasks; an error for other environments, which have none of their own."""
-        return fetch_layers(spec_of(self._reference_env).id) or super().layers()
+    def stages(self) -> list[dict[str, Any]]:
+        """The stages of the Fetch tasks; an error for other environments, which have none of their own."""
+        return fetch_stages(spec_of(self._reference_env).id) or super().stages()
 
     def state_names(self) -> dict[str, list[int]]:
         """Names for entries of the state: ``observation`` and ``desired_goal``, and what is nested in them.

@@ -140,19 +140,19 @@ class ThrowingEnv(BatchedEnv):
         (x, y), (other_x, other_y) = achieved_goal.unbind(-1), desired_goal.unbind(-1)
         return within(x - other_x, y - other_y, self.threshold).unsqueeze(-1)
 
-    def layers(self) -> list[dict[str, Any]]:
-        """Returns two layers: reach the ball; then throw it into the black hole.
+    def stages(self) -> list[dict[str, Any]]:
+        """Returns two stages: reach the ball; then throw it into the black hole.
 
-        In the first layer the agent sees the hand or the arm, and wants its grip at the ball. In the second
-        it also sees the ball, at the place in its input where the first layer had its goal, and wants the
-        ball in the black hole. Goals of the first layer lie where episodes start, so IBS weights do not
+        In the first stage the agent sees the hand or the arm, and wants its grip at the ball. In the second
+        it also sees the ball, at the place in its input where the first stage had its goal, and wants the
+        ball in the black hole. Goals of the first stage lie where episodes start, so IBS weights do not
         apply to them.
 
         Raises:
             ValueError: the task has no throw, so reaching is all of it.
         """
         if not self.task.throws:
-            raise ValueError(f"{self.task_name} has no curriculum: it has one layer; choose a throwing task")
+            raise ValueError(f"{self.task_name} has no curriculum: it has one stage; choose a throwing task")
         seen = self.effector.observation_size
         ball = [seen, seen + 1]
         return [

@@ -38,7 +38,7 @@ class ToyEnv(BatchedEnv):
     """N environments whose states are places on a lattice, and whose goals are such places too.
 
     Keys: ``observation`` (the place), ``achieved_goal`` (the place too; the last part of it in a
-    :class:`Chain` of layers), ``desired_goal``, ``state`` (the observation with the desired goal behind
+    :class:`Chain` of stages), ``desired_goal``, ``state`` (the observation with the desired goal behind
     it), ``action`` (a whole number), ``reward`` (0 where the goal is achieved, -1 elsewhere),
     ``terminated`` (the goal is achieved), ``truncated`` (the last step, or an end that says nothing
     about the goal), ``done``.

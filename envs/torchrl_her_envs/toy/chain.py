@@ -26,7 +26,7 @@ class Chain(ToyEnv):
     learn place by place instead.
 
     The agent sees n links. At place k the first k are closed (1) and the others open (-1); the goal is
-    that all are closed. With ``layers`` above 1 the chain is made of so many equal parts, and only the
+    that all are closed. With ``stages`` above 1 the chain is made of so many equal parts, and only the
     links of the last part count as the achieved goal, just as only the ball does in the throwing tasks:
     until the agent comes to that part, hindsight teaches nothing.
 
@@ -35,7 +35,7 @@ class Chain(ToyEnv):
         forward_probability: p, in (0, 1].
 
     Keyword Args:
-        layers: number of equal parts, each of ``n / layers`` steps.
+        stages: number of equal parts, each of ``n / stages`` steps.
         alternating: whether action 0 goes forward at odd places. Then a policy that always takes the
             same action, as an untrained network does, leads nowhere; otherwise it may solve the chain.
         reset_state: whether going back leads to the first place (the thesis's "reset-state game").
@@ -55,7 +55,7 @@ class Chain(ToyEnv):
         [[1.0, -1.0, -1.0], [1.0, 1.0, -1.0], [1.0, 1.0, 1.0]]
         >>> steps["next", "reward"][0].flatten().tolist()
         [-1.0, -1.0, 0.0]
-        >>> steps = Chain(4, 1.0, layers=2, num_envs=2).rollout(4, forward)
+        >>> steps = Chain(4, 1.0, stages=2, num_envs=2).rollout(4, forward)
         >>> steps["next", "achieved_goal"][0].tolist()
         [[-1.0, -1.0], [-1.0, -1.0], [1.0, -1.0], [1.0, 1.0]]
     """
@@ -67,7 +67,7 @@ class Chain(ToyEnv):
         length: int,
         forward_probability: float,
         *,
-        layers: int = 1,
+        stages: int = 1,
         alternating: bool = False,
         reset_state: bool = False,
         max_steps: int | None = None,
@@ -75,12 +75,12 @@ class Chain(ToyEnv):
         seed: int | Sequence[int] = 0,
     ) -> None:
         length = check_whole("length", length, 1, MOST_STEPS)
-        layers = check_whole("layers", layers, 1, length)
-        if length % layers:
-            raise ValueError(f"layers must divide length={length}, got {layers}")
+        stages = check_whole("stages", stages, 1, length)
+        if length % stages:
+            raise ValueError(f"stages must divide length={length}, got {stages}")
         if not isinstance(forward_probability, int | float) or not 0.0 < forward_probability <= 1.0:
             raise ValueError(f"forward_probability must be in (0, 1], got {forward_probability}")
-        goal = [1.0] * (length // layers)
+        goal = [1.0] * (length // stages)
         super().__init__(
             LatticeGoals(goal, goal, count=1),
             places=2,
@@ -95,12 +95,12 @@ class Chain(ToyEnv):
         self.length, self.forward_probability = length, forward_probability
         self.reset_state = check_flag("reset_state", reset_state)
         self.alternating = check_flag("alternating", alternating)
-        self.num_layers = layers
+        self.num_stages = stages
         self._all = torch.arange(num_envs)
 
-    def layers(self) -> list[dict[str, Any]]:
-        """Returns a layer for each part of the chain, whose goal is to close the links of that part."""
-        links = self.length // self.num_layers
+    def stages(self) -> list[dict[str, Any]]:
+        """Returns a stage for each part of the chain, whose goal is to close the links of that part."""
+        links = self.length // self.num_stages
         return [
             {
                 "name": f"part {end // links}",
@@ -115,7 +115,7 @@ class Chain(ToyEnv):
 
     def state_names(self) -> dict[str, list[int]]:
         """Returns names for entries of the state: ``observation``, ``desired_goal``, ``part_1``, ..."""
-        links = self.length // self.num_layers
+        links = self.length // self.num_stages
         ends = range(links, self.length + 1, links)
         parts = {f"part_{end // links}": list(range(end - links, end)) for end in ends}
         return parts | super().state_names()
@@ -137,4 +137,4 @@ class Chain(ToyEnv):
         return (place > torch.arange(self.length)).to(torch.int64), None
 
     def _goal_of(self, place: Tensor) -> Tensor:
-        return place[:, -(self.length // self.num_layers) :]
+        return place[:, -(self.length // self.num_stages) :]

@@ -23,13 +23,13 @@ def check(options: tuple[str, ...], steps: int) -> int:
     """
     (wanted,) = requests(options, multirun=False)
     facts = recipes.look_at(wanted.recipe, steps=steps)
-    file = Path(f"{file_name(wanted.recipe.task.name)}_layers.yaml")
+    file = Path(f"{file_name(wanted.recipe.task.name)}_stages.yaml")
     click.echo("\n".join(_table(facts)))
     lines = recipes.advice(facts, wanted.recipe, str(file))
     if any(str(file) in line for line in lines):
         if not file.exists():
-            file.write_text(yaml.safe_dump(facts.layers, sort_keys=False, default_flow_style=None))
-        click.echo(f"  layers                {file}")
+            file.write_text(yaml.safe_dump(facts.stages, sort_keys=False, default_flow_style=None))
+        click.echo(f"  stages                {file}")
     click.echo("")
     click.echo("\n".join(f"- {line}" for line in lines) or "no obstacle to learning was found")
     return 0

@@ -79,7 +79,7 @@ def _train(wanted: RunRequest) -> recipes.RunResult:
         values = (f"{name}={getattr(getattr(components.recipe, group), name)}" for group, name in chosen)
         click.echo(f"chosen for this environment (auto): {' '.join(values)}")
     if wanted.recipe.hindsight.algo == AUTO and components.recipe.hindsight.algo == "cher":
-        inside = components.recipe.curriculum.layers[0]["achieved_goal"]
+        inside = components.recipe.curriculum.stages[0]["achieved_goal"]
         click.echo(
             f"random actions seldom change the achieved goal: entries {inside} of the observation are first "
             "brought near it (algo=filtered_her does without)"

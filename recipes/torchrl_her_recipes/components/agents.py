@@ -12,7 +12,7 @@ from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
 from torchrl_her.curriculum.guide import GuidedExploration
-from torchrl_her.curriculum.layers import Curriculum, zero_unused_inputs
+from torchrl_her.curriculum.stages import Curriculum, zero_unused_inputs
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.networks import StackedLinear, stack_runs
 from torchrl_her.objectives.cloning import Cloning
@@ -44,7 +44,7 @@ def make_agent(
         env: tells the widths of observations and actions.
         generators: of the exploration of each run, on the device.
         rewards: the least and the greatest that there can be.
-        state: Curriculum whose layers the networks see, or None.
+        state: Curriculum whose stages the networks see, or None.
         device: where it learns.
     """
     curriculum = None if state is None else state.curriculum
@@ -160,7 +160,7 @@ def _guide_of(
         state.curriculum,
         share=options.guided_share,
         per=cast(Literal["episode", "step"], options.guided_per),
-        layer_key="layer" if state.progress.by_episode else None,
+        stage_key="stage" if state.progress.by_episode else None,
         runs=len(generators),
         generators=generators,
     )

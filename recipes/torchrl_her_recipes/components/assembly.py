@@ -16,7 +16,7 @@ from torchrl_her_recipes.components.buffers import make_buffer
 from torchrl_her_recipes.components.collection import ProcessCollector
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import (
-    in_layers,
+    in_stages,
     is_guided,
     make_curriculum_state,
     make_played_env,
@@ -59,7 +59,7 @@ def build(recipe: Recipe) -> Components:
     )
     behavior = make_behavior(recipe, task, agent, rewards=rewards, state=state)
     progress = None if state is None else state.progress
-    env = in_layers(
+    env = in_stages(
         task,
         progress,
         begins=is_guided(recipe.curriculum, progress),

@@ -50,7 +50,7 @@ def make_behavior(
         )
     given: dict[str, Any] = {"real_share": options.real_share, "memory": options.goal_memory}
     if state is not None and state.progress.by_episode:
-        given |= {"layer_key": "layer", "layer": len(state.curriculum) - 1}
+        given |= {"stage_key": "stage", "stage": len(state.curriculum) - 1}
     pad = None if state is None else ZeroPad(state.curriculum, at_the_top(state.curriculum, runs))
     values = partial(
         GoalValues, agent.loss, agent.actor, runs=runs, before_actor=pad, before_critic=agent.norm

@@ -13,14 +13,14 @@ from torchrl.data.replay_buffers.scheduler import LinearScheduler
 from torchrl.envs import DeviceCastTransform, EnvBase
 
 from torchrl_her.curriculum.normalization import count_inputs
-from torchrl_her.curriculum.switch import set_layer_goals
+from torchrl_her.curriculum.switch import set_stage_goals
 from torchrl_her.curriculum.transforms import ZeroPad
-from torchrl_her.curriculum.view import LayerView
+from torchrl_her.curriculum.view import StageView
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch
-from torchrl_her.replay_buffers.layer_rules import LayerRule
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler
+from torchrl_her.replay_buffers.stage_rules import StageRule
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
@@ -97,7 +97,7 @@ def make_buffer(
             exclude=_NOT_STORED,
             runs=runs,
             generators=generators,
-            layers=_rules(state, rule, every=getattr(recipe.order, "every_layer", False)),
+            stages=_rules(state, rule, every=getattr(recipe.order, "every_stage", False)),
             on_write=counted,
         ),
         sampler=_make_sampler(recipe.replay, recipe.learner.priority_power, generators, size, devices.replay),
@@ -108,25 +108,25 @@ def make_buffer(
     if state is not None:
         if not state.progress.by_episode:
             for run in range(runs):
-                set_layer_goals(buffer.writer, state.progress.layer_of(run), run=run)
+                set_stage_goals(buffer.writer, state.progress.stage_of(run), run=run)
         buffer.append_transform(ZeroPad(state.curriculum, state.progress))
     if norm is not None:
         buffer.append_transform(NormalizeBatch(norm))
     return buffer
 
 
-def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) -> list[LayerRule] | None:
-    """How the episodes of each layer are relabeled, where they have layers of their own.
+def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) -> list[StageRule] | None:
+    """How the episodes of each stage are relabeled, where they have stages of their own.
 
     Args:
-        every: whether they are written for all layers.
+        every: whether they are written for all stages.
     """
     if state is None or not state.progress.by_episode:
         return None
-    rules = [LayerRule(layer.reward_fn or task, layer.instructive) for layer in state.curriculum.layers]
+    rules = [StageRule(stage.reward_fn or task, stage.instructive) for stage in state.curriculum.stages]
     if not every:
         return rules
-    views = [LayerView(state.curriculum, number, rule.reward_fn) for number, rule in enumerate(rules)]
+    views = [StageView(state.curriculum, number, rule.reward_fn) for number, rule in enumerate(rules)]
     return [rule._replace(view=view) for rule, view in zip(rules, views, strict=True)]
 
 

@@ -28,7 +28,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
-from torchrl_her.curriculum.layers import CurriculumProgress
+from torchrl_her.curriculum.stages import CurriculumProgress
 from torchrl_her_recipes.components.collection_worker import (
     Beginning,
     WorkerCollector,
@@ -142,7 +142,7 @@ class ProcessCollector(BaseCollector):
     Args:
         recipe: of the runs.
         policy: whose weights, epsilon of exploration included, are sent to the processes.
-        progress: the layers of the runs, which are sent with each reset; None without a curriculum.
+        progress: the stages of the runs, which are sent with each reset; None without a curriculum.
         storing_device: where batches come. The processes are on the CPU.
 
     Raises:

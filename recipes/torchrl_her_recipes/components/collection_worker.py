@@ -16,14 +16,14 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_her.curriculum.guide import GuidedExploration
-from torchrl_her.curriculum.layers import CurriculumProgress
-from torchrl_her.curriculum.orders import EpisodeLayers
+from torchrl_her.curriculum.orders import EpisodeStages
+from torchrl_her.curriculum.stages import CurriculumProgress
 from torchrl_her.curriculum.transforms import StateToObs
 from torchrl_her.modules.exploration import Exploration
 from torchrl_her.modules.stochastic_actor import StochasticActor
 from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her_envs.common.goal_env import goal_env
-from torchrl_her_recipes.components.curricula import in_layers, is_guided, make_progress
+from torchrl_her_recipes.components.curricula import in_stages, is_guided, make_progress
 from torchrl_her_recipes.components.devices import CPU, make_generators
 from torchrl_her_recipes.components.envs import make_task_envs
 from torchrl_her_recipes.components.streams import Stream
@@ -38,7 +38,7 @@ def share_of_envs(options: CollectionConfig) -> int:
 
 
 def make_worker_env(recipe: Recipe, modules: Sequence[str] = ()) -> EnvBase:
-    """A process's share of the environments of all runs: R equal blocks, as the layers of the runs see them.
+    """A process's share of the environments of all runs: R equal blocks, as the stages of the runs see them.
 
     Args:
         recipe: of the runs. The process that sends it was permitted to import what its task names.
@@ -48,7 +48,7 @@ def make_worker_env(recipe: Recipe, modules: Sequence[str] = ()) -> EnvBase:
     import_modules(modules)
     env = make_task_envs(recipe, share_of_envs(recipe.collection), recipe.seeds)
     progress = make_progress(recipe, env)
-    env = in_layers(env, progress, begins=is_guided(recipe.curriculum, progress))
+    env = in_stages(env, progress, begins=is_guided(recipe.curriculum, progress))
     # Only ids tell there which environment a row belongs to: batches come one by one, or a node is replaced.
     if not recipe.collection.sync or recipe.collection.ray is not None:
         env = env if isinstance(env, TransformedEnv) else TransformedEnv(env)
@@ -113,8 +113,8 @@ class WorkerCollector(Collector):
         if beginning.progress is not None:
             progress = _progress_of(self.env)
             progress.load_state_dict(beginning.progress)
-            if isinstance(progress, EpisodeLayers):  # each process draws other ones
-                seeds = [derive_seed(seed, Stream.LAYERS) for seed in beginning.seeds]
+            if isinstance(progress, EpisodeStages):  # each process draws other ones
+                seeds = [derive_seed(seed, Stream.STAGES) for seed in beginning.seeds]
                 progress.generators = make_generators(seeds, CPU)
         self.reset()
 

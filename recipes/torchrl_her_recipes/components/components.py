@@ -54,7 +54,7 @@ class Components(Agent):
         loss: any TorchRL loss module.
         optimizer: over the loss module's parameters.
         target: moves the target networks.
-        curriculum: the curriculum and the layer of each run, or None.
+        curriculum: the curriculum and the stage of each run, or None.
         goal_target: q* [cells] of the task's goals, to which the divergence of virtual goals is
             measured; None if they are not counted in cells.
         generators: sources of the random numbers of each run (exploration, relabeling, sampling).
@@ -63,7 +63,7 @@ class Components(Agent):
         norm: statistics of observations and goals by which actor and sampled transitions are normalized, or
             None.
         average: follows the actor, and is what is evaluated, filmed and kept in its place; or None.
-        guide: begins episodes as the layer below has learned it, see ``guided_share``; or None.
+        guide: begins episodes as the stage below has learned it, see ``guided_share``; or None.
         virtual_env: environments for evaluation at virtual goals, or None.
         behavior: proposes the goals of episodes, or None. It is one of the environment's transforms, and its
             state a part of the collector's.

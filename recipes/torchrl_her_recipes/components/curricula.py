@@ -1,4 +1,4 @@
-"""The curriculum that a recipe asks for, and the layers that its runs are in."""
+"""The curriculum that a recipe asks for, and the stages that its runs are in."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 from torchrl.envs import CatTensors, Compose, EnvBase, InitTracker, Transform, TransformedEnv
 
 from torchrl_her.behavior import BehaviorGoals
-from torchrl_her.curriculum.layers import Curriculum, CurriculumLayer, CurriculumProgress
-from torchrl_her.curriculum.orders import EpisodeLayers, TeacherStudent
-from torchrl_her.curriculum.transforms import LayerOutcomes, StateToObs, ZeroPad
+from torchrl_her.curriculum.orders import EpisodeStages, TeacherStudent
+from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress, CurriculumStage
+from torchrl_her.curriculum.transforms import StageOutcomes, StateToObs, ZeroPad
 from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
 from torchrl_her_recipes.components.envs import evaluation_envs, judging, make_task_envs
@@ -27,76 +27,76 @@ _STATE = ["observation", "desired_goal"]  # what the state is made of, in this o
 
 @dataclass
 class CurriculumState:
-    """The curriculum of some runs, and the layer that each of them is in.
+    """The curriculum of some runs, and the stage that each of them is in.
 
     Attributes:
-        progress: the layer of each run.
-        layer_env: for evaluation at the layers' goals; None where episodes have layers, and not runs.
+        progress: the stage of each run.
+        stage_env: for evaluation at the stages' goals; None where episodes have stages, and not runs.
     """
 
     progress: CurriculumProgress
-    layer_env: EnvBase | None
+    stage_env: EnvBase | None
 
     @property
     def curriculum(self) -> Curriculum:
-        """The layers that the runs go through."""
+        """The stages that the runs go through."""
         return self.progress.curriculum
 
     def at_the_top(self, run: int) -> bool:
-        """Whether a run is in the last layer, which is the full task."""
-        return self.progress.layers[run] == len(self.curriculum) - 1
+        """Whether a run is in the last stage, which is the full task."""
+        return self.progress.stages[run] == len(self.curriculum) - 1
 
 
 def make_curriculum(recipe: Recipe, env: EnvBase) -> Curriculum | None:
-    """The curriculum that the recipe asks for: its own layers, or those of its task."""
-    if not recipe.in_layers:
+    """The curriculum that the recipe asks for: its own stages, or those of its task."""
+    if not recipe.in_stages:
         return None
     task = goal_env(env)
     return read_curriculum(
-        task.layers() if recipe.curriculum.layers is None else recipe.curriculum.layers, task
+        task.stages() if recipe.curriculum.stages is None else recipe.curriculum.stages, task
     )
 
 
-def read_curriculum(layers: object, env: GoalEnv) -> Curriculum:
+def read_curriculum(stages: object, env: GoalEnv) -> Curriculum:
     """A curriculum from plain values, for an environment whose state they index.
 
     The state is the observation with the desired goal behind it. Its entries may be given by the names that
-    the environment has for them (``env.state_names()``). The last layer is the environment's own task; layers
+    the environment has for them (``env.state_names()``). The last stage is the environment's own task; stages
     below it give the same rewards for missed and achieved goals.
 
     Args:
-        layers: a list of mappings with the options of :class:`~torchrl_her.CurriculumLayer`.
+        stages: a list of mappings with the options of :class:`~torchrl_her.CurriculumStage`.
         env: its width of the state and its rewards are used.
 
     Example:
         >>> from torchrl_her_envs import make_env
         >>> env = make_env("hand_v1")
-        >>> [layer.name for layer in read_curriculum(env.layers(), env).layers]
+        >>> [stage.name for stage in read_curriculum(env.stages(), env).stages]
         ['reach', 'throw']
     """
-    if not isinstance(layers, Sequence) or isinstance(layers, str):
-        raise ValueError(f"curriculum must be a list of layers, got {type(layers).__name__}")
+    if not isinstance(stages, Sequence) or isinstance(stages, str):
+        raise ValueError(f"curriculum must be a list of stages, got {type(stages).__name__}")
     width = sum(env.observation_spec[key].shape[-1] for key in _STATE)
-    parsed = [_read_layer(layer, env, is_last=layer is layers[-1]) for layer in layers]
+    parsed = [_read_stage(stage, env, is_last=stage is stages[-1]) for stage in stages]
     curriculum, goal = Curriculum(parsed, width, names=env.state_names()), env.state_names()["desired_goal"]
-    if list(last := curriculum.layers[-1].desired_goal) != goal:
+    if list(last := curriculum.stages[-1].desired_goal) != goal:
         raise ValueError(
-            f"layer {parsed[-1].name!r}: the last layer is the task itself, so its desired_goal must be "
+            f"stage {parsed[-1].name!r}: the last stage is the task itself, so its desired_goal must be "
             f"{goal}, got {list(last)}"
         )
     return curriculum
 
 
-def _read_layer(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumLayer:
+def _read_stage(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumStage:
     try:
         if is_last and "threshold" in options:
             raise ValueError(
-                f"layer {options.get('name')!r}: threshold has no effect in the last layer, whose goals the "
+                f"stage {options.get('name')!r}: threshold has no effect in the last stage, whose goals the "
                 "environment judges; leave it out"
             )
-        return CurriculumLayer(**options, rewards=reward_range(env))
+        return CurriculumStage(**options, rewards=reward_range(env))
     except TypeError as error:  # missing or unknown options, or none at all
-        raise ValueError(f"{options!r} is no layer of a curriculum: {error}") from error
+        raise ValueError(f"{options!r} is no stage of a curriculum: {error}") from error
 
 
 def make_curriculum_state(recipe: Recipe, env: EnvBase, seeds: Sequence[int]) -> CurriculumState | None:
@@ -104,32 +104,32 @@ def make_curriculum_state(recipe: Recipe, env: EnvBase, seeds: Sequence[int]) ->
 
     Raises:
         ValueError: Processes collect, each of which would have to know how the episodes of the others ended;
-            or the weights cannot tell layers apart.
+            or the weights cannot tell stages apart.
     """
     progress, order = make_progress(recipe, env), recipe.order
     if progress is None:
         return None
-    if not isinstance(progress, EpisodeLayers):
-        layer_env = in_layers(make_task_envs(recipe, evaluation_envs(recipe), seeds), progress)
-        return CurriculumState(progress, layer_env)
+    if not isinstance(progress, EpisodeStages):
+        stage_env = in_stages(make_task_envs(recipe, evaluation_envs(recipe), seeds), progress)
+        return CurriculumState(progress, stage_env)
     if not isinstance(recipe.weights, Equal):
         raise ValueError(
             f"weights={recipe.weights.name} must not be used with order={order.name}: they would take the "
-            "goals of all layers for one kind; choose order=threshold"
+            "goals of all stages for one kind; choose order=threshold"
         )
     if progress.adapts and recipe.collection.processes > 0:
         raise ValueError(
-            f"order={order.name} draws layers by how all episodes have ended: it needs processes=0, "
+            f"order={order.name} draws stages by how all episodes have ended: it needs processes=0, "
             f"got processes={recipe.collection.processes}"
         )
     return CurriculumState(progress, None)
 
 
 def make_progress(recipe: Recipe, env: EnvBase) -> CurriculumProgress | None:
-    """Returns the layers of the recipe's runs at their beginning; None if it has no curriculum."""
+    """Returns the stages of the recipe's runs at their beginning; None if it has no curriculum."""
     if (curriculum := make_curriculum(recipe, env)) is None:
         return None
-    generators, order = generators_of(recipe.seeds, Stream.LAYERS), recipe.order
+    generators, order = generators_of(recipe.seeds, Stream.STAGES), recipe.order
     progress: CurriculumProgress = load_name(order.maker)(
         order, curriculum, runs=recipe.run.num_runs, generators=generators
     )
@@ -137,23 +137,23 @@ def make_progress(recipe: Recipe, env: EnvBase) -> CurriculumProgress | None:
 
 
 def make_threshold(options: Threshold, curriculum: Curriculum, *, runs: int, **_: Any) -> CurriculumProgress:
-    """Runs learn one layer after the other."""
+    """Runs learn one stage after the other."""
     return CurriculumProgress(
         curriculum,
         runs=runs,
         window=options.window,
         success_threshold=options.success_threshold,
-        patience=options.layer_epochs or None,
+        patience=options.stage_epochs or None,
     )
 
 
-def make_all_at_once(options: AllAtOnce, curriculum: Curriculum, **runs: Any) -> EpisodeLayers:
-    """Draws each episode's layer, with the same probabilities all the time."""
-    return EpisodeLayers(curriculum, **runs, task_share=options.task_share)
+def make_all_at_once(options: AllAtOnce, curriculum: Curriculum, **runs: Any) -> EpisodeStages:
+    """Draws each episode's stage, with the same probabilities all the time."""
+    return EpisodeStages(curriculum, **runs, task_share=options.task_share)
 
 
 def make_teacher(options: Teacher, curriculum: Curriculum, **runs: Any) -> TeacherStudent:
-    """Draws each episode's layer, and rather the layers whose success changes."""
+    """Draws each episode's stage, and rather the stages whose success changes."""
     return TeacherStudent(
         curriculum,
         **runs,
@@ -175,15 +175,15 @@ def make_played_env(
     env = make_task_envs(recipe, num_envs, seeds, pictures=pictures)
     curriculum = make_curriculum(recipe, env)
     progress = None if curriculum is None else at_the_top(curriculum, len(seeds))
-    return in_layers(env, progress, behavior=behavior)
+    return in_stages(env, progress, behavior=behavior)
 
 
 def is_guided(options: CurriculumConfig, progress: CurriculumProgress | None) -> bool:
-    """Whether some episodes are begun by what was learned in the layer below."""
+    """Whether some episodes are begun by what was learned in the stage below."""
     return progress is not None and options.guided_share > 0 and len(progress.curriculum) > 1
 
 
-def in_layers(
+def in_stages(
     env: EnvBase,
     progress: CurriculumProgress | None,
     *,
@@ -191,7 +191,7 @@ def in_layers(
     behavior: BehaviorGoals | None = None,
     starts: DemonstrationStarts | None = None,
 ) -> EnvBase:
-    """An environment as its runs see it: in their layers, with the networks' input, and with proposed goals.
+    """An environment as its runs see it: in their stages, with the networks' input, and with proposed goals.
 
     Args:
         env: of the full task.
@@ -215,16 +215,16 @@ def in_layers(
         transforms.insert(0, CatTensors(_STATE, "state", del_keys=False, sort=False))
     if begins:
         transforms.append(InitTracker())
-    if isinstance(progress, EpisodeLayers):
-        transforms.append(LayerOutcomes(progress, **judging(env)))
+    if isinstance(progress, EpisodeStages):
+        transforms.append(StageOutcomes(progress, **judging(env)))
     if starts is not None:
         transforms = [starts, *transforms, starts.outcomes()]
     return TransformedEnv(env, Compose(*transforms), auto_unwrap=True)
 
 
 def at_the_top(curriculum: Curriculum, runs: int) -> CurriculumProgress:
-    """Progress of runs that are all in the last layer: the full task."""
+    """Progress of runs that are all in the last stage: the full task."""
     progress = CurriculumProgress(curriculum, runs=runs)
     for run in range(runs):
-        progress.set_layer(run, len(curriculum) - 1)
+        progress.set_stage(run, len(curriculum) - 1)
     return progress

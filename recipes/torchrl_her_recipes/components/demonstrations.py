@@ -9,10 +9,10 @@ import torch
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
-from torchrl_her.curriculum.switch import enter_layer, set_layer_goals
+from torchrl_her.curriculum.switch import enter_stage, set_stage_goals
 from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.demonstrations.replay import MixedReplay, write_demonstrations
-from torchrl_her.demonstrations.shown import in_layer, with_reward
+from torchrl_her.demonstrations.shown import in_stage, with_reward
 from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her.trainers.checkpoint import buffer_state_dict, load_buffer_state_dict
 from torchrl_her_envs.common.goal_env import goal_env
@@ -41,11 +41,11 @@ class RunDemonstrations:
     starts: DemonstrationStarts | None = None
 
     def shown(self, run: int) -> Demonstrations:
-        """The demonstrations in the layer that a run is in, with the task's rewards."""
+        """The demonstrations in the stage that a run is in, with the task's rewards."""
         rule = task_reward(self.env)
         if self.state is None:
             return with_reward(self.recorded, rule)
-        return in_layer(self.recorded, self.state.curriculum, self.state.progress.layers[run], rule)
+        return in_stage(self.recorded, self.state.curriculum, self.state.progress.stages[run], rule)
 
     def fill(self, buffer: TensorDictReplayBuffer, runs: int) -> None:
         """Writes the rows of all runs into an empty buffer."""
@@ -53,11 +53,11 @@ class RunDemonstrations:
         for run in range(runs):
             write_demonstrations(buffer, self.shown(run), run=run)
 
-    def enter_layer(self, run: int) -> None:
-        """Shows a run its demonstrations in the layer that it has entered."""
+    def enter_stage(self, run: int) -> None:
+        """Shows a run its demonstrations in the stage that it has entered."""
         assert self.state is not None
         if self.buffer is not None:
-            enter_layer(self.buffer, self.state.progress.layer_of(run), run=run)
+            enter_stage(self.buffer, self.state.progress.stage_of(run), run=run)
             write_demonstrations(self.buffer, self.shown(run), run=run)
         if self.starts is not None:
             self.starts.show(self.shown(run), run=run)
@@ -81,7 +81,7 @@ class RunDemonstrations:
             return
         for run in range(self.state.progress.runs):
             if self.buffer is not None:
-                set_layer_goals(self.buffer.writer, self.state.progress.layer_of(run), run=run)
+                set_stage_goals(self.buffer.writer, self.state.progress.stage_of(run), run=run)
             if self.starts is not None:
                 self.starts.show(self.shown(run), run=run)
 
@@ -100,7 +100,7 @@ def load_demonstrations(
         return None
     if state is not None and state.progress.by_episode:
         raise ValueError(
-            f"demonstrations are shown in a run's layer, and with order={recipe.order.name} "
+            f"demonstrations are shown in a run's stage, and with order={recipe.order.name} "
             "it has none: choose order=threshold"
         )
     try:

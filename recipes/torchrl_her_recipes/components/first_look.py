@@ -53,8 +53,8 @@ class Facts:
         fallen: share of the episodes that terminated without the goal, as by a fall.
         constant: entries of the observation that never changed.
         goal_inside: entries of the observation that are the desired goal.
-        own_layers: whether the task has a curriculum of its own.
-        layers: of a curriculum, as ``propose_layers`` gives them; empty if none is proposed, as where
+        own_stages: whether the task has a curriculum of its own.
+        stages: of a curriculum, as ``propose_stages`` gives them; empty if none is proposed, as where
             rewards depend on more than goals.
         ends: what ends an episode at its goal, and what the environment was seen to do there; None if the
             environment itself says so for all goals.
@@ -73,8 +73,8 @@ class Facts:
     fallen: float
     constant: list[int]
     goal_inside: list[int]
-    own_layers: bool
-    layers: list[dict[str, Any]]
+    own_stages: bool
+    stages: list[dict[str, Any]]
     ends: GoalEnds | None
 
 
@@ -87,17 +87,17 @@ def resolved(recipe: Recipe) -> Recipe:
     """
     if not auto_options(recipe) and not ends_open(recipe):
         return recipe
-    needs_layers = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
-    known = f"{recipe.task} {needs_layers}"
+    needs_stages = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
+    known = f"{recipe.task} {needs_stages}"
     if (facts := _FACTS.get(known)) is None:
         with closing(make_task_envs(_watched(recipe), 1, [0])) as env:
             task = goal_env(env)
             facts = EnvFacts(max_steps=task.max_steps, batched=task.batched)
             ends: GoalEnds | None = getattr(task, "goal_ends", None)
         open_ends = ends is not None and ends.env_ends is None and ends_open(recipe)
-        if (needs_layers or open_ends) and not facts.batched:
+        if (needs_stages or open_ends) and not facts.batched:
             look = look_at(recipe.replace(seed=0), seconds=None)
-            facts, ends = replace(facts, layers=_needed_layers(look) if needs_layers else None), look.ends
+            facts, ends = replace(facts, stages=_needed_stages(look) if needs_stages else None), look.ends
         if ends is not None and ends_open(recipe):
             facts = replace(facts, ends=ends.found() or "never")
             say_once(ends.line())
@@ -113,13 +113,13 @@ def _watched(recipe: Recipe) -> Recipe:
     return recipe.replace(**values)
 
 
-def _needed_layers(facts: Facts) -> list[dict[str, Any]] | None:
-    """Layers for a task whose achieved goal seldom changes by chance; None if it needs none, or has none.
+def _needed_stages(facts: Facts) -> list[dict[str, Any]] | None:
+    """Stages for a task whose achieved goal seldom changes by chance; None if it needs none, or has none.
 
     They are the same for each seed. There are none where episodes end in failures, which say nothing about
-    the goals of a layer below the task.
+    the goals of a stage below the task.
     """
-    return None if facts.fallen > 0 or facts.moved >= _SELDOM else facts.layers or None
+    return None if facts.fallen > 0 or facts.moved >= _SELDOM else facts.stages or None
 
 
 def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SECONDS) -> Facts:
@@ -214,15 +214,15 @@ def _facts(
         fallen=sum(fallen) / count,
         constant=(spread == 0).nonzero().flatten().tolist(),
         goal_inside=_columns(seen, rows["desired_goal"].double()),
-        own_layers=_has_layers(task),
-        layers=[] if task.info_keys else propose_layers(rows, meets),
+        own_stages=_has_stages(task),
+        stages=[] if task.info_keys else propose_stages(rows, meets),
         ends=getattr(task, "goal_ends", None),
     )
 
 
-def _has_layers(task: GoalEnv) -> bool:
+def _has_stages(task: GoalEnv) -> bool:
     try:
-        return len(task.layers()) > 1
+        return len(task.stages()) > 1
     except ValueError:
         return False
 
@@ -247,8 +247,8 @@ def _columns(seen: Tensor, goal: Tensor) -> list[int]:
     return []
 
 
-def propose_layers(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
-    """Two layers of a curriculum: bring near what comes near the achieved goal where it moves, then the task.
+def propose_stages(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
+    """Two stages of a curriculum: bring near what comes near the achieved goal where it moves, then the task.
 
     The achieved goal must be observed, and other entries of the observation, as many, must be nearer to it in
     the steps in which it moves than in others: those of a hand, for instance, that pushes it. They are to
@@ -260,7 +260,7 @@ def propose_layers(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
         meets: which achieved goals [..., g] are the desired ones [..., g], [...] of bool.
 
     Returns:
-        Layers as ``curriculum=FILE.yaml`` takes them, or none if there are no such entries.
+        Stages as ``curriculum=FILE.yaml`` takes them, or none if there are no such entries.
     """
     seen, goal = rows["observation"].double(), rows["achieved_goal"].double()
     width, wide = goal.shape[-1], seen.shape[-1]
@@ -283,7 +283,7 @@ def propose_layers(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
         return []
     others = [
         entry for entry in range(wide) if entry not in place
-    ]  # and the goal of the first layer behind them
+    ]  # and the goal of the first stage behind them
     reach = {
         "observation": others,
         "achieved_goal": list(range(best, best + width)),

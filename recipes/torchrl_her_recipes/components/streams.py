@@ -15,7 +15,7 @@ class Stream(IntEnum):
 
     EVALUATION = 1 << 32
     PROPOSED_GOALS = 1 << 33
-    LAYERS = 1 << 34
+    STAGES = 1 << 34
     GOAL_SPACE = 1 << 40
     DEMONSTRATED_STARTS = (1 << 40) + (1 << 32)
 

@@ -22,7 +22,7 @@ class Algorithm:
         name: the name that recipes take.
         virtual: whether virtual rows are written at all.
         filter: whether virtual goals that were already achieved are left out.
-        curriculum: whether runs learn the layers of a curriculum (CHER).
+        curriculum: whether runs learn the stages of a curriculum (CHER).
         weights: the weights of virtual goals; None if recipes choose them.
         summary: one-line description for users.
     """
@@ -70,7 +70,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         _cher(
             name="cher_ibs",
             weights="ibs",
-            summary="CHER that prefers instructive goals in the layers that say so",
+            summary="CHER that prefers instructive goals in the stages that say so",
         ),
         _cher(
             name="cher_rare", weights="rare", summary="CHER that prefers goals with few others around them"

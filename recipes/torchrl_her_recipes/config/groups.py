@@ -163,7 +163,7 @@ class HindsightConfig(Group):
     algo: str = option(
         AUTO,
         "an algorithm of `torchrl-her list`; auto: filtered_her, or cher where random actions seldom change "
-        "the achieved goal, or with the layers of curriculum=FILE",
+        "the achieved goal, or with the stages of curriculum=FILE",
     )
     k: int = option(4, "virtual transitions for each real one", at_least=0)
     strategy: str = option(
@@ -207,51 +207,51 @@ class HindsightConfig(Group):
 
 @dataclass(frozen=True, kw_only=True)
 class CurriculumConfig(Group):
-    """The layers that runs learn, one after the other or at once (Curriculum-HER)."""
+    """The stages that runs learn, one after the other or at once (Curriculum-HER)."""
 
     needs: ClassVar[Needs] = (("guided_share", bool, "guided_per"),)
 
     name: str = option(
         "task",
-        "task: the layers that the task itself has; or a YAML file with a list of layers",
+        "task: the stages that the task itself has; or a YAML file with a list of stages",
         shown_as="curriculum",
     )
-    layers: Any = option(None, "the layers themselves, as a list of their options")
+    stages: Any = option(None, "the stages themselves, as a list of their options")
     guided_share: float = option(
         0.0,
-        "share of the episodes that the policy of the layer below begins, until its goal is achieved",
+        "share of the episodes that the policy of the stage below begins, until its goal is achieved",
         at_least=0,
         at_most=1,
     )
     guided_per: str = option(
         "episode",
-        "whether guided_share is of episodes, or of the steps in which the goal of the layer below is not "
+        "whether guided_share is of episodes, or of the steps in which the goal of the stage below is not "
         "achieved",
         choices=("episode", "step"),
     )
     alpha_actor: float = option(
-        0.0, "scale of the actor's initial weights for inputs that the first layer hides", at_least=0
+        0.0, "scale of the actor's initial weights for inputs that the first stage hides", at_least=0
     )
     alpha_critic: float = option(0.0, "the same scale for the critic", at_least=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.name != "task" and self.layers is None:  # a recipe holds the layers, not just their file
-            object.__setattr__(self, "layers", _read_layers(Path(self.name)))
-        layers = self.layers
-        if layers is not None and not (
-            isinstance(layers, list | tuple)
-            and layers
-            and all(isinstance(layer, Mapping) for layer in layers)
+        if self.name != "task" and self.stages is None:  # a recipe holds the stages, not just their file
+            object.__setattr__(self, "stages", _read_stages(Path(self.name)))
+        stages = self.stages
+        if stages is not None and not (
+            isinstance(stages, list | tuple)
+            and stages
+            and all(isinstance(stage, Mapping) for stage in stages)
         ):
             raise ValueError(
-                f"a curriculum must be a list of layers, each with its options by name, got {layers!r}"
+                f"a curriculum must be a list of stages, each with its options by name, got {stages!r}"
             )
 
 
-def _read_layers(path: Path) -> Any:
+def _read_stages(path: Path) -> Any:
     if not path.is_file():
-        raise ValueError(f"curriculum must be 'task' or a YAML file with a list of layers, got {str(path)!r}")
+        raise ValueError(f"curriculum must be 'task' or a YAML file with a list of stages, got {str(path)!r}")
     return read_yaml(path)
 
 

@@ -55,7 +55,7 @@ class Recipe:
     run: groups.RunConfig = field(default_factory=groups.RunConfig)
 
     def __post_init__(self) -> None:
-        if self.hindsight.algo == AUTO and self.curriculum.layers is not None:
+        if self.hindsight.algo == AUTO and self.curriculum.stages is not None:
             object.__setattr__(self, "hindsight", replace(self.hindsight, algo="cher"))
         if self.run.frames is not None and self.collection.epoch_frames != AUTO:
             epochs = -(-self.run.frames // self.collection.epoch_frames)
@@ -80,8 +80,8 @@ class Recipe:
         return get_algorithm(self.hindsight.algo).filter
 
     @property
-    def in_layers(self) -> bool:
-        """Whether runs learn the layers of a curriculum."""
+    def in_stages(self) -> bool:
+        """Whether runs learn the stages of a curriculum."""
         return get_algorithm(self.hindsight.algo).curriculum
 
     @property
@@ -260,10 +260,10 @@ def _drop_options_of_another_task(below: Nested, given: Nested) -> None:
 
 def _drop_another_curriculum(below: Nested, given: Nested) -> None:
     asked = given.get("curriculum", {})
-    if asked.get("name", "task") != "task" and asked.get("layers") is not None:
-        raise ValueError(f"curriculum={asked['name']} and layers={asked['layers']!r}: give one of them")
-    if "name" in asked or "layers" in asked:
-        below.get("curriculum", {}).pop("layers", None)
+    if asked.get("name", "task") != "task" and asked.get("stages") is not None:
+        raise ValueError(f"curriculum={asked['name']} and stages={asked['stages']!r}: give one of them")
+    if "name" in asked or "stages" in asked:
+        below.get("curriculum", {}).pop("stages", None)
         below.get("curriculum", {}).pop("name", None)
 
 

@@ -15,8 +15,8 @@ from torchrl_her_recipes.config.without_effect import without_effect
 TERMINATION = "termination"  # option of a task: the rule that ends an episode at its goal
 _WARMUP = 1_000  # environment steps, at least
 _EPISODES = 100  # in an epoch, where environments are stepped one by one
-_AT_ONCE = {"order": "all_at_once", "every_layer": True, "task_share": 1.0}  # order of a found curriculum
-_LAYER_EPOCHS = 10  # epochs after which its first layer ends, learned or not, where goals are weighted
+_AT_ONCE = {"order": "all_at_once", "every_stage": True, "task_share": 1.0}  # order of a found curriculum
+_STAGE_EPOCHS = 10  # epochs after which its first stage ends, learned or not, where goals are weighted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,14 +26,14 @@ class EnvFacts:
     Args:
         max_steps: steps of an episode, at most.
         batched: whether the environments of a batch are stepped together, at little cost for each of them.
-        layers: layers of a curriculum, if the achieved goal seldom changes without one.
+        stages: stages of a curriculum, if the achieved goal seldom changes without one.
         ends: rule that ends an episode at its goal, as ``task.options.termination`` takes it; None if the
             task has no such option.
     """
 
     max_steps: int
     batched: bool = False
-    layers: Any = None
+    stages: Any = None
     ends: str | None = None
 
 
@@ -54,7 +54,7 @@ def _epoch_frames(recipe: Recipe, facts: EnvFacts) -> int:
 
 # In this order: later ones depend on earlier ones.
 _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
-    "algo": lambda _recipe, facts: "cher" if facts.layers else "filtered_her",
+    "algo": lambda _recipe, facts: "cher" if facts.stages else "filtered_her",
     "goal_sources": lambda recipe, _facts: recipe.hindsight.sources,
     # a horizon of half an episode
     "gamma": lambda _recipe, facts: round(min(max(1 - 2 / facts.max_steps, 0.9), 0.99), 4),
@@ -106,9 +106,9 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
         recipe = recipe.replace(**{f"task.options.{TERMINATION}": facts.ends})
     for group, name in auto_options(recipe):
         values = {f"{group}.{name}": _VALUES[name](recipe, facts)}
-        if name == "algo" and facts.layers:
-            values |= {"layers": facts.layers, "guided_share": 0.5, "guided_per": "step"}
-            # Weights of goals know one layer at a time.
-            values |= _AT_ONCE if recipe.weights.name == "none" else {"layer_epochs": _LAYER_EPOCHS}
+        if name == "algo" and facts.stages:
+            values |= {"stages": facts.stages, "guided_share": 0.5, "guided_per": "step"}
+            # Weights of goals know one stage at a time.
+            values |= _AT_ONCE if recipe.weights.name == "none" else {"stage_epochs": _STAGE_EPOCHS}
         recipe = recipe.replace(**values)
     return recipe

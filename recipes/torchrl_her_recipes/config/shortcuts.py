@@ -34,7 +34,14 @@ GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
 }
 KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)}
 # options that had another name before
-FORMER_NAMES = {"products": "matmul_dtype", "average_decay": "ema_decay"}
+FORMER_NAMES = {
+    "products": "matmul_dtype",
+    "average_decay": "ema_decay",
+    "layers": "stages",
+    "layer_epochs": "stage_epochs",
+    "layer_epsilon": "stage_epsilon",
+    "every_layer": "every_stage",
+}
 # groups that had options before, and the groups that have them now
 FORMER = {"ibs": ("weights", "behavior"), "novelty": ("weights",), "curriculum": ("order",)}
 # groups whose options are always named with them: ``file`` alone would be unclear
@@ -83,7 +90,7 @@ def renamed(name: str) -> list[str]:
     """Returns the names that an option has now, if it had another one or was in another group before.
 
     Example:
-        >>> renamed("curriculum.window"), renamed("curriculum.order"), renamed("curriculum.layers")
+        >>> renamed("curriculum.window"), renamed("curriculum.order"), renamed("curriculum.stages")
         (['order.window'], ['order'], [])
         >>> renamed("learner.average_decay")
         ['learner.ema_decay']
@@ -184,7 +191,7 @@ def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
         if value is None and "name" in names.get(name, []):
             continue  # task=null: the default
         if name == "curriculum" and isinstance(value, list | tuple):
-            placed.setdefault("curriculum", {})["layers"] = list(value)
+            placed.setdefault("curriculum", {})["stages"] = list(value)
             continue
         option, *entry = split_name(name)
         group, field = locate(option, placed, base or {})

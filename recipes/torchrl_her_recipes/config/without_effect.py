@@ -47,9 +47,9 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     yield not sources, "with k=0", relabeling
     yield not algorithm.virtual, with_algo, [*relabeling, "hindsight.k", "hindsight.goal_sources"]
 
-    yield not learner.has_epsilon, f"with learner={learner.name}", ["order.layer_epsilon"]
-    layers = [*_options(groups, "curriculum"), "order.name", *_options(groups, "order")]
-    yield not algorithm.curriculum, with_algo, layers
+    yield not learner.has_epsilon, f"with learner={learner.name}", ["order.stage_epsilon"]
+    stages = [*_options(groups, "curriculum"), "order.name", *_options(groups, "order")]
+    yield not algorithm.curriculum, with_algo, stages
     greedy = getattr(learner, "epsilon_start", None) == 0.0 and not algorithm.curriculum
     yield greedy, "with epsilon_start=0", ["learner.action_noise", "learner.uniform_share"]
     cloning = ["demonstrations.bc_weight", "demonstrations.q_filter"]

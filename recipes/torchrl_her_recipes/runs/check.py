@@ -17,13 +17,13 @@ _STILL = (
 )
 
 
-def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> list[str]:
+def advice(facts: Facts, recipe: Recipe, stages_file: str = "stages.yaml") -> list[str]:
     """Returns a line for each problem that the facts show, with the options to set.
 
     Args:
         facts: Facts of :func:`look_at`.
         recipe: Recipe of the planned run.
-        layers_file: File of the proposed layers.
+        stages_file: File of the proposed stages.
     """
     recipe, lines = resolved(recipe), []
     if facts.disagree:
@@ -39,7 +39,7 @@ def advice(facts: Facts, recipe: Recipe, layers_file: str = "layers.yaml") -> li
         )
     if facts.moved < _SELDOM:
         lines.append(
-            f"{_STILL.format(facts=facts, moved=_percent(facts.moved))} {_remedy(facts, recipe, layers_file)}"
+            f"{_STILL.format(facts=facts, moved=_percent(facts.moved))} {_remedy(facts, recipe, stages_file)}"
         )
     if not facts.moved:
         lines.append("by the reward, achieved_goal never changed: does it hold what the goal is about?")
@@ -67,22 +67,22 @@ def _percent(share: float) -> str:
     return "less than 1%" if 0 < share < _ROUNDED else f"{share:.0%}"
 
 
-def _remedy(facts: Facts, recipe: Recipe, layers_file: str) -> str:
+def _remedy(facts: Facts, recipe: Recipe, stages_file: str) -> str:
     shown = "demonstrations (demonstrations.file=FILE)"
-    if recipe.in_layers and recipe.filters:
-        layers = recipe.curriculum.layers
+    if recipe.in_stages and recipe.filters:
+        stages = recipe.curriculum.stages
         first = (
-            f", whose first goals are for entries {layers[0]['achieved_goal']} of the observation"
-            if layers
+            f", whose first goals are for entries {stages[0]['achieved_goal']} of the observation"
+            if stages
             else ""
         )
         return f"This recipe has a curriculum{first}; {shown} help, too"
-    if facts.own_layers:
+    if facts.own_stages:
         return f"What helps: the task's own curriculum (algo=cher) or {shown}"
-    if facts.layers:
-        inside = facts.layers[0]["achieved_goal"]
+    if facts.stages:
+        inside = facts.stages[0]["achieved_goal"]
         return (
             f"What helps: a curriculum that first brings entries {inside[0]} to {inside[-1]} of the "
-            f"observation near it (algo=cher curriculum={layers_file}) or {shown}"
+            f"observation near it (algo=cher curriculum={stages_file}) or {shown}"
         )
     return f"What helps: a curriculum (algo=cher curriculum=FILE) or {shown}"

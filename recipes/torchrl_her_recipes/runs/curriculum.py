@@ -1,4 +1,4 @@
-"""Runs in a curriculum: measures their success in their layer, and moves them to the next one."""
+"""Runs in a curriculum: measures their success in their stage, and moves them to the next one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_her.curriculum.normalization import restart_inputs
-from torchrl_her.curriculum.switch import enter_layer
+from torchrl_her.curriculum.switch import enter_stage
 from torchrl_her.trainers.metrics import at_the_end, success
 from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env
@@ -34,38 +34,38 @@ def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDic
     return torch.cat([batch.unflatten(0, (runs, worlds)) for batch in played], 1)[:, :episodes].flatten(0, 1)
 
 
-def layer_success(
+def stage_success(
     components: Components, state: CurriculumState, rollout: TensorDictBase, epoch: int
 ) -> Tensor:
-    """Returns success [R, n] at the goals of the runs' layers; in the last layer that of ``rollout``."""
+    """Returns success [R, n] at the goals of the runs' stages; in the last stage that of ``rollout``."""
     runs, last = components.recipe.run.num_runs, len(state.curriculum) - 1
     full = success(rollout, **judging(components.eval_env)).float().view(runs, -1)
-    below = state.progress.layer < last
-    if state.layer_env is None or not bool(below.any()):
+    below = state.progress.stage < last
+    if state.stage_env is None or not bool(below.any()):
         return full
-    played = play_greedily(components, state.layer_env, epoch)
-    in_layer = at_the_end(played, played["next", "terminated"].squeeze(-1)).float().view(runs, -1)
-    return torch.where(below.unsqueeze(1), in_layer, full)
+    played = play_greedily(components, state.stage_env, epoch)
+    in_stage = at_the_end(played, played["next", "terminated"].squeeze(-1)).float().view(runs, -1)
+    return torch.where(below.unsqueeze(1), in_stage, full)
 
 
 def move_on(components: Components, state: CurriculumState, samples: Tensor, frames: int) -> list[str]:
-    """Moves runs that have learned their layer to the next one, and returns a message for each of them."""
-    before, evaluations = state.progress.layers, state.progress.evaluations
+    """Moves runs that have learned their stage to the next one, and returns a message for each of them."""
+    before, evaluations = state.progress.stages, state.progress.evaluations
     # As many as the window takes: more in one evaluation would give a lucky streak many chances.
     moved = state.progress.record(samples[:, : state.progress.window])
     learner, exploration, lines = components.recipe.learner, components.exploration, []
     for run in moved.nonzero().flatten().tolist():
-        old, new = state.curriculum.layers[before[run]], state.progress.layer_of(run)
+        old, new = state.curriculum.stages[before[run]], state.progress.stage_of(run)
         seed = components.recipe.seeds[run]
         learned = "learned" if evaluations[run] + 1 != state.progress.patience else "not learned, but left"
         lines.append(f"seed {seed}: {old.name!r} {learned} after {frames:,} frames, {new.name!r} begins")
         if components.guide is not None:
             components.guide.follow(components.greedy, before[run], run=run)
-        enter_layer(
+        enter_stage(
             components.buffer,
             new,
             exploration if learner.has_epsilon else None,
-            epsilon=getattr(components.recipe.order, "layer_epsilon", 1.0),
+            epsilon=getattr(components.recipe.order, "stage_epsilon", 1.0),
             run=run,
         )
         if components.behavior is not None:
@@ -73,5 +73,5 @@ def move_on(components: Components, state: CurriculumState, samples: Tensor, fra
         if components.norm is not None:
             restart_inputs(components.norm, old, new, run=run)
         if components.demonstrations is not None:
-            components.demonstrations.enter_layer(run)
+            components.demonstrations.enter_stage(run)
     return lines

@@ -73,7 +73,7 @@ def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) ->
 
 
 def _success(row: Row) -> float:
-    return row.get("layer_success", row["success"])  # in a curriculum, at the goals of the present layer
+    return row.get("stage_success", row["success"])  # in a curriculum, at the goals of the present stage
 
 
 def _nothing_achieved(rows: Sequence[Row], recipe: Recipe) -> str | None:
@@ -148,8 +148,8 @@ def _beyond(bounds: tuple[float, float]) -> Rule:
 
 def _fallen(rows: Sequence[Row], recipe: Recipe) -> str | None:
     means = _means([row["success"] for row in rows])
-    layers = {row.get("layer", 0.0) for row in rows[-2 * _STREAK :]}
-    if len(means) <= _STREAK or len(layers) > 1 or max(means) < _LITTLE or means[-1] > max(means) / 2:
+    stages = {row.get("stage", 0.0) for row in rows[-2 * _STREAK :]}
+    if len(means) <= _STREAK or len(stages) > 1 or max(means) < _LITTLE or means[-1] > max(means) / 2:
         return None
     learner, helps = recipe.learner, [f"learning_rate below {recipe.learner.learning_rate:g}"]
     if learner.norm != "layer":

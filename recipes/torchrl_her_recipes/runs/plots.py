@@ -49,7 +49,7 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
             frames, _, middle, _ = band(rows, "reached")
             axes.plot(frames, middle, "--", color="#dd6b20", label="reached at some step")
             axes.legend(fontsize=8)
-        for change in layer_changes(rows):
+        for change in stage_changes(rows):
             axes.axvline(change, color="#a0aec0", linewidth=0.8, linestyle=":")
         axes.set(xlabel="environment steps", ylabel=label)
         count_frames(axes)
@@ -58,7 +58,7 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
             axes.set_ylim(*limits)
     several = len({row["run"] for row in rows}) > 1
     said = ["line: median, band: 33rd to 67th percentile, thin lines: single runs"] if several else []
-    said += ["dotted: a run goes on to the next layer"] if layer_changes(rows) else []
+    said += ["dotted: a run goes on to the next stage"] if stage_changes(rows) else []
     figure.supxlabel("; ".join(said), fontsize=9)
     save_figure(figure, path)
 
@@ -130,13 +130,13 @@ def count_frames(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
-def layer_changes(rows: Rows) -> list[float]:
-    """Returns the numbers of frames after which runs moved to another layer of their curriculum."""
+def stage_changes(rows: Rows) -> list[float]:
+    """Returns the numbers of frames after which runs moved to another stage of their curriculum."""
     last: dict[float, dict[str, float]] = {}
     changes = []
     for row in rows:
         before = last.get(row["run"], row)
-        if row.get("layer") != before.get("layer"):
+        if row.get("stage") != before.get("stage"):
             changes.append(before["frames"])
         last[row["run"]] = row
     return changes

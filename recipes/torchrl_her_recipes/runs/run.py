@@ -22,7 +22,7 @@ from torchrl_her_recipes.config.loggers import check_installed
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.callbacks import Callback, RunView, Stopped
-from torchrl_her_recipes.runs.curriculum import layer_success, move_on, play_greedily
+from torchrl_her_recipes.runs.curriculum import move_on, play_greedily, stage_success
 from torchrl_her_recipes.runs.evaluation import measure, written
 from torchrl_her_recipes.runs.film import film_policy
 from torchrl_her_recipes.runs.folder import RunFolder
@@ -292,8 +292,8 @@ class _Run:
             measured["proposed_success"] = components.behavior.success()
         measured |= {"epsilon": components.exploration.epsilon} | at_virtual_goals(components, trainer.epochs)
         if state is not None:
-            samples = layer_success(components, state, rollout, trainer.epochs)
-            measured["layer_success"] = samples.mean(1)
+            samples = stage_success(components, state, rollout, trainer.epochs)
+            measured["stage_success"] = samples.mean(1)
         seconds = (self.rows[-1]["seconds"] if self.rows else 0.0) + time.perf_counter() - began
         rows = []
         for run, seed in enumerate(self.recipe.seeds):
@@ -301,11 +301,11 @@ class _Run:
             times = {"updates": trainer.updates, "seconds": seconds}
             values = {name: float(value[run]) for name, value in measured.items()}
             if state is not None:
-                values["mean_layer" if state.progress.by_episode else "layer"] = state.progress.mean_layer(
+                values["mean_stage" if state.progress.by_episode else "stage"] = state.progress.mean_stage(
                     run
                 )
             rows.append({**counters, **times, **values, **written(components, run)})
-        self.best.see(rows, components.greedy)  # before a new layer changes it
+        self.best.see(rows, components.greedy)  # before a new stage changes it
         if state is not None:
             for line in move_on(components, state, samples, trainer.frames):
                 shown.say(line)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torchrl.envs import EnvBase
 
-from torchrl_her.curriculum.switch import set_layer_goals
+from torchrl_her.curriculum.switch import set_stage_goals
 from torchrl_her.goals.sources import sources_name
 from torchrl_her.goals.strategies import strategy_name
 from torchrl_her.modules.noise import generator_states, set_generator_states
@@ -59,7 +59,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
         assert state is not None
         state.progress.load_state_dict(progress)
         for run in range(0 if state.progress.by_episode else state.progress.runs):
-            set_layer_goals(buffer.writer, state.progress.layer_of(run), run=run)
+            set_stage_goals(buffer.writer, state.progress.stage_of(run), run=run)
 
     def begin_episodes(_state: dict[str, Any]) -> None:
         if trainer.in_epoch:  # the episodes of such environments cannot be resumed
@@ -83,7 +83,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             partial(torch.cuda.get_rng_state, device), partial(torch.cuda.set_rng_state, device=device)
         ),
         "progress": None if state is None else Part(state.progress.state_dict, load_progress),
-        "demonstrations": components.demonstrations,  # rewards of layers follow from the progress
+        "demonstrations": components.demonstrations,  # rewards of stages follow from the progress
         "collector": Part(
             partial(collector_state_dict, collector), partial(load_collector_state_dict, collector)
         ),

@@ -24,7 +24,7 @@ def at_virtual_goals(components: Components, epoch: int) -> dict[str, Tensor]:
 
     Returns:
         ``virtual_success``, ``virtual_q`` and ``virtual_q_bias``, which are to virtual goals what ``success``
-        and so on are to the task's own; NaN for runs without virtual goals, or below the last layer.
+        and so on are to the task's own; NaN for runs without virtual goals, or below the last stage.
     """
     env = components.virtual_env
     if env is None:
@@ -71,7 +71,7 @@ def _virtual_goals(
     rows = buffer.storage[torch.randint(begin, end, (_TRIES * number,), generator=generator)]
     fits = rows.get("virtual").squeeze(-1)
     if state is not None and state.progress.by_episode:
-        fits = fits & (rows.get("layer").squeeze(-1) == len(state.curriculum) - 1)
+        fits = fits & (rows.get("stage").squeeze(-1) == len(state.curriculum) - 1)
     return rows.get("desired_goal")[fits][:number].to("cpu", torch.float32)
 
 

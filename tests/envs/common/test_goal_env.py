@@ -62,28 +62,28 @@ def test_pictures_are_given_or_refused_in_one_line(name: str) -> None:
 @pytest.mark.parametrize("name", ["bit_flip", "treasure_hunt", f"gym:{WALK}"])
 def test_tasks_without_a_curriculum_say_so(name: str) -> None:
     with pytest.raises(
-        ValueError, match=f"^{name} has no curriculum: give its layers as curriculum=FILE.yaml$"
+        ValueError, match=f"^{name} has no curriculum: give its stages as curriculum=FILE.yaml$"
     ):
-        make_env(name).layers()
+        make_env(name).stages()
 
 
 KEYS = {"name", "observation", "achieved_goal", "desired_goal", "threshold", "instructive"}
 
 
-@pytest.mark.parametrize(("name", "options"), [("hand_v1", {}), ("robot_v2", {}), ("chain", {"layers": 5})])
-def test_layers_are_plain_data_that_index_the_state(name: str, options: dict[str, int]) -> None:
+@pytest.mark.parametrize(("name", "options"), [("hand_v1", {}), ("robot_v2", {}), ("chain", {"stages": 5})])
+def test_stages_are_plain_data_that_index_the_state(name: str, options: dict[str, int]) -> None:
     env = make_env(name, **options)
     width = env.observation_spec["state"].shape[-1]
-    *below, last = env.layers()
-    assert all(isinstance(layer["threshold"], float) for layer in below)
+    *below, last = env.stages()
+    assert all(isinstance(stage["threshold"], float) for stage in below)
     assert set(last) == KEYS - {"threshold"}  # its goals are the task's
-    for layer in (*below, last):
-        assert set(layer) | {"threshold"} == KEYS
-        assert isinstance(layer["name"], str)
-        assert isinstance(layer["instructive"], bool)
+    for stage in (*below, last):
+        assert set(stage) | {"threshold"} == KEYS
+        assert isinstance(stage["name"], str)
+        assert isinstance(stage["instructive"], bool)
         for key in ("observation", "achieved_goal", "desired_goal"):
-            assert all(type(index) is int and 0 <= index < width for index in layer[key])
-        assert len(layer["achieved_goal"]) == len(layer["desired_goal"])
+            assert all(type(index) is int and 0 <= index < width for index in stage[key])
+        assert len(stage["achieved_goal"]) == len(stage["desired_goal"])
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -107,16 +107,16 @@ def test_entries_of_throwing_states_are_what_their_names_say(name: str) -> None:
     assert env.task.effector in names
     if env.task.throws:
         assert torch.equal(state[:, names["hole"]], env.worlds.goal.float())
-        for layer, parts in zip(
-            env.layers(),
+        for stage, parts in zip(
+            env.stages(),
             ([env.task.effector], [env.task.effector, "ball", "ball_speed"]),
             strict=True,
         ):
-            assert layer["observation"] == [place for part in parts for place in names[part]]
+            assert stage["observation"] == [place for part in parts for place in names[part]]
 
 
 def test_entries_of_a_chain_are_named_by_its_parts() -> None:
-    names = make_env("chain", length=6, layers=3).state_names()
+    names = make_env("chain", length=6, stages=3).state_names()
     assert (names["part_1"], names["part_3"], names["desired_goal"]) == ([0, 1], [4, 5], [6, 7])
 
 
@@ -134,7 +134,7 @@ def test_defaults_of_an_environment_that_says_nothing() -> None:
         None,
     )
     with pytest.raises(ValueError, match="Silent has no curriculum"):
-        silent.layers()
+        silent.stages()
     with pytest.raises(ValueError, match="Silent gives no pictures"):
         silent.render()
 

@@ -1,4 +1,4 @@
-"""The Fetch tasks' names and layers are those of what gymnasium-robotics shows."""
+"""The Fetch tasks' names and stages are those of what gymnasium-robotics shows."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchrl_her import Curriculum, CurriculumLayer
+from torchrl_her import Curriculum, CurriculumStage
 from torchrl_her_envs import make_gym_env, record_episodes
 from torchrl_her_envs.common.rendering.video import write_video
-from torchrl_her_envs.gym.fetch import fetch_layers, fetch_names
+from torchrl_her_envs.gym.fetch import fetch_names, fetch_stages
 from torchrl_her_envs.gym.from_gym import GymGoalEnv
 
 OBJECTS = ("FetchPush-v4", "FetchSlide-v4", "FetchPickAndPlace-v4")
@@ -49,26 +49,26 @@ def test_names_are_of_what_they_say(env: GymGoalEnv) -> None:
 
 
 @pytest.mark.parametrize("env", ["FetchPush-v4"], indirect=True)
-def test_inputs_keep_their_meaning_from_layer_to_layer(env: GymGoalEnv) -> None:
-    layers = [CurriculumLayer(**layer) for layer in env.layers()]
-    curriculum = Curriculum(layers, state_width=28, names=env.state_names())
-    reach, move = curriculum.layers
+def test_inputs_keep_their_meaning_from_stage_to_stage(env: GymGoalEnv) -> None:
+    stages = [CurriculumStage(**stage) for stage in env.stages()]
+    curriculum = Curriculum(stages, state_width=28, names=env.state_names())
+    reach, move = curriculum.stages
     assert (*reach.observation, *reach.desired_goal) == move.observation[: curriculum.first_inputs]
     assert sorted((*move.observation, *move.desired_goal)) == [*range(28)]
 
 
 @pytest.mark.parametrize("id", OBJECTS)
 def test_the_object_is_reached_before_it_is_moved(id: str) -> None:
-    reach, move = fetch_layers(id)
+    reach, move = fetch_stages(id)
     assert (reach["achieved_goal"], reach["desired_goal"]) == ("grip", "object")
     assert (move["achieved_goal"], move["desired_goal"]) == ("object", "place")
-    assert fetch_layers(id.replace("-v4", "Dense-v2")) == [reach, move]
+    assert fetch_stages(id.replace("-v4", "Dense-v2")) == [reach, move]
 
 
 @pytest.mark.parametrize("env", ["FetchPickAndPlace-v4"], indirect=True)
 @pytest.mark.parametrize("fingers", [-1.0, 1.0], ids=["closed", "open"])
 def test_what_is_picked_up_is_reached_with_open_fingers_only(env: GymGoalEnv, fingers: float) -> None:
-    threshold, nearest = fetch_layers("FetchPickAndPlace-v4")[0]["threshold"], []
+    threshold, nearest = fetch_stages("FetchPickAndPlace-v4")[0]["threshold"], []
     shown = env.reset()
     for step in range(25):  # above the block, then down
         way = shown["observation"][:, 6:9] + torch.tensor([0.0, 0.0, 0.1 if step < 10 else 0.0])
@@ -79,21 +79,21 @@ def test_what_is_picked_up_is_reached_with_open_fingers_only(env: GymGoalEnv, fi
     assert reached.tolist() == [fingers > 0] * 2
 
 
-def test_to_reach_is_a_single_layer() -> None:
-    (layer,) = fetch_layers("FetchReach-v4")
-    assert (layer["achieved_goal"], layer["desired_goal"]) == ("grip", "place")
+def test_to_reach_is_a_single_stage() -> None:
+    (stage,) = fetch_stages("FetchReach-v4")
+    assert (stage["achieved_goal"], stage["desired_goal"]) == ("grip", "place")
 
 
 @pytest.mark.parametrize("id", ["FetchPushFar-v4", "MyFetchPush-v4", "HandReach-v2", "FetchPush"])
 def test_other_environments_have_none(id: str) -> None:
-    assert fetch_layers(id) == []
+    assert fetch_stages(id) == []
     assert fetch_names(id) == {}
 
 
 @pytest.mark.parametrize("env", ["torchrl_her_envs:torchrl_her/HandReach-v0"], indirect=True)
 def test_they_say_so(env: GymGoalEnv) -> None:
-    with pytest.raises(ValueError, match="has no curriculum: give its layers as curriculum=FILE.yaml"):
-        env.layers()
+    with pytest.raises(ValueError, match="has no curriculum: give its stages as curriculum=FILE.yaml"):
+        env.stages()
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])

@@ -404,8 +404,8 @@ def test_what_it_says_of_its_task() -> None:
         False,
     )
     assert env.goal_sigma == 0.2
-    with pytest.raises(ValueError, match=f"gym:{WALK} has no curriculum: give its layers"):
-        env.layers()
+    with pytest.raises(ValueError, match=f"gym:{WALK} has no curriculum: give its stages"):
+        env.stages()
 
 
 # gymnasium-robotics

@@ -1,4 +1,4 @@
-"""Entries of nested dictionaries can be named by the layers of a curriculum."""
+"""Entries of nested dictionaries can be named by the stages of a curriculum."""
 
 from __future__ import annotations
 

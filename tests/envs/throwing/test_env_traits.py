@@ -1,4 +1,4 @@
-"""What throwing environments say of their task: layers, boxes, regions, pictures."""
+"""What throwing environments say of their task: stages, boxes, regions, pictures."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ REACHES = [name for name, task in TASKS.items() if not task.throws]
 
 
 @pytest.mark.parametrize("name", THROWS)
-def test_the_layers_are_the_reach_and_the_throw(name: str) -> None:
+def test_the_stages_are_the_reach_and_the_throw(name: str) -> None:
     env = make_env(name, num_envs=3)
-    reach, throw = env.layers()
+    reach, throw = env.stages()
     assert (reach["name"], throw["name"]) == ("reach", "throw")
     assert (reach["instructive"], throw["instructive"]) == (False, True)
     assert reach["threshold"] == pytest.approx(0.06)
@@ -30,17 +30,17 @@ def test_the_layers_are_the_reach_and_the_throw(name: str) -> None:
     torch.testing.assert_close(state[:, reach["achieved_goal"]], grip.float())
 
 
-def test_the_layer_of_an_arm_of_three_links_follows_its_observation() -> None:
+def test_the_stage_of_an_arm_of_three_links_follows_its_observation() -> None:
     env = make_env("robot_v1", num_links=3)
-    reach, throw = env.layers()
+    reach, throw = env.stages()
     assert (len(reach["observation"]), len(throw["observation"])) == (14, 18)
     assert reach["achieved_goal"] == [6, 7]
 
 
 @pytest.mark.parametrize("name", REACHES)
-def test_a_reach_is_a_single_layer(name: str) -> None:
-    with pytest.raises(ValueError, match=f"^{name} has no curriculum: it has one layer; choose a throwing"):
-        make_env(name).layers()
+def test_a_reach_is_a_single_stage(name: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name} has no curriculum: it has one stage; choose a throwing"):
+        make_env(name).stages()
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -1,4 +1,4 @@
-"""The chain step by step, and as a task of layers."""
+"""The chain step by step, and as a task of stages."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ def test_in_an_alternating_chain_odd_places_want_the_other_action() -> None:
     assert [closed(act(env, action)) for action in (1, 1, 1, 0, 1, 0)] == [1, 0, 1, 2, 3, 4]
 
 
-def test_of_a_chain_of_layers_only_the_last_is_achieved() -> None:
-    env = Chain(6, 1.0, layers=3)
+def test_of_a_chain_of_stages_only_the_last_is_achieved() -> None:
+    env = Chain(6, 1.0, stages=3)
     assert env.reset()["desired_goal"].tolist() == [[1.0, 1.0]]
     steps = [act(env, 1) for _ in range(6)]
     assert [after["achieved_goal"][0].tolist() for after in steps] == [[-1.0, -1.0]] * 4 + [
@@ -99,26 +99,26 @@ def test_of_a_chain_of_layers_only_the_last_is_achieved() -> None:
     assert [after["terminated"].item() for after in steps] == [False] * 5 + [True]
 
 
-def test_each_part_of_a_chain_is_a_layer() -> None:
-    env = Chain(6, 1.0, layers=3)
-    layers = env.layers()
-    assert [layer["name"] for layer in layers] == ["part 1", "part 2", "part 3"]
-    assert [layer["observation"] for layer in layers] == [[0, 1], [0, 1, 2, 3], [0, 1, 2, 3, 4, 5]]
-    assert [layer["achieved_goal"] for layer in layers] == [[0, 1], [2, 3], [4, 5]]
-    assert all(layer["desired_goal"] == [6, 7] for layer in layers)
-    assert [layer.get("threshold") for layer in layers] == [env.threshold, env.threshold, None]
-    assert all(layer["instructive"] for layer in layers)
+def test_each_part_of_a_chain_is_a_stage() -> None:
+    env = Chain(6, 1.0, stages=3)
+    stages = env.stages()
+    assert [stage["name"] for stage in stages] == ["part 1", "part 2", "part 3"]
+    assert [stage["observation"] for stage in stages] == [[0, 1], [0, 1, 2, 3], [0, 1, 2, 3, 4, 5]]
+    assert [stage["achieved_goal"] for stage in stages] == [[0, 1], [2, 3], [4, 5]]
+    assert all(stage["desired_goal"] == [6, 7] for stage in stages)
+    assert [stage.get("threshold") for stage in stages] == [env.threshold, env.threshold, None]
+    assert all(stage["instructive"] for stage in stages)
     state = env.reset()["state"]
-    assert state[0, layers[0]["desired_goal"]].tolist() == [1.0, 1.0]
-    assert len(Chain(6, 1.0).layers()) == 1
+    assert state[0, stages[0]["desired_goal"]].tolist() == [1.0, 1.0]
+    assert len(Chain(6, 1.0).stages()) == 1
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: Chain(0, 0.5), "length must be a whole number from 1 to 1048575, got 0"),
-        (lambda: Chain(6, 0.5, layers=4), "layers must divide length=6, got 4"),
-        (lambda: Chain(3, 0.5, layers=4), "layers must be a whole number from 1 to 3, got 4"),
+        (lambda: Chain(6, 0.5, stages=4), "stages must divide length=6, got 4"),
+        (lambda: Chain(3, 0.5, stages=4), "stages must be a whole number from 1 to 3, got 4"),
         (lambda: Chain(3, 0.0), r"forward_probability must be in \(0, 1\], got 0.0"),
         (lambda: Chain(3, 1.1), r"forward_probability must be in \(0, 1\], got 1.1"),
         (lambda: Chain(3, float("nan")), r"forward_probability must be in \(0, 1\], got nan"),

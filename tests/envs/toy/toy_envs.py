@@ -23,7 +23,7 @@ ENVS: dict[str, Make] = {
     "treasure": lambda **options: TreasureHunt(10, **options),
     "chain": lambda **options: Chain(6, 0.7, **options),
     "chain that resets": lambda **options: Chain(6, 0.7, reset_state=True, **options),
-    "chain of layers": lambda **options: Chain(6, 0.7, layers=2, alternating=True, **options),
+    "chain of stages": lambda **options: Chain(6, 0.7, stages=2, alternating=True, **options),
 }
 
 

@@ -158,20 +158,20 @@ def _normalized() -> dict[str, Any]:
 
 
 def _curriculum() -> dict[str, Any]:
-    """The desired goals before and after all runs came to the last layer."""
+    """The desired goals before and after all runs came to the last stage."""
     components = build(
         small(
             task="hand_v1", algo="cher", num_runs=RUNS, processes=2, success_threshold=0.01, guided_share=0.5
         )
     )
     collector, shown = components.collector, []
-    for layer in range(2):
+    for stage in range(2):
         for number in range(RUNS):
-            components.curriculum.progress.set_layer(number, layer)  # type: ignore[union-attr]
+            components.curriculum.progress.set_stage(number, stage)  # type: ignore[union-attr]
         collector.reset()
         shown.append(collector.next().clone())
     trained = run(components, progress=False)
-    return {"batches": shown, "layers": [row["layer"] for row in trained.rows]}
+    return {"batches": shown, "stages": [row["stage"] for row in trained.rows]}
 
 
 def _guided() -> dict[str, Any]:
@@ -189,7 +189,7 @@ def _guided() -> dict[str, Any]:
     components.collector.reset()
     components.collector.next()  # the processes are there, and nothing guides them
     for number in range(RUNS):
-        components.curriculum.progress.set_layer(number, 1)  # type: ignore[union-attr]
+        components.curriculum.progress.set_stage(number, 1)  # type: ignore[union-attr]
     components.guide.follow(components.actor, 0, run=1)  # type: ignore[union-attr]
     for weight in components.actor.parameters():
         weight.data.zero_()

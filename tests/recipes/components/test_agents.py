@@ -70,7 +70,7 @@ def test_the_weights_of_a_run_depend_on_its_own_seed_alone() -> None:
         assert torch.equal(stacked[1], own.view_as(stacked[1]))
 
 
-def test_a_learner_that_explores_by_itself_gets_no_epsilon_when_a_layer_begins(
+def test_a_learner_that_explores_by_itself_gets_no_epsilon_when_a_stage_begins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     components = build(small(task="hand_v1", algo="cher", learner="sac", window=1))
@@ -79,7 +79,7 @@ def test_a_learner_that_explores_by_itself_gets_no_epsilon_when_a_layer_begins(
     record = progress.record
     monkeypatch.setattr(progress, "record", lambda samples: record(torch.ones_like(samples)))
     run(components, progress=False)
-    assert progress.layers == (1,)
+    assert progress.stages == (1,)
     assert components.exploration.epsilon.tolist() == [0.0]
 
 

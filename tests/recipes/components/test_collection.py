@@ -158,9 +158,9 @@ def test_statistics_of_normalized_inputs_reach_the_processes(apart: dict[str, An
         assert not torch.allclose(action, before, atol=1e-3)
 
 
-def test_layers_reach_the_processes(apart: dict[str, Any]) -> None:
+def test_stages_reach_the_processes(apart: dict[str, Any]) -> None:
     reach, throw = apart["curriculum"]["batches"]
-    assert apart["curriculum"]["layers"] == [1, 1, 1, 1]
+    assert apart["curriculum"]["stages"] == [1, 1, 1, 1]
     assert (reach["observation"][..., 5:] == 0).all()  # the ball is not seen there, but wanted
     assert (throw["observation"][..., 5:] != 0).any()
     assert (reach["desired_goal"][..., 0] < 0).any()  # the ball lies in the left half

@@ -54,12 +54,12 @@ def test_seeds_repeat_what_follows_and_runs_have_their_own() -> None:
         assert not torch.equal(first[key][4:], changed[key][4:])
 
 
-def test_each_process_draws_the_layers_of_its_episodes() -> None:
+def test_each_process_draws_the_stages_of_its_episodes() -> None:
     at_once = {"task": "hand_v1", "algo": "cher", "order": "all_at_once", "num_envs": 64}
-    one, same, other = (collect([5, 6], seeds, **at_once)["layer"] for seeds in ([7, 8], [7, 8], [7, 9]))
+    one, same, other = (collect([5, 6], seeds, **at_once)["stage"] for seeds in ([7, 8], [7, 8], [7, 9]))
     assert torch.equal(one, same)
     assert torch.equal(one[:32], other[:32])
     assert not torch.equal(one[32:], other[32:])
-    whole = collect([5, 6], [7, 8], **at_once, every_layer=True, task_share=1.0)
-    assert (whole["layer"] == 1).all()
-    assert "state" in whole  # of which every layer is shown where transitions are stored
+    whole = collect([5, 6], [7, 8], **at_once, every_stage=True, task_share=1.0)
+    assert (whole["stage"] == 1).all()
+    assert "state" in whole  # of which every stage is shown where transitions are stored

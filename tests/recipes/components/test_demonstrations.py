@@ -1,4 +1,4 @@
-"""The demonstrations of a recipe: in batches, in layers, as starts, and over a stop."""
+"""The demonstrations of a recipe: in batches, in stages, as starts, and over a stop."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_another_threshold_rewards_them_anew(file: str) -> None:
 # Curricula
 
 
-def test_a_run_that_changes_its_layer_sees_them_in_the_new_one(file: str) -> None:
+def test_a_run_that_changes_its_stage_sees_them_in_the_new_one(file: str) -> None:
     components = build(small(**asked(file, starts_share=0.5), algo="cher", num_runs=2, normalize=True))
     shown, state = components.demonstrations, components.curriculum
     assert shown is not None
@@ -113,8 +113,8 @@ def test_a_run_that_changes_its_layer_sees_them_in_the_new_one(file: str) -> Non
     assert state is not None
     before = [rows_of_run(shown.buffer, own).clone() for own in range(2)]
     assert (before[0]["observation"][:, 5:] == 0).all()  # the ball is hidden
-    state.progress.set_layer(1, 1)
-    shown.enter_layer(1)
+    state.progress.set_stage(1, 1)
+    shown.enter_stage(1)
     after = [rows_of_run(shown.buffer, own) for own in range(2)]
     assert (after[0] == before[0]).all()
     assert (after[1]["observation"][:, 5:] != 0).any()
@@ -134,7 +134,7 @@ def test_a_curriculum_is_trained_with_them(file: str) -> None:
         )
     )
     result = run(components, progress=False)
-    assert {row["layer"] for row in result.rows} == {0, 1}
+    assert {row["stage"] for row in result.rows} == {0, 1}
     assert components.demonstrations is not None
     assert (components.demonstrations.buffer.storage[:]["observation"][:, 5:] != 0).any()
 

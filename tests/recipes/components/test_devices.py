@@ -96,13 +96,13 @@ TWO = {"num_runs": 2, "compile": "never"}
 @ELSEWHERE
 def test_a_run_goes_on_as_if_it_had_not_stopped(name: str, tmp_path: Path) -> None:
     options = {**CURRICULUM, **SHORT, **TWO, "learner.device": name, "checkpoint_interval": 1}
-    options |= {"seed": 2, "epsilon_start": 1.0}  # of which a run comes to the second layer
+    options |= {"seed": 2, "epsilon_start": 1.0}  # of which a run comes to the second stage
     whole = run(build(small(epochs=3, **options)), tmp_path / "whole", progress=False)
     run(build(small(epochs=2, **options)), tmp_path / "parts", progress=False)
-    layers = load_checkpoint(tmp_path / "parts" / "checkpoint.pt")["guide"]["layer"]
+    stages = load_checkpoint(tmp_path / "parts" / "checkpoint.pt")["guide"]["stage"]
     again = resume(tmp_path / "parts", options={"epochs": 3}, progress=False)
     assert [row["success"] for row in again.rows] == [row["success"] for row in whole.rows]
-    assert 0 in layers.tolist()  # so that guided episodes went on
+    assert 0 in stages.tolist()  # so that guided episodes went on
     ends = [load_checkpoint(tmp_path / own / "checkpoint.pt")["loss"] for own in ("whole", "parts")]
     assert_same(*ends)
 

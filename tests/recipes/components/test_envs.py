@@ -107,16 +107,16 @@ def test_other_learners_train_by_name(learner: str, loss: type, tmp_path: Path) 
         ({"task": "chain", "options": 7}, "task.options must be a mapping of options by name, got 7"),
         ({"task": "chain", "threshold": 0.1}, "threshold=0.1 has no effect with task=chain"),
         ({"task": "bit_flip", "algo": "cher"}, "bit_flip has no curriculum"),
-        ({"task": "treasure_hunt", "algo": "cher", "curriculum": [{"name": "all"}]}, "is no layer"),
+        ({"task": "treasure_hunt", "algo": "cher", "curriculum": [{"name": "all"}]}, "is no stage"),
         (
             {"task": "treasure_hunt", "algo": "cher", "curriculum": [FINE | {"threshold": 0.1}]},
-            "layer 'fine': threshold has no effect in the last layer",
+            "stage 'fine': threshold has no effect in the last stage",
         ),
         (
             {"task": "treasure_hunt", "algo": "cher", "curriculum": [FINE | {"desired_goal": [0]}]},
-            "layer 'fine': desired_goal must share no index",
+            "stage 'fine': desired_goal must share no index",
         ),
-        ({"task": "hand_v1", "algo": "cher", "curriculum": {"layers": {"name": "all"}}}, "must be a list"),
+        ({"task": "hand_v1", "algo": "cher", "curriculum": {"stages": {"name": "all"}}}, "must be a list"),
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(options: dict[str, Any], message: str) -> None:
@@ -133,13 +133,13 @@ def test_unknown_names_list_what_there_is() -> None:
     message = "learner must be one of ddpg, td3, sac, redq, tqc, dqn, auto, got 'ppo'"
     with pytest.raises(ValueError, match=message):
         small(learner="ppo")
-    with pytest.raises(ValueError, match="curriculum must be 'task' or a YAML file with a list of layers"):
+    with pytest.raises(ValueError, match="curriculum must be 'task' or a YAML file with a list of stages"):
         small(curriculum="nowhere.yaml")
 
 
 def test_a_curriculum_comes_from_a_file(tmp_path: Path) -> None:
     """The state of treasure_hunt is [place, goal]: somewhere in the middle first, then where it shall go."""
-    layers = [
+    stages = [
         {
             "name": "middle",
             "observation": [0],
@@ -149,13 +149,13 @@ def test_a_curriculum_comes_from_a_file(tmp_path: Path) -> None:
         },
         FINE,
     ]
-    path = tmp_path / "layers.yaml"
-    path.write_text(yaml.safe_dump(layers))
+    path = tmp_path / "stages.yaml"
+    path.write_text(yaml.safe_dump(stages))
     folder = tmp_path / "run"
     options = overrides(task="treasure_hunt", algo="cher", curriculum=path, folder=folder)
     assert main(["train", *options, "options={step: 10}"]) == 0
     config = yaml.safe_load((folder / "config.yaml").read_text())
-    assert config["curriculum"]["layers"] == layers
+    assert config["curriculum"]["stages"] == stages
 
 
 # Gymnasium's environments
@@ -164,8 +164,8 @@ def test_a_curriculum_comes_from_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("algo", ["her", "filtered_her_ibs", "cher"])
 def test_an_environment_of_gymnasium_trains_by_its_id(algo: str, tmp_path: Path) -> None:
     """One of ours, on its way out to gymnasium and in again: its state is [hand, 5 | ball, 2]."""
-    layer = {"observation": [0, 1, 2, 3, 4], "achieved_goal": [0, 1], "desired_goal": [5, 6]}
-    curriculum = [layer | {"name": "near", "threshold": 0.5}, layer | {"name": "at"}]
+    stage = {"observation": [0, 1, 2, 3, 4], "achieved_goal": [0, 1], "desired_goal": [5, 6]}
+    curriculum = [stage | {"name": "near", "threshold": 0.5}, stage | {"name": "at"}]
     recipe = small(
         task="gym:torchrl_her/HandReach-v0",
         algo=algo,

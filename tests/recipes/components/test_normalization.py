@@ -107,7 +107,7 @@ def test_normalization_is_an_option() -> None:
 # In a curriculum
 
 
-def test_inputs_of_a_layer_are_normalized_by_the_rows_of_that_layer() -> None:
+def test_inputs_of_a_stage_are_normalized_by_the_rows_of_that_stage() -> None:
     components, norm, _ = trained(task="hand_v1", algo="cher", num_runs=2, window=50)
     assert norm.keys == ["input"]
     for number in range(2):
@@ -126,7 +126,7 @@ def test_inputs_of_a_layer_are_normalized_by_the_rows_of_that_layer() -> None:
     assert torch.equal(drawn["observation"], raw["observation"])
 
 
-def test_a_layer_begins_with_the_statistics_of_what_still_means_the_same() -> None:
+def test_a_stage_begins_with_the_statistics_of_what_still_means_the_same() -> None:
     components, norm, _ = trained(task="hand_v1", algo="cher", num_runs=2, window=10)
     assert components.curriculum is not None
     before = norm.n.clone()
@@ -134,8 +134,8 @@ def test_a_layer_begins_with_the_statistics_of_what_still_means_the_same() -> No
     (line,) = move_on(components, components.curriculum, samples, 100)
     assert line == "seed 1: 'reach' learned after 100 frames, 'throw' begins"
     assert torch.equal(norm.n[0], before[0])
-    assert norm.n[1].tolist() == before[1].tolist()  # the ball, the goal of the first layer, is seen now
+    assert norm.n[1].tolist() == before[1].tolist()  # the ball, the goal of the first stage, is seen now
     norm.n.fill_(3.0)
-    components.curriculum.progress.set_layer(1, 0)
+    components.curriculum.progress.set_stage(1, 0)
     move_on(components, components.curriculum, samples, 100)
     assert norm.n.tolist() == [[3.0] * 11, [3.0] * 7 + [0.0] * 4]

@@ -25,8 +25,8 @@ from ..small import assert_same_runs, small, stop_after
 CASES: dict[str, dict[str, Any]] = {
     "rare": {"algo": "filtered_her_rare"},
     "rnd": {"algo": "filtered_her_rnd"},
-    "layers, rare": {"algo": "cher_rare", "task": "hand_v1", "success_threshold": 0.01, "window": 4},
-    "layers, rnd": {"algo": "cher_rnd", "task": "hand_v1", "success_threshold": 0.01, "window": 4},
+    "stages, rare": {"algo": "cher_rare", "task": "hand_v1", "success_threshold": 0.01, "window": 4},
+    "stages, rnd": {"algo": "cher_rnd", "task": "hand_v1", "success_threshold": 0.01, "window": 4},
     "kernel": {"algo": "filtered_her_ibs", "estimator": "kernel"},
     "many numbers, rare": {"algo": "filtered_her_rare", "task": "bit_flip"},
     "many numbers, IBS": {"algo": "her_ibs", "task": "bit_flip"},
@@ -156,7 +156,7 @@ def test_a_fetch_task_trains_with_a_curriculum_and_ibs_by_kernels() -> None:
     components = build(recipe)
     weights = components.buffer.writer.weights
     assert isinstance(weights, KernelInstructiveness)
-    assert weights.alike  # the first layer reaches for the object
+    assert weights.alike  # the first stage reaches for the object
     rows = run(components, progress=False).rows
     assert rows[-1]["rows_virtual"] == weights.written > 0
-    assert math.isnan(rows[-1]["kl"])  # until the last layer
+    assert math.isnan(rows[-1]["kl"])  # until the last stage

@@ -33,15 +33,15 @@ def test_values_follow_from_the_environment(max_steps: int, batched: bool, value
 
 
 def test_a_curriculum_comes_with_its_options() -> None:
-    layers = [{"name": "near"}, {"name": "all"}]
-    recipe = resolve(make_recipe(), EnvFacts(max_steps=50, layers=layers))
-    assert (recipe.hindsight.algo, recipe.curriculum.layers) == ("cher", layers)
+    stages = [{"name": "near"}, {"name": "all"}]
+    recipe = resolve(make_recipe(), EnvFacts(max_steps=50, stages=stages))
+    assert (recipe.hindsight.algo, recipe.curriculum.stages) == ("cher", stages)
     assert (recipe.curriculum.guided_share, recipe.curriculum.guided_per) == (0.5, "step")
-    assert recipe.order == AllAtOnce(every_layer=True, task_share=1.0)
-    weighted = resolve(make_recipe(weights="rare"), EnvFacts(max_steps=50, layers=layers))
-    assert weighted.order == Threshold(layer_epochs=10)
+    assert recipe.order == AllAtOnce(every_stage=True, task_share=1.0)
+    weighted = resolve(make_recipe(weights="rare"), EnvFacts(max_steps=50, stages=stages))
+    assert weighted.order == Threshold(stage_epochs=10)
     assert resolve(make_recipe(), EnvFacts(max_steps=50)).hindsight.algo == "filtered_her"
-    assert make_recipe(curriculum=layers).hindsight.algo == "cher"
+    assert make_recipe(curriculum=stages).hindsight.algo == "cher"
 
 
 def test_values_that_are_given_stay() -> None:

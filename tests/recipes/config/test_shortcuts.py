@@ -75,5 +75,5 @@ def test_later_values_replace_earlier_ones() -> None:
     assert merged == {
         "run": {"seed": 2},
         "task": {"name": "hand_v0"},
-        "curriculum": {"layers": [{"name": "a"}]},
+        "curriculum": {"stages": [{"name": "a"}]},
     }

@@ -28,7 +28,7 @@ from .tiny import needs_onnx, tiny_policy
         {"task": "hand_v1", "algo": "cher_ibs", "seed": 3, "sigma": 0.1, "norm": "layer"},
         {"task": "bit_flip", "algo": "her", "learner": "dqn", "task.options.bits": 8},
         {"task": "hand_v0", "algo": "her", "learner": "sac", "critics": 3, "clamp_targets": True},
-        {"task": "hand_v2", "algo": "cher", "curriculum": make_env("hand_v1").layers()},
+        {"task": "hand_v2", "algo": "cher", "curriculum": make_env("hand_v1").stages()},
         {
             "task": "chain",
             "algo": "her",

@@ -31,8 +31,8 @@ from .tiny import needs_onnx, states, tiny_policy
 
 
 def backwards() -> list[dict[str, Any]]:
-    """A layer of hand_v1 that sees its observation from the end, and not all of it."""
-    (*_, last) = make_env("hand_v1", num_envs=1).layers()
+    """A stage of hand_v1 that sees its observation from the end, and not all of it."""
+    (*_, last) = make_env("hand_v1", num_envs=1).stages()
     observation = last["observation"][:0:-1]
     return [last | {"observation": observation}]
 

@@ -114,14 +114,14 @@ def test_options_that_are_varied_are_columns(tmp_path: Path) -> None:
 
 def test_numbers_have_six_digits_and_metrics_that_are_not_there_stay_away(tmp_path: Path) -> None:
     row: dict[str, float] = {"run": 0, "seed": 5, "epoch": 1, "frames": 12_345_678}
-    rows = {"a": [{**row, "kl": 1 / 3, "layer": 2}], "b": [{**row, "kl": math.nan, "q": -1e-9}]}
+    rows = {"a": [{**row, "kl": 1 / 3, "stage": 2}], "b": [{**row, "kl": math.nan, "q": -1e-9}]}
     write_files(
         {"study": "x", "summary": ""}, [combination(name, own) for name, own in rows.items()], tmp_path
     )
     lines = table(tmp_path / "runs.csv")
-    assert [lines[0][name] for name in ("frames", "kl", "layer", "q")] == ["12345678", "0.333333", "2", ""]
+    assert [lines[0][name] for name in ("frames", "kl", "stage", "q")] == ["12345678", "0.333333", "2", ""]
     first, second = (cell.rows[0] for cell in read_results(tmp_path).cells)
-    assert first == {**row, "kl": 0.333333, "layer": 2}
+    assert first == {**row, "kl": 0.333333, "stage": 2}
     assert math.isnan(second["kl"])
     assert second.keys() == {*row, "kl", "q"}
 

@@ -151,4 +151,4 @@ def test_runs_in_different_stages_of_a_curriculum_are_what_they_are_alone(learne
     options = {"algo": "cher", "task": "hand_v1", "learner": learner, "seed": seed, "dtype": "float64"}
     stages = {"window": 4, "success_threshold": 0.25, "guided_share": 0.5, "epochs": 3, "epoch_frames": 480}
     rows = check_like_alone({**LATER, **options, **stages})
-    assert [row["layer"] for row in rows] == [0, 0, 0, 1, 0, 0, 1, 0, 0]
+    assert [row["stage"] for row in rows] == [0, 0, 0, 1, 0, 0, 1, 0, 0]

@@ -1,4 +1,4 @@
-"""Runs whose episodes ask for goals that were achieved before, and runs whose episodes have layers."""
+"""Runs whose episodes ask for goals that were achieved before, and runs whose episodes have stages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 
 from torchrl_her import Instructiveness
 from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalFactor, InverseDensity, ValueCutoff
-from torchrl_her.curriculum import EpisodeLayers, LayerOutcomes, TeacherStudent
+from torchrl_her.curriculum import EpisodeStages, StageOutcomes, TeacherStudent
 from torchrl_her.replay_buffers import rows_of_run
 from torchrl_her_recipes import Components, Recipe, RunResult, build, make_recipe, resume, run
 from torchrl_her_recipes.components.behavior import scaled_cutoffs
@@ -21,15 +21,15 @@ from torchrl_her_recipes.runs.curriculum import move_on
 from ..small import assert_same_runs, small, stop_after
 
 PLAIN: dict[str, Any] = {"task": "hand_v0", "algo": "her", "behavior.goal_memory": 5_000}
-LAYERS: dict[str, Any] = {"task": "hand_v1", "algo": "cher_ibs", "normalize": True, "guided_share": 0.5}
+STAGES: dict[str, Any] = {"task": "hand_v1", "algo": "cher_ibs", "normalize": True, "guided_share": 0.5}
 WAYS: dict[str, dict[str, Any]] = {
     "uniform_achieved": {**PLAIN, "behavior": "uniform_achieved", "num_runs": 2},
     "ibs": {**PLAIN, "behavior": "ibs"},
     "mega": {**PLAIN, "behavior": "mega", "normalize": True},
     "discover": {**PLAIN, "behavior": "discover", "learner": "td3", "num_runs": 2},
-    "all at once": {**LAYERS, "order": "all_at_once"},
-    "teacher": {**LAYERS, "order": "teacher_student", "behavior": "mega", "behavior.goal_memory": 5_000},
-    "every layer": {**LAYERS, "order": "all_at_once", "every_layer": True, "task_share": 1.0},
+    "all at once": {**STAGES, "order": "all_at_once"},
+    "teacher": {**STAGES, "order": "teacher_student", "behavior": "mega", "behavior.goal_memory": 5_000},
+    "every stage": {**STAGES, "order": "all_at_once", "every_stage": True, "task_share": 1.0},
 }
 
 
@@ -115,12 +115,12 @@ def test_a_single_critic_leaves_it_to_rare_goals_what_is_new() -> None:
 def test_evaluation_asks_for_the_tasks_goals() -> None:
     components = build(recipe("mega"))
     assert not isinstance(getattr(components.eval_env, "transform", None), BehaviorGoals)
-    layered = build(recipe("teacher"))
-    assert not any(isinstance(own, BehaviorGoals) for own in layered.eval_env.transform)
-    assert any(isinstance(own, BehaviorGoals) for own in layered.env.transform)
+    stageed = build(recipe("teacher"))
+    assert not any(isinstance(own, BehaviorGoals) for own in stageed.eval_env.transform)
+    assert any(isinstance(own, BehaviorGoals) for own in stageed.env.transform)
 
 
-def test_in_a_curriculum_goals_are_proposed_in_the_last_layer() -> None:
+def test_in_a_curriculum_goals_are_proposed_in_the_last_stage() -> None:
     components = build(small(task="hand_v1", algo="cher", behavior="uniform_achieved", num_runs=2))
     assert components.behavior is not None
     assert components.curriculum is not None
@@ -132,7 +132,7 @@ def test_in_a_curriculum_goals_are_proposed_in_the_last_layer() -> None:
     assert components.behavior.memory.sizes[1] > 0
 
 
-def test_ibs_proposals_begin_with_the_last_layer() -> None:
+def test_ibs_proposals_begin_with_the_last_stage() -> None:
     components = build(small(task="hand_v1", algo="cher", behavior="ibs"))
     assert components.behavior is not None
     assert components.curriculum is not None
@@ -154,41 +154,41 @@ def test_ibs_proposals_shrink_their_sigma_with_the_epochs() -> None:
     assert weights.sigma < before  # type: ignore[attr-defined]
 
 
-# Episodes with layers of their own
+# Episodes with stages of their own
 
 
-def test_one_buffer_holds_rows_of_all_layers(whole: Whole) -> None:
+def test_one_buffer_holds_rows_of_all_stages(whole: Whole) -> None:
     components, _ = whole("all at once")
     assert components.curriculum is not None
-    assert isinstance(components.curriculum.progress, EpisodeLayers)
+    assert isinstance(components.curriculum.progress, EpisodeStages)
     rows = rows_of_run(components.buffer, 0)
-    counts = rows["layer"].flatten().bincount(minlength=2)
+    counts = rows["stage"].flatten().bincount(minlength=2)
     assert counts.min() > 0
-    first = rows["layer"].squeeze(-1) == 0
-    # The first layer sees the hand alone: its goal is not observed, nor is the ball's speed.
+    first = rows["stage"].squeeze(-1) == 0
+    # The first stage sees the hand alone: its goal is not observed, nor is the ball's speed.
     assert (rows["observation"][first][:, 5:] == 0).all()
     assert (rows["observation"][~first][:, 5:7] != 0).any()
 
 
-def test_the_full_task_alone_is_played_and_trains_every_layer(whole: Whole) -> None:
-    components, _ = whole("every layer")
+def test_the_full_task_alone_is_played_and_trains_every_stage(whole: Whole) -> None:
+    components, _ = whole("every stage")
     rows = rows_of_run(components.buffer, 0)
     rows = rows[~rows["virtual"].squeeze(-1)]
-    reach, throw = (rows[rows["layer"].squeeze(-1) == layer] for layer in (0, 1))
+    reach, throw = (rows[rows["stage"].squeeze(-1) == stage] for stage in (0, 1))
     assert torch.equal(reach["action"], throw["action"])
     assert torch.equal(reach["observation"][:, :5], throw["observation"][:, :5])
     assert (reach["observation"][:, 5:] == 0).all()
     assert torch.equal(reach["desired_goal"], throw["observation"][:, 5:7])  # the hand is to be at the ball
 
 
-def test_a_teacher_knows_both_layers(whole: Whole) -> None:
+def test_a_teacher_knows_both_stages(whole: Whole) -> None:
     components, result = whole("teacher")
     assert components.curriculum is not None
     teacher = components.curriculum.progress
     assert isinstance(teacher, TeacherStudent)
-    assert isinstance(components.env.transform[-1], LayerOutcomes)
-    assert 0.0 < result.rows[-1]["mean_layer"] < 1.0
-    assert "layer" not in result.rows[-1]
+    assert isinstance(components.env.transform[-1], StageOutcomes)
+    assert 0.0 < result.rows[-1]["mean_stage"] < 1.0
+    assert "stage" not in result.rows[-1]
 
 
 def test_the_policy_itself_begins_episodes() -> None:
@@ -197,11 +197,11 @@ def test_the_policy_itself_begins_episodes() -> None:
     assert components.guide.guide is components.actor
     batch = components.collector.next()
     assert components.guide.guided is not None
-    top = batch["next", "layer"][:, -1] == 1
+    top = batch["next", "stage"][:, -1] == 1
     assert ((components.guide.guided == 0) <= top).all()
 
 
-def test_a_teacher_is_told_of_the_layers_own_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_teacher_is_told_of_the_stages_own_goals(monkeypatch: pytest.MonkeyPatch) -> None:
     told = torch.zeros(2, dtype=torch.int64)
 
     def record(self: TeacherStudent, ended: torch.Tensor, achieved: torch.Tensor) -> None:
@@ -213,7 +213,7 @@ def test_a_teacher_is_told_of_the_layers_own_goals(monkeypatch: pytest.MonkeyPat
     for _ in range(20):
         batch = components.collector.next()
         counts = batch["next", "done"] & ~batch["proposed"]
-        ended += batch["layer"][counts].bincount(minlength=2)
+        ended += batch["stage"][counts].bincount(minlength=2)
     assert batch["proposed"].any()
     assert torch.equal(told, ended)
 
@@ -292,7 +292,7 @@ def test_a_memory_below_what_comes_at_once_is_refused() -> None:
         build(recipe("mega", **{"behavior.goal_memory": 7}))
 
 
-def test_weights_that_cannot_tell_layers_apart_are_refused() -> None:
+def test_weights_that_cannot_tell_stages_apart_are_refused() -> None:
     with pytest.raises(ValueError, match="weights=rare must not be used with order=all_at_once"):
         build(small(task="hand_v1", algo="cher_rare", order="all_at_once"))
 

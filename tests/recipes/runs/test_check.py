@@ -94,7 +94,7 @@ def said(facts: Facts, **options: Any) -> str:
     return "\n".join(advice(facts, make_recipe(task=f"{HERE}:Push", **options)))
 
 
-def test_a_block_that_lies_still_is_told_and_layers_are_proposed() -> None:
+def test_a_block_that_lies_still_is_told_and_stages_are_proposed() -> None:
     facts = look()
     assert facts.steps >= 2_000
     assert facts.max_steps == 20
@@ -103,13 +103,13 @@ def test_a_block_that_lies_still_is_told_and_layers_are_proposed() -> None:
     assert 0.0 < facts.kept < 0.2
     assert facts.constant == [0]
     assert (facts.disagree, facts.fallen, facts.goal_inside) == (0.0, 0.0, [])
-    reach, task = facts.layers
+    reach, task = facts.stages
     assert [reach[key] for key in GOALS] == [[0, 2], [2], [1]]
     assert [task[key] for key in GOALS] == [[0, 2, 1], [1], "desired_goal"]
     assert reach["threshold"] == 0.05  # half of the task's, since the hand comes to the block itself
-    assert 0.1 <= look(arm=0.08).layers[0]["threshold"] < 0.3  # it can but touch it
+    assert 0.1 <= look(arm=0.08).stages[0]["threshold"] < 0.3  # it can but touch it
     assert "threshold" not in task  # the environment's own
-    assert "algo=cher curriculum=layers.yaml" in said(facts, algo="filtered_her")
+    assert "algo=cher curriculum=stages.yaml" in said(facts, algo="filtered_her")
     assert "entries 2 to 2 of the observation" in said(facts, algo="filtered_her")
     assert "has a curriculum" in said(facts)
 
@@ -119,8 +119,8 @@ def test_a_block_that_lies_still_gets_a_curriculum() -> None:
     components = build(recipe)
     assert components.curriculum is not None
     assert components.recipe.hindsight.algo == "cher"
-    assert components.recipe.curriculum.layers == look_at(recipe.replace(seed=0)).layers
-    assert components.recipe.order == AllAtOnce(every_layer=True, task_share=1.0)
+    assert components.recipe.curriculum.stages == look_at(recipe.replace(seed=0)).stages
+    assert components.recipe.order == AllAtOnce(every_stage=True, task_share=1.0)
     assert resolved(components.recipe) == components.recipe
     components.close()
 
@@ -141,12 +141,12 @@ def test_a_cost_of_actions_is_no_obstacle_to_a_curriculum() -> None:
 )
 def test_others_get_none(options: dict[str, Any]) -> None:
     recipe = resolved(make_recipe(task=f"{HERE}:Push", **options))
-    assert (recipe.hindsight.algo, recipe.curriculum.layers) == ("filtered_her", None)
+    assert (recipe.hindsight.algo, recipe.curriculum.stages) == ("filtered_her", None)
 
 
 def test_what_never_changes_is_told() -> None:
     facts = look(moves=False)
-    assert (facts.moved, facts.kept, facts.layers) == (0.0, 0.0, [])
+    assert (facts.moved, facts.kept, facts.stages) == (0.0, 0.0, [])
     assert "achieved_goal never changed: does it hold what the goal is about?" in said(facts)
 
 
@@ -192,9 +192,9 @@ def test_on_the_command_line(
     monkeypatch.chdir(tmp_path)
     assert main(["check", f"task={HERE}:Push", "algo=filtered_her", "--steps", "1000"]) == 0
     out = capsys.readouterr().out
-    file = next(tmp_path.glob("*_layers.yaml"))
+    file = next(tmp_path.glob("*_stages.yaml"))
     assert f"curriculum={file.name}" in out
-    assert [layer["name"] for layer in yaml.safe_load(file.read_text())] == ["reach", "task"]
+    assert [stage["name"] for stage in yaml.safe_load(file.read_text())] == ["reach", "task"]
     assert "&" not in file.read_text()
     assert main(["check", "task=hand_reach", "--steps", "500"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "no obstacle to learning was found"

@@ -1,4 +1,4 @@
-"""Runs that climb a curriculum: what changes with a layer, and what goes on."""
+"""Runs that climb a curriculum: what changes with a stage, and what goes on."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_her import Instructiveness, enter_layer
+from torchrl_her import Instructiveness, enter_stage
 from torchrl_her.replay_buffers.runs import sizes_of
 from torchrl_her_envs import TASKS, Chain, base_env, make_env
 from torchrl_her_recipes import Components, Recipe, build, play, resume, run
@@ -30,7 +30,7 @@ def climbing(**options: object) -> Recipe:
 
 
 def move(components: Components, *, run: int) -> list[str]:
-    """Lets one run learn its layer."""
+    """Lets one run learn its stage."""
     samples = torch.zeros(components.recipe.run.num_runs, components.recipe.order.window)
     samples[run] = 1.0
     assert components.curriculum is not None
@@ -44,10 +44,10 @@ def weights(components: Components) -> Tensor:
 @pytest.mark.parametrize("task", THROWS)
 def test_every_throwing_task_has_a_curriculum_that_hands_over(task: str) -> None:
     env = make_env(task, num_envs=2)
-    curriculum = read_curriculum(env.layers(), env)
+    curriculum = read_curriculum(env.stages(), env)
     shown = env.reset()
     state = shown["state"]
-    reach, throw = curriculum.layers
+    reach, throw = curriculum.stages
     grip, ball = (
         (where * (2.0 / env.world.size) - 1.0).float() for where in (env.worlds.grip, env.worlds.ball)
     )
@@ -59,47 +59,47 @@ def test_every_throwing_task_has_a_curriculum_that_hands_over(task: str) -> None
     assert [*reach.observation, *reach.desired_goal] == list(throw.observation[: curriculum.first_inputs])
 
 
-def test_parts_of_the_chain_are_layers_that_end_at_the_next_one_s_start() -> None:
-    env = Chain(6, 1.0, layers=3)
+def test_parts_of_the_chain_are_stages_that_end_at_the_next_one_s_start() -> None:
+    env = Chain(6, 1.0, stages=3)
     state = env.reset()["state"][0]
-    first, second, third = read_curriculum(env.layers(), env).layers
+    first, second, third = read_curriculum(env.stages(), env).stages
     assert (first.observation, first.achieved_goal) == ((0, 1), (0, 1))
     assert (second.observation, second.achieved_goal) == ((0, 1, 2, 3), (2, 3))
     assert (third.observation, third.achieved_goal) == ((0, 1, 2, 3, 4, 5), (4, 5))
     assert first.threshold < 2.0  # what a single open link is away
     assert third.threshold is None
-    for layer in (first, second, third):
-        assert state[list(layer.desired_goal)].tolist() == [1.0, 1.0]
+    for stage in (first, second, third):
+        assert state[list(stage.desired_goal)].tolist() == [1.0, 1.0]
 
 
-def test_the_guide_s_file_of_layers_is_trained_with(
+def test_the_guide_s_file_of_stages_is_trained_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     guide = (Path(__file__).parents[3] / "docs" / "curriculum.md").read_text()
-    (layers,) = re.findall(r"```yaml\n(# near.yaml\n.*?)```", guide, re.DOTALL)
+    (stages,) = re.findall(r"```yaml\n(# near.yaml\n.*?)```", guide, re.DOTALL)
     (command,) = re.findall(r"^torchrl-her (train .*curriculum=near.yaml.*)$", guide, re.MULTILINE)
     monkeypatch.chdir(tmp_path)
-    Path("near.yaml").write_text(layers)
+    Path("near.yaml").write_text(stages)
     given = {word.partition("=")[0] for word in command.split()}
     shrunk = [word for word in overrides(folder="out", epochs=1) if word.partition("=")[0] not in given]
     assert main([*command.split(), *shrunk]) == 0
     recipe, env = RunFolder("out").recipe(), make_env("hand_v1")
-    near, *own = read_curriculum(recipe.curriculum.layers, env).layers
-    assert own == list(read_curriculum(env.layers(), env).layers)
+    near, *own = read_curriculum(recipe.curriculum.stages, env).stages
+    assert own == list(read_curriculum(env.stages(), env).stages)
     assert (near.name, near.achieved_goal, near.threshold) == ("come near", (0, 1), 0.3)
-    Path("near.yaml").unlink()  # the run has its layers
+    Path("near.yaml").unlink()  # the run has its stages
     assert main(["train", "--resume", "out", "epochs=2"]) == 0
-    Path("near.yaml").write_text(layers.replace("observation: hand,", "observation: hands,"))
+    Path("near.yaml").write_text(stages.replace("observation: hand,", "observation: hands,"))
     capsys.readouterr()
     assert main(["train", "task=hand_v1", "algo=cher", "curriculum=near.yaml"]) == 2
     assert capsys.readouterr().err == (
-        "torchrl-her: layer 'come near': observation has the unknown name 'hands'; known are 'hand', 'grip', "
+        "torchrl-her: stage 'come near': observation has the unknown name 'hands'; known are 'hand', 'grip', "
         "'ball', 'ball_speed', 'hole', 'observation', 'desired_goal'\n"
     )
 
 
 def test_a_chain_is_climbed() -> None:
-    options = {"length": 4, "layers": 2, "alternating": True}
+    options = {"length": 4, "stages": 2, "alternating": True}
     recipe = small(
         task="chain",
         options=options,
@@ -110,11 +110,11 @@ def test_a_chain_is_climbed() -> None:
         frames_per_update=4,
     )
     rows = run(build(recipe), progress=False).rows
-    assert rows[0]["layer"] == 0
-    assert rows[-1]["layer"] == 1
+    assert rows[0]["stage"] == 0
+    assert rows[-1]["stage"] == 1
 
 
-def test_a_task_of_one_layer_has_none() -> None:
+def test_a_task_of_one_stage_has_none() -> None:
     with pytest.raises(ValueError, match="hand_reach has no curriculum"):
         build(small(task="hand_reach", algo="cher"))
 
@@ -124,8 +124,8 @@ def test_a_run_begins_with_the_reach_and_is_measured_at_the_full_task_too(tmp_pa
     components = build(recipe)
     run(components, tmp_path / "run", progress=False)
     rows = pd.read_csv(tmp_path / "run" / "metrics.csv")
-    assert rows["layer"].tolist() == [0, 0]
-    assert {"success", "layer_success"} <= set(rows.columns)
+    assert rows["stage"].tolist() == [0, 0]
+    assert {"success", "stage_success"} <= set(rows.columns)
     assert rows["kl"].isna().all()  # q* is that of the throw
     stored = components.buffer[:]
     assert (stored["observation"][:, 5:] == 0).all()  # of a reach: no ball is seen
@@ -149,7 +149,7 @@ def test_inputs_that_the_reach_does_not_use_keep_their_weights() -> None:
     assert (before[1][:, 7:] == 0).all()
 
 
-def test_a_change_of_layer_empties_and_restarts_one_run_alone() -> None:
+def test_a_change_of_stage_empties_and_restarts_one_run_alone() -> None:
     components = build(climbing(num_runs=2, success_threshold=1.0, window=30))
     run(components, progress=False)
     networks = weights(components)
@@ -172,7 +172,7 @@ def test_a_change_of_layer_empties_and_restarts_one_run_alone() -> None:
     assert [state["step"].tolist() for state in components.optimizer.state.values()] == steps
 
 
-def test_training_goes_on_in_two_layers_at_once() -> None:
+def test_training_goes_on_in_two_stages_at_once() -> None:
     components = build(climbing(num_runs=2, success_threshold=1.0, normalize=False))
     trainer = components.trainer()
     trainer.epoch()
@@ -190,10 +190,10 @@ def test_a_run_that_was_stopped_after_a_change_goes_on_as_if_it_had_not(tmp_path
     recipe = climbing(success_threshold=0.01, episodes=30, window=30, epochs=4, seed=4)
     whole = build(recipe)
     run(whole, tmp_path / "whole", progress=False)
-    layers = pd.read_csv(tmp_path / "whole" / "metrics.csv")["layer"].tolist()
-    assert layers[0] == 0
-    assert layers[-1] == 1
-    changed = layers.index(1)
+    stages = pd.read_csv(tmp_path / "whole" / "metrics.csv")["stage"].tolist()
+    assert stages[0] == 0
+    assert stages[-1] == 1
+    changed = stages.index(1)
     run(build(recipe.replace(epochs=changed + 1)), tmp_path / "part", progress=False)
     config = (tmp_path / "part" / "config.yaml").read_text()
     (tmp_path / "part" / "config.yaml").write_text(config.replace(f"epochs: {changed + 1}", "epochs: 4"))
@@ -201,10 +201,10 @@ def test_a_run_that_was_stopped_after_a_change_goes_on_as_if_it_had_not(tmp_path
     resume(tmp_path / "part", components=part, progress=False)
     assert torch.equal(weights(part), weights(whole))
     assert part.curriculum is not None
-    assert part.curriculum.progress.layers == (1,)
+    assert part.curriculum.progress.stages == (1,)
 
 
-def test_runs_are_guided_by_the_layer_that_they_have_learned() -> None:
+def test_runs_are_guided_by_the_stage_that_they_have_learned() -> None:
     components = build(climbing(num_runs=2, guided_share=1.0, epsilon_start=0.0, epsilon_end=0.0))
     guide = components.guide
     assert guide is not None
@@ -212,7 +212,7 @@ def test_runs_are_guided_by_the_layer_that_they_have_learned() -> None:
     trainer.epoch()
     learned = {name: value.clone() for name, value in components.greedy.state_dict().items()}
     move(components, run=1)
-    assert guide.layer.tolist() == [-1, 0]
+    assert guide.stage.tolist() == [-1, 0]
     for name, value in guide.module.state_dict().items():
         assert torch.equal(value.chunk(2)[1], learned[name].chunk(2)[1])
     rows = next(iter(components.collector))
@@ -258,8 +258,8 @@ def test_a_buffer_that_does_not_relabel_is_refused() -> None:
     with pytest.raises(
         TypeError, match="a curriculum needs a buffer with a HERWriter, got a TensorDictRoundRobinWriter"
     ):
-        enter_layer(
-            TensorDictReplayBuffer(storage=LazyTensorStorage(4)), components.curriculum.progress.layer_of(0)
+        enter_stage(
+            TensorDictReplayBuffer(storage=LazyTensorStorage(4)), components.curriculum.progress.stage_of(0)
         )
 
 

@@ -76,7 +76,7 @@ def test_q_is_not_logged_if_nobody_knows_it() -> None:
 def test_few_worlds_play_as_many_episodes_as_asked(algo: str) -> None:
     options: dict[str, Any] = {"task": "gym:torchrl_her/HandThrow-v1", "algo": algo, "episodes": 25}
     if algo == "cher":
-        options["curriculum"] = make_env("hand_v1", num_envs=1).layers()
+        options["curriculum"] = make_env("hand_v1", num_envs=1).stages()
     components, alone = build(small(num_runs=2, **options)), build(small(seed=1, **options))
     for each in (components, alone):
         each.actor.load_state_dict({name: value * 0 for name, value in each.actor.state_dict().items()})
@@ -130,22 +130,22 @@ def test_virtual_goals_are_asked_for_in_every_round() -> None:
         assert all((known == goal).all(-1).any() for goal in rows["desired_goal"][:, 0])
 
 
-def test_with_layers_for_episodes_they_are_goals_of_the_last() -> None:
+def test_with_stages_for_episodes_they_are_goals_of_the_last() -> None:
     components = build(small(task="hand_v1", algo="unfiltered_cher", order="all_at_once", virtual_goals=True))
     components.trainer().epoch()
     env = components.virtual_env
     assert env is not None
     assert ask_for_virtual_goals(components, env, 1) == [True]
     own = rows_of_run(components.buffer, 0)
-    last = own["virtual"].squeeze(-1) & (own["layer"].squeeze(-1) == 1)
+    last = own["virtual"].squeeze(-1) & (own["stage"].squeeze(-1) == 1)
     assert all((own["desired_goal"][last] == goal).all(-1).any() for goal in env.reset()["desired_goal"])
 
 
-def test_virtual_goals_of_lower_layers_are_not_those_of_the_task() -> None:
+def test_virtual_goals_of_lower_stages_are_not_those_of_the_task() -> None:
     components = build(small(task="hand_v1", algo="cher", num_runs=2, virtual_goals=True))
     assert components.curriculum is not None
     components.trainer().epoch()
-    components.curriculum.progress.set_layer(1, 1)
+    components.curriculum.progress.set_stage(1, 1)
     assert at_virtual_goals(components, 1)["virtual_success"].isnan().tolist() == [True, False]
 
 

@@ -116,9 +116,9 @@ def test_actions_at_their_bounds_for_three_epochs_in_a_row() -> None:
     assert "What helps: learning_rate" in only(table(3, success=0.1, saturation=1.0), after=3, learner="sac")
 
 
-def test_in_a_curriculum_the_success_of_the_present_layer_counts() -> None:
-    assert not any(said(table(3, success=0.0, saturation=1.0, layer_success=0.9)))
-    assert "with 20% success" in only(table(3, success=0.0, saturation=1.0, layer_success=0.2), after=3)
+def test_in_a_curriculum_the_success_of_the_present_stage_counts() -> None:
+    assert not any(said(table(3, success=0.0, saturation=1.0, stage_success=0.9)))
+    assert "with 20% success" in only(table(3, success=0.0, saturation=1.0, stage_success=0.2), after=3)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_success_that_falls_after_it_rose() -> None:
     assert line.startswith(
         "seed 5: success was 90% and has fallen to 43%; best.safetensors has the best policy."
     )
-    assert not any(said(table(9, success=fallen, layer=[0, 0, 0, 0, 1, 1, 1, 1, 1])))  # a new layer
+    assert not any(said(table(9, success=fallen, stage=[0, 0, 0, 0, 1, 1, 1, 1, 1])))  # a new stage
 
 
 def test_runs_that_differ_for_five_epochs() -> None:

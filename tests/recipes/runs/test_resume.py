@@ -36,11 +36,11 @@ from ..small import assert_same, assert_same_runs, small
 from .killed import is_killed
 
 KILLS = 20
-# Everything there is to save: a curriculum whose layer changes on the way, q, priorities, held-back episodes.
+# Everything there is to save: a curriculum whose stage changes on the way, q, priorities, held-back episodes.
 ALL: dict[str, Any] = {
     "task": "hand_v1",
     "algo": "cher_ibs",
-    "seed": 5,  # of which the first layer ends with the first epoch
+    "seed": 5,  # of which the first stage ends with the first epoch
     "epochs": 3,
     "epoch_frames": 480,
     "episodes": 10,
@@ -121,7 +121,7 @@ def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not
     assert not is_killed(recipe, tmp_path / "alone", after=300.0)
     seconds = time.perf_counter() - began
     assert_same_runs(tmp_path / "whole", tmp_path / "alone")
-    assert pd.read_csv(tmp_path / "whole" / "metrics.csv")["layer"].nunique() == 2
+    assert pd.read_csv(tmp_path / "whole" / "metrics.csv")["stage"].nunique() == 2
     kills, folder = 0, tmp_path / "0"
     while kills < most:
         if is_killed(recipe, folder, after=draw.uniform(0.0, seconds)):

@@ -130,7 +130,7 @@ def test_a_whole_study_ends_without_a_word(tmp_path: Path) -> None:
 def test_mappings_are_called_by_the_entries_that_differ() -> None:
     vary: dict[str, Sequence[object]] = {
         "algo": ["her"],
-        "options": [{"length": 4, "layers": 2}, {"length": 6, "layers": 2}],
+        "options": [{"length": 4, "stages": 2}, {"length": 6, "stages": 2}],
     }
     study = Study(name="one", recipe={**SMALL, "task": "chain"}, vary=vary)
     assert [label for label, _ in study.cells()] == ["her_length=4", "her_length=6"]

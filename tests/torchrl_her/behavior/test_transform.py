@@ -234,18 +234,18 @@ def test_runs_that_take_no_part() -> None:
     assert env.reset()["proposed"].flatten().tolist() == [False, False, True, True]
 
 
-def test_layers_that_take_no_part() -> None:
-    class Layers(Line):
-        """Two environments in two layers."""
+def test_stages_that_take_no_part() -> None:
+    class Stages(Line):
+        """Two environments in two stages."""
 
         def _shown(self) -> dict[str, Tensor]:
-            return super()._shown() | {"layer": torch.tensor([[0], [1]])}
+            return super()._shown() | {"stage": torch.tensor([[0], [1]])}
 
-    line = Layers(2)
+    line = Stages(2)
     seen = line.observation_spec.clone()
-    seen["layer"] = seen["observation"].to(torch.int64)
+    seen["stage"] = seen["observation"].to(torch.int64)
     line.observation_spec = seen
-    behavior = BehaviorGoals(REWARD, real_share=0.0, layer_key="layer", layer=1)
+    behavior = BehaviorGoals(REWARD, real_share=0.0, stage_key="stage", stage=1)
     env = TransformedEnv(line, behavior)
     played(env)
     assert behavior.memory.sizes == [5]

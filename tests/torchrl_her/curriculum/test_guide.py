@@ -15,8 +15,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_her import (
     Curriculum,
-    CurriculumLayer,
     CurriculumProgress,
+    CurriculumStage,
     GuidedExploration,
     StateToObs,
     ZeroPad,
@@ -24,9 +24,9 @@ from torchrl_her import (
 )
 from torchrl_her_envs import make_env
 
-# The state is [own place, block, wanted place]; the first layer wants the block to be reached.
-REACH = CurriculumLayer(name="reach", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.5)
-MOVE = CurriculumLayer(name="move", observation=[0, 1], achieved_goal=[1], desired_goal=[2], threshold=0.5)
+# The state is [own place, block, wanted place]; the first stage wants the block to be reached.
+REACH = CurriculumStage(name="reach", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.5)
+MOVE = CurriculumStage(name="move", observation=[0, 1], achieved_goal=[1], desired_goal=[2], threshold=0.5)
 CURRICULUM = Curriculum([REACH, MOVE], 3)
 
 
@@ -69,7 +69,7 @@ def guide() -> GuidedExploration:
     return made
 
 
-def test_it_sees_what_the_layer_below_sees(guide: GuidedExploration) -> None:
+def test_it_sees_what_the_stage_below_sees(guide: GuidedExploration) -> None:
     # [own place, block, 0], times the weight that was learned
     assert acts(guide, [[3.0, 5.0, 7.0]]) == [2.0 * (3.0 + 50.0)]
 
@@ -92,7 +92,7 @@ def test_by_the_step_it_acts_wherever_the_goal_below_is_not_achieved() -> None:
     assert not acted.all(0).any()  # in no environment always
 
 
-def test_without_a_layer_below_it_does_nothing() -> None:
+def test_without_a_stage_below_it_does_nothing() -> None:
     guide = GuidedExploration(policy(1.0), CURRICULUM, share=1.0)
     assert acts(guide, [[3.0, 5.0, 7.0]]) == [-1.0]
     assert guide.guided is None
@@ -138,7 +138,7 @@ def test_runs_beside_others_draw_as_they_would_alone() -> None:
     assert 0.3 < (both > 0).double().mean() < 0.7
 
 
-def test_a_run_without_a_layer_below_draws_nothing() -> None:
+def test_a_run_without_a_stage_below_draws_nothing() -> None:
     generators = [torch.Generator().manual_seed(seed) for seed in range(2)]
     before = [generator.get_state() for generator in generators]
     guide = GuidedExploration(policy(1.0, 1.0), CURRICULUM, runs=2, generators=generators)
@@ -148,36 +148,36 @@ def test_a_run_without_a_layer_below_draws_nothing() -> None:
     assert not torch.equal(generators[1].get_state(), before[1])
 
 
-# Where episodes have layers of their own, the policy itself acts, as in one layer after the other.
-HOLD = CurriculumLayer(name="hold", observation=[0, 1], achieved_goal=[0], desired_goal=[2], threshold=0.5)
+# Where episodes have stages of their own, the policy itself acts, as in one stage after the other.
+HOLD = CurriculumStage(name="hold", observation=[0, 1], achieved_goal=[0], desired_goal=[2], threshold=0.5)
 THREE = Curriculum([REACH, MOVE, HOLD], 3)
 
 
-def in_layers(
-    guide: GuidedExploration, layers: list[int], state: list[list[float]], **options: object
+def in_stages(
+    guide: GuidedExploration, stages: list[int], state: list[list[float]], **options: object
 ) -> list[float]:
     seen = rows(state, **options)  # type: ignore[arg-type]
-    seen["layer"] = torch.tensor(layers).unsqueeze(-1)
+    seen["stage"] = torch.tensor(stages).unsqueeze(-1)
     return guide(seen)["action"].flatten().tolist()
 
 
-def test_episodes_above_the_first_layer_are_begun_as_in_it() -> None:
+def test_episodes_above_the_first_stage_are_begun_as_in_it() -> None:
     own = policy(2.0)
-    guide = GuidedExploration(own, CURRICULUM, share=1.0, layer_key="layer")
-    assert in_layers(guide, [1, 0], [[3.0, 5.0, 7.0]] * 2) == [2.0 * 53.0, -1.0]
+    guide = GuidedExploration(own, CURRICULUM, share=1.0, stage_key="stage")
+    assert in_stages(guide, [1, 0], [[3.0, 5.0, 7.0]] * 2) == [2.0 * 53.0, -1.0]
     own.module.weight.data.fill_(3.0)  # it has learned meanwhile
-    assert in_layers(guide, [1, 0], [[3.0, 5.0, 7.0]] * 2, begun=False) == [3.0 * 53.0, -1.0]
-    assert in_layers(guide, [1, 0], [[5.0, 5.0, 7.0]] * 2, begun=False) == [-1.0, -1.0]  # reached
-    assert in_layers(guide, [1, 0], [[3.0, 5.0, 7.0]] * 2, begun=False) == [-1.0, -1.0]
+    assert in_stages(guide, [1, 0], [[3.0, 5.0, 7.0]] * 2, begun=False) == [3.0 * 53.0, -1.0]
+    assert in_stages(guide, [1, 0], [[5.0, 5.0, 7.0]] * 2, begun=False) == [-1.0, -1.0]  # reached
+    assert in_stages(guide, [1, 0], [[3.0, 5.0, 7.0]] * 2, begun=False) == [-1.0, -1.0]
     assert list(guide.parameters()) == []
 
 
-def test_layer_after_layer_up_to_the_episodes_own() -> None:
-    guide = GuidedExploration(policy(1.0), THREE, share=1.0, layer_key="layer")
-    assert in_layers(guide, [2, 1], [[3.0, 5.0, 7.0]] * 2) == [53.0, 53.0]  # sees [own place, block, 0]
-    # Both have reached the block: one goes on as in the second layer, which sees the wanted place, too.
-    assert in_layers(guide, [2, 1], [[5.0, 5.0, 7.0]] * 2, begun=False) == [5.0 + 50.0 + 700.0, -1.0]
-    assert in_layers(guide, [2, 1], [[5.0, 7.0, 7.0]] * 2, begun=False) == [-1.0, -1.0]
+def test_stage_after_stage_up_to_the_episodes_own() -> None:
+    guide = GuidedExploration(policy(1.0), THREE, share=1.0, stage_key="stage")
+    assert in_stages(guide, [2, 1], [[3.0, 5.0, 7.0]] * 2) == [53.0, 53.0]  # sees [own place, block, 0]
+    # Both have reached the block: one goes on as in the second stage, which sees the wanted place, too.
+    assert in_stages(guide, [2, 1], [[5.0, 5.0, 7.0]] * 2, begun=False) == [5.0 + 50.0 + 700.0, -1.0]
+    assert in_stages(guide, [2, 1], [[5.0, 7.0, 7.0]] * 2, begun=False) == [-1.0, -1.0]
     assert guide.guided is not None
     assert guide.guided.flatten().tolist() == [-1, -1]
 
@@ -187,10 +187,10 @@ def test_a_share_of_the_episodes_above_is_begun() -> None:
         policy(1.0),
         CURRICULUM,
         share=0.3,
-        layer_key="layer",
+        stage_key="stage",
         generators=[torch.Generator().manual_seed(0)],
     )
-    begun = in_layers(guide, [1] * 1000 + [0] * 10, [[3.0, 5.0, 7.0]] * 1010)
+    begun = in_stages(guide, [1] * 1000 + [0] * 10, [[3.0, 5.0, 7.0]] * 1010)
     assert begun[:1000].count(53.0) == pytest.approx(300, abs=50)
     assert begun[1000:] == [-1.0] * 10
 
@@ -204,9 +204,9 @@ def test_impossible_shares_are_refused(share: float) -> None:
 @pytest.fixture
 def collected() -> Iterator[TensorDict]:
     env = make_env("hand_v1", num_envs=6, seed=1)
-    curriculum = Curriculum([CurriculumLayer(**layer) for layer in env.layers()], 11)
+    curriculum = Curriculum([CurriculumStage(**stage) for stage in env.stages()], 11)
     progress = CurriculumProgress(curriculum)
-    progress.set_layer(0, 1)
+    progress.set_stage(0, 1)
     shown = TransformedEnv(
         env, Compose(StateToObs(curriculum, progress), ZeroPad(curriculum, progress), InitTracker())
     )
@@ -223,7 +223,7 @@ def collected() -> Iterator[TensorDict]:
 def test_a_collector_begins_episode_after_episode_with_it(collected: TensorDict) -> None:
     guided = (collected["action"] != 0).any(-1)
     near = (collected["state"][..., :2] - collected["state"][..., 5:7]).norm(dim=-1)
-    threshold = make_env("hand_v1", num_envs=1).layers()[0]["threshold"]
+    threshold = make_env("hand_v1", num_envs=1).stages()[0]["threshold"]
     begun = collected["is_init"].squeeze(-1)
     assert begun.sum() > 6  # more than one episode each
     for env in range(6):

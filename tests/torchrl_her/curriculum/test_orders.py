@@ -1,4 +1,4 @@
-"""Layers of episodes: which layer each is played in, how its rows carry it, and what is made of them."""
+"""Stages of episodes: which stage each is played in, how its rows carry it, and what is made of them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_her import Curriculum, GoalReward, GoalWeights, HERWriter, StateToObs, ZeroPad
-from torchrl_her.curriculum import EpisodeLayers, LayerOutcomes, LayerView, TeacherStudent, count_inputs
+from torchrl_her.curriculum import EpisodeStages, StageOutcomes, StageView, TeacherStudent, count_inputs
 from torchrl_her.modules import RunningNorm
-from torchrl_her.replay_buffers import LayerRule, RunsSampler
+from torchrl_her.replay_buffers import RunsSampler, StageRule
 
 from ..her_data import make_batch, tag
 from .test_transforms import TinyEnv, make_three
@@ -23,12 +23,12 @@ from .test_transforms import TinyEnv, make_three
 THREE = make_three()
 
 
-class Fixed(EpisodeLayers):
-    """Says which layers come next, and what it was told."""
+class Fixed(EpisodeStages):
+    """Says which stages come next, and what it was told."""
 
-    def __init__(self, *layers: int, runs: int = 1) -> None:
+    def __init__(self, *stages: int, runs: int = 1) -> None:
         super().__init__(THREE, runs=runs, generators=[torch.Generator() for _ in range(runs)])
-        self.next, self.told = list(layers), []
+        self.next, self.told = list(stages), []
 
     def draw(self, counts: object) -> Tensor:
         some, self.next = self.next[: sum(counts)], self.next[sum(counts) :]  # type: ignore[call-overload]
@@ -38,8 +38,8 @@ class Fixed(EpisodeLayers):
         self.told.append((ended.tolist(), achieved.tolist()))
 
 
-def shown(progress: EpisodeLayers, num_envs: int, **options: int) -> TransformedEnv:
-    transforms = StateToObs(THREE, progress), ZeroPad(THREE, progress), LayerOutcomes(progress)
+def shown(progress: EpisodeStages, num_envs: int, **options: int) -> TransformedEnv:
+    transforms = StateToObs(THREE, progress), ZeroPad(THREE, progress), StageOutcomes(progress)
     return TransformedEnv(TinyEnv((num_envs,), **options), Compose(*transforms))
 
 
@@ -51,34 +51,34 @@ def act(env: TransformedEnv, rows: TensorDictBase, *actions: float) -> TensorDic
 # Drawing
 
 
-def test_all_layers_are_drawn_alike() -> None:
-    layers = EpisodeLayers(THREE, generators=[torch.Generator().manual_seed(0)])
-    counts = layers.draw([3_000]).bincount()
+def test_all_stages_are_drawn_alike() -> None:
+    stages = EpisodeStages(THREE, generators=[torch.Generator().manual_seed(0)])
+    counts = stages.draw([3_000]).bincount()
     torch.testing.assert_close(counts / 3_000, torch.full((3,), 1 / 3), atol=0.03, rtol=0.0)
 
 
 def test_a_share_of_the_episodes_is_of_the_full_task() -> None:
-    assert EpisodeLayers(THREE, task_share=0.5).shares.tolist() == [[0.25, 0.25, 0.5]]
-    layers = EpisodeLayers(THREE, task_share=1.0)
-    assert layers.draw([100]).tolist() == [2] * 100
+    assert EpisodeStages(THREE, task_share=0.5).shares.tolist() == [[0.25, 0.25, 0.5]]
+    stages = EpisodeStages(THREE, task_share=1.0)
+    assert stages.draw([100]).tolist() == [2] * 100
     with pytest.raises(ValueError, match=r"task_share must be in \[0, 1\], got 1.5"):
-        EpisodeLayers(THREE, task_share=1.5)
+        EpisodeStages(THREE, task_share=1.5)
 
 
 def test_a_run_draws_as_it_would_alone() -> None:
-    both = EpisodeLayers(THREE, runs=2, generators=[torch.Generator().manual_seed(seed) for seed in (0, 1)])
-    alone = EpisodeLayers(THREE, generators=[torch.Generator().manual_seed(1)])
+    both = EpisodeStages(THREE, runs=2, generators=[torch.Generator().manual_seed(seed) for seed in (0, 1)])
+    alone = EpisodeStages(THREE, generators=[torch.Generator().manual_seed(1)])
     assert torch.equal(both.draw([5, 20])[5:], alone.draw([20]))
     assert torch.equal(both.draw([0, 7]), alone.draw([7]))
 
 
-def test_runs_stay_in_the_last_layer() -> None:
-    layers = EpisodeLayers(THREE)
-    assert layers.layers == (2,)
-    layers.record(torch.ones(1, 30))
-    assert layers.layers == (2,)
-    with pytest.raises(ValueError, match="run 0 cannot be moved to layer 1"):
-        layers.set_layer(0, 1)
+def test_runs_stay_in_the_last_stage() -> None:
+    stages = EpisodeStages(THREE)
+    assert stages.stages == (2,)
+    stages.record(torch.ones(1, 30))
+    assert stages.stages == (2,)
+    with pytest.raises(ValueError, match="run 0 cannot be moved to stage 1"):
+        stages.set_stage(0, 1)
 
 
 def test_progress_is_preferred_whether_up_or_down() -> None:
@@ -86,18 +86,18 @@ def test_progress_is_preferred_whether_up_or_down() -> None:
     assert teacher.shares[0].tolist() == pytest.approx([1 / 3] * 3)  # nothing is known
     ended = torch.tensor([[100, 100, 100]])
     teacher.record_episodes(ended, torch.tensor([[100, 50, 0]]))
-    # short - long: (1 - e^-2) - (1 - e^-1) = 0.2325, half of it for the second layer
+    # short - long: (1 - e^-2) - (1 - e^-1) = 0.2325, half of it for the second stage
     assert (teacher.short - teacher.long)[0].tolist() == pytest.approx([0.2325, 0.1163, 0.0], abs=1e-4)
     each = [0.2525 / 0.4088, 0.1363 / 0.4088, 0.02 / 0.4088]  # each with 0.02 for standing still
     assert teacher.shares[0].tolist() == pytest.approx([0.1 + 0.7 * own for own in each], abs=1e-3)
     for _ in range(40):
         teacher.record_episodes(ended, torch.tensor([[100, 50, 0]]))  # nothing changes any more
     assert teacher.shares[0].tolist() == pytest.approx([1 / 3] * 3)
-    teacher.record_episodes(ended, torch.tensor([[0, 50, 0]]))  # the first layer is forgotten
+    teacher.record_episodes(ended, torch.tensor([[0, 50, 0]]))  # the first stage is forgotten
     assert teacher.shares[0].tolist() == pytest.approx([0.1 + 0.7 * 0.2525 / 0.2925, *[0.1479] * 2], abs=1e-3)
 
 
-def test_chance_in_a_learned_layer_does_not_starve_another() -> None:
+def test_chance_in_a_learned_stage_does_not_starve_another() -> None:
     teacher, generator = TeacherStudent(THREE), torch.Generator().manual_seed(0)
     shares = []
     for _ in range(2_000):
@@ -130,16 +130,16 @@ def test_bad_options() -> None:
     with pytest.raises(ValueError, match="memory must be positive and finite, got -1"):
         TeacherStudent(THREE, memory=-1)
     with pytest.raises(ValueError, match="2 runs need 2 generators"):
-        EpisodeLayers(THREE, runs=2)
+        EpisodeStages(THREE, runs=2)
 
 
 # What an environment shows. World n starts at 1000 n + (10, 20, 30, 40); a goes to b, b to c, c to d.
 
 
-def test_each_environment_is_shown_in_its_layer() -> None:
+def test_each_environment_is_shown_in_its_stage() -> None:
     env = shown(Fixed(2, 0, 1), 3)
     rows = env.reset()
-    assert rows["layer"].flatten().tolist() == [2, 0, 1]
+    assert rows["stage"].flatten().tolist() == [2, 0, 1]
     assert rows["observation"].tolist() == [
         [10.0, 20.0, 30.0],
         [1010.0, 0.0, 0.0],
@@ -154,45 +154,45 @@ def test_each_environment_is_shown_in_its_layer() -> None:
     ]
 
 
-def test_an_episode_stays_in_its_layer() -> None:
+def test_an_episode_stays_in_its_stage() -> None:
     progress = Fixed(0, 1, 1)
     env = shown(progress, 2)
-    step, after = act(env, env.reset(), 10.0, 0.0)  # the first layer's goal: a at b
+    step, after = act(env, env.reset(), 10.0, 0.0)  # the first stage's goal: a at b
     assert step["next", "reward"].flatten().tolist() == [0.0, -1.0]
-    assert step["next", "layer"].flatten().tolist() == [0, 1]
-    assert after["layer"].flatten().tolist() == [1, 1]  # a new episode, and the same one
+    assert step["next", "stage"].flatten().tolist() == [0, 1]
+    assert after["stage"].flatten().tolist() == [1, 1]  # a new episode, and the same one
     assert after["desired_goal"].flatten().tolist() == [30.0, 1030.0]
     step, _ = act(env, after, 0.0, 0.0)
-    assert step["next", "layer"].flatten().tolist() == [1, 1]
+    assert step["next", "stage"].flatten().tolist() == [1, 1]
     assert progress.next == []
 
 
-def test_it_is_told_how_the_episodes_of_each_layer_end() -> None:
+def test_it_is_told_how_the_episodes_of_each_stage_end() -> None:
     progress = Fixed(0, 0, 1, 2, 0, 0, 0, 0, runs=2)
-    env = shown(progress, 4, horizon=1)  # the last layer's goal is near enough from the beginning
+    env = shown(progress, 4, horizon=1)  # the last stage's goal is near enough from the beginning
     act(env, env.reset(), 10.0, 0.0, 0.0, 0.0)
     assert progress.told == [([[2, 0, 0], [0, 1, 1]], [[1, 0, 0], [0, 0, 1]])]
 
 
 def test_episodes_with_proposed_goals_do_not_count() -> None:
     progress = Fixed(0, 0)
-    outcomes = LayerOutcomes(progress)
+    outcomes = StageOutcomes(progress)
     flags = torch.tensor([[True], [True]])
-    before = TensorDict({"layer": torch.tensor([[0], [2]]), "proposed": torch.tensor([[True], [False]])}, [2])
+    before = TensorDict({"stage": torch.tensor([[0], [2]]), "proposed": torch.tensor([[True], [False]])}, [2])
     outcomes._step(before, TensorDict({"done": flags, "terminated": flags, "reward": 0.0 * flags}, [2]))
     assert progress.told == [([[0, 0, 1]], [[0, 0, 1]])]
 
 
 def test_specs_hold() -> None:
-    check_env_specs(shown(EpisodeLayers(THREE), 2))  # type: ignore[arg-type]
+    check_env_specs(shown(EpisodeStages(THREE), 2))  # type: ignore[arg-type]
 
 
-def test_thresholds_are_those_of_the_rows_layers() -> None:
-    layers = [
+def test_thresholds_are_those_of_the_rows_stages() -> None:
+    stages = [
         replace(own, threshold=threshold)
-        for own, threshold in zip(THREE.layers, (8.0, 12.0, 8.0), strict=True)
+        for own, threshold in zip(THREE.stages, (8.0, 12.0, 8.0), strict=True)
     ]
-    curriculum = Curriculum(layers, 4)
+    curriculum = Curriculum(stages, 4)
     progress = Fixed(0, 1, 2)
     progress.curriculum = curriculum
     env = TransformedEnv(TinyEnv((3,)), StateToObs(curriculum, progress))
@@ -201,9 +201,9 @@ def test_thresholds_are_those_of_the_rows_layers() -> None:
     assert step["next", "terminated"].flatten().tolist() == [False, True, False]
 
 
-# The view of another layer
+# The view of another stage
 
-RULES = [*(own.reward_fn for own in THREE.layers[:-1]), lambda achieved, desired: always_seven(achieved)]
+RULES = [*(own.reward_fn for own in THREE.stages[:-1]), lambda achieved, desired: always_seven(achieved)]
 
 
 def always_seven(achieved: Tensor) -> tuple[Tensor, Tensor]:
@@ -213,47 +213,47 @@ def always_seven(achieved: Tensor) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("played", range(3))
 @pytest.mark.parametrize("wanted", range(3))
-@pytest.mark.parametrize("action", [0.0, 10.0])  # with 10 the goal of the first layer is achieved
-def test_a_view_shows_what_the_layer_would_have_shown(played: int, wanted: int, action: float) -> None:
-    def step(layer: int) -> TensorDictBase:
-        env = shown(Fixed(*[layer] * 4), 2)
+@pytest.mark.parametrize("action", [0.0, 10.0])  # with 10 the goal of the first stage is achieved
+def test_a_view_shows_what_the_stage_would_have_shown(played: int, wanted: int, action: float) -> None:
+    def step(stage: int) -> TensorDictBase:
+        env = shown(Fixed(*[stage] * 4), 2)
         return act(env, env.reset(), action, 0.0)[0]
 
-    rows, own, view = step(played), step(wanted), LayerView(THREE, wanted, RULES[wanted])  # type: ignore[arg-type]
+    rows, own, view = step(played), step(wanted), StageView(THREE, wanted, RULES[wanted])  # type: ignore[arg-type]
     before = rows.clone()
     seen = view(rows)
-    for key in ("observation", "achieved_goal", "desired_goal", "layer", "reward", "terminated"):
+    for key in ("observation", "achieved_goal", "desired_goal", "stage", "reward", "terminated"):
         assert torch.equal(seen["next", key], own["next", key]), key
         if key in own:
             assert torch.equal(seen[key], own[key]), key
-    # Where the episode ended in its own layer, it does not go on in any other.
+    # Where the episode ended in its own stage, it does not go on in any other.
     assert torch.equal(seen["next", "done"], rows["next", "done"] | own["next", "done"])
     cut = rows["next", "done"] & ~own["next", "done"]
     assert torch.equal(seen["next", "truncated"], cut)
     assert (rows == before).all()
 
 
-def test_a_view_keeps_what_was_played_in_its_layer() -> None:
+def test_a_view_keeps_what_was_played_in_its_stage() -> None:
     env = shown(Fixed(2, 2), 1)
     begun = env.reset().set("desired_goal", torch.tensor([[55.0]]))  # proposed in place of the state's
     rows = act(env, begun, 30.0)[0]  # the environment terminates the full task, which no rule would
-    seen = LayerView(THREE, 2, RULES[2])(rows)  # type: ignore[arg-type]
+    seen = StageView(THREE, 2, RULES[2])(rows)  # type: ignore[arg-type]
     assert seen["desired_goal"].item() == 55.0
     assert seen["next", "terminated"].item()
     assert not seen["next", "truncated"].item()
-    with pytest.raises(ValueError, match=r"layer must be in \[0, 2\], got 3"):
-        LayerView(THREE, 3, strict)
+    with pytest.raises(ValueError, match=r"stage must be in \[0, 2\], got 3"):
+        StageView(THREE, 3, strict)
 
 
 # What is written and sampled
 
 
-def test_transitions_are_written_for_every_layer() -> None:
+def test_transitions_are_written_for_every_stage() -> None:
     rules = [
-        LayerRule(rule, view=LayerView(THREE, layer, rule))  # type: ignore[arg-type]
-        for layer, rule in enumerate(RULES)
+        StageRule(rule, view=StageView(THREE, stage, rule))  # type: ignore[arg-type]
+        for stage, rule in enumerate(RULES)
     ]
-    writer = HERWriter(strict, k=1, strategy="final", layers=rules, exclude=["state", "input"])
+    writer = HERWriter(strict, k=1, strategy="final", stages=rules, exclude=["state", "input"])
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), writer=writer, batch_size=4)
     env, steps = shown(Fixed(0, 2, 0, 2), 2, horizon=2), []
     rows = env.reset()
@@ -263,13 +263,13 @@ def test_transitions_are_written_for_every_layer() -> None:
     index = buffer.extend(torch.stack(steps, -1))
     stored = buffer[:]
     real = stored[~stored["virtual"].squeeze(-1)]
-    assert real["layer"].flatten().tolist() == [0] * 4 + [1] * 4 + [2] * 4
-    assert stored["layer"].flatten().bincount().tolist() == [8] * 3
-    first = real[real["layer"].squeeze(-1) == 1]
+    assert real["stage"].flatten().tolist() == [0] * 4 + [1] * 4 + [2] * 4
+    assert stored["stage"].flatten().bincount().tolist() == [8] * 3
+    first = real[real["stage"].squeeze(-1) == 1]
     assert first["achieved_goal"].flatten().tolist() == [20.0, 20.0, 1020.0, 1020.0]
     assert first["desired_goal"].flatten().tolist() == [30.0, 30.0, 1030.0, 1030.0]
-    # A transition is where the writer says: its last copy, that of the last layer.
-    assert stored["layer"][index].flatten().tolist() == [2] * 4
+    # A transition is where the writer says: its last copy, that of the last stage.
+    assert stored["stage"][index].flatten().tolist() == [2] * 4
     assert stored["observation"][index][..., 0].tolist() == [[10.0, 11.0], [1010.0, 1012.0]]
     assert writer.counts.real == 12
 
@@ -287,11 +287,11 @@ class OnlyLast(GoalWeights):
         self.told += goals[:, 0].tolist()
 
 
-def episodes(layer: list[int], length: int = 3) -> TensorDict:
-    """One episode of each of some environments, in a layer each."""
-    rows = make_batch([[length]] * len(layer))
-    layers = torch.tensor(layer).view(-1, 1, 1).expand(-1, length, 1).clone()
-    rows["layer"], rows["next", "layer"] = layers, layers.clone()
+def episodes(stage: list[int], length: int = 3) -> TensorDict:
+    """One episode of each of some environments, in a stage each."""
+    rows = make_batch([[length]] * len(stage))
+    stages = torch.tensor(stage).view(-1, 1, 1).expand(-1, length, 1).clone()
+    rows["stage"], rows["next", "stage"] = stages, stages.clone()
     return rows
 
 
@@ -300,90 +300,90 @@ def strict(achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
     return -torch.ones_like(achieved[..., :1]), torch.zeros_like(achieved[..., :1], dtype=torch.bool)
 
 
-def test_each_layer_has_its_reward() -> None:
-    writer = HERWriter(strict, k=1, strategy="final", layers=[LayerRule(strict), LayerRule(GoalReward(0.5))])
+def test_each_stage_has_its_reward() -> None:
+    writer = HERWriter(strict, k=1, strategy="final", stages=[StageRule(strict), StageRule(GoalReward(0.5))])
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), writer=writer, batch_size=4)
     index = buffer.extend(episodes([1, 0, 1]))
     stored = buffer[:]
     virtual = stored[stored["virtual"].squeeze(-1)]
     achieved = virtual["next", "reward"].squeeze(-1) == 0.0
-    assert virtual["layer"][achieved].flatten().tolist() == [1, 1]  # the last steps of two episodes
+    assert virtual["stage"][achieved].flatten().tolist() == [1, 1]  # the last steps of two episodes
     assert virtual["next", "terminated"].sum() == 2
     # Each transition is where the writer says.
     assert torch.equal(stored["achieved_goal"][index], episodes([1, 0, 1])["achieved_goal"])
 
 
-def test_weights_apply_in_some_layers() -> None:
+def test_weights_apply_in_some_stages() -> None:
     weights = OnlyLast()
-    rules = [LayerRule(GoalReward(0.5), weighted=False), LayerRule(GoalReward(0.5))]
-    writer = HERWriter(strict, k=20, layers=rules, weights=weights)
+    rules = [StageRule(GoalReward(0.5), weighted=False), StageRule(GoalReward(0.5))]
+    writer = HERWriter(strict, k=20, stages=rules, weights=weights)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), writer=writer, batch_size=4)
     buffer.extend(episodes([0, 1]))
     stored = buffer[:]
     virtual = stored[stored["virtual"].squeeze(-1)]
     goals = [
-        set(virtual["desired_goal"][virtual["layer"].squeeze(-1) == own][:, 0].tolist()) for own in (0, 1)
+        set(virtual["desired_goal"][virtual["stage"].squeeze(-1) == own][:, 0].tolist()) for own in (0, 1)
     ]
     assert goals == [{1.0, 2.0, 3.0}, {tag(1, 0, 3)}]
     assert set(weights.told) == {tag(1, 0, 3)}
 
 
-def test_goals_of_other_episodes_are_of_the_same_layer() -> None:
-    rules = [LayerRule(GoalReward(0.5))] * 2
-    writer = HERWriter(strict, goal_sources={"achieved": 30}, layers=rules)
+def test_goals_of_other_episodes_are_of_the_same_stage() -> None:
+    rules = [StageRule(GoalReward(0.5))] * 2
+    writer = HERWriter(strict, goal_sources={"achieved": 30}, stages=rules)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), writer=writer, batch_size=4)
     buffer.extend(episodes([0, 1, 0]))
     stored = buffer[:]
     virtual = stored[stored["virtual"].squeeze(-1)]
-    for layer, envs in ((0, {0.0, 2.0}), (1, {1.0})):
-        own = virtual["desired_goal"][virtual["layer"].squeeze(-1) == layer][:, 0]
+    for stage, envs in ((0, {0.0, 2.0}), (1, {1.0})):
+        own = virtual["desired_goal"][virtual["stage"].squeeze(-1) == stage][:, 0]
         assert set(own.div(1000).floor().tolist()) == envs
     state = writer.state_dict()
-    other = HERWriter(strict, goal_sources={"achieved": 30}, layers=rules)
+    other = HERWriter(strict, goal_sources={"achieved": 30}, stages=rules)
     TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), writer=other, batch_size=4)
     other.load_state_dict(state)
     assert [own["achieved"][0].shape for own in other.state_dict()["recent"]] == [(6, 2), (3, 2)]
 
 
-def test_runs_with_layers_write_what_they_would_alone() -> None:
-    def stored(layers: list[int], seeds: list[int]) -> TensorDictBase:
+def test_runs_with_stages_write_what_they_would_alone() -> None:
+    def stored(stages: list[int], seeds: list[int]) -> TensorDictBase:
         generators = [torch.Generator().manual_seed(seed) for seed in seeds]
-        rules = [LayerRule(GoalReward(0.5)), LayerRule(GoalReward(1.5))]
-        writer = HERWriter(strict, k=2, layers=rules, runs=len(seeds), generators=generators)
+        rules = [StageRule(GoalReward(0.5)), StageRule(GoalReward(1.5))]
+        writer = HERWriter(strict, k=2, stages=rules, runs=len(seeds), generators=generators)
         buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(100 * len(seeds)),
             writer=writer,
             sampler=RunsSampler(100, runs=len(seeds), generators=generators),
             batch_size=4,
         )
-        rows = episodes(layers)
+        rows = episodes(stages)
         rows["achieved_goal"] %= 1000.0
         rows["next", "achieved_goal"] %= 1000.0
         buffer.extend(rows)
         return buffer.storage[:]
 
     both, alone = stored([0, 1, 1, 0], [0, 1]), stored([1, 0], [1])
-    for key in ("desired_goal", "layer", ("next", "reward")):
+    for key in ("desired_goal", "stage", ("next", "reward")):
         assert torch.equal(both[key][100:118], alone[key][:18])
 
 
-def test_rows_without_a_layer_are_refused() -> None:
-    writer = HERWriter(strict, layers=[LayerRule(strict)])
+def test_rows_without_a_stage_are_refused() -> None:
+    writer = HERWriter(strict, stages=[StageRule(strict)])
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), writer=writer, batch_size=4)
-    with pytest.raises(KeyError, match="episodes of several layers need the entry 'layer'"):
+    with pytest.raises(KeyError, match="episodes of several stages need the entry 'stage'"):
         buffer.extend(make_batch([[3]]))
-    with pytest.raises(ValueError, match=r"'layer' must be in \[0, 0\], got 1"):
+    with pytest.raises(ValueError, match=r"'stage' must be in \[0, 0\], got 1"):
         buffer.extend(episodes([1]))
-    with pytest.raises(TypeError, match="layers must be a list of LayerRule"):
-        HERWriter(strict, layers=[strict])  # type: ignore[list-item]
+    with pytest.raises(TypeError, match="stages must be a list of StageRule"):
+        HERWriter(strict, stages=[strict])  # type: ignore[list-item]
 
 
-def test_sampled_rows_are_padded_by_their_layer() -> None:
+def test_sampled_rows_are_padded_by_their_stage() -> None:
     rows = TensorDict(
         {
             "observation": torch.tensor([[1.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 0.0]]),
             "desired_goal": torch.tensor([[9.0], [8.0], [7.0]]),
-            "layer": torch.tensor([[0], [2], [1]]),
+            "stage": torch.tensor([[0], [2], [1]]),
             "next": {
                 "observation": torch.tensor([[4.0, 0.0, 0.0], [4.0, 5.0, 6.0], [4.0, 5.0, 0.0]]),
                 "desired_goal": torch.tensor([[9.0], [8.0], [7.0]]),
@@ -391,22 +391,22 @@ def test_sampled_rows_are_padded_by_their_layer() -> None:
         },
         [3],
     )
-    padded = ZeroPad(THREE, EpisodeLayers(THREE))(rows)
+    padded = ZeroPad(THREE, EpisodeStages(THREE))(rows)
     assert padded["input"].tolist() == [[1, 9, 0, 0], [1, 2, 3, 8], [1, 2, 7, 0]]
     assert padded["next", "input"].tolist() == [[4, 9, 0, 0], [4, 5, 6, 8], [4, 5, 7, 0]]
-    assert ZeroPad(THREE, EpisodeLayers(THREE)).in_keys == ["observation", "desired_goal", "layer"]
+    assert ZeroPad(THREE, EpisodeStages(THREE)).in_keys == ["observation", "desired_goal", "stage"]
 
 
-def test_inputs_are_counted_layer_by_layer() -> None:
+def test_inputs_are_counted_stage_by_stage() -> None:
     norm = RunningNorm({"input": 4})
     rows = TensorDict(
         {
             "observation": torch.tensor([[1.0, 0.0, 0.0], [3.0, 2.0, 3.0]]),
             "desired_goal": torch.tensor([[9.0], [8.0]]),
-            "layer": torch.tensor([[0], [2]]),
+            "stage": torch.tensor([[0], [2]]),
         },
         [2],
     )
-    count_inputs(norm, EpisodeLayers(THREE), rows, [0], [2])
+    count_inputs(norm, EpisodeStages(THREE), rows, [0], [2])
     moments = norm.moments_of("input")
-    assert moments.n.tolist() == [2.0, 2.0, 1.0, 1.0]  # what a layer does not use does not count
+    assert moments.n.tolist() == [2.0, 2.0, 1.0, 1.0]  # what a stage does not use does not count

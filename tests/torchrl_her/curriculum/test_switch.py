@@ -1,4 +1,4 @@
-"""What is forgotten and what is kept when a layer begins."""
+"""What is forgotten and what is kept when a stage begins."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 
 from torchrl_her import (
-    CurriculumLayer,
+    CurriculumStage,
     DecayingEpsilon,
     GoalGrid,
     GoalReward,
     HERWriter,
     Instructiveness,
-    enter_layer,
+    enter_stage,
 )
-from torchrl_her.curriculum import set_layer_goals
+from torchrl_her.curriculum import set_stage_goals
 
 from ..her_data import make_batch
 
 
-def make_layer(threshold: float, *, instructive: bool = True) -> CurriculumLayer:
-    return CurriculumLayer(
+def make_stage(threshold: float, *, instructive: bool = True) -> CurriculumStage:
+    return CurriculumStage(
         name="one",
         observation=[0],
         achieved_goal=[0],
@@ -53,7 +53,7 @@ def test_transitions_and_q_are_forgotten_and_sigma_and_epsilon_start_anew() -> N
     assert len(buffer) == 9
     assert int(weights.counts.sum()) == 6
     assert weights.sigma < 1.5
-    enter_layer(buffer, make_layer(0.2), exploration)
+    enter_stage(buffer, make_stage(0.2), exploration)
     assert len(buffer) == 0
     assert int(weights.counts.sum()) == 0
     assert weights.sigma == 1.5
@@ -66,15 +66,15 @@ def test_epsilon_of_one_run_starts_where_it_is_told() -> None:
     generators = [torch.Generator(), torch.Generator()]
     exploration = DecayingEpsilon(-torch.ones(1), torch.ones(1), decay=0.5, generators=generators)
     exploration.step()
-    enter_layer(make_buffer(), make_layer(0.2), exploration, epsilon=0.8, run=1)
+    enter_stage(make_buffer(), make_stage(0.2), exploration, epsilon=0.8, run=1)
     assert exploration.epsilon.tolist() == [0.5, 0.8]
 
 
-def test_a_layer_says_whether_goals_are_weighed() -> None:
+def test_a_stage_says_whether_goals_are_weighed() -> None:
     writer = make_buffer().writer
-    set_layer_goals(writer, make_layer(0.3, instructive=False))
+    set_stage_goals(writer, make_stage(0.3, instructive=False))
     assert writer.weights.alike
-    set_layer_goals(writer, make_layer(0.3))
+    set_stage_goals(writer, make_stage(0.3))
     assert not writer.weights.alike
     assert writer.reward_of(0).threshold == 0.3
 
@@ -82,4 +82,4 @@ def test_a_layer_says_whether_goals_are_weighed() -> None:
 def test_a_buffer_without_hindsight_is_refused() -> None:
     buffer = ReplayBuffer(storage=LazyTensorStorage(10))
     with pytest.raises(TypeError, match="needs a buffer with a HERWriter, got a RoundRobinWriter"):
-        enter_layer(buffer, make_layer(0.3))
+        enter_stage(buffer, make_stage(0.3))

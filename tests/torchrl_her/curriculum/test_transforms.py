@@ -1,4 +1,4 @@
-"""What each layer sees and is rewarded for, run by run; TorchRL's list of tests for transforms."""
+"""What each stage sees and is rewarded for, run by run; TorchRL's list of tests for transforms."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_her import (
     Curriculum,
-    CurriculumLayer,
     CurriculumProgress,
+    CurriculumStage,
     GoalReward,
     HERWriter,
     StateToObs,
@@ -106,8 +106,8 @@ def make_three(threshold: float = 0.5) -> Curriculum:
     """a goes to b, then b to c, then c to d."""
     return Curriculum(
         [
-            CurriculumLayer(
-                name=f"layer {i}",
+            CurriculumStage(
+                name=f"stage {i}",
                 observation=range(i + 1),
                 achieved_goal=[i],
                 desired_goal=[i + 1],
@@ -120,20 +120,20 @@ def make_three(threshold: float = 0.5) -> Curriculum:
 
 
 def make_hand() -> Curriculum:
-    reach = CurriculumLayer(
+    reach = CurriculumStage(
         name="reach", observation=range(5), achieved_goal=[0, 1], desired_goal=[5, 6], threshold=0.06
     )
-    throw = CurriculumLayer(
+    throw = CurriculumStage(
         name="throw", observation=range(9), achieved_goal=[5, 6], desired_goal=[9, 10], threshold=0.1
     )
     return Curriculum([reach, throw], 11)
 
 
-def at(curriculum: Curriculum, *layers: int) -> CurriculumProgress:
-    """Progress of as many runs as layers are given."""
-    progress = CurriculumProgress(curriculum, runs=len(layers))
-    for run, layer in enumerate(layers):
-        progress.set_layer(run, layer)
+def at(curriculum: Curriculum, *stages: int) -> CurriculumProgress:
+    """Progress of as many runs as stages are given."""
+    progress = CurriculumProgress(curriculum, runs=len(stages))
+    for run, stage in enumerate(stages):
+        progress.set_stage(run, stage)
     return progress
 
 
@@ -141,8 +141,8 @@ def both(progress: CurriculumProgress) -> Compose:
     return Compose(StateToObs(progress.curriculum, progress), ZeroPad(progress.curriculum, progress))
 
 
-def wrap(env: EnvBase, *layers: int, threshold: float = 0.5) -> TransformedEnv:
-    return TransformedEnv(env, both(at(make_three(threshold), *layers)))
+def wrap(env: EnvBase, *stages: int, threshold: float = 0.5) -> TransformedEnv:
+    return TransformedEnv(env, both(at(make_three(threshold), *stages)))
 
 
 def act(env: EnvBase, actions: list[float]) -> TensorDictBase:
@@ -155,7 +155,7 @@ def act(env: EnvBase, actions: list[float]) -> TensorDictBase:
 # What is seen
 
 
-def test_each_run_sees_its_own_layer() -> None:
+def test_each_run_sees_its_own_stage() -> None:
     seen = wrap(TinyEnv((6,)), 1, 0, 2).reset()
     assert seen["observation"].tolist() == [
         [10, 20, 0],
@@ -178,10 +178,10 @@ def test_each_run_sees_its_own_layer() -> None:
     assert seen["state"][0].tolist() == [10, 20, 30, 40]  # stays
 
 
-@pytest.mark.parametrize("layer", [0, 1, 2])
-def test_runs_all_in_one_layer_see_what_they_see_in_a_mixture(layer: int) -> None:
-    alike = act(wrap(TinyEnv((4,)), layer, layer), [1.0, 2.0, 3.0, 4.0])
-    mixed = act(wrap(TinyEnv((4,)), layer, (layer + 1) % 3), [1.0, 2.0, 3.0, 4.0])
+@pytest.mark.parametrize("stage", [0, 1, 2])
+def test_runs_all_in_one_stage_see_what_they_see_in_a_mixture(stage: int) -> None:
+    alike = act(wrap(TinyEnv((4,)), stage, stage), [1.0, 2.0, 3.0, 4.0])
+    mixed = act(wrap(TinyEnv((4,)), stage, (stage + 1) % 3), [1.0, 2.0, 3.0, 4.0])
     assert (alike[:2] == mixed[:2]).all()
     assert (alike["input"][2:] != mixed["input"][2:]).any()
     assert {key: entry.dtype for key, entry in alike.items()} == {
@@ -196,25 +196,25 @@ def test_the_next_state_is_seen_too() -> None:
 
 
 def test_indices_need_not_be_in_order() -> None:
-    layer = CurriculumLayer(
+    stage = CurriculumStage(
         name="odd", observation=[3, 0], achieved_goal=[0, 3], desired_goal=[2, 1], threshold=1.0
     )
-    seen = TransformedEnv(TinyEnv(), both(at(Curriculum([layer], 4), 0))).reset()
+    seen = TransformedEnv(TinyEnv(), both(at(Curriculum([stage], 4), 0))).reset()
     assert seen["observation"].tolist() == [40, 10]
     assert seen["achieved_goal"].tolist() == [10, 40]
     assert seen["input"].tolist() == [40, 10, 30, 20]
 
 
-def test_a_change_of_layer_is_seen_at_once() -> None:
+def test_a_change_of_stage_is_seen_at_once() -> None:
     env = wrap(TinyEnv((2,)), 0, 0)
     assert env.reset()["observation"][:, 1].tolist() == [0, 0]
-    env.transform[0].progress.set_layer(1, 2)
+    env.transform[0].progress.set_stage(1, 2)
     assert env.reset()["observation"].tolist() == [[10, 0, 0], [1010, 1020, 1030]]
 
 
 @pytest.mark.parametrize("device", [None, "cpu"])
 @pytest.mark.parametrize("changed", [(1, 1), (0, 2)])
-def test_a_change_in_mid_episode_leaves_no_row_of_two_layers(
+def test_a_change_in_mid_episode_leaves_no_row_of_two_stages(
     changed: tuple[int, int], device: str | None
 ) -> None:
     env = wrap(TinyEnv((4,)), 0, 0, threshold=0.05)
@@ -232,8 +232,8 @@ def test_a_change_in_mid_episode_leaves_no_row_of_two_layers(
     assert not before["next", "done"].any()
     kept = collector.next()
     copy = kept.clone()
-    for run, layer in enumerate(changed):
-        progress.set_layer(run, layer)
+    for run, stage in enumerate(changed):
+        progress.set_stage(run, stage)
     after = collector.next().clone()
     collector.shutdown()
     assert (kept == copy).all()  # what was collected earlier stays as it is
@@ -245,7 +245,7 @@ def test_a_change_in_mid_episode_leaves_no_row_of_two_layers(
     for key in ("observation", "achieved_goal", "desired_goal", "input"):
         for name in (key, ("next", key)):
             assert torch.equal(after[name], expected[name]), name
-    cut = torch.tensor(changed).repeat_interleave(2) > 0  # layers that changed
+    cut = torch.tensor(changed).repeat_interleave(2) > 0  # stages that changed
     for flag in ("truncated", "done"):
         assert after["next", flag][:, 0, 0].tolist() == cut.tolist()
         assert not after["next", flag][:, 1:].any()
@@ -258,7 +258,7 @@ def test_a_change_in_mid_episode_leaves_no_row_of_two_layers(
 def test_environments_that_were_reset_after_a_change_are_not_cut() -> None:
     env = wrap(TinyEnv((4,)), 0, 0, threshold=0.05)
     seen = env.reset()
-    env.transform[0].progress.set_layer(1, 2)
+    env.transform[0].progress.set_stage(1, 2)
     half = torch.tensor([[False], [False], [True], [False]])
     seen = env.reset(seen.set("_reset", half))
     assert seen["observation"][:, 1].tolist() == [0, 0, 2020, 0]
@@ -266,7 +266,7 @@ def test_environments_that_were_reset_after_a_change_are_not_cut() -> None:
     after = env.step(seen)
     assert after["observation"][:, 1].tolist() == [0, 0, 2020, 3020]
     assert after["next", "truncated"].flatten().tolist() == [False, False, False, True]
-    env.transform[0].progress.set_layer(0, 1)
+    env.transform[0].progress.set_stage(0, 1)
     seen = env.reset()
     seen["action"] = torch.ones(4, 1)
     assert not env.step(seen)["next", "done"].any()
@@ -275,7 +275,7 @@ def test_environments_that_were_reset_after_a_change_are_not_cut() -> None:
 # Reward and ends
 
 
-def test_reward_and_ends_are_of_the_layer() -> None:
+def test_reward_and_ends_are_of_the_stage() -> None:
     near = [9.6, 10.0, 9.4]  # a is then 0.4, 0 and 0.6 from b
     after = act(wrap(TinyEnv((3,)), 0), near)
     assert after["reward"].flatten().tolist() == [0.0, 0.0, -1.0]
@@ -284,17 +284,17 @@ def test_reward_and_ends_are_of_the_layer() -> None:
     assert not after["truncated"].any()
 
 
-def test_each_run_has_the_threshold_of_its_layer() -> None:
-    # b is 10 from c: thresholds are 1.5 and 15 in layers 0 and 1; layer 2 is the environment's own task
+def test_each_run_has_the_threshold_of_its_stage() -> None:
+    # b is 10 from c: thresholds are 1.5 and 15 in stages 0 and 1; stage 2 is the environment's own task
     after = act(wrap(TinyEnv((6,)), 0, 1, 2, threshold=1.5), [0.0, 8.6, 0.0, 0.0, 0.0, 30.0])
     assert after["terminated"].flatten().tolist() == [False, True, True, True, False, True]
     after = act(wrap(TinyEnv((3,)), 2, 0, 1, threshold=0.5), [0.0, 9.0, 0.0])
     assert after["reward"].flatten().tolist() == [7.0, -1.0, -1.0]  # 0.5 < 1, 5 < 10
 
 
-def test_layers_below_have_the_rewards_that_they_are_given() -> None:
-    layers = [replace(layer, rewards=(-4.0, -1.5)) for layer in make_three().layers]
-    progress = at(Curriculum(layers, 4), 0, 2)
+def test_stages_below_have_the_rewards_that_they_are_given() -> None:
+    stages = [replace(stage, rewards=(-4.0, -1.5)) for stage in make_three().stages]
+    progress = at(Curriculum(stages, 4), 0, 2)
     env = TransformedEnv(TinyEnv((4,)), StateToObs(progress.curriculum, progress))
     assert act(env, [10.0, 0.0, 30.0, 0.0])["reward"].flatten().tolist() == [-1.5, -4.0, 7.0, 7.0]
 
@@ -319,7 +319,7 @@ def test_an_end_by_the_environments_own_goal_is_none() -> None:
 
 def test_the_time_limit_is_kept() -> None:
     env = wrap(TinyEnv((2,), horizon=1), 0)
-    after = act(env, [30.0, 10.0])  # the first achieves the environment's goal, the second the layer's
+    after = act(env, [30.0, 10.0])  # the first achieves the environment's goal, the second the stage's
     assert after["truncated"].flatten().tolist() == [True, True]
     assert after["terminated"].flatten().tolist() == [False, True]
     assert after["done"].flatten().tolist() == [True, True]
@@ -348,15 +348,15 @@ def test_a_step_counter_behind_ends_episodes() -> None:
 )
 @example([0.7] * 6, 0.7, (0, 1, 0))
 def test_rewards_agree_with_goal_reward_to_the_last_bit(
-    offsets: list[float], threshold: float, layers: tuple[int, int, int]
+    offsets: list[float], threshold: float, stages: tuple[int, int, int]
 ) -> None:
     env = TinyEnv((6,))
     env.start = torch.zeros(6, 4)
     env.start[:, 2] = 0.1
-    transformed = wrap(env, *layers, threshold=threshold)
+    transformed = wrap(env, *stages, threshold=threshold)
     after = act(transformed, offsets)
     for row in range(6):
-        reward, terminated = GoalReward(threshold * 10 ** layers[row // 2])(
+        reward, terminated = GoalReward(threshold * 10 ** stages[row // 2])(
             after["achieved_goal"][row], after["desired_goal"][row]
         )
         assert torch.equal(after["reward"][row], reward)
@@ -365,17 +365,17 @@ def test_rewards_agree_with_goal_reward_to_the_last_bit(
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 2), min_size=1, max_size=4), st.integers(1, 3), st.integers(0, 2), st.data())
-def test_another_runs_layer_never_touches_a_run(
-    layers: list[int], worlds: int, other: int, data: st.DataObject
+def test_another_runs_stage_never_touches_a_run(
+    stages: list[int], worlds: int, other: int, data: st.DataObject
 ) -> None:
-    runs = len(layers)
+    runs = len(stages)
     which = data.draw(st.integers(0, runs - 1))
-    changed = [other if run == which else layer for run, layer in enumerate(layers)]
+    changed = [other if run == which else stage for run, stage in enumerate(stages)]
     actions = torch.linspace(0.0, 12.0, runs * worlds).tolist()
-    one, two = (act(wrap(TinyEnv((runs * worlds,)), *own), actions) for own in (layers, changed))
+    one, two = (act(wrap(TinyEnv((runs * worlds,)), *own), actions) for own in (stages, changed))
     rest = torch.arange(runs * worlds) // worlds != which
     assert (one[rest] == two[rest]).all()
-    alone = act(wrap(TinyEnv((runs * worlds,)), *[other] * runs), actions)  # by the path for one layer
+    alone = act(wrap(TinyEnv((runs * worlds,)), *[other] * runs), actions)  # by the path for one stage
     assert (two[~rest] == alone[~rest]).all()
 
 
@@ -397,7 +397,7 @@ def test_the_hand_reaches_first() -> None:
         assert torch.equal(part["input"][2:], state[2:])
 
 
-def test_a_task_that_goes_on_at_its_goal_does_so_in_the_last_layer() -> None:
+def test_a_task_that_goes_on_at_its_goal_does_so_in_the_last_stage() -> None:
     """What a step gives is what it would give without the curriculum, also where the goal is near."""
     base, env = TinyEnv((3,)), wrap(TinyEnv((3,)), 2, threshold=100.0)
     for actions in ([0.0, 30.0, 31.0], [30.0, 0.0, -1.0]):
@@ -407,7 +407,7 @@ def test_a_task_that_goes_on_at_its_goal_does_so_in_the_last_layer() -> None:
         ).all()
 
 
-def test_the_last_layer_is_the_environment_itself() -> None:
+def test_the_last_stage_is_the_environment_itself() -> None:
     base, env = (make_env("hand_v2", num_envs=64, seed=3) for _ in range(2))
     transformed = TransformedEnv(env, StateToObs(make := make_hand(), at(make, 1, 1)))
     torch.manual_seed(0)
@@ -430,9 +430,9 @@ def test_specs(batch: tuple[int, ...]) -> None:
     assert env.full_reward_spec["reward"].shape == (*batch, 1)
 
 
-@pytest.mark.parametrize("layers", [(0, 0), (0, 1), (1, 1)])
-def test_specs_of_the_hand(layers: tuple[int, int]) -> None:
-    check_env_specs(TransformedEnv(make_env("hand_v1", num_envs=4), both(at(make_hand(), *layers))))
+@pytest.mark.parametrize("stages", [(0, 0), (0, 1), (1, 1)])
+def test_specs_of_the_hand(stages: tuple[int, int]) -> None:
+    check_env_specs(TransformedEnv(make_env("hand_v1", num_envs=4), both(at(make_hand(), *stages))))
 
 
 def test_float64_stays() -> None:
@@ -453,7 +453,7 @@ def test_inside_of_a_serial_env() -> None:
     progress = at(make_three(), 1)
     env = SerialEnv(2, lambda: TransformedEnv(TinyEnv((2,)), both(progress)))
     check_env_specs(env)
-    progress.set_layer(0, 2)  # one process: its environments follow
+    progress.set_stage(0, 2)  # one process: its environments follow
     assert env.reset()["observation"][1].tolist() == [[10, 20, 30], [1010, 1020, 1030]]
 
 
@@ -467,7 +467,7 @@ def test_around_a_serial_env() -> None:
 
 @pytest.fixture(scope="module")
 def parallel_env() -> Iterator[ParallelEnv]:
-    """Two workers, each with transforms inside in the first layer."""
+    """Two workers, each with transforms inside in the first stage."""
     server()  # so that they need not import torch
     make = partial(make_env, "hand_v1", num_envs=2)
     env = ParallelEnv(
@@ -559,11 +559,11 @@ def test_in_a_replay_buffer() -> None:
         assert torch.equal(part["input"][:, :2], part["observation"][:, :2])
         assert torch.equal(part["input"][:, 2:3], part["desired_goal"])
         assert (part["input"][:, 3] == 0).all()
-    progress.set_layer(1, 2)
+    progress.set_stage(1, 2)
     sample = buffer.sample()
     assert torch.equal(sample["input"], torch.cat((sample["observation"], sample["desired_goal"]), -1))
-    progress.set_layer(0, 2)  # another run's
-    progress.set_layer(1, 0)
+    progress.set_stage(0, 2)  # another run's
+    progress.set_stage(1, 0)
     assert (buffer.sample()["input"][:, 2:] == 0).all()
 
 
@@ -577,27 +577,27 @@ def test_rows_of_one_run_may_have_any_shape(shape: tuple[int, ...]) -> None:
     assert flat["input"][0].tolist() == [1, 100, 0, 0]
 
 
-@pytest.mark.parametrize("layers", [(0, 0), (0, 2)])
-def test_no_rows(layers: tuple[int, int]) -> None:
-    progress = at(make_three(), *layers)
+@pytest.mark.parametrize("stages", [(0, 0), (0, 2)])
+def test_no_rows(stages: tuple[int, int]) -> None:
+    progress = at(make_three(), *stages)
     assert ZeroPad(progress.curriculum, progress)(make_rows(0))["input"].shape == (0, 4)
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 2), min_size=1, max_size=4), st.integers(1, 4), st.integers(1, 3))
-def test_inputs_by_the_book(layers: list[int], worlds: int, steps: int) -> None:
-    progress = at(make_three(), *layers)
-    shape = (len(layers) * worlds, steps)
+def test_inputs_by_the_book(stages: list[int], worlds: int, steps: int) -> None:
+    progress = at(make_three(), *stages)
+    shape = (len(stages) * worlds, steps)
     rows = make_rows(shape[0] * steps, shape)
     out = ZeroPad(progress.curriculum, progress)(rows)["input"]
     for i in range(shape[0]):
         for t in range(steps):
-            n = layers[i // worlds] + 1
+            n = stages[i // worlds] + 1
             expected = [*rows["observation"][i, t, :n].tolist(), *rows["desired_goal"][i, t].tolist()]
             assert out[i, t].tolist() == expected + [0.0] * (3 - n)
 
 
-def test_what_lies_behind_a_layers_entries_is_not_seen() -> None:
+def test_what_lies_behind_a_stages_entries_is_not_seen() -> None:
     progress = at(make_three(), 0, 1)  # rows whose observation is not padded with zeros
     assert ZeroPad(progress.curriculum, progress)(make_rows(2))["input"].tolist() == [
         [1, 100, 0, 0],
@@ -625,7 +625,7 @@ def test_inverse() -> None:
 def test_clones_follow_the_same_progress() -> None:
     progress = at(make_three(), 0)
     clones = [transform.clone() for transform in both(progress)]
-    progress.set_layer(0, 1)
+    progress.set_stage(0, 1)
     assert TransformedEnv(TinyEnv(), Compose(*clones)).reset()["input"].tolist() == [10, 20, 30, 0]
 
 
@@ -669,7 +669,7 @@ def test_nested_keys() -> None:
 
 
 def test_batches_that_are_no_blocks_are_refused() -> None:
-    # Also while all runs are in one layer: it must not come out at the first change
+    # Also while all runs are in one stage: it must not come out at the first change
     for batch in ((), (3,), (3, 2)):
         with pytest.raises(ValueError, match=r"must be 2 equal blocks, one for each run, got a batch of \["):
             wrap(TinyEnv(batch), 0, 0).reset()
@@ -721,11 +721,11 @@ def test_columns_of_blocks() -> None:
     assert take_columns(rows, torch.tensor([[2, 0], [1, 1]])).tolist() == [[2, 0], [5, 3], [7, 7], [10, 10]]
 
 
-# Downstream: hindsight in a layer
+# Downstream: hindsight in a stage
 
 
 def collect_and_write(exclude: tuple[str, ...]) -> tuple[CurriculumProgress, list[TensorDictReplayBuffer]]:
-    """Two runs, in layers 0 and 1 of the hand, each with a buffer of its own."""
+    """Two runs, in stages 0 and 1 of the hand, each with a buffer of its own."""
     progress = at(make_hand(), 0, 1)
     env = TransformedEnv(make_env("hand_v1", num_envs=8, seed=0), both(progress))
     collector = Collector(
@@ -737,7 +737,7 @@ def collect_and_write(exclude: tuple[str, ...]) -> tuple[CurriculumProgress, lis
     )
     buffers = []
     for run in range(2):
-        writer = HERWriter(GoalReward(progress.layer_of(run).threshold), k=4, exclude=exclude)
+        writer = HERWriter(GoalReward(progress.stage_of(run).threshold), k=4, exclude=exclude)
         buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(5000), writer=writer, batch_size=256)
         buffer.set_rng(torch.Generator().manual_seed(run))
         buffers.append(buffer)
@@ -747,7 +747,7 @@ def collect_and_write(exclude: tuple[str, ...]) -> tuple[CurriculumProgress, lis
     return progress, buffers
 
 
-def test_rows_of_a_layer_have_its_goals() -> None:
+def test_rows_of_a_stage_have_its_goals() -> None:
     _, (reach, throw) = collect_and_write(("state", "input"))
     for buffer, achieved in ((reach, slice(0, 2)), (throw, slice(5, 7))):
         rows = buffer[:]
@@ -797,15 +797,15 @@ def test_an_input_that_was_stored_is_replaced() -> None:
 # Environments that cannot go on after an end of their own
 
 
-def wrap_ending(*layers: int, threshold: float = 0.5) -> TransformedEnv:
-    progress = at(make_three(threshold), *layers)
+def wrap_ending(*stages: int, threshold: float = 0.5) -> TransformedEnv:
+    progress = at(make_three(threshold), *stages)
     return TransformedEnv(
         TinyEnv((2,)), StateToObs(progress.curriculum, progress, continues_after_termination=False)
     )
 
 
-def test_an_end_of_the_environment_cuts_the_layer_s_episode_off() -> None:
-    """World 0 moves from 10 to 40, its own goal; the layer's goal is 20."""
+def test_an_end_of_the_environment_cuts_the_stage_s_episode_off() -> None:
+    """World 0 moves from 10 to 40, its own goal; the stage's goal is 20."""
     after = act(wrap_ending(0), [30.0, 0.0])
     assert after["terminated"].flatten().tolist() == [False, False]
     assert after["truncated"].flatten().tolist() == [True, False]
@@ -813,14 +813,14 @@ def test_an_end_of_the_environment_cuts_the_layer_s_episode_off() -> None:
     assert after["reward"].flatten().tolist() == [-1.0, -1.0]
 
 
-def test_where_the_layer_s_goal_is_achieved_as_well_its_episode_is_terminated() -> None:
+def test_where_the_stage_s_goal_is_achieved_as_well_its_episode_is_terminated() -> None:
     after = act(wrap_ending(0, threshold=21.0), [30.0, 0.0])  # 40 is 20 away from 20
     assert after["terminated"].flatten().tolist() == [True, True]
     assert after["truncated"].flatten().tolist() == [False, False]
     assert after["reward"].flatten().tolist() == [0.0, 0.0]
 
 
-def test_where_the_environment_can_go_on_so_does_the_layer() -> None:
+def test_where_the_environment_can_go_on_so_does_the_stage() -> None:
     after = act(wrap(TinyEnv((2,)), 0), [30.0, 0.0])
     assert after["done"].flatten().tolist() == [False, False]
 

@@ -1,4 +1,4 @@
-"""Demonstrations as a run sees them: its reward and ends, and the layers of its curriculum."""
+"""Demonstrations as a run sees them: its reward and ends, and the stages of its curriculum."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
-from torchrl_her import Curriculum, CurriculumLayer, CurriculumProgress, EnvReward, GoalReward, StateToObs
-from torchrl_her.demonstrations import Demonstrations, demonstrate, in_layer, with_reward
+from torchrl_her import Curriculum, CurriculumProgress, CurriculumStage, EnvReward, GoalReward, StateToObs
+from torchrl_her.demonstrations import Demonstrations, demonstrate, in_stage, with_reward
 from torchrl_her_envs import make_controller, make_env
 
 from .walks import walks
@@ -57,23 +57,23 @@ def test_what_was_recorded_stays_as_it_was() -> None:
     assert own.digest == before
 
 
-# Layers
+# Stages
 
 
 def curriculum() -> Curriculum:
     env = make_env("hand_v1")
-    return Curriculum([CurriculumLayer(**layer) for layer in env.layers()], 11)
+    return Curriculum([CurriculumStage(**stage) for stage in env.stages()], 11)
 
 
-@pytest.mark.parametrize("layer", [0, 1])
-def test_a_layer_shows_what_its_environments_show(layer: int) -> None:
-    """The actions of demonstrations, played in environments of the layer, give the same rows."""
+@pytest.mark.parametrize("stage", [0, 1])
+def test_a_stage_shows_what_its_environments_show(stage: int) -> None:
+    """The actions of demonstrations, played in environments of the stage, give the same rows."""
     env = make_env("hand_v1", num_envs=6, seed=3)
     recorded = demonstrate(env, make_controller(env), max_steps=50, task="hand_v1")
-    own = in_layer(recorded, curriculum(), layer)
-    progress = CurriculumProgress(layers := curriculum())
-    progress.set_layer(0, layer)
-    shown = TransformedEnv(make_env("hand_v1", num_envs=6, seed=3), StateToObs(layers, progress))
+    own = in_stage(recorded, curriculum(), stage)
+    progress = CurriculumProgress(stages := curriculum())
+    progress.set_stage(0, stage)
+    shown = TransformedEnv(make_env("hand_v1", num_envs=6, seed=3), StateToObs(stages, progress))
     step, alive = shown.reset(), torch.ones(6, dtype=torch.bool)
     for t in range(int(own.lengths.max())):
         row = own.begins + t
@@ -90,20 +90,20 @@ def test_a_layer_shows_what_its_environments_show(layer: int) -> None:
         assert torch.equal(alive & (t + 1 == own.lengths), alive & ended)
         step = shown.step_mdp(step)
     assert own.achieved.all()
-    assert (own.lengths < recorded.lengths).all() == (layer == 0)
+    assert (own.lengths < recorded.lengths).all() == (stage == 0)
 
 
 def test_the_full_task_is_what_was_recorded() -> None:
     env = make_env("hand_v1", num_envs=3, seed=3)
     recorded = demonstrate(env, make_controller(env), max_steps=50, task="hand_v1")
-    own = in_layer(recorded, curriculum(), 1)
+    own = in_stage(recorded, curriculum(), 1)
     assert own.lengths.tolist() == recorded.lengths.tolist()
     assert (own.rows == recorded.rows).all()
 
 
 def test_a_state_of_another_width_is_refused() -> None:
     with pytest.raises(ValueError, match="needs states of width 11, demonstrations of walk have 2"):
-        in_layer(walks(3), curriculum(), 0)
+        in_stage(walks(3), curriculum(), 0)
 
 
 def test_episodes_of_an_environment_without_states_have_none() -> None:

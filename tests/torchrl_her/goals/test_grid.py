@@ -244,8 +244,8 @@ def test_bad_sigmas_are_named(sigma: Any) -> None:
     ],
 )
 def test_boxes_without_a_volume_are_named(low: Any, high: Any) -> None:
-    with pytest.raises(ValueError, match=r"^layer 1: the box of goals needs a volume.*got low=\(0.[19]"):
-        box_target(SCREEN, low, high, 0.2, name="layer 1")
+    with pytest.raises(ValueError, match=r"^stage 1: the box of goals needs a volume.*got low=\(0.[19]"):
+        box_target(SCREEN, low, high, 0.2, name="stage 1")
     with pytest.raises(ValueError, match="^the box of goals"):
         box_target(SCREEN, low, high, 0.2)
 

@@ -14,16 +14,16 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import (
-    CurriculumLayer,
+    CurriculumStage,
     GoalGrid,
     GoalReward,
     GoalWeights,
     HERWriter,
     Instructiveness,
     box_target,
-    enter_layer,
+    enter_stage,
 )
-from torchrl_her.curriculum import set_layer_goals
+from torchrl_her.curriculum import set_stage_goals
 from torchrl_her.goals import KernelInstructiveness
 from torchrl_her.trainers import load_checkpoint, save_checkpoint
 
@@ -285,8 +285,8 @@ def test_the_writer_prefers_goals_near_the_real_ones_in_15_dimensions() -> None:
     assert max(divergences[1:]) < 0.7 * divergences[0]
 
 
-def make_layer(*, instructive: bool) -> CurriculumLayer:
-    return CurriculumLayer(
+def make_stage(*, instructive: bool) -> CurriculumStage:
+    return CurriculumStage(
         name="one",
         observation=[0],
         achieved_goal=[0],
@@ -296,16 +296,16 @@ def make_layer(*, instructive: bool) -> CurriculumLayer:
     )
 
 
-def test_a_layer_of_a_curriculum_turns_it_off_and_starts_sigma_anew() -> None:
+def test_a_stage_of_a_curriculum_turns_it_off_and_starts_sigma_anew() -> None:
     weights = KernelInstructiveness(PAIR, sigma=0.5)
     buffer = make_buffer(weights)
     weights.step()
     weights.update(PAIR)
-    set_layer_goals(buffer.writer, make_layer(instructive=False))
+    set_stage_goals(buffer.writer, make_stage(instructive=False))
     assert weights.alike
-    weights.update(torch.zeros(4, 3))  # a layer's goals may have another width
+    weights.update(torch.zeros(4, 3))  # a stage's goals may have another width
     assert weights.written == 2
-    enter_layer(buffer, make_layer(instructive=True))
+    enter_stage(buffer, make_stage(instructive=True))
     assert not weights.alike
     assert (weights.written, weights.sigma) == (0, 1.5)
     with pytest.raises(ValueError, match="real goals have 1 numbers, got goals of 3"):

@@ -41,7 +41,7 @@ OTHERS = {
     "trajectory_key": "path",
     "env_ids_key": "who",
     "real_goal_key": ("goals", "real"),
-    "layer_key": "stage",
+    "stage_key": "phase",
     "virtual_key": None,
 }
 

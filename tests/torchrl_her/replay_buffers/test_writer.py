@@ -537,8 +537,8 @@ def test_padded_trajectories_are_refused() -> None:
 
 
 @pytest.mark.parametrize("unit", [False, True])
-def test_rows_of_several_layers_are_refused_where_one_reward_relabels_them(unit: bool) -> None:
-    batch = make_batch([[3]]).set("layer", torch.zeros(1, 3, 1, dtype=torch.int64))
+def test_rows_of_several_stages_are_refused_where_one_reward_relabels_them(unit: bool) -> None:
+    batch = make_batch([[3]]).set("stage", torch.zeros(1, 3, 1, dtype=torch.int64))
     if unit:
         hindsight = HERSampleUnit(REWARD)
         storage = LazyTensorStorage(10)
@@ -549,9 +549,9 @@ def test_rows_of_several_layers_are_refused_where_one_reward_relabels_them(unit:
         refused = buffer.sample
     else:
         refused = partial(make_buffer().extend, batch)
-    with pytest.raises(ValueError, match=r"carry their layer \('layer'\).* HERWriter\(layers=\[...\]\)"):
+    with pytest.raises(ValueError, match=r"carry their stage \('stage'\).* HERWriter\(stages=\[...\]\)"):
         refused()
-    make_buffer(layer_key="floor").extend(batch)
+    make_buffer(stage_key="floor").extend(batch)
     make_buffer(k=0).extend(batch)
 
 

@@ -1,4 +1,4 @@
-"""Orders of layers by name: the options of each, whose makers are in :mod:`..components.curricula`."""
+"""Orders of stages by name: the options of each, whose makers are in :mod:`..components.curricula`."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _MAKERS = "torchrl_her_recipes.components.curricula"
 
 @dataclass(frozen=True, kw_only=True)
 class Order(Choice):
-    """Order in which the layers of a curriculum are learned.
+    """Order in which the stages of a curriculum are learned.
 
     The maker takes the options and the :class:`~torchrl_her.Curriculum`, and by keyword ``runs`` and
     ``generators`` (of random numbers, one for each run). It returns the
-    :class:`~torchrl_her.CurriculumProgress` of the runs, or :class:`~torchrl_her.curriculum.EpisodeLayers` if
-    each episode has a layer of its own; with a true option ``every_layer``, transitions are then stored for
-    every layer. A run that begins a layer explores with the epsilon of the option
-    ``layer_epsilon``, or with 1 if the order has no such option.
+    :class:`~torchrl_her.CurriculumProgress` of the runs, or :class:`~torchrl_her.curriculum.EpisodeStages` if
+    each episode has a stage of its own; with a true option ``every_stage``, transitions are then stored for
+    every stage. A run that begins a stage explores with the epsilon of the option
+    ``stage_epsilon``, or with 1 if the order has no such option.
     """
 
 
@@ -29,35 +29,35 @@ ORDER = Kind("order", Order, default="threshold")
 @ORDER.register
 @dataclass(frozen=True, kw_only=True)
 class Threshold(Order):
-    """Trains layer after layer, each until it is learned."""
+    """Trains stage after stage, each until it is learned."""
 
     name = "threshold"
     maker = f"{_MAKERS}:make_threshold"
 
-    window: int = option(20, "a layer ends by the mean success of this many greedy episodes", at_least=1)
-    success_threshold: float = option(0.9, "mean success at which a layer ends", above=0, at_most=1)
-    layer_epochs: int = option(0, "epochs after which a layer ends, learned or not; 0 for never", at_least=0)
-    layer_epsilon: float = option(1.0, "epsilon of exploration when a layer begins", at_least=0, at_most=1)
+    window: int = option(20, "a stage ends by the mean success of this many greedy episodes", at_least=1)
+    success_threshold: float = option(0.9, "mean success at which a stage ends", above=0, at_most=1)
+    stage_epochs: int = option(0, "epochs after which a stage ends, learned or not; 0 for never", at_least=0)
+    stage_epsilon: float = option(1.0, "epsilon of exploration when a stage begins", at_least=0, at_most=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _ByEpisode(Order):
-    every_layer: bool = option(
-        False, "whether a transition is stored for every layer, not for that of its episode alone"
+    every_stage: bool = option(
+        False, "whether a transition is stored for every stage, not for that of its episode alone"
     )
 
 
 @ORDER.register
 @dataclass(frozen=True, kw_only=True)
 class AllAtOnce(_ByEpisode):
-    """Each episode is played in any of the layers."""
+    """Each episode is played in any of the stages."""
 
     name = "all_at_once"
     maker = f"{_MAKERS}:make_all_at_once"
 
     task_share: float | None = option(
         None,
-        "share of the episodes that are played in the last layer; all layers alike if None",
+        "share of the episodes that are played in the last stage; all stages alike if None",
         at_least=0,
         at_most=1,
     )
@@ -66,17 +66,17 @@ class AllAtOnce(_ByEpisode):
 @ORDER.register
 @dataclass(frozen=True, kw_only=True)
 class Teacher(_ByEpisode):
-    """Episodes prefer layers whose success changes (Matiisen et al., 2017)."""
+    """Episodes prefer stages whose success changes (Matiisen et al., 2017)."""
 
     name = "teacher_student"
     maker = f"{_MAKERS}:make_teacher"
 
     progress_memory: float = option(
-        200.0, "episodes of a layer after which one counts 1 / e of what it counted at first", above=0
+        200.0, "episodes of a stage after which one counts 1 / e of what it counted at first", above=0
     )
     even_share: float = option(
-        0.2, "share of the episodes that are drawn from all layers alike", above=0, at_most=1
+        0.2, "share of the episodes that are drawn from all stages alike", above=0, at_most=1
     )
     least_progress: float = option(
-        0.02, "added to the change of each layer's success, so that chance alone prefers none", above=0
+        0.02, "added to the change of each stage's success, so that chance alone prefers none", above=0
     )

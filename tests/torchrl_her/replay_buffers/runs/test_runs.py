@@ -292,7 +292,7 @@ def test_emptying_a_run_empties_it_alone(weights: str) -> None:
 
 
 def test_runs_relabel_with_rewards_and_weights_of_their_own() -> None:
-    """As in a curriculum, where runs are in several layers."""
+    """As in a curriculum, where runs are in several stages."""
     options: dict[str, Any] = {"filter_achieved": True, "weights": "ibs"}
     together = make_buffer(range(RUNS), **options)
     alone = [make_buffer(range(run, run + 1), **options) for run in range(RUNS)]

@@ -1,4 +1,4 @@
-"""Layers and their checks, when a layer ends, and what the unused inputs of a network do."""
+"""Stages and their checks, when a stage ends, and what the unused inputs of a network do."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from torchrl_her import Curriculum, CurriculumLayer, CurriculumProgress
+from torchrl_her import Curriculum, CurriculumProgress, CurriculumStage
 from torchrl_her.curriculum import zero_unused_inputs
 from torchrl_her.modules import ActorNet, CriticNet
 
 
-def make_layer(name: str = "one", **options: Any) -> CurriculumLayer:
-    return CurriculumLayer(
+def make_stage(name: str = "one", **options: Any) -> CurriculumStage:
+    return CurriculumStage(
         **{
             "name": name,
             "observation": [0, 1],
@@ -36,8 +36,8 @@ def make_three(threshold: float = 0.5) -> Curriculum:
     """State [a, b, c, d]: a goes to b, then b to c, then c to d."""
     return Curriculum(
         [
-            make_layer(
-                f"layer {i}",
+            make_stage(
+                f"stage {i}",
                 observation=range(i + 1),
                 achieved_goal=[i],
                 desired_goal=[i + 1],
@@ -49,12 +49,12 @@ def make_three(threshold: float = 0.5) -> Curriculum:
     )
 
 
-# Layers
+# Stages
 
 
 def test_widths_and_indices_of_the_hand() -> None:
-    reach = make_layer("reach", observation=range(5), achieved_goal=[0, 1], desired_goal=[5, 6])
-    throw = make_layer("throw", observation=range(9), achieved_goal=[5, 6], desired_goal=[9, 10])
+    reach = make_stage("reach", observation=range(5), achieved_goal=[0, 1], desired_goal=[5, 6])
+    throw = make_stage("throw", observation=range(9), achieved_goal=[5, 6], desired_goal=[9, 10])
     curriculum = Curriculum([reach, throw], 11)
     assert len(curriculum) == 2
     assert (curriculum.observation_width, curriculum.goal_width, curriculum.input_width) == (9, 2, 11)
@@ -69,7 +69,7 @@ def test_widths_and_indices_of_the_hand() -> None:
     ]
 
 
-def test_inputs_keep_their_meaning_from_layer_to_layer() -> None:
+def test_inputs_keep_their_meaning_from_stage_to_stage() -> None:
     curriculum = make_three()
     state = torch.cat((torch.tensor([10.0, 20.0, 30.0, 40.0]), torch.zeros(1)))
     inputs = []
@@ -81,53 +81,53 @@ def test_inputs_keep_their_meaning_from_layer_to_layer() -> None:
 
 def test_names_stand_for_indices() -> None:
     names = {"hand": [0, 1, 2], "ball": [3, 4], "hole": [5, 6]}
-    reach = make_layer("reach", observation="hand", achieved_goal=[0, 1], desired_goal="ball")
-    throw = make_layer("throw", observation=["hand", 3, 4], achieved_goal=["ball"], desired_goal="hole")
-    first, last = Curriculum([reach, throw], 7, names=names).layers
+    reach = make_stage("reach", observation="hand", achieved_goal=[0, 1], desired_goal="ball")
+    throw = make_stage("throw", observation=["hand", 3, 4], achieved_goal=["ball"], desired_goal="hole")
+    first, last = Curriculum([reach, throw], 7, names=names).stages
     assert (first.observation, first.achieved_goal, first.desired_goal) == ((0, 1, 2), (0, 1), (3, 4))
     assert (last.observation, last.achieved_goal, last.desired_goal) == ((0, 1, 2, 3, 4), (3, 4), (5, 6))
 
 
-def test_a_layer_keeps_what_it_is_given() -> None:
-    layer = Curriculum([make_layer(threshold=0.25, instructive=False)], 3).layers[0]
-    assert (layer.name, layer.threshold, layer.instructive) == ("one", 0.25, False)
-    assert make_layer().instructive
+def test_a_stage_keeps_what_it_is_given() -> None:
+    stage = Curriculum([make_stage(threshold=0.25, instructive=False)], 3).stages[0]
+    assert (stage.name, stage.threshold, stage.instructive) == ("one", 0.25, False)
+    assert make_stage().instructive
     with pytest.raises(AttributeError, match="cannot assign"):
-        layer.threshold = 1.0  # type: ignore[misc]
+        stage.threshold = 1.0  # type: ignore[misc]
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"threshold": 0.0}, r"layer 'one': threshold must be positive and finite, got 0.0"),
+        ({"threshold": 0.0}, r"stage 'one': threshold must be positive and finite, got 0.0"),
         ({"threshold": -1.0}, r"got -1.0"),
         ({"threshold": math.nan}, r"got nan"),
         ({"threshold": math.inf}, r"got inf"),
-        ({"observation": []}, r"layer 'one': observation must not be empty"),
-        ({"desired_goal": [-1]}, r"layer 'one': desired_goal must have indices of at least 0, got \(-1,\)"),
-        ({"observation": [0, 1, 0]}, r"layer 'one': observation must have each index once, got \(0, 1, 0\)"),
-        ({"desired_goal": [1]}, r"layer 'one': desired_goal must share no index with observation, got \[1\]"),
+        ({"observation": []}, r"stage 'one': observation must not be empty"),
+        ({"desired_goal": [-1]}, r"stage 'one': desired_goal must have indices of at least 0, got \(-1,\)"),
+        ({"observation": [0, 1, 0]}, r"stage 'one': observation must have each index once, got \(0, 1, 0\)"),
+        ({"desired_goal": [1]}, r"stage 'one': desired_goal must share no index with observation, got \[1\]"),
         (
             {"observation": [1], "desired_goal": [0]},
-            r"layer 'one': desired_goal must share no index with achieved_goal, got \[0\]",
+            r"stage 'one': desired_goal must share no index with achieved_goal, got \[0\]",
         ),
-        ({"desired_goal": [2, 3]}, r"layer 'one': .* of one width, got \(0,\) and \(2, 3\)"),
-        ({"constant_goal": [0.5]}, r"layer 'one': give desired_goal or constant_goal, got both"),
+        ({"desired_goal": [2, 3]}, r"stage 'one': .* of one width, got \(0,\) and \(2, 3\)"),
+        ({"constant_goal": [0.5]}, r"stage 'one': give desired_goal or constant_goal, got both"),
         ({"desired_goal": [], "constant_goal": [math.nan]}, r"constant_goal must be finite, got \(nan,\)"),
         ({"desired_goal": [], "constant_goal": [1.0, 2.0]}, r"of one width, got \(0,\) and \(1.0, 2.0\)"),
-        ({"desired_goal": []}, r"layer 'one': desired_goal must not be empty"),
+        ({"desired_goal": []}, r"stage 'one': desired_goal must not be empty"),
     ],
 )
-def test_bad_layers_are_named(options: dict[str, Any], message: str) -> None:
+def test_bad_stages_are_named(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        make_layer(**options)
+        make_stage(**options)
 
 
 def test_a_stage_may_have_a_constant_goal() -> None:
-    gap = CurriculumLayer(
+    gap = CurriculumStage(
         name="gap", observation=[0, 1], achieved_goal=[0, 1], constant_goal=[5.0, 8.5], threshold=0.5
     )
-    cross = CurriculumLayer(
+    cross = CurriculumStage(
         name="cross", observation=[0, 1], achieved_goal=[0, 1], desired_goal=[2, 3], threshold=0.5
     )
     curriculum = Curriculum([gap, cross], 4)
@@ -142,37 +142,37 @@ def test_a_stage_may_have_a_constant_goal() -> None:
 
 def test_indices_must_be_whole_numbers() -> None:
     with pytest.raises(TypeError, match="float"):
-        make_layer(observation=[0.5])
+        make_stage(observation=[0.5])
 
 
 @pytest.mark.parametrize(
-    ("layers", "message"),
+    ("stages", "message"),
     [
-        ([], r"at least one layer, got none"),
-        ([make_layer(desired_goal=[], constant_goal=[1.0])], r"'one': .* its goal must not be constant"),
-        ([make_layer(desired_goal=[9])], r"layer 'one': desired_goal has index 9, .* at most 4 is allowed"),
+        ([], r"at least one stage, got none"),
+        ([make_stage(desired_goal=[], constant_goal=[1.0])], r"'one': .* its goal must not be constant"),
+        ([make_stage(desired_goal=[9])], r"stage 'one': desired_goal has index 9, .* at most 4 is allowed"),
         (
-            [make_layer("a", observation=[0, 1, 4]), make_layer("b")],
-            r"layer 'a': observation and goal have 4 entries, but .* last one, 'b', with 3",
+            [make_stage("a", observation=[0, 1, 4]), make_stage("b")],
+            r"stage 'a': observation and goal have 4 entries, but .* last one, 'b', with 3",
         ),
         (
-            [make_layer("a"), make_layer("b", achieved_goal=[0, 1], desired_goal=[2, 3])],
-            r"layer 'a': the goal has 1 entries, but .* as the last one, 'b': 2",
+            [make_stage("a"), make_stage("b", achieved_goal=[0, 1], desired_goal=[2, 3])],
+            r"stage 'a': the goal has 1 entries, but .* as the last one, 'b': 2",
         ),
-        ([make_layer("a", observation="arm")], r"layer 'a': .* unknown name 'arm'; known are 'hand', 'hole'"),
-        # What a layer of names hides until the names are resolved
-        ([make_layer("a", desired_goal="hand")], r"layer 'a': .* share no index with observation, got \[0\]"),
-        ([make_layer("a", observation=["hand", 0])], r"layer 'a': .* each index once, got \(0, 0\)"),
-        ([make_layer("a", desired_goal="hole")], r"layer 'a': .* of one width, got \(0,\) and \(2, 3\)"),
+        ([make_stage("a", observation="arm")], r"stage 'a': .* unknown name 'arm'; known are 'hand', 'hole'"),
+        # What a stage of names hides until the names are resolved
+        ([make_stage("a", desired_goal="hand")], r"stage 'a': .* share no index with observation, got \[0\]"),
+        ([make_stage("a", observation=["hand", 0])], r"stage 'a': .* each index once, got \(0, 0\)"),
+        ([make_stage("a", desired_goal="hole")], r"stage 'a': .* of one width, got \(0,\) and \(2, 3\)"),
     ],
 )
-def test_bad_curricula_are_named(layers: list[CurriculumLayer], message: str) -> None:
+def test_bad_curricula_are_named(stages: list[CurriculumStage], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Curriculum(layers, 5, names={"hand": [0], "hole": [2, 3]})
+        Curriculum(stages, 5, names={"hand": [0], "hole": [2, 3]})
 
 
-def test_a_layer_may_be_as_wide_as_the_last_one() -> None:
-    curriculum = Curriculum([make_layer("a"), make_layer("b", desired_goal=[3])], 4)
+def test_a_stage_may_be_as_wide_as_the_last_one() -> None:
+    curriculum = Curriculum([make_stage("a"), make_stage("b", desired_goal=[3])], 4)
     assert curriculum.first_inputs == curriculum.input_width == 3
 
 
@@ -199,13 +199,13 @@ def test_the_defaults_of_the_thesis() -> None:
 def test_only_a_full_window_counts() -> None:
     progress = make_progress()
     assert not progress.record_run(0, flags("111"))
-    assert progress.layers == (0,)
+    assert progress.stages == (0,)
     assert progress.record_run(0, flags("0"))
-    assert progress.layers == (1,)
+    assert progress.stages == (1,)
 
 
-def test_a_layer_ends_after_some_evaluations_at_the_latest() -> None:
-    curriculum = Curriculum([make_layer("a"), make_layer("b")], 5)
+def test_a_stage_ends_after_some_evaluations_at_the_latest() -> None:
+    curriculum = Curriculum([make_stage("a"), make_stage("b")], 5)
     progress = CurriculumProgress(curriculum, runs=2, window=2, patience=3)
     poor = torch.tensor([[0.0], [0.5]])
     assert progress.record(poor).tolist() == progress.record(poor).tolist() == [False, False]
@@ -213,7 +213,7 @@ def test_a_layer_ends_after_some_evaluations_at_the_latest() -> None:
     again.load_state_dict(progress.state_dict())
     assert again.evaluations == [2, 2]
     assert again.record(poor).tolist() == [True, True]
-    assert (again.layers, again.evaluations) == ((1, 1), [0, 0])
+    assert (again.stages, again.evaluations) == ((1, 1), [0, 0])
     assert [again.record(poor).tolist() for _ in range(4)] == 4 * [[False, False]]  # the last one has no end
 
 
@@ -229,37 +229,37 @@ def test_the_window_is_cleared_at_a_change() -> None:
     assert progress.record_run(0, flags("1111"))
     assert progress.successes == [[]]
     assert not progress.record_run(0, flags("111"))  # with an old sample it would be full
-    assert progress.layers == (1,)
+    assert progress.stages == (1,)
 
 
-def test_samples_behind_the_end_of_a_layer_are_dropped() -> None:
+def test_samples_behind_the_end_of_a_stage_are_dropped() -> None:
     progress = make_progress()
     assert progress.record_run(0, flags("1" * 40))
-    assert progress.layers == (1,)  # a call ends one layer
+    assert progress.stages == (1,)  # a call ends one stage
     assert progress.successes == [[]]
 
 
-def test_a_layer_ends_at_its_first_full_window_within_a_call() -> None:
+def test_a_stage_ends_at_its_first_full_window_within_a_call() -> None:
     progress = make_progress()
     assert progress.record_run(0, flags("1111" + "0000"))  # as sample by sample
 
 
-def test_layers_are_counted_from_the_data() -> None:
+def test_stages_are_counted_from_the_data() -> None:
     progress = make_progress()
     moved = [progress.record_run(0, flags("1111")) for _ in range(4)]
     assert moved == [True, True, False, False]
-    assert progress.layers == (2,)
+    assert progress.stages == (2,)
 
 
-def test_the_last_layer_has_no_end_but_experts() -> None:
+def test_the_last_stage_has_no_end_but_experts() -> None:
     progress = make_progress(runs=2)
-    progress.set_layer(1, 2)
+    progress.set_stage(1, 2)
     assert progress.record(torch.stack((flags("1111"), flags("1110")))).tolist() == [True, False]
-    assert progress.expert.tolist() == [False, True]  # layer 0 was left, but not the last one
+    assert progress.expert.tolist() == [False, True]  # stage 0 was left, but not the last one
     progress.record_run(1, flags("0000"))
     assert progress.expert.tolist() == [False, True]  # it was reached
-    assert progress.layers == (1, 2)
-    progress.set_layer(1, 2)
+    assert progress.stages == (1, 2)
+    progress.set_stage(1, 2)
     assert progress.expert.tolist() == [False, False]
 
 
@@ -268,10 +268,10 @@ def test_each_run_moves_on_by_itself() -> None:
     moved = progress.record(torch.stack((flags("0000"), flags("1111"), flags("1100"))))
     assert moved.tolist() == [False, True, False]
     assert moved.dtype == torch.bool
-    assert progress.layer.tolist() == [0, 1, 0]
-    assert progress.layer.dtype == torch.int64
+    assert progress.stage.tolist() == [0, 1, 0]
+    assert progress.stage.dtype == torch.int64
     assert progress.successes == [[0.0] * 4, [], [1.0, 1.0, 0.0, 0.0]]
-    assert [progress.layer_of(run).name for run in range(3)] == ["layer 0", "layer 1", "layer 0"]
+    assert [progress.stage_of(run).name for run in range(3)] == ["stage 0", "stage 1", "stage 0"]
 
 
 def test_samples_may_be_bools() -> None:
@@ -280,9 +280,9 @@ def test_samples_may_be_bools() -> None:
 
 def test_what_is_read_is_a_copy() -> None:
     progress = make_progress()
-    progress.layer.add_(2)
+    progress.stage.add_(2)
     progress.successes[0].append(1.0)
-    assert progress.layers == (0,)
+    assert progress.stages == (0,)
     assert progress.successes == [[]]
 
 
@@ -317,19 +317,19 @@ def test_bad_samples_are_named_and_none_of_them_counts() -> None:
     for run in (-1, 2):
         with pytest.raises(ValueError, match=rf"run must be in \[0, 1\], got {run}"):
             progress.record_run(run, good)
-    with pytest.raises(ValueError, match=r"layer must be in \[0, 2\], got 3"):
-        progress.set_layer(0, 3)
-    assert progress.layers == (0, 0)
+    with pytest.raises(ValueError, match=r"stage must be in \[0, 2\], got 3"):
+        progress.set_stage(0, 3)
+    assert progress.stages == (0, 0)
     assert progress.successes == [[], []]
 
 
 def test_state_goes_through_a_file(tmp_path: Path) -> None:
     progress, other = make_progress(runs=3), make_progress(runs=3)
-    progress.set_layer(2, 2)
+    progress.set_stage(2, 2)
     progress.record(torch.stack((flags("1100"), flags("1111"), flags("1111"))))
     torch.save(progress.state_dict(), tmp_path / "progress.pt")
     other.load_state_dict(torch.load(tmp_path / "progress.pt", weights_only=True))
-    assert other.layers == (0, 1, 2)
+    assert other.stages == (0, 1, 2)
     assert other.expert.tolist() == [False, False, True]
     assert other.successes == [[1.0, 1.0, 0.0, 0.0], [], [1.0] * 4]
     more = flags("11").expand(3, 2)  # goes on as the first one does
@@ -349,9 +349,9 @@ def test_a_state_that_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="the state is of 2 runs, but there are 1"):
         make_progress().load_state_dict(make_progress(runs=2).state_dict())
     deep = make_progress()
-    deep.set_layer(0, 2)
-    shallow = CurriculumProgress(Curriculum([make_layer()], 3))
-    with pytest.raises(ValueError, match=r"layers are \(2,\), but there are 1 layers"):
+    deep.set_stage(0, 2)
+    shallow = CurriculumProgress(Curriculum([make_stage()], 3))
+    with pytest.raises(ValueError, match=r"stages are \(2,\), but there are 1 stages"):
         shallow.load_state_dict(deep.state_dict())
 
 
@@ -364,10 +364,10 @@ def test_a_smaller_window_keeps_the_latest_samples() -> None:
 
 def test_progress_can_be_copied_and_pickled() -> None:
     progress = make_progress()
-    progress.set_layer(0, 1)
+    progress.set_stage(0, 1)
     for copied in (copy.deepcopy(progress), pickle.loads(pickle.dumps(progress))):
-        copied.set_layer(0, 2)
-        assert (progress.layers, copied.layers) == ((1,), (2,))
+        copied.set_stage(0, 2)
+        assert (progress.stages, copied.stages) == ((1,), (2,))
 
 
 @settings(max_examples=100, deadline=None)
@@ -376,16 +376,16 @@ def test_progress_can_be_copied_and_pickled() -> None:
 )
 def test_progress_by_the_book(calls: list[list[bool]], window: int, threshold: float) -> None:
     progress = make_progress(window=window, success_threshold=threshold)
-    layer, seen = 0, []
+    stage, seen = 0, []
     for call in calls:
         moved = False
         for sample in call:
             seen.append(sample)
-            if layer < 2 and len(seen) >= window and sum(seen[-window:]) >= threshold * window:
-                layer, seen, moved = layer + 1, [], True
+            if stage < 2 and len(seen) >= window and sum(seen[-window:]) >= threshold * window:
+                stage, seen, moved = stage + 1, [], True
                 break
         assert progress.record_run(0, torch.tensor(call, dtype=torch.bool)) is moved
-        assert progress.layers == (layer,)
+        assert progress.stages == (stage,)
         assert progress.successes == [seen[-window:]]
 
 
@@ -422,20 +422,20 @@ def prepare(net: ActorNet | CriticNet, used: int, alpha: float) -> nn.Parameter:
     return first.weight
 
 
-def inputs_of_layer(layer: int, rows: int) -> Tensor:
-    """Network inputs of the three-layer curriculum: 2, 3 or 4 numbers, then zeros."""
-    return torch.cat((torch.randn(rows, layer + 2), torch.zeros(rows, 2 - layer)), -1)
+def inputs_of_stage(stage: int, rows: int) -> Tensor:
+    """Network inputs of the three-stage curriculum: 2, 3 or 4 numbers, then zeros."""
+    return torch.cat((torch.randn(rows, stage + 2), torch.zeros(rows, 2 - stage)), -1)
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.1])
 @pytest.mark.parametrize("kind", ["actor", "critic"])
-def test_unused_weights_stay_as_they_are_until_their_layer(kind: str, alpha: float) -> None:
+def test_unused_weights_stay_as_they_are_until_their_stage(kind: str, alpha: float) -> None:
     net = ActorNet(4, 1, runs=2) if kind == "actor" else CriticNet(4, 1, runs=2)
     weight = prepare(net, make_three().first_inputs, alpha)
     before = weight.detach().clone()
     optimizer = torch.optim.Adam(net.parameters(), lr=1e-2)
     for _ in range(5):
-        seen = torch.cat((inputs_of_layer(0, 8), inputs_of_layer(1, 8)))  # run 0 and run 1
+        seen = torch.cat((inputs_of_stage(0, 8), inputs_of_stage(1, 8)))  # run 0 and run 1
         out = net(seen) if kind == "actor" else net(seen, torch.randn(16, 1))
         optimizer.zero_grad()
         out.square().sum().backward()
@@ -445,14 +445,14 @@ def test_unused_weights_stay_as_they_are_until_their_layer(kind: str, alpha: flo
     assert torch.equal(weight[0, 2:], before[0, 2:])
     assert torch.equal(weight[1, 3:], before[1, 3:])
     assert (weight[0, :2] != before[0, :2]).any()
-    assert (weight[1, 2] != before[1, 2]).any()  # run 1's layer uses this input
+    assert (weight[1, 2] != before[1, 2]).any()  # run 1's stage uses this input
 
 
-def test_new_inputs_change_no_output_at_the_change_of_layer() -> None:
+def test_new_inputs_change_no_output_at_the_change_of_stage() -> None:
     """With alpha = 0: the first inputs keep their values (b was the goal, and is b), all others are free."""
     for alpha, same in ((0.0, True), (1.0, False)):
         actor = ActorNet(4, 1)
         prepare(actor, 2, alpha)
-        old = inputs_of_layer(0, 8)
+        old = inputs_of_stage(0, 8)
         new = torch.cat((old[:, :2], 100 * torch.randn(8, 2)), -1)
         assert torch.equal(actor(old), actor(new)) is same

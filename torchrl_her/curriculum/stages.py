@@ -1,4 +1,4 @@
-"""CHER: the observation and the goal of each layer of a curriculum, and the layer that each run is in.
+"""CHER: the observation and the goal of each stage of a curriculum, and the stage that each run is in.
 
 After chapter 6 (Curriculum HER) of the thesis that the method is from. The transforms that apply
 this to environments and to replay buffers are :class:`~torchrl_her.StateToObs` and
@@ -26,8 +26,8 @@ _LISTS = ("observation", "achieved_goal", "desired_goal")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CurriculumLayer:
-    """Layer of a curriculum: the entries of the state that it observes, achieves and desires.
+class CurriculumStage:
+    """Stage of a curriculum: the entries of the state that it observes, achieves and desires.
 
     Args:
         name: for messages and reports.
@@ -35,11 +35,11 @@ class CurriculumLayer:
             :class:`~torchrl_her.Curriculum` is given.
         constant_goal: one goal for all episodes, as a gap in a wall, in place of ``desired_goal``; in the
             unit of the achieved goal.
-        threshold: the goal is achieved at distances below this, in the unit of the state. The last layer,
+        threshold: the goal is achieved at distances below this, in the unit of the state. The last stage,
             which is the environment's own task, needs none: relabeled goals then have the reward function
             that the writer was made with.
-        rewards: rewards of a missed and of an achieved goal, in layers below the last.
-        instructive: whether IBS weights apply in this layer.
+        rewards: rewards of a missed and of an achieved goal, in stages below the last.
+        instructive: whether IBS weights apply in this stage.
 
     Raises:
         ValueError: a list is empty, an index is negative or repeated, the desired goal shares an index with
@@ -47,7 +47,7 @@ class CurriculumLayer:
             finite, or the threshold is not positive.
 
     Example:
-        >>> CurriculumLayer(
+        >>> CurriculumStage(
         ...     name="reach", observation=[0, 1], achieved_goal=[0], desired_goal=[2], threshold=0.1
         ... ).observation
         (0, 1)
@@ -65,23 +65,23 @@ class CurriculumLayer:
     def __post_init__(self) -> None:
         if self.threshold is not None and not 0 < self.threshold < math.inf:
             raise ValueError(
-                f"layer {self.name!r}: threshold must be positive and finite, got {self.threshold}"
+                f"stage {self.name!r}: threshold must be positive and finite, got {self.threshold}"
             )
         self._check_constant_goal()
         for key in _LISTS:
             given = getattr(self, key)
             entries = [given] if isinstance(given, str) else list(given)
             if not entries and not (key == "desired_goal" and self.constant_goal):
-                raise ValueError(f"layer {self.name!r}: {key} must not be empty")
+                raise ValueError(f"stage {self.name!r}: {key} must not be empty")
             object.__setattr__(
                 self, key, tuple(e if isinstance(e, str) else operator.index(e) for e in entries)
             )
         if not any(isinstance(entry, str) for key in _LISTS for entry in getattr(self, key)):
             self._check_indices()
 
-    @cached_property  # the same function for all runs in a layer, so that a writer can relabel them at once
+    @cached_property  # the same function for all runs in a stage, so that a writer can relabel them at once
     def reward_fn(self) -> RewardFunction | None:
-        """Reward function of the layer's goals; None without a threshold."""
+        """Reward function of the stage's goals; None without a threshold."""
         if self.threshold is None:
             return None
         missed, achieved = self.rewards
@@ -90,70 +90,70 @@ class CurriculumLayer:
     def _check_constant_goal(self) -> None:
         object.__setattr__(self, "constant_goal", tuple(map(float, self.constant_goal)))
         if not all(map(math.isfinite, self.constant_goal)):
-            raise ValueError(f"layer {self.name!r}: constant_goal must be finite, got {self.constant_goal}")
+            raise ValueError(f"stage {self.name!r}: constant_goal must be finite, got {self.constant_goal}")
         if self.constant_goal and self.desired_goal:
-            raise ValueError(f"layer {self.name!r}: give desired_goal or constant_goal, got both")
+            raise ValueError(f"stage {self.name!r}: give desired_goal or constant_goal, got both")
 
     def _check_indices(self) -> None:
-        """Checks the indices of a layer whose names are resolved, except against the width of the state."""
+        """Checks the indices of a stage whose names are resolved, except against the width of the state."""
         for key in _LISTS:
             entries = getattr(self, key)
             if min(entries, default=0) < 0:
-                raise ValueError(f"layer {self.name!r}: {key} must have indices of at least 0, got {entries}")
+                raise ValueError(f"stage {self.name!r}: {key} must have indices of at least 0, got {entries}")
             if len(set(entries)) < len(entries):
-                raise ValueError(f"layer {self.name!r}: {key} must have each index once, got {entries}")
+                raise ValueError(f"stage {self.name!r}: {key} must have each index once, got {entries}")
         for key in ("observation", "achieved_goal"):  # observation and achieved goal usually share entries
             shared = sorted(set(self.desired_goal) & set(getattr(self, key)))
             if shared:
                 raise ValueError(
-                    f"layer {self.name!r}: desired_goal must share no index with {key}, got {shared} in both"
+                    f"stage {self.name!r}: desired_goal must share no index with {key}, got {shared} in both"
                 )
         goal = self.desired_goal or self.constant_goal
         if len(self.achieved_goal) != len(goal):
             raise ValueError(
-                f"layer {self.name!r}: achieved_goal and the goal must be of one width, "
+                f"stage {self.name!r}: achieved_goal and the goal must be of one width, "
                 f"got {self.achieved_goal} and {goal}"
             )
 
 
 class Curriculum:
-    """Layers in the order in which they are trained, the last one being the full task.
+    """Stages in the order in which they are trained, the last one being the full task.
 
-    The network's input is, in each layer, [its n observation entries | its desired goal | zeros],
-    as wide as the last layer's. Order the state so that a layer's inputs, its observation and then its
-    desired goal, are the first inputs of the next layer. Inputs then keep their meaning, and what was
+    The network's input is, in each stage, [its n observation entries | its desired goal | zeros],
+    as wide as the last stage's. Order the state so that a stage's inputs, its observation and then its
+    desired goal, are the first inputs of the next stage. Inputs then keep their meaning, and what was
     learned carries over: with the hand, reaching sees [hand | ball], throwing [hand | ball | speed | black
     hole].
 
     Args:
-        layers: layers in the order of training, one or more.
+        stages: stages in the order of training, one or more.
         state_width: width of the state vector, the real observation with the real goal behind it.
 
     Keyword Args:
-        names: the indices into the state that names in the layers' lists stand for.
+        names: the indices into the state that names in the stages' lists stand for.
 
     Attributes:
-        layers: the layers, with indices in place of names and of constant goals.
+        stages: the stages, with indices in place of names and of constant goals.
         appended: the zero and the constant goals that :meth:`extend` puts behind a state.
-        observation_width, goal_width: widths of these entries, the same in every layer.
+        observation_width, goal_width: widths of these entries, the same in every stage.
         input_width: width of the network's input.
-        first_inputs: number of inputs that the first layer uses; they are the leading ones.
-        state_index: [layers, observation_width + 2 * goal_width], indices of observation, achieved and
+        first_inputs: number of inputs that the first stage uses; they are the leading ones.
+        state_index: [stages, observation_width + 2 * goal_width], indices of observation, achieved and
             desired goal in the extended state.
-        input_index: [layers, input_width], indices of the network's input in the observation with the
+        input_index: [stages, input_width], indices of the network's input in the observation with the
             desired goal and a zero appended.
 
     Raises:
-        ValueError: there is no layer, a name is unknown, an index lies outside of the state, goals differ in
-            width, a layer is wider than the last one, one below the last has no threshold, or the last one
+        ValueError: there is no stage, a name is unknown, an index lies outside of the state, goals differ in
+            width, a stage is wider than the last one, one below the last has no threshold, or the last one
             has a constant goal.
 
     Example:
         >>> parts = {"hand": [0, 1], "ball": [2], "hole": [3]}
-        >>> reach = CurriculumLayer(
+        >>> reach = CurriculumStage(
         ...     name="reach", observation="hand", achieved_goal=[0], desired_goal="ball", threshold=0.1
         ... )
-        >>> throw = CurriculumLayer(
+        >>> throw = CurriculumStage(
         ...     name="throw",
         ...     observation=["hand", "ball"],
         ...     achieved_goal="ball",
@@ -167,51 +167,51 @@ class Curriculum:
 
     def __init__(
         self,
-        layers: Sequence[CurriculumLayer],
+        stages: Sequence[CurriculumStage],
         state_width: int,
         *,
         names: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
-        if not layers:
-            raise ValueError("a curriculum needs at least one layer, got none")
-        resolved = [_resolve(layer, names or {}) for layer in layers]
+        if not stages:
+            raise ValueError("a curriculum needs at least one stage, got none")
+        resolved = [_resolve(stage, names or {}) for stage in stages]
         if resolved[-1].constant_goal:
             raise ValueError(
-                f"layer {resolved[-1].name!r}: the last layer is the full task, its goal must not be constant"
+                f"stage {resolved[-1].name!r}: the last stage is the full task, its goal must not be constant"
             )
         self.state_width = state_width
         self.observation_width = len(resolved[-1].observation)
         self.goal_width = len(resolved[-1].desired_goal)
-        for layer in resolved:
-            self._check(layer, resolved[-1])
-            if layer.threshold is None and layer is not resolved[-1]:
-                raise ValueError(f"layer {layer.name!r}: all layers but the last need a threshold")
-        self.appended = [0.0, *(number for layer in resolved for number in layer.constant_goal)]
-        ends = accumulate((len(layer.constant_goal) for layer in resolved), initial=state_width + 1)
-        self.layers = tuple(
-            replace(layer, desired_goal=range(start, end), constant_goal=()) if end > start else layer
-            for layer, (start, end) in zip(resolved, pairwise(ends), strict=True)
+        for stage in resolved:
+            self._check(stage, resolved[-1])
+            if stage.threshold is None and stage is not resolved[-1]:
+                raise ValueError(f"stage {stage.name!r}: all stages but the last need a threshold")
+        self.appended = [0.0, *(number for stage in resolved for number in stage.constant_goal)]
+        ends = accumulate((len(stage.constant_goal) for stage in resolved), initial=state_width + 1)
+        self.stages = tuple(
+            replace(stage, desired_goal=range(start, end), constant_goal=()) if end > start else stage
+            for stage, (start, end) in zip(resolved, pairwise(ends), strict=True)
         )
         self.input_width = self.observation_width + self.goal_width
-        self.first_inputs = len(self.layers[0].observation) + self.goal_width
-        self.state_index = torch.tensor([self._state_index(layer) for layer in self.layers])
-        self.input_index = torch.tensor([self._input_index(layer) for layer in self.layers])
+        self.first_inputs = len(self.stages[0].observation) + self.goal_width
+        self.state_index = torch.tensor([self._state_index(stage) for stage in self.stages])
+        self.input_index = torch.tensor([self._input_index(stage) for stage in self.stages])
 
     def __len__(self) -> int:
-        return len(self.layers)
+        return len(self.stages)
 
     def extend(self, state: Tensor) -> Tensor:
-        """Appends a zero and the constant goals, to which layers refer, to states [..., state_width].
+        """Appends a zero and the constant goals, to which stages refer, to states [..., state_width].
 
         Example:
-            >>> gap = CurriculumLayer(
+            >>> gap = CurriculumStage(
             ...     name="gap", observation=[0], achieved_goal=[0], constant_goal=[5.0], threshold=0.5
             ... )
-            >>> cross = CurriculumLayer(
+            >>> cross = CurriculumStage(
             ...     name="cross", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.5
             ... )
             >>> curriculum = Curriculum([gap, cross], 2)
-            >>> curriculum.extend(torch.tensor([3.0, 9.0])).tolist(), curriculum.layers[0].desired_goal
+            >>> curriculum.extend(torch.tensor([3.0, 9.0])).tolist(), curriculum.stages[0].desired_goal
             ([3.0, 9.0, 0.0, 5.0], (3,))
         """
         extended = torch.nn.functional.pad(state, (0, len(self.appended)))
@@ -219,95 +219,95 @@ class Curriculum:
             extended[..., self.state_width :] = extended.new_tensor(self.appended)
         return extended
 
-    def show(self, state: Tensor, layer: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the observation, the achieved and the desired goal of states as a layer shows them.
+    def show(self, state: Tensor, stage: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns the observation, the achieved and the desired goal of states as a stage shows them.
 
         Args:
             state: [..., state_width].
-            layer: index of the layer, from 0.
+            stage: index of the stage, from 0.
 
         Returns:
-            [..., observation_width], zeros behind the layer's own entries, and [..., g] twice.
+            [..., observation_width], zeros behind the stage's own entries, and [..., g] twice.
         """
-        entries = self.extend(state).index_select(-1, self.state_index[layer].to(state.device))
+        entries = self.extend(state).index_select(-1, self.state_index[stage].to(state.device))
         observation, achieved, desired = entries.split(
             [self.observation_width, self.goal_width, self.goal_width], -1
         )
         return observation, achieved, desired
 
-    def _check(self, layer: CurriculumLayer, last: CurriculumLayer) -> None:
+    def _check(self, stage: CurriculumStage, last: CurriculumStage) -> None:
         for key in _LISTS:
-            highest = max(getattr(layer, key), default=0)
+            highest = max(getattr(stage, key), default=0)
             if highest >= self.state_width:
                 raise ValueError(
-                    f"layer {layer.name!r}: {key} has index {highest}, "
+                    f"stage {stage.name!r}: {key} has index {highest}, "
                     f"but the state has {self.state_width} entries: at most {self.state_width - 1} is allowed"
                 )
-        width = len(layer.desired_goal or layer.constant_goal)
+        width = len(stage.desired_goal or stage.constant_goal)
         if width != self.goal_width:
             raise ValueError(
-                f"layer {layer.name!r}: the goal has {width} entries, but all layers need "
+                f"stage {stage.name!r}: the goal has {width} entries, but all stages need "
                 f"as many as the last one, {last.name!r}: {self.goal_width}"
             )
-        if len(layer.observation) > self.observation_width:
+        if len(stage.observation) > self.observation_width:
             raise ValueError(
-                f"layer {layer.name!r}: observation and goal have "
-                f"{len(layer.observation) + self.goal_width} entries, but no layer may be wider than the "
+                f"stage {stage.name!r}: observation and goal have "
+                f"{len(stage.observation) + self.goal_width} entries, but no stage may be wider than the "
                 f"last one, {last.name!r}, with {self.observation_width + self.goal_width}"
             )
 
-    def _state_index(self, layer: CurriculumLayer) -> list[Any]:
-        zeros = [self.state_width] * (self.observation_width - len(layer.observation))
-        return [*layer.observation, *zeros, *layer.achieved_goal, *layer.desired_goal]
+    def _state_index(self, stage: CurriculumStage) -> list[Any]:
+        zeros = [self.state_width] * (self.observation_width - len(stage.observation))
+        return [*stage.observation, *zeros, *stage.achieved_goal, *stage.desired_goal]
 
-    def _input_index(self, layer: CurriculumLayer) -> list[int]:
-        n, goal = len(layer.observation), range(self.observation_width, self.input_width)
+    def _input_index(self, stage: CurriculumStage) -> list[int]:
+        n, goal = len(stage.observation), range(self.observation_width, self.input_width)
         return [*range(n), *goal, *([self.input_width] * (self.observation_width - n))]
 
 
-def _resolve(layer: CurriculumLayer, names: Mapping[str, Sequence[int]]) -> CurriculumLayer:
-    """Returns a layer with indices in place of names, checked on its own."""
+def _resolve(stage: CurriculumStage, names: Mapping[str, Sequence[int]]) -> CurriculumStage:
+    """Returns a stage with indices in place of names, checked on its own."""
 
     def indices(key: str) -> list[int]:
         found: list[int] = []
-        for entry in getattr(layer, key):
+        for entry in getattr(stage, key):
             if isinstance(entry, str) and entry not in names:
                 raise ValueError(
-                    f"layer {layer.name!r}: {key} has the unknown name {entry!r}; "
+                    f"stage {stage.name!r}: {key} has the unknown name {entry!r}; "
                     f"known are {', '.join(map(repr, names)) or 'none'}"
                 )
             found += names[entry] if isinstance(entry, str) else [entry]
         return found
 
-    return replace(layer, **{key: indices(key) for key in _LISTS})  # type: ignore[arg-type]
+    return replace(stage, **{key: indices(key) for key in _LISTS})  # type: ignore[arg-type]
 
 
 class CurriculumProgress:
-    """Progress of R independent runs: the layer that each is in, and its recent successes there.
+    """Progress of R independent runs: the stage that each is in, and its recent successes there.
 
-    A run moves to the next layer when the mean of its last ``window`` samples of success reaches the
-    threshold. The window is then cleared, so that samples of earlier layers never count. The last layer has
+    A run moves to the next stage when the mean of its last ``window`` samples of success reaches the
+    threshold. The window is then cleared, so that samples of earlier stages never count. The last stage has
     no end.
 
     Args:
-        curriculum: the layers.
+        curriculum: the stages.
 
     Keyword Args:
         runs: R.
-        window: number of samples that are averaged; with fewer a run stays in its layer.
-        success_threshold: the mean at which a layer ends.
-        patience: number of evaluations (calls of :meth:`record`) after which a layer ends although the mean
+        window: number of samples that are averaged; with fewer a run stays in its stage.
+        success_threshold: the mean at which a stage ends.
+        patience: number of evaluations (calls of :meth:`record`) after which a stage ends although the mean
             is lower; None for no limit.
 
     Attributes:
-        layers: R numbers, the layer of each run, from 0.
+        stages: R numbers, the stage of each run, from 0.
 
     Raises:
         ValueError: ``runs`` or ``window`` is below 1, or the threshold is outside of (0, 1].
 
     Example:
         >>> first, last = (
-        ...     CurriculumLayer(
+        ...     CurriculumStage(
         ...         name=name, observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
         ...     )
         ...     for name in ("first", "last")
@@ -315,11 +315,11 @@ class CurriculumProgress:
         >>> progress = CurriculumProgress(Curriculum([first, last], 2), runs=2, window=3)
         >>> progress.record(torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, 1.0]])).tolist()
         [True, False]
-        >>> progress.layers
+        >>> progress.stages
         (1, 0)
     """
 
-    # Whether each episode has a layer of its own, and not each run.
+    # Whether each episode has a stage of its own, and not each run.
     by_episode = False
 
     def __init__(
@@ -337,49 +337,49 @@ class CurriculumProgress:
         self.curriculum, self.runs = curriculum, runs
         self.window, self.success_threshold, self.patience = window, success_threshold, patience
         # Plain numbers: transforms read them in every step, and must not wait for a device.
-        self.layers = (0,) * runs
+        self.stages = (0,) * runs
         self._successes: list[list[float]] = [[] for _ in range(runs)]
         self._expert = [False] * runs
-        self._evaluations = [0] * runs  # evaluations in the present layer
+        self._evaluations = [0] * runs  # evaluations in the present stage
 
     @property
-    def layer(self) -> Tensor:
-        """The layer of each run, [R] of int64. It is a copy; :meth:`set_layer` moves a run."""
-        return torch.tensor(self.layers)
+    def stage(self) -> Tensor:
+        """The stage of each run, [R] of int64. It is a copy; :meth:`set_stage` moves a run."""
+        return torch.tensor(self.stages)
 
     @property
     def expert(self) -> Tensor:
-        """Whether each run has ever reached the threshold in the last layer, [R] of bool."""
+        """Whether each run has ever reached the threshold in the last stage, [R] of bool."""
         return torch.tensor(self._expert)
 
     @property
     def successes(self) -> list[list[float]]:
-        """Copies of the R windows: samples of the present layer, the latest at the end."""
+        """Copies of the R windows: samples of the present stage, the latest at the end."""
         return [list(samples) for samples in self._successes]
 
     @property
     def evaluations(self) -> list[int]:
-        """Number of evaluations of each run in its present layer."""
+        """Number of evaluations of each run in its present stage."""
         return list(self._evaluations)
 
-    def mean_layer(self, run: int) -> float:
-        """Mean index of the layers in which a run's episodes are played."""
-        return float(self.layers[self._check_run(run)])
+    def mean_stage(self, run: int) -> float:
+        """Mean index of the stages in which a run's episodes are played."""
+        return float(self.stages[self._check_run(run)])
 
-    def layer_of(self, run: int) -> CurriculumLayer:
-        """The present layer of a run."""
-        return self.curriculum.layers[self.layers[self._check_run(run)]]
+    def stage_of(self, run: int) -> CurriculumStage:
+        """The present stage of a run."""
+        return self.curriculum.stages[self.stages[self._check_run(run)]]
 
-    def set_layer(self, run: int, layer: int) -> None:
-        """Moves a run to a layer, and clears its window of successes.
+    def set_stage(self, run: int, stage: int) -> None:
+        """Moves a run to a stage, and clears its window of successes.
 
         Raises:
-            ValueError: there is no such run or layer.
+            ValueError: there is no such run or stage.
         """
         self._check_run(run)
-        if not 0 <= layer < len(self.curriculum):
-            raise ValueError(f"layer must be in [0, {len(self.curriculum) - 1}], got {layer}")
-        self.layers = (*self.layers[:run], layer, *self.layers[run + 1 :])
+        if not 0 <= stage < len(self.curriculum):
+            raise ValueError(f"stage must be in [0, {len(self.curriculum) - 1}], got {stage}")
+        self.stages = (*self.stages[:run], stage, *self.stages[run + 1 :])
         self._successes[run], self._expert[run], self._evaluations[run] = [], False, 0
 
     def record(self, successes: Tensor) -> Tensor:
@@ -399,15 +399,15 @@ class CurriculumProgress:
     def record_run(self, run: int, successes: Tensor) -> bool:
         """Adds samples of success of one run, one after the other.
 
-        A layer ends at the first sample that completes it. The samples after that one were made in the
-        old layer and are dropped, so a call ends at most one layer.
+        A stage ends at the first sample that completes it. The samples after that one were made in the
+        old stage and are dropped, so a call ends at most one stage.
 
         Args:
             run: the run's number, from 0.
             successes: [n], each in [0, 1] (or of bool), the earliest first.
 
         Returns:
-            Whether the run moved on to its next layer.
+            Whether the run moved on to its next stage.
 
         Raises:
             ValueError: there is no such run, the shape is another one, or a sample is outside of [0, 1].
@@ -417,7 +417,7 @@ class CurriculumProgress:
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain data that :meth:`load_state_dict` takes."""
         return {
-            "layer": self.layer,
+            "stage": self.stage,
             "expert": self.expert,
             "successes": self.successes,
             "evaluations": self.evaluations,
@@ -427,14 +427,14 @@ class CurriculumProgress:
         """Restores the state that :meth:`state_dict` returned.
 
         Raises:
-            ValueError: it has another number of runs, or a layer that does not exist.
+            ValueError: it has another number of runs, or a stage that does not exist.
         """
-        layers = tuple(state["layer"].tolist())
-        if len(layers) != self.runs:
-            raise ValueError(f"the state is of {len(layers)} runs, but there are {self.runs}")
-        if not all(0 <= layer < len(self.curriculum) for layer in layers):
-            raise ValueError(f"the state's layers are {layers}, but there are {len(self.curriculum)} layers")
-        self.layers, self._expert = layers, state["expert"].tolist()
+        stages = tuple(state["stage"].tolist())
+        if len(stages) != self.runs:
+            raise ValueError(f"the state is of {len(stages)} runs, but there are {self.runs}")
+        if not all(0 <= stage < len(self.curriculum) for stage in stages):
+            raise ValueError(f"the state's stages are {stages}, but there are {len(self.curriculum)} stages")
+        self.stages, self._expert = stages, state["expert"].tolist()
         self._successes = [list(samples)[-self.window :] for samples in state["successes"]]
         self._evaluations = list(state["evaluations"])
 
@@ -445,13 +445,13 @@ class CurriculumProgress:
             del latest[: -self.window]
             if len(latest) < self.window or sum(latest) / self.window < self.success_threshold:
                 continue
-            if self.layers[run] < last:
-                self.set_layer(run, self.layers[run] + 1)
+            if self.stages[run] < last:
+                self.set_stage(run, self.stages[run] + 1)
                 return True
             self._expert[run] = True
         self._evaluations[run] += 1
-        if self.layers[run] < last and self._evaluations[run] == self.patience:
-            self.set_layer(run, self.layers[run] + 1)
+        if self.stages[run] < last and self._evaluations[run] == self.patience:
+            self.set_stage(run, self.stages[run] + 1)
             return True
         return False
 
@@ -474,9 +474,9 @@ def _samples(successes: Tensor) -> list[float]:
 def zero_unused_inputs(weight: Tensor, used: int, *, alpha: float = 0.0) -> Tensor:
     """Scales down the weights that the first layer of a network gives to inputs that are not used yet.
 
-    Unused inputs are 0, so these weights have gradients of 0 and stay as they are until their layer begins
+    Unused inputs are 0, so these weights have gradients of 0 and stay as they are until their stage begins
     (under an optimizer without weight decay). With ``alpha = 0``, the outputs at that moment do not depend
-    on the new inputs, so the change of layer does not change what the network does.
+    on the new inputs, so the change of stage does not change what the network does.
 
     Args:
         weight: [..., inputs, outputs], as :class:`~torchrl_her.modules.StackedLinear` has it

@@ -1,0 +1,74 @@
+"""Rules for relabeling episodes that carry the stage of a curriculum in which they were played."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from torchrl_her.goals.rewards import RewardFunction
+from torchrl_her.replay_buffers.episodes import Episodes
+
+
+class StageRule(NamedTuple):
+    """Rule by which :class:`~torchrl_her.HERWriter` relabels the episodes of one stage.
+
+    Attributes:
+        reward_fn: maps (achieved, desired) goals to (reward, terminated).
+        weighted: whether the weights of goals apply, and are updated with the goals that were written.
+        view: shows transitions [n] of any stage as this one would have
+            (:class:`~torchrl_her.curriculum.StageView`): those of all episodes are then written for this
+            stage. None for episodes that were played in it alone.
+    """
+
+    reward_fn: RewardFunction
+    weighted: bool = True
+    view: Callable[[TensorDictBase], TensorDictBase] | None = None
+
+
+def split_stages(
+    rows: TensorDictBase, episodes: Episodes, run: Tensor | None, key: NestedKey, stages: Sequence[StageRule]
+) -> Iterator[tuple[int, TensorDictBase, Episodes, Tensor | None]]:
+    """Yields the transitions as each stage shows them, and its episodes, in the order in which they came.
+
+    Args:
+        rows: [n], transitions.
+        episodes: positions among them.
+        run: [E] int64, the run of each episode; None if there is only one.
+        key: key of the stage [n, 1].
+        stages: rules of the stages.
+
+    Raises:
+        KeyError: rows do not carry their stage.
+        ValueError: there is no such stage.
+    """
+    if len(episodes.lengths) == 0:
+        return
+    stage = rows.get(key, None)
+    if stage is None:
+        raise KeyError(f"episodes of several stages need the entry {key!r}, got {list(rows.keys())}")
+    episode_stages = stage.reshape(-1)[episodes.rows[:, 0]]
+    least, most = int(episode_stages.min()), int(episode_stages.max())
+    if least < 0 or most >= len(stages):
+        raise ValueError(f"{key!r} must be in [0, {len(stages) - 1}], got {least if least < 0 else most}")
+    for number, rule in enumerate(stages):
+        which = episode_stages == number
+        if rule.view is not None:
+            yield number, rule.view(rows), episodes, run
+        elif bool(which.any()):
+            part = Episodes(episodes.rows[which], episodes.lengths[which])
+            yield number, rows, part, None if run is None else run[which]
+
+
+def check_stages(stages: Sequence[StageRule] | None) -> list[StageRule]:
+    """Returns the rules of stages as a list; empty without stages.
+
+    Raises:
+        TypeError: one of them is no rule.
+    """
+    for rule in stages or ():
+        if not isinstance(rule, StageRule):
+            raise TypeError(f"stages must be a list of StageRule, got {rule!r} in it")
+    return list(stages or ())
