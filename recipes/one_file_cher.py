@@ -33,6 +33,7 @@ from torchrl_her import (
     FusedLearner,
     GoalReward,
     HERWriter,
+    NetworkShape,
     StateToObs,
     ZeroPad,
     enter_stage,
@@ -45,6 +46,7 @@ from torchrl_her import (
 )
 from torchrl_her.curriculum import zero_unused_inputs
 from torchrl_her.modules import PolicyAverage, StackedLinear
+from torchrl_her.objectives import ActorTerms, Targets
 from torchrl_her_envs import make_env
 
 
@@ -113,7 +115,8 @@ def make_network(
     make: Callable[..., TensorDictModule], curriculum: Curriculum, hidden: int
 ) -> TensorDictModule:
     """Returns an actor or a critic whose weights of inputs that the first stage does not use are 0."""
-    network = make([curriculum.input_width], 3, hidden=hidden, norm="layer", in_keys=["input"])
+    shape = NetworkShape(hidden=hidden, norm="layer")
+    network = make([curriculum.input_width], 3, shape=shape, in_keys=["input"])
     first = next(module for module in network.modules() if isinstance(module, StackedLinear))
     first.weight.data = zero_unused_inputs(first.weight.data, curriculum.first_inputs, alpha=0.0)
     return network
@@ -155,7 +158,12 @@ def train(options: Options) -> Iterator[Evaluation]:
         low, high, decay=options.epsilon_decay, end=options.epsilon_end, noise=options.noise
     )
     policy = TensorDictSequential(actor, exploration)
-    loss = make_ddpg_loss(actor, critic, gamma=options.gamma, action_penalty=options.action_penalty)
+    loss = make_ddpg_loss(
+        actor,
+        critic,
+        targets=Targets(gamma=options.gamma, reward_range=(-1.0, 0.0)),
+        terms=ActorTerms(action_penalty=options.action_penalty),
+    )
     optimizer = torch.optim.Adam(loss.parameters(), lr=options.learning_rate)
     target = make_target_updater(loss, tau=options.tau, hard_interval=0)
     learner = FusedLearner(loss, optimizer, target, max_grad_norm=options.max_grad_norm)

@@ -13,13 +13,14 @@ from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress, CurriculumStage
 from torchrl_her.curriculum.switch import enter_stage
 from torchrl_her.curriculum.transforms import StateToObs, ZeroPad
+from torchrl_her.env_keys import EnvKeys
 from torchrl_her.goals.grid import GoalGrid, box_target
 from torchrl_her.goals.ibs import Instructiveness
 from torchrl_her.goals.rewards import EnvReward, GoalReward
 from torchrl_her.goals.strategies import register_strategy
 from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.modules.exploration import DecayingEpsilon
-from torchrl_her.modules.networks import make_actor, make_critic
+from torchrl_her.modules.networks import NetworkShape, make_actor, make_critic
 from torchrl_her.objectives.ddpg import make_ddpg_loss
 from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her.replay_buffers.env_ids import EnvIds
@@ -38,6 +39,7 @@ __all__ = [
     "CurriculumStage",
     "DecayingEpsilon",
     "EnvIds",
+    "EnvKeys",
     "EnvReward",
     "FusedLearner",
     "GoalGrid",
@@ -49,6 +51,7 @@ __all__ = [
     "HindsightOptions",
     "Instructiveness",
     "LossLearner",
+    "NetworkShape",
     "StateToObs",
     "Trainer",
     "ZeroPad",

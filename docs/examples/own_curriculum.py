@@ -40,6 +40,7 @@ from torchrl_her import (
 )
 from torchrl_her.curriculum import zero_unused_inputs
 from torchrl_her.modules import StackedLinear
+from torchrl_her.objectives import ActorTerms
 from torchrl_her.replay_buffers import PackedStorage, RunsSampler
 
 STEPS = 75  # of an episode
@@ -146,7 +147,7 @@ def train(
     low, high = -torch.ones(1), torch.ones(1)
     exploration = DecayingEpsilon(low, high, decay=0.9, noise=0.15, generators=generators)
     policy = TensorDictSequential(actor, exploration)
-    loss = make_ddpg_loss(actor, critic, action_penalty=0.03, reduction="none")
+    loss = make_ddpg_loss(actor, critic, terms=ActorTerms(action_penalty=0.03), reduction="none")
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     target = make_target_updater(loss, tau=0.02, hard_interval=0)
     buffer = make_buffer(progress, generators)

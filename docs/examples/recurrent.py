@@ -28,6 +28,7 @@ from torchrl.modules import MLP, AdditiveGaussianModule, GRUModule, ValueOperato
 from torchrl.objectives import SoftUpdate
 
 from torchrl_her import EnvReward, HERWriter, evaluate, make_ddpg_loss, success
+from torchrl_her.objectives import ActorTerms
 from torchrl_her_envs import make_env
 
 SHOWN = 3  # steps of an episode in which the goal is seen
@@ -135,7 +136,7 @@ def train(
     buffer = make_buffer(env)
     noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, annealing_num_steps=frames)
     policy = TensorDictSequential(actor, noise)
-    loss = make_ddpg_loss(actor, critic, gamma=0.98, action_penalty=0.3)
+    loss = make_ddpg_loss(actor, critic, terms=ActorTerms(action_penalty=0.3))
     target = SoftUpdate(loss, tau=0.02)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     collector = Collector(env, policy, frames_per_batch=64 * 10, total_frames=frames)

@@ -3,6 +3,7 @@ from .common.goal_env import GoalEnv as GoalEnv
 from .common.goal_env import goal_env as goal_env
 from .common.goal_env import reward_bounds as reward_bounds
 from .common.goal_env import reward_range as reward_range
+from .common.live import LiveEpisodes as LiveEpisodes
 from .common.own_env import OwnGoalEnv as OwnGoalEnv
 from .common.own_env import make_own_env as make_own_env
 from .common.recording import record_episodes as record_episodes

@@ -10,9 +10,11 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss, LossModule
 
-from torchrl_her import LossLearner, make_actor, make_critic, make_ddpg_loss
+from torchrl_her import LossLearner, NetworkShape, make_actor, make_critic, make_ddpg_loss
+from torchrl_her.objectives import Targets
 
 WEIGHT = "priority_weight"
+SMALL = NetworkShape(hidden=16)
 
 
 def rows(
@@ -55,11 +57,16 @@ def constant_loss(value: float, **options: Any) -> DDPGLoss:
         in_keys=["observation", "desired_goal", "action"],
         out_keys=["state_action_value"],
     )
-    return make_ddpg_loss(make_actor((4, 2), 3), critic, **options)
+    return make_ddpg_loss(make_actor((4, 2), 3), critic, targets=targets(**options))
 
 
 def make_loss(**options: Any) -> DDPGLoss:
-    return make_ddpg_loss(make_actor((4, 2), 3, hidden=16), make_critic((4, 2), 3, hidden=16), **options)
+    networks = make_actor((4, 2), 3, shape=SMALL), make_critic((4, 2), 3, shape=SMALL)
+    return make_ddpg_loss(*networks, targets=targets(**options))
+
+
+def targets(**options: Any) -> Targets:
+    return Targets(**{"reward_range": (-1.0, 0.0), **options})
 
 
 def weights(loss: LossModule, network: str = "") -> Tensor:
@@ -69,7 +76,7 @@ def weights(loss: LossModule, network: str = "") -> Tensor:
 
 
 def networks() -> tuple[TensorDictModule, TensorDictModule]:
-    actor, critic = make_actor((4, 2), 3, hidden=16), make_critic((4, 2), 3, hidden=16)
+    actor, critic = make_actor((4, 2), 3, shape=SMALL), make_critic((4, 2), 3, shape=SMALL)
     with torch.no_grad():
         actor.module.layers[3].weight.normal_()  # actions all over the range
     return actor, critic

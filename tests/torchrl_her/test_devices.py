@@ -50,6 +50,7 @@ from torchrl_her.goals import (
 from torchrl_her.goals.grid import kl_divergence
 from torchrl_her.modules import (
     DecayingEpsilonGreedy,
+    NetworkShape,
     NormalizeBatch,
     NormalizedPolicy,
     PolicyAverage,
@@ -57,7 +58,14 @@ from torchrl_her.modules import (
     make_q_actor,
     make_stochastic_actor,
 )
-from torchrl_her.objectives import critic_value, make_dqn_loss, make_sac_loss, make_td3_loss, make_tqc_loss
+from torchrl_her.objectives import (
+    ActorTerms,
+    critic_value,
+    make_dqn_loss,
+    make_sac_loss,
+    make_td3_loss,
+    make_tqc_loss,
+)
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler, empty_run
 from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
 from torchrl_her.trainers.metrics import discounted_return, final_distance
@@ -324,7 +332,8 @@ def test_averages_of_runs_some_of_which_are_idle(device: torch.device) -> None:
 
 
 def networks() -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
-    return make_actor((4, 2), 3, norm="layer"), make_critic((4, 2), 3, norm="layer")
+    shape = NetworkShape(norm="layer")
+    return make_actor((4, 2), 3, shape=shape), make_critic((4, 2), 3, shape=shape)
 
 
 SPEC = Bounded(-1.0, 1.0, shape=(3,))
@@ -332,27 +341,21 @@ SPEC = Bounded(-1.0, 1.0, shape=(3,))
 
 def make_loss(name: str, generators: list[torch.Generator], device: torch.device) -> LossModule:
     actor, critic = networks()
-    spec = SPEC.to(device)
+    spec, terms = SPEC.to(device), ActorTerms(action_penalty=0.1)
     if name == "ddpg":
-        return make_ddpg_loss(actor.to(device), critic.to(device), action_penalty=0.1)
+        return make_ddpg_loss(actor.to(device), critic.to(device), terms=terms)
     if name == "td3":
         return make_td3_loss(
-            actor.to(device), critic.to(device), action_spec=spec, generators=generators, action_penalty=0.1
+            actor.to(device), critic.to(device), action_spec=spec, generators=generators, terms=terms
         )
-    stochastic = make_stochastic_actor((4, 2), spec).to(device)
+    stochastic = make_stochastic_actor((4, 2), spec, generators=generators).to(device)
     if name == "sac":
-        return make_sac_loss(stochastic, critic.to(device), action_spec=spec, generators=generators)
+        return make_sac_loss(stochastic, critic.to(device))
     if name == "redq":
-        return make_sac_loss(
-            stochastic,
-            critic.to(device),
-            action_spec=spec,
-            critics=4,
-            target_critics=2,
-            generators=generators,
-        )
+        critics = [networks()[1].to(device) for _ in range(4)]
+        return make_sac_loss(stochastic, critics, target_critics=2)
     quantiles = make_critic((4, 2), 3, outputs=5).to(device)
-    return make_tqc_loss(stochastic, quantiles, action_spec=spec, generators=generators)
+    return make_tqc_loss(stochastic, quantiles)
 
 
 @pytest.mark.parametrize("name", ["ddpg", "td3", "sac", "redq", "tqc"])

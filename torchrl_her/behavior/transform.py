@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite
 from torchrl.envs import Transform
@@ -14,6 +14,7 @@ from torchrl.envs import Transform
 from torchrl_her.behavior.factors import GoalCandidates, GoalFactor
 from torchrl_her.behavior.memory import AchievedGoals
 from torchrl_her.checks import check_whole
+from torchrl_her.env_keys import EnvKeys
 from torchrl_her.goals.factors import draw
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
@@ -69,8 +70,7 @@ class BehaviorGoals(Transform):
         achieved_reward: the reward of an achieved goal.
         continues_after_termination: whether the environment can be stepped further after it terminated an
             episode; if not, the episode is truncated there.
-        observation_key, achieved_goal_key, desired_goal_key, reward_key, terminated_key, truncated_key,
-            done_key: read, and all but the first two written.
+        keys: keys of the entries that are read, and all but the first two written.
         real_goal_key: key under which the task's own goal is written.
         proposed_key: key under which a bool [..., 1] is written: whether the goal is a proposed one.
         reached_key: key under which a bool [..., 1] is written: whether
@@ -118,13 +118,7 @@ class BehaviorGoals(Transform):
         generators: Sequence[torch.Generator] | None = None,
         achieved_reward: float = 0.0,
         continues_after_termination: bool = False,
-        observation_key: NestedKey = "observation",
-        achieved_goal_key: NestedKey = "achieved_goal",
-        desired_goal_key: NestedKey = "desired_goal",
-        reward_key: NestedKey = "reward",
-        terminated_key: NestedKey = "terminated",
-        truncated_key: NestedKey | None = "truncated",
-        done_key: NestedKey = "done",
+        keys: EnvKeys = EnvKeys(),
         real_goal_key: NestedKey = "real_desired_goal",
         proposed_key: NestedKey = "proposed",
         reached_key: NestedKey = "proposed_reached",
@@ -137,12 +131,10 @@ class BehaviorGoals(Transform):
         if update_on not in get_args(UpdateOn):
             raise ValueError(f"update_on must be one of {', '.join(get_args(UpdateOn))}, got {update_on!r}")
         run_weights = weights_by_run(weights, runs)
-        if truncated_key is None and not continues_after_termination:
-            raise ValueError(
-                "continues_after_termination=False needs a truncated_key, to say where the environment ended"
-            )
-        out_keys = [desired_goal_key, real_goal_key, proposed_key, reached_key]
-        super().__init__(in_keys=[observation_key, achieved_goal_key, desired_goal_key], out_keys=out_keys)
+        keys.check_ends(continues_after_termination=continues_after_termination)
+        in_keys = [keys.observation, keys.achieved_goal, keys.desired_goal]
+        out_keys = [keys.desired_goal, real_goal_key, proposed_key, reached_key]
+        super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.generators: Generators = check_generators(runs, generators) or [None]
         self.reward_fn, self.weights, self.factors = reward_fn, run_weights, list(factors)
         self.remember = remember
@@ -158,10 +150,7 @@ class BehaviorGoals(Transform):
             continues_after_termination,
         )
         self.memory = AchievedGoals(memory, runs=runs)
-        self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
-        self.truncated_key = None if truncated_key is None else unravel_key(truncated_key)
-        self.done_key = unravel_key(done_key)
-        self.stage_key, self.stage = stage_key, stage
+        self.keys, self.stage_key, self.stage = keys, stage_key, stage
         self.ended = torch.zeros(runs, dtype=torch.int64)
         self.achieved = torch.zeros(runs, dtype=torch.int64)
         self._active = [True] * runs
@@ -246,8 +235,8 @@ class BehaviorGoals(Transform):
         wanted = torch.where(proposed, tensordict.get(goal_key), real)
         outcome = outcomes(self.reward_fn, achieved, next_tensordict, tensordict)
         reward, terminated = call_reward(self.reward_fn, outcome, wanted)
-        before = self._get(next_tensordict, self.reward_key)
-        ended = self._get(next_tensordict, self.terminated_key)
+        before = self._get(next_tensordict, self.keys.reward)
+        ended = self._get(next_tensordict, self.keys.terminated)
         fell = ended & (before < self.achieved_reward)
         if bool(fell.any()):  # such an end holds for any goal, unless the task's own goal has caused it
             own_reward, own_end = call_reward(self.reward_fn, outcome, real)
@@ -256,16 +245,16 @@ class BehaviorGoals(Transform):
         reached = self._get(tensordict, reached_key) | (proposed & (reward >= self.achieved_reward))
         terminated = torch.where(proposed, terminated | fell, ended)
         done = terminated
-        if self.truncated_key is not None:
-            truncated = self._get(next_tensordict, self.truncated_key)
+        if self.keys.truncated is not None:
+            truncated = self._get(next_tensordict, self.keys.truncated)
             if not self.continues_after_termination:
                 truncated = truncated | (ended & ~terminated)
-            next_tensordict.set(self.truncated_key, truncated)
+            next_tensordict.set(self.keys.truncated, truncated)
             done = terminated | truncated
-        done = torch.where(proposed, done, self._get(next_tensordict, self.done_key))
+        done = torch.where(proposed, done, self._get(next_tensordict, self.keys.done))
         reward = torch.where(proposed, reward.to(before), before)
-        keys = (goal_key, self.reward_key, self.terminated_key, self.done_key, reached_key)
-        for key, value in zip(keys, (wanted, reward, terminated, done, reached), strict=True):
+        written = (goal_key, self.keys.reward, self.keys.terminated, self.keys.done, reached_key)
+        for key, value in zip(written, (wanted, reward, terminated, done, reached), strict=True):
             next_tensordict.set(key, value)
         self._count(proposed & done, reached)
         return next_tensordict

@@ -41,7 +41,7 @@ class GoalValues:
         >>> from torchrl.data import Bounded
         >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss
         >>> actor, critic = make_actor((4, 2), 3), make_critic((4, 2), 3)
-        >>> loss = make_ddpg_loss(actor, critic, gamma=0.98)
+        >>> loss = make_ddpg_loss(actor, critic)
         >>> values = GoalValues(loss, actor)
         >>> values(torch.zeros(5, 4), torch.zeros(5, 10, 2), [5]).shape
         torch.Size([5, 10, 1])

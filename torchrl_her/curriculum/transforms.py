@@ -13,6 +13,7 @@ from torchrl.envs import Transform
 
 from torchrl_her.curriculum.orders import EpisodeStages
 from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress
+from torchrl_her.env_keys import EnvKeys
 from torchrl_her.goals.rewards import RewardFunction, is_achieved
 from torchrl_her.replay_buffers.keys import device_of
 
@@ -146,8 +147,8 @@ class StateToObs(_StageTransform):
     would stay in the stages in which they were started.
 
     Change stages between episodes, and reset the collector. If a stage changes in mid-episode, the next step
-    is still shown as a whole in the new stage, and the episode is truncated there (done, without a
-    ``truncated_key``). The action of that step was chosen in the old stage. For this the environment must
+    is still shown as a whole in the new stage, and the episode is truncated there (done, without a key for
+    ``truncated``). The action of that step was chosen in the old stage. For this the environment must
     work on the tensors that the collector keeps, so on the policy's device.
 
     GymWrapper shows an entry ``state`` of a dict as ``observation``: put a RenameTransform before this one.
@@ -161,18 +162,16 @@ class StateToObs(_StageTransform):
 
     Keyword Args:
         state_key: the state vector, which is read.
-        observation_key, achieved_goal_key, desired_goal_key, reward_key, terminated_key, done_key: what is
-            written.
+        keys: keys of the entries that are written. The flag ``truncated`` is read; its key is None if the
+            environment below has no time limit (a StepCounter after this transform may add one).
         stage_key: key under which the stage of each row is written, [..., 1] of int64, if episodes have
             stages of their own (:class:`~torchrl_her.curriculum.EpisodeStages`).
-        truncated_key: read; None if the environment below has no time limit (a StepCounter after this
-            transform may add one).
         continues_after_termination: whether the environment can be stepped further after it terminated an
             episode; if not, ``truncated`` is written, too.
 
     Raises:
         ValueError: ``progress`` belongs to another curriculum, or ``continues_after_termination`` is False
-            without a ``truncated_key``; when used, the state has another width, or the batch is
+            without a key for ``truncated``; when used, the state has another width, or the batch is
             not R equal blocks.
         KeyError: when used, the environment has no such state or flags.
 
@@ -201,25 +200,14 @@ class StateToObs(_StageTransform):
         progress: CurriculumProgress,
         *,
         state_key: NestedKey = "state",
-        observation_key: NestedKey = "observation",
-        achieved_goal_key: NestedKey = "achieved_goal",
-        desired_goal_key: NestedKey = "desired_goal",
-        reward_key: NestedKey = "reward",
-        terminated_key: NestedKey = "terminated",
-        truncated_key: NestedKey | None = "truncated",
-        done_key: NestedKey = "done",
+        keys: EnvKeys = EnvKeys(),
         stage_key: NestedKey = "stage",
         continues_after_termination: bool = True,
     ) -> None:
-        if not continues_after_termination and truncated_key is None:
-            raise ValueError(
-                "continues_after_termination=False needs a truncated_key, to say where the environment ended"
-            )
-        shown = [observation_key, achieved_goal_key, desired_goal_key]
+        keys.check_ends(continues_after_termination=continues_after_termination)
+        shown = [keys.observation, keys.achieved_goal, keys.desired_goal]
         super().__init__(curriculum, progress, None, [state_key], shown, stage_key)
-        self.reward_key, self.terminated_key = unravel_key(reward_key), unravel_key(terminated_key)
-        self.truncated_key = None if truncated_key is None else unravel_key(truncated_key)
-        self.done_key, self.continues_after_termination = unravel_key(done_key), continues_after_termination
+        self.keys, self.continues_after_termination = keys, continues_after_termination
         goal = curriculum.goal_width
         self._widths = [curriculum.observation_width, goal, goal]
 
@@ -239,11 +227,11 @@ class StateToObs(_StageTransform):
         self._observe(next_tensordict)
         self._judge(next_tensordict)
         if cut is not None:
-            done = next_tensordict.get(self.done_key)
+            done = next_tensordict.get(self.keys.done)
             cut = cut.unsqueeze(-1) & ~done
-            next_tensordict.set(self.done_key, done | cut)
-            if self.truncated_key is not None:
-                next_tensordict.set(self.truncated_key, next_tensordict.get(self.truncated_key) | cut)
+            next_tensordict.set(self.keys.done, done | cut)
+            if self.keys.truncated is not None:
+                next_tensordict.set(self.keys.truncated, next_tensordict.get(self.keys.truncated) | cut)
         return next_tensordict
 
     def _judge(self, tensordict: TensorDictBase) -> None:
@@ -259,7 +247,7 @@ class StateToObs(_StageTransform):
                 rows = rows.view(-1, *[1] * (achieved.ndim - 2)).expand(achieved.shape[:-1])
         if not below:
             return
-        reward, ended = tensordict.get(self.reward_key), tensordict.get(self.terminated_key)
+        reward, ended = tensordict.get(self.keys.reward), tensordict.get(self.keys.terminated)
         terminated = ended
         for stage in below:
             rule = cast(RewardFunction, self.curriculum.stages[stage].reward_fn)
@@ -271,15 +259,15 @@ class StateToObs(_StageTransform):
                 reward = torch.where(here, result[0].to(reward.dtype), reward)
                 terminated = torch.where(here, result[1], terminated)
         done = terminated.clone()
-        if self.truncated_key is not None:
-            truncated = tensordict.get(self.truncated_key)
+        if self.keys.truncated is not None:
+            truncated = tensordict.get(self.keys.truncated)
             if not self.continues_after_termination:
                 truncated = truncated | (ended & ~terminated)
-                tensordict.set(self.truncated_key, truncated)
+                tensordict.set(self.keys.truncated, truncated)
             done |= truncated
-        tensordict.set(self.reward_key, reward)
-        tensordict.set(self.terminated_key, terminated)
-        tensordict.set(self.done_key, done)
+        tensordict.set(self.keys.reward, reward)
+        tensordict.set(self.keys.terminated, terminated)
+        tensordict.set(self.keys.done, done)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Raises a RuntimeError: sampled transitions would lose their virtual goals."""
@@ -304,7 +292,7 @@ class StateToObs(_StageTransform):
 
     def transform_done_spec(self, done_spec: Composite) -> Composite:
         known = list(done_spec.keys(True, True))
-        for key in (self.terminated_key, self.truncated_key, self.done_key):
+        for key in (self.keys.terminated, self.keys.truncated, self.keys.done):
             if key is not None and key not in known:
                 raise KeyError(f"StateToObs needs the flag {key!r} of the environment, got {known}")
         return done_spec

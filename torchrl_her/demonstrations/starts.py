@@ -38,7 +38,8 @@ class DemonstrationStarts(Transform):
         share: fraction of the episodes.
         runs: R.
         generators: generators, one for each run, or None for torch's own.
-        width, stride, threshold, samples: options of :class:`~torchrl_her.demonstrations.WalkBack`.
+        **walk: options of :class:`~torchrl_her.demonstrations.WalkBack`: ``width``, ``stride``,
+            ``threshold`` and ``samples``.
 
     Attributes:
         walk: how far starts have walked back.
@@ -66,10 +67,7 @@ class DemonstrationStarts(Transform):
         share: float = 0.5,
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
-        width: int = 4,
-        stride: int = 2,
-        threshold: float = 0.5,
-        samples: int = 50,
+        **walk: Any,
     ) -> None:
         super().__init__()
         if not 0.0 <= share <= 1.0:
@@ -82,13 +80,7 @@ class DemonstrationStarts(Transform):
         self._shown = [first if single else usable(demos) for demos in given]
         self.share, self.runs = share, runs
         self._generators = [None] * runs if generators is None else list(generators)
-        self.walk = WalkBack(
-            [int(demos.lengths.max()) for demos in self._shown],
-            width=width,
-            stride=stride,
-            threshold=threshold,
-            samples=samples,
-        )
+        self.walk = WalkBack([int(demos.lengths.max()) for demos in self._shown], **walk)
         self._back: Tensor | None = None  # [N], how many steps before the end the present episodes started
         self._asks_elsewhere = False
 

@@ -103,12 +103,10 @@ class Instructiveness(InstructiveWeights, GoalHistogram):
 
     Keyword Args:
         sigma: the final standard deviation of the kernel, in the unit of the goals.
-        start_factor: the first sigma divided by the final one; at least 1.
-        decay: factor of the covariance in each step, in (0, 1]; 1 never shrinks it.
-        floor: the least weight of a goal. At 0, a goal is no longer drawn once q reaches q* in its cell.
         floor_is_relative: whether ``floor`` is multiplied by the largest q*; the thesis's floor is absolute.
-        subtract: False for the weights q* alone, without q and floor (the sequential architecture).
         recent: number of the newest virtual goals that q counts; None for all since the buffer was emptied.
+        **options: ``start_factor``, ``decay``, ``floor`` and ``subtract`` of
+            :class:`~torchrl_her.goals.InstructiveWeights`.
 
     Attributes:
         sigma, q_star: their present values.
@@ -135,18 +133,13 @@ class Instructiveness(InstructiveWeights, GoalHistogram):
         target: Callable[[float], Tensor],
         *,
         sigma: float,
-        start_factor: float = 3.0,
-        decay: float = 0.9,
-        floor: float = 0.002,
         floor_is_relative: bool = True,
-        subtract: bool = True,
         recent: int | None = None,
+        **options: Any,
     ) -> None:
         GoalHistogram.__init__(self, grid, recent=recent)
         self.target, self.floor_is_relative = target, floor_is_relative
-        InstructiveWeights.__init__(
-            self, sigma=sigma, start_factor=start_factor, decay=decay, floor=floor, subtract=subtract
-        )
+        InstructiveWeights.__init__(self, sigma=sigma, **options)
         self.final_q_star = self._target(sigma)
 
     @property

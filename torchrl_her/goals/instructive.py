@@ -20,7 +20,7 @@ class InstructiveWeights(GoalWeights):
         sigma: the final standard deviation of the kernel.
         start_factor: the first sigma divided by the final one; at least 1.
         decay: factor of the covariance in each step, in (0, 1]; 1 never shrinks it.
-        floor: the least weight of a goal.
+        floor: the least weight of a goal. At 0, a goal is no longer drawn once q reaches q* at it.
         subtract: False for the weights q* alone, without q and floor (the sequential architecture).
 
     Attributes:
@@ -31,7 +31,7 @@ class InstructiveWeights(GoalWeights):
         ValueError: an option is out of its range.
 
     Example:
-        >>> weights = InstructiveWeights(sigma=0.2, start_factor=3.0, decay=0.9, floor=0.0, subtract=True)
+        >>> weights = InstructiveWeights(sigma=0.2)
         >>> weights.step()
         >>> round(weights.sigma**2, 3)  # 0.6 squared, times 0.9
         0.324
@@ -41,7 +41,13 @@ class InstructiveWeights(GoalWeights):
     sigma: float
 
     def __init__(
-        self, *, sigma: float, start_factor: float, decay: float, floor: float, subtract: bool
+        self,
+        *,
+        sigma: float,
+        start_factor: float = 3.0,
+        decay: float = 0.9,
+        floor: float = 0.002,
+        subtract: bool = True,
     ) -> None:
         if not 0 < sigma < math.inf:
             raise ValueError(f"sigma must be positive and finite, got {sigma}")

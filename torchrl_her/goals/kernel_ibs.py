@@ -34,16 +34,14 @@ class KernelInstructiveness(InstructiveWeights):
 
     Keyword Args:
         sigma: the final standard deviation of the kernel, in the unit of the goals divided by ``scale``.
-        start_factor: the first sigma divided by the final one; at least 1.
-        decay: factor of the covariance in each step, in (0, 1]; 1 never shrinks it.
-        floor: the least weight of a goal, as a share of the largest q* of a real goal.
-        subtract: False for the weights q* alone, without q and floor (the sequential architecture).
         scale: divisor of goals, a number or g of them, where their numbers have different
             units.
         samples: maximum number of real goals, and of virtual ones, from which densities are computed. The
             virtual ones are a part that is spread evenly over all that were written.
         log_target: maps goals [m, g] and a sigma to the logarithm of the density q* [m], in place of the
             kernel density of ``goals``.
+        **options: ``start_factor``, ``decay``, ``floor``, as a share of the largest q* of a real goal, and
+            ``subtract`` of :class:`~torchrl_her.goals.InstructiveWeights`.
 
     Attributes:
         sigma: its present value.
@@ -75,13 +73,10 @@ class KernelInstructiveness(InstructiveWeights):
         goals: Tensor,
         *,
         sigma: float,
-        start_factor: float = 3.0,
-        decay: float = 0.9,
-        floor: float = 0.002,
-        subtract: bool = True,
         scale: Numbers = 1.0,
         samples: int = 1_000,
         log_target: Callable[[Tensor, float], Tensor] | None = None,
+        **options: Any,
     ) -> None:
         if goals.ndim != 2 or len(goals) == 0 or not goals.isfinite().all():
             raise ValueError(f"goals must be finite, [n, g] with n > 0, got a shape of {list(goals.shape)}")
@@ -94,7 +89,7 @@ class KernelInstructiveness(InstructiveWeights):
         self._scale = factor.to(goals.device).expand(g)
         self._real = goals.detach()[spread_evenly(len(goals), samples, goals.device)].double()
         self.clear()
-        super().__init__(sigma=sigma, start_factor=start_factor, decay=decay, floor=floor, subtract=subtract)
+        super().__init__(sigma=sigma, **options)
 
     @property
     def divergence(self) -> float:

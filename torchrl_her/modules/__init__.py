@@ -11,6 +11,7 @@ from torchrl_her.modules.exploration import (
 from torchrl_her.modules.networks import (
     ActorNet,
     CriticNet,
+    NetworkShape,
     StackedLayerNorm,
     StackedLinear,
     make_actor,
@@ -31,6 +32,7 @@ __all__ = [
     "DecayingEpsilonGreedy",
     "Exploration",
     "Moments",
+    "NetworkShape",
     "NormalizeBatch",
     "NormalizedPolicy",
     "PolicyAverage",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import torch
@@ -118,50 +119,58 @@ class StackedLayerNorm(nn.Module):
         return torch.nn.functional.layer_norm(x, x.shape[-1:]) * self.weight + self.bias
 
 
-def hidden_layer(
-    inputs: int, outputs: int, *, runs: int = 1, norm: Norm = "none", activation: ActivationName = "relu"
-) -> nn.Sequential:
-    """Makes a stacked linear layer, a normalization unless ``norm`` is none, and an activation."""
-    norms: dict[str, Any] = {"layer": StackedLayerNorm, "batch": StackedBatchNorm}
-    between = [norms[norm](outputs, runs=runs)] if norm in norms else []
-    return nn.Sequential(StackedLinear(inputs, outputs, runs=runs), *between, ACTIVATIONS[activation]())
+@dataclass(frozen=True, kw_only=True)
+class NetworkShape:
+    """Hidden layers of a network.
+
+    Args:
+        hidden: width of each hidden layer.
+        depth: number of hidden layers, at least 2.
+        activation: behind each of them: ``"relu"``, ``"tanh"`` or ``"elu"``.
+        norm: ``"layer"`` for layer normalization before each activation, ``"none"`` without; ``"batch"`` for
+            batch normalization of the hidden layers and, in a critic, of its input, but not in actors.
+
+    Raises:
+        ValueError: a number is too small, or a name is unknown.
+
+    Example:
+        >>> NetworkShape(hidden=256, norm="layer")
+        NetworkShape(hidden=256, depth=3, activation='relu', norm='layer')
+    """
+
+    hidden: int = 64
+    depth: int = 3
+    activation: ActivationName = "relu"
+    norm: Norm = "none"
+
+    def __post_init__(self) -> None:
+        check_whole(hidden=self.hidden)
+        check_whole(depth=self.depth, least=_LEAST_DEPTH)
+        for name, known in (("norm", get_args(Norm)), ("activation", tuple(ACTIVATIONS))):
+            if (word := getattr(self, name)) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, got {word!r}")
 
 
-def hidden_layers(
-    inputs: int,
-    hidden: int,
-    depth: int,
-    *,
-    joined: int = 0,
-    runs: int = 1,
-    norm: Norm = "none",
-    activation: ActivationName = "relu",
-) -> list[nn.Module]:
-    """Makes hidden layers of one width, one after the other.
+def hidden_layers(inputs: int, shape: NetworkShape, *, joined: int = 0, runs: int = 1) -> list[nn.Module]:
+    """Makes hidden layers, one after the other: linear, a normalization if there is one, an activation.
 
     Args:
         inputs: width of the input.
-        hidden: width of each layer.
-        depth: number of layers, at least 2.
+        shape: width, number and kind of the layers.
         joined: width of what the second one takes in besides the outputs of the first.
         runs: R.
-        norm: normalization of each layer.
-        activation: behind each layer.
-
-    Raises:
-        ValueError: the width or the depth is too small, or a word is not one of those that there are.
 
     Example:
-        >>> len(hidden_layers(4, 64, 3))
+        >>> len(hidden_layers(4, NetworkShape()))
         3
     """
-    check_whole(hidden=hidden)
-    check_whole(depth=depth, least=_LEAST_DEPTH)
-    for name, word, known in (("norm", norm, get_args(Norm)), ("activation", activation, tuple(ACTIVATIONS))):
-        if word not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}, got {word!r}")
-    widths = [inputs, hidden + joined, *[hidden] * (depth - 2)]
-    return [hidden_layer(width, hidden, runs=runs, norm=norm, activation=activation) for width in widths]
+    norms: dict[str, Any] = {"layer": StackedLayerNorm, "batch": StackedBatchNorm}
+    layers: list[nn.Module] = []
+    for width in (inputs, shape.hidden + joined, *[shape.hidden] * (shape.depth - 2)):
+        linear = StackedLinear(width, shape.hidden, runs=runs)
+        between = [norms[shape.norm](shape.hidden, runs=runs)] if shape.norm in norms else []
+        layers.append(nn.Sequential(linear, *between, ACTIVATIONS[shape.activation]()))
+    return layers
 
 
 class ActorNet(nn.Module):
@@ -170,14 +179,11 @@ class ActorNet(nn.Module):
     Args:
         inputs: width of all inputs together.
         actions: width of the action.
-        hidden: width of the hidden layers.
-        depth: number of hidden layers, at least 2.
-        activation: behind each of them: ``"relu"``, ``"tanh"`` or ``"elu"``.
-        norm: ``"layer"`` for layer normalization before each activation, ``"none"`` without.
+        shape: its hidden layers.
         runs: R, how many independent actors.
 
     Raises:
-        ValueError: an option cannot be; batch normalization, among others, is for critics only.
+        ValueError: the shape has batch normalization, which is for critics only.
 
     Example:
         >>> ActorNet(11, 3)(torch.zeros(2, 9), torch.zeros(2, 2)).shape
@@ -189,19 +195,16 @@ class ActorNet(nn.Module):
         inputs: int,
         actions: int,
         *,
-        hidden: int = 64,
-        depth: int = 3,
-        activation: ActivationName = "relu",
-        norm: Norm = "none",
+        shape: NetworkShape = NetworkShape(),
         runs: int = 1,
     ) -> None:
         super().__init__()
-        if norm == "batch":
+        if shape.norm == "batch":
             raise ValueError("norm must be none or layer in an actor, got 'batch'")
         self.runs = runs
         self.layers = nn.Sequential(
-            *hidden_layers(inputs, hidden, depth, runs=runs, norm=norm, activation=activation),
-            StackedLinear(hidden, actions, runs=runs, bound=_LAST_LAYER),
+            *hidden_layers(inputs, shape, runs=runs),
+            StackedLinear(shape.hidden, actions, runs=runs, bound=_LAST_LAYER),
             nn.Tanh(),
         )
 
@@ -217,16 +220,12 @@ class CriticNet(nn.Module):
     Args:
         inputs: width of all inputs together, without the action.
         actions: width of the action, the last input.
-        hidden: width of the hidden layers.
-        depth: number of hidden layers, at least 2.
-        activation: behind each of them: ``"relu"``, ``"tanh"`` or ``"elu"``.
-        norm: ``"layer"`` for layer normalization of the hidden layers, ``"batch"`` for batch normalization of
-            the input and the hidden layers, ``"none"`` without.
+        shape: its hidden layers.
         runs: R, how many independent critics.
         outputs: number of outputs.
 
     Raises:
-        ValueError: an option cannot be.
+        ValueError: ``outputs`` is not positive.
 
     Example:
         >>> CriticNet(11, 3)(torch.zeros(2, 9), torch.zeros(2, 2), torch.zeros(2, 3)).shape
@@ -238,22 +237,17 @@ class CriticNet(nn.Module):
         inputs: int,
         actions: int,
         *,
-        hidden: int = 64,
-        depth: int = 3,
-        activation: ActivationName = "relu",
-        norm: Norm = "none",
+        shape: NetworkShape = NetworkShape(),
         runs: int = 1,
         outputs: int = 1,
     ) -> None:
         super().__init__()
         check_whole(outputs=outputs)
         self.runs, self.outputs = runs, outputs
-        first, *rest = hidden_layers(
-            inputs, hidden, depth, joined=actions, runs=runs, norm=norm, activation=activation
-        )
-        norms = [StackedBatchNorm(inputs, runs=runs)] if norm == "batch" else []
+        first, *rest = hidden_layers(inputs, shape, joined=actions, runs=runs)
+        norms = [StackedBatchNorm(inputs, runs=runs)] if shape.norm == "batch" else []
         self.first = nn.Sequential(*norms, first)
-        self.rest = nn.Sequential(*rest, StackedLinear(hidden, outputs, runs=runs, bound=_LAST_LAYER))
+        self.rest = nn.Sequential(*rest, StackedLinear(shape.hidden, outputs, runs=runs, bound=_LAST_LAYER))
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Maps inputs [..., width], the action last, to [..., outputs]."""
@@ -267,6 +261,17 @@ class CriticNet(nn.Module):
 def by_run(x: Tensor, runs: int) -> Tensor:
     """Separates the R equal blocks of a batch: reshapes [..., width] to [R, rows, width]."""
     return x.reshape(runs, -1, x.shape[-1])
+
+
+def stacked_runs(module: nn.Module) -> int:
+    """Returns the number of runs that the networks within a module are stacked for.
+
+    Example:
+        >>> stacked_runs(make_actor((9, 2), 3, runs=5)), stacked_runs(nn.Linear(2, 2))
+        (5, 1)
+    """
+    numbers = (getattr(part, "runs", None) for part in module.modules())
+    return next((number for number in numbers if isinstance(number, int)), 1)
 
 
 def stack_runs(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
@@ -301,10 +306,7 @@ def make_actor(
     widths: Sequence[int],
     actions: int,
     *,
-    hidden: int = 64,
-    depth: int = 3,
-    activation: ActivationName = "relu",
-    norm: Norm = "none",
+    shape: NetworkShape = NetworkShape(),
     runs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     action_key: NestedKey = "action",
@@ -314,7 +316,7 @@ def make_actor(
     Args:
         widths: widths of the inputs, one for each of ``in_keys``.
         actions: width of the action, which is within [-1, 1].
-        hidden, depth, activation, norm: see :class:`ActorNet`.
+        shape: its hidden layers.
         runs: R, how many independent actors.
         in_keys: keys of the inputs; the goal must be among them.
         action_key: key under which the action is written.
@@ -326,9 +328,7 @@ def make_actor(
         >>> actor(TensorDict(seen, [4]))["action"].shape
         torch.Size([4, 3])
     """
-    net = ActorNet(
-        sum(widths), actions, hidden=hidden, depth=depth, activation=activation, norm=norm, runs=runs
-    )
+    net = ActorNet(sum(widths), actions, shape=shape, runs=runs)
     return TensorDictModule(net, in_keys=list(in_keys), out_keys=[action_key])
 
 
@@ -336,10 +336,7 @@ def make_critic(
     widths: Sequence[int],
     actions: int,
     *,
-    hidden: int = 64,
-    depth: int = 3,
-    activation: ActivationName = "relu",
-    norm: Norm = "none",
+    shape: NetworkShape = NetworkShape(),
     runs: int = 1,
     outputs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
@@ -351,7 +348,7 @@ def make_critic(
     Args:
         widths: widths of the inputs, one for each of ``in_keys``.
         actions: width of the action.
-        hidden, depth, activation, norm: see :class:`CriticNet`.
+        shape: its hidden layers.
         runs: R, how many independent critics.
         outputs: number of outputs, for example quantiles of the return.
         in_keys: keys of the inputs besides the action; the goal must be among them.
@@ -365,14 +362,5 @@ def make_critic(
         >>> critic(TensorDict({**seen, "action": torch.zeros(4, 3)}, [4]))["state_action_value"].shape
         torch.Size([4, 1])
     """
-    net = CriticNet(
-        sum(widths),
-        actions,
-        hidden=hidden,
-        depth=depth,
-        activation=activation,
-        norm=norm,
-        runs=runs,
-        outputs=outputs,
-    )
+    net = CriticNet(sum(widths), actions, shape=shape, runs=runs, outputs=outputs)
     return TensorDictModule(net, in_keys=[*in_keys, action_key], out_keys=[value_key])

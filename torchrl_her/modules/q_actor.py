@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
 
-from torchrl_her.modules.networks import ActivationName, Norm, StackedLinear, by_run, hidden_layers
+from torchrl_her.modules.networks import NetworkShape, StackedLinear, by_run, hidden_layers
 
 
 class QNet(nn.Module):
@@ -20,7 +20,7 @@ class QNet(nn.Module):
     Args:
         inputs: width of all inputs together.
         actions: number of actions.
-        hidden, depth, activation, norm: see :class:`~torchrl_her.modules.ActorNet`.
+        shape: its hidden layers.
         runs: R, how many independent networks.
 
     Example:
@@ -33,16 +33,13 @@ class QNet(nn.Module):
         inputs: int,
         actions: int,
         *,
-        hidden: int = 64,
-        depth: int = 3,
-        activation: ActivationName = "relu",
-        norm: Norm = "none",
+        shape: NetworkShape = NetworkShape(),
         runs: int = 1,
     ) -> None:
         super().__init__()
         self.runs = runs
-        layers = hidden_layers(inputs, hidden, depth, runs=runs, norm=norm, activation=activation)
-        self.layers = nn.Sequential(*layers, StackedLinear(hidden, actions, runs=runs))
+        layers = hidden_layers(inputs, shape, runs=runs)
+        self.layers = nn.Sequential(*layers, StackedLinear(shape.hidden, actions, runs=runs))
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Maps inputs [..., width] to values [..., actions]."""
@@ -98,10 +95,7 @@ def make_q_actor(
     widths: Sequence[int],
     actions: int,
     *,
-    hidden: int = 64,
-    depth: int = 3,
-    activation: ActivationName = "relu",
-    norm: Norm = "none",
+    shape: NetworkShape = NetworkShape(),
     runs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     value_key: NestedKey = "state_action_value",
@@ -111,7 +105,7 @@ def make_q_actor(
     Args:
         widths: widths of the inputs, one for each of ``in_keys``.
         actions: number of actions; they are integers (``Categorical``).
-        hidden, depth, activation, norm: see :class:`~torchrl_her.modules.ActorNet`.
+        shape: its hidden layers.
         runs: R, how many independent networks.
         in_keys: keys of the inputs; the goal must be among them.
         value_key: key under which the value of a given action is written.
@@ -127,6 +121,6 @@ def make_q_actor(
         >>> critic(actor(seen))["state_action_value"].shape
         torch.Size([2, 1])
     """
-    net = QNet(sum(widths), actions, hidden=hidden, depth=depth, activation=activation, norm=norm, runs=runs)
+    net = QNet(sum(widths), actions, shape=shape, runs=runs)
     actor = QValueActor(net, spec=Categorical(actions), in_keys=list(in_keys), action_space="categorical")
     return actor, TensorDictModule(_ChosenValue(net), in_keys=[*in_keys, "action"], out_keys=[value_key])

@@ -13,7 +13,7 @@ from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from torchrl_her.modules.networks import ActivationName, Norm, StackedLinear, by_run, hidden_layers
+from torchrl_her.modules.networks import NetworkShape, StackedLinear, by_run, hidden_layers
 from torchrl_her.modules.noise import RunNoise
 
 _LEAST_SCALE, _GREATEST_SCALE = -10.0, 2.0  # bounds of the scale's logarithm: Haarnoja et al., 2018
@@ -25,7 +25,7 @@ class StochasticActorNet(nn.Module):
     Args:
         inputs: width of all inputs together.
         actions: width of the action.
-        hidden, depth, activation, norm: see :class:`~torchrl_her.modules.ActorNet`.
+        shape: its hidden layers.
         runs: R, how many independent actors.
 
     Example:
@@ -39,16 +39,13 @@ class StochasticActorNet(nn.Module):
         inputs: int,
         actions: int,
         *,
-        hidden: int = 64,
-        depth: int = 3,
-        activation: ActivationName = "relu",
-        norm: Norm = "none",
+        shape: NetworkShape = NetworkShape(),
         runs: int = 1,
     ) -> None:
         super().__init__()
         self.runs = runs
-        layers = hidden_layers(inputs, hidden, depth, runs=runs, norm=norm, activation=activation)
-        self.layers = nn.Sequential(*layers, StackedLinear(hidden, 2 * actions, runs=runs))
+        layers = hidden_layers(inputs, shape, runs=runs)
+        self.layers = nn.Sequential(*layers, StackedLinear(shape.hidden, 2 * actions, runs=runs))
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Maps inputs [..., width] to location and scale, [..., actions] each."""
@@ -129,10 +126,7 @@ def make_stochastic_actor(
     widths: Sequence[int],
     action_spec: Bounded,
     *,
-    hidden: int = 64,
-    depth: int = 3,
-    activation: ActivationName = "relu",
-    norm: Norm = "none",
+    shape: NetworkShape = NetworkShape(),
     runs: int = 1,
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     generators: Sequence[torch.Generator] | None = None,
@@ -142,7 +136,7 @@ def make_stochastic_actor(
     Args:
         widths: widths of the inputs, one for each of ``in_keys``.
         action_spec: least and greatest actions, of one environment.
-        hidden, depth, activation, norm: see :class:`~torchrl_her.modules.ActorNet`.
+        shape: its hidden layers.
         runs: R, how many independent actors.
         in_keys: keys of the inputs; the goal must be among them.
         generators: generators of the actions that each run draws; None for torch's own.
@@ -154,15 +148,7 @@ def make_stochastic_actor(
         >>> actor(seen)["action"].shape
         torch.Size([4, 3])
     """
-    net = StochasticActorNet(
-        sum(widths),
-        action_spec.shape[-1],
-        hidden=hidden,
-        depth=depth,
-        activation=activation,
-        norm=norm,
-        runs=runs,
-    )
+    net = StochasticActorNet(sum(widths), action_spec.shape[-1], shape=shape, runs=runs)
     return StochasticActor(
         TensorDictModule(net, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

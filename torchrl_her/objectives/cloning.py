@@ -72,23 +72,21 @@ def cloning_terms(
     return torch.where(counted, squares, 0.0) / flagged.sum(-1, keepdim=True).clamp(min=1)
 
 
-def with_cloning(loss: Any, value: Tensor, transitions: TensorDictBase) -> Tensor:
-    """Adds the cloning loss of a loss with ``cloning`` to its actor's loss.
+def with_cloning(value: Tensor, loss: Any, cloning: Cloning, transitions: TensorDictBase) -> Tensor:
+    """Adds the cloning loss to the loss of an actor.
 
     For stochastic policies the cloned action is the greedy one.
 
     Args:
-        loss: TorchRL loss with an actor and the attribute ``cloning``; nothing is added if that is None.
-        value: its actor's loss: the mean over all rows, or one number for each.
+        value: the actor's loss: the mean over all rows, or one number for each.
+        loss: TorchRL loss that has the actor.
+        cloning: how it clones.
         transitions: rows [..., B]; each block of B is averaged by itself.
 
     Raises:
         KeyError: rows have no flag.
         ValueError: the loss has no critics for the Q filter.
     """
-    cloning: Cloning | None = loss.cloning
-    if cloning is None:
-        return value
     flag = transitions.get(cloning.key, None)
     if flag is None:
         raise KeyError(

@@ -126,26 +126,24 @@ def checked_subset(target_critics: int, critics: int) -> int:
 
 
 def as_critics(
-    critic: TensorDictModule | Sequence[TensorDictModule], critics: int
-) -> TensorDictModule | list[TensorDictModule]:
-    """Returns one critic that others are made like, or a list of all, as TorchRL's losses take them.
+    critic: TensorDictModule | Sequence[TensorDictModule],
+) -> tuple[TensorDictModule | list[TensorDictModule], int]:
+    """Returns one critic that two are made like, or a list of all, as TorchRL takes them, and their number.
 
     TorchRL registers the weights of a list of one critic as buffers, which are not trained. So a single one
     is handed over by itself; TorchRL then draws weights anew, which :func:`keep_weights` puts back.
 
     Raises:
-        ValueError: the list has another length than ``critics``, or that is below 1; a critic has batch
-            normalization, whose statistics a stack of critics cannot move.
+        ValueError: the list is empty, or a critic has batch normalization, whose statistics a stack of
+            critics cannot move.
     """
-    check_whole(critics=critics)
-    for module in [critic] if isinstance(critic, TensorDictModule) else critic:
+    every = [critic] if isinstance(critic, TensorDictModule) else list(critic)
+    check_whole(critics=len(every))
+    for module in every:
         if any(isinstance(layer, StackedBatchNorm) for layer in module.modules()):
             raise ValueError("norm must be none or layer in critics of this loss, got 'batch'; DDPG has it")
-    if isinstance(critic, TensorDictModule):
-        return critic
-    if len(critic) != critics:
-        raise ValueError(f"there must be {critics} critics, got {len(critic)}")
-    return list(critic) if critics > 1 else critic[0]
+    number = 2 if isinstance(critic, TensorDictModule) else len(every)
+    return every if len(every) > 1 else every[0], number
 
 
 def keep_weights(loss: LossModule, critic: TensorDictModule | Sequence[TensorDictModule]) -> None:

@@ -11,40 +11,27 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss
 
-from torchrl_her.objectives.action_cost import action_cost
-from torchrl_her.objectives.cloning import Cloning, with_cloning
-from torchrl_her.objectives.targets import clamped_td0
+from torchrl_her.objectives.actor_terms import ActorTerms
+from torchrl_her.objectives.targets import Targets
 
 
 class PenalizedDDPGLoss(DDPGLoss):
-    """TorchRL's DDPG loss with a cost of actions, see :func:`~torchrl_her.objectives.action_cost`.
+    """TorchRL's DDPG loss with more terms in the loss of its actor.
 
     Args:
         *args: arguments of :class:`torchrl.objectives.DDPGLoss`.
         **kwargs: keyword arguments of the same class.
-        action_penalty: weight of the action L2 penalty, at least 0.
-        saturation_penalty: weight of the saturation penalty, at least 0.
-        cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
+        terms: these terms.
     """
 
-    def __init__(
-        self,
-        *args: Any,
-        action_penalty: float = 0.0,
-        saturation_penalty: float = 0.0,
-        cloning: Cloning | None = None,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, *args: Any, terms: ActorTerms = ActorTerms(), **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.action_penalty, self.saturation_penalty = action_penalty, saturation_penalty
-        self.cloning = cloning
+        self.terms = terms
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         with actions_of(self.actor_network) as actions:
             loss, metadata = super().loss_actor(tensordict)
-        cost = action_cost(actions[0], l2=self.action_penalty, saturation=self.saturation_penalty)
-        loss = loss + (cost if loss.ndim else cost.mean())
-        return with_cloning(self, loss, tensordict), metadata
+        return self.terms.add_to(loss, self, actions[0], tensordict), metadata
 
 
 @contextmanager
@@ -79,28 +66,18 @@ def make_ddpg_loss(
     actor: TensorDictModule,
     critic: TensorDictModule,
     *,
-    gamma: float = 0.98,
-    reward_range: tuple[float, float] | None = (-1.0, 0.0),
-    action_penalty: float = 0.0,
-    saturation_penalty: float = 0.0,
+    targets: Targets = Targets(reward_range=(-1.0, 0.0)),
+    terms: ActorTerms = ActorTerms(),
     reduction: Literal["mean", "none"] = "mean",
-    cloning: Cloning | None = None,
 ) -> DDPGLoss:
     """Makes TorchRL's DDPG loss with clamped targets, and target networks for actor and critic.
 
     Args:
         actor: from :func:`~torchrl_her.make_actor`.
         critic: from :func:`~torchrl_her.make_critic`.
-        gamma: discount, in [0, 1).
-        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
-            leave them as they are.
-        action_penalty, saturation_penalty: weights of the costs of actions, see
-            :func:`~torchrl_her.objectives.action_cost`.
+        targets: discount, and the rewards whose returns targets are clamped to.
+        terms: further terms of the actor's loss.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
-        cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
-
-    Raises:
-        ValueError: ``gamma`` is outside of [0, 1).
 
     Example:
         >>> from torchrl_her import make_actor, make_critic
@@ -113,13 +90,10 @@ def make_ddpg_loss(
         critic,
         delay_actor=True,
         delay_value=True,
-        action_penalty=action_penalty,
-        saturation_penalty=saturation_penalty,
+        terms=terms,
         reduction=reduction,
-        cloning=cloning,
     )
-    estimator = clamped_td0(gamma, reward_range, loss.actor_critic)
-    loss.set_keys(state_action_value=critic.out_keys[0])
-    estimator.set_keys(value=critic.out_keys[0])
-    loss.make_value_estimator(estimator)
+    key = critic.out_keys[0]
+    loss.set_keys(state_action_value=key)
+    loss.make_value_estimator(targets.estimator(loss.actor_critic, value_key=key))
     return loss

@@ -7,14 +7,13 @@ from typing import Literal
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
 
-from torchrl_her.objectives.targets import clamped_td0
+from torchrl_her.objectives.targets import Targets
 
 
 def make_dqn_loss(
     actor: QValueActor,
     *,
-    gamma: float = 0.98,
-    reward_range: tuple[float, float] | None = (-1.0, 0.0),
+    targets: Targets = Targets(reward_range=(-1.0, 0.0)),
     double: bool = True,
     reduction: Literal["mean", "none"] = "mean",
 ) -> DQNLoss:
@@ -22,14 +21,9 @@ def make_dqn_loss(
 
     Args:
         actor: from :func:`~torchrl_her.modules.make_q_actor`.
-        gamma: discount, in [0, 1).
-        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
-            leave them as they are.
+        targets: discount, and the rewards whose returns targets are clamped to.
         double: whether the online network chooses the next action (van Hasselt et al., 2016).
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
-
-    Raises:
-        ValueError: ``gamma`` is outside of [0, 1).
 
     Example:
         >>> from torchrl_her.modules import make_q_actor
@@ -38,7 +32,5 @@ def make_dqn_loss(
         (-50, 0)
     """
     loss = DQNLoss(actor, delay_value=True, double_dqn=double, reduction=reduction)
-    estimator = clamped_td0(gamma, reward_range, loss.value_network)
-    estimator.set_keys(value="chosen_action_value")
-    loss.make_value_estimator(estimator)
+    loss.make_value_estimator(targets.estimator(loss.value_network, value_key="chosen_action_value"))
     return loss

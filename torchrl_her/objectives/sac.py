@@ -1,4 +1,4 @@
-"""SAC from TorchRL's loss, with an action L2 penalty."""
+"""SAC from TorchRL's loss, with more terms in the loss of its actor."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SACLoss
 
+from torchrl_her.modules.networks import stacked_runs
 from torchrl_her.modules.noise import RunNoise
-from torchrl_her.objectives.cloning import Cloning, with_cloning
+from torchrl_her.objectives.actor_terms import ActorTerms
 from torchrl_her.objectives.critics import as_critics, checked_subset, keep_weights, least_of_some
-from torchrl_her.objectives.targets import clamped_td0
+from torchrl_her.objectives.targets import Targets
 
 
 class PenalizedSACLoss(SACLoss):
-    """TorchRL's SAC loss (its second version) with an action L2 penalty, for one run or several.
+    """TorchRL's SAC loss (its second version) with more terms in the loss of its actor, for several runs.
 
     Each of R runs has its own temperature and its own random numbers.
 
@@ -34,34 +34,32 @@ class PenalizedSACLoss(SACLoss):
     Args:
         *args: arguments of :class:`torchrl.objectives.SACLoss`.
         **kwargs: keyword arguments of the same class.
-        action_penalty: the weight of the penalty on drawn actions, see
-            :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
-        cloning: options of behavior cloning, see :class:`~torchrl_her.objectives.Cloning`.
+        terms: these terms; penalties are on drawn actions.
         target_critics: number of critics that are drawn for targets; 0 for all.
-        runs: R.
         noise: source of its random numbers.
 
     Raises:
-        ValueError: ``target_critics`` is not from 0 to the number of critics.
+        ValueError: ``target_critics`` is not from 0 to the number of critics, or ``terms`` have a saturation
+            penalty.
     """
 
     def __init__(
         self,
         *args: Any,
-        action_penalty: float = 0.0,
-        cloning: Cloning | None = None,
+        terms: ActorTerms = ActorTerms(),
         target_critics: int = 0,
-        runs: int = 1,
         noise: RunNoise | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        self.action_penalty, self.cloning, self.runs = action_penalty, cloning, runs
+        if terms.saturation_penalty:
+            raise ValueError("saturation_penalty is for deterministic actors; choose action_penalty")
+        self.terms, self.runs = terms, stacked_runs(self.actor_network)
         self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
         self.noise = noise or RunNoise()
         start: Tensor = self.log_alpha.detach()  # type: ignore[has-type]
         dtype = next(self.actor_network_params.values(True, True)).dtype  # as fused steps need it
-        self.log_alpha = nn.Parameter(start.to(dtype).repeat(runs) if runs > 1 else start.to(dtype))
+        self.log_alpha = nn.Parameter(start.to(dtype).repeat(self.runs) if self.runs > 1 else start.to(dtype))
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         weights = self._maybe_get_priority_weight(tensordict)
@@ -73,9 +71,7 @@ class PenalizedSACLoss(SACLoss):
         loss = self._reduce_loss(
             self._by_run(self._alpha, log_prob) * log_prob - value, tensordict=tensordict, weights=weights
         )
-        penalty = self.action_penalty * action.square().mean(-1)
-        loss = loss + (penalty if loss.ndim else penalty.mean())
-        return with_cloning(self, loss, tensordict), {"log_prob": log_prob.detach()}
+        return self.terms.add_to(loss, self, action, tensordict), {"log_prob": log_prob.detach()}
 
     def _value_for_actor(self, values: Tensor) -> Tensor:
         """Returns the value [...] that the actor maximizes, from the outputs [N, ..., 1] of N critics."""
@@ -118,79 +114,64 @@ def make_sac_loss(
     actor: ProbabilisticActor,
     critic: TensorDictModule | Sequence[TensorDictModule],
     *,
-    action_spec: Bounded,
-    critics: int = 2,
     target_critics: int = 0,
-    gamma: float = 0.98,
-    reward_range: tuple[float, float] | None = None,
+    targets: Targets = Targets(reward_range=None),
     temperature: float = 0.1,
-    action_penalty: float = 0.0,
-    runs: int = 1,
-    generators: Sequence[torch.Generator] | None = None,
+    terms: ActorTerms = ActorTerms(),
     reduction: Literal["mean", "none"] = "mean",
-    cloning: Cloning | None = None,
 ) -> SACLoss:
     """Makes TorchRL's SAC loss with several critics and a learned temperature.
 
     Targets contain the policy's entropy besides the rewards, so they may rightly be outside of the range of
-    possible returns, and are not clamped unless ``reward_range`` is given. Clamping them makes sense where
-    rewards outweigh entropy, as they do when the temperature has become small: an overestimated value cannot
-    exceed what is possible then.
+    possible returns, and are not clamped unless ``targets`` have a range of rewards. Clamping them makes
+    sense where rewards outweigh entropy, as they do when the temperature has become small: an overestimated
+    value cannot exceed what is possible then.
 
     Haarnoja et al., Soft actor-critic algorithms and applications, 2018.
 
     Args:
-        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`.
-        critic: from :func:`~torchrl_her.make_critic`, the others are made like it; or all critics in a list.
-        action_spec: least and greatest actions, of one environment.
-        critics: number of critics; targets and policy use the least of their values.
+        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators. Each run that its
+            networks are stacked for has a temperature of its own.
+        critic: from :func:`~torchrl_her.make_critic`, a second one is made like it; or all critics in a list.
+            Targets and policy use the least of their values.
         target_critics: number of critics drawn at random in each gradient step: targets use the least of
             their values alone, while the policy has the mean of all. 0: both have the least of all. Chen et
             al., Randomized ensembled double Q-learning, 2021.
-        gamma: discount, in [0, 1).
-        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
-            leave them as they are.
+        targets: discount, and the rewards whose returns targets are clamped to.
         temperature: first value of the temperature. At TorchRL's 1, entropy outweighs rewards of -1 and 0 for
             so long that some runs never find what is rewarded.
-        action_penalty: weight of the action L2 penalty, see
-            :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
-        runs: R, how many runs the networks are stacked for; each has a temperature of its own.
-        generators: generators of the random numbers of each run; None for torch's own.
+        terms: further terms of the actor's loss, without a saturation penalty.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
-        cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 
     Raises:
-        ValueError: ``gamma`` is outside of [0, 1), ``temperature`` is not positive, ``critics`` is below 1 or
-            not their number, or ``target_critics`` is not from 0 to ``critics``.
+        ValueError: ``temperature`` is not positive, the list of critics is empty, or ``target_critics`` is
+            not from 0 to their number.
 
     Example:
+        >>> from torchrl.data import Bounded
         >>> from torchrl_her import make_critic
         >>> from torchrl_her.modules import make_stochastic_actor
-        >>> spec = Bounded(-1.0, 1.0, (3,))
-        >>> actor, critic = make_stochastic_actor((9, 2), spec), make_critic((9, 2), 3)
-        >>> loss = make_sac_loss(actor, critic, action_spec=spec)
+        >>> actor = make_stochastic_actor((9, 2), Bounded(-1.0, 1.0, (3,)))
+        >>> loss = make_sac_loss(actor, make_critic((9, 2), 3))
         >>> loss.num_qvalue_nets
         2
     """
-    networks = as_critics(critic, critics)
+    networks, number = as_critics(critic)
     loss = PenalizedSACLoss(
         actor,
         networks,
-        action_spec=action_spec,
-        num_qvalue_nets=critics,
+        num_qvalue_nets=number,
         loss_function="l2",
         alpha_init=positive_temperature(temperature),
-        action_penalty=action_penalty,
+        terms=terms,
         target_critics=target_critics,
-        runs=runs,
-        noise=RunNoise(generators),
+        noise=RunNoise(getattr(actor, "generators", None)),
         reduction=reduction,
         scalar_output_mode="exclude" if reduction == "none" else None,
-        cloning=cloning,
     )
     keep_weights(loss, critic)
-    loss.set_keys(state_action_value=(networks[0] if isinstance(networks, list) else networks).out_keys[0])
-    set_soft_targets(loss, gamma, reward_range)
+    loss.set_keys(state_action_value=loss.qvalue_network.out_keys[0])
+    loss.make_value_estimator(targets.estimator(value_key=loss.tensor_keys.value))
     return loss
 
 
@@ -203,17 +184,3 @@ def positive_temperature(temperature: float) -> float:
     if not temperature > 0:
         raise ValueError(f"temperature must be positive, got {temperature}")
     return temperature
-
-
-def set_soft_targets(loss: SACLoss, gamma: float, reward_range: tuple[float, float] | None) -> None:
-    """Gives a loss targets of one or several steps, clamped to possible returns if these are given.
-
-    Raises:
-        ValueError: ``gamma`` is outside of [0, 1).
-    """
-    clamped = clamped_td0(gamma, reward_range)
-    if reward_range is None:
-        loss.make_value_estimator(gamma=gamma)
-    else:
-        clamped.set_keys(value=loss.tensor_keys.value)
-        loss.make_value_estimator(clamped)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
@@ -41,28 +42,49 @@ class ClampedTD0(TD0Estimator):
         return super().value_estimate(tensordict, *args, **kwargs).clamp(self.low, self.high)
 
 
-def clamped_td0(
-    gamma: float, reward_range: tuple[float, float] | None, value_network: TensorDictModule | None = None
-) -> ClampedTD0:
-    """Makes targets for ``loss.make_value_estimator``, clamped to the returns that are possible.
+@dataclass(frozen=True, kw_only=True)
+class Targets:
+    """Targets of a loss: their discount, and the rewards that bound them.
 
     Args:
         gamma: discount, in [0, 1).
-        reward_range: least and greatest reward; None to leave targets as they are.
-        value_network: gives the value of the next state; None if the loss passes it.
+        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
+            leave targets as they are.
 
     Raises:
         ValueError: ``gamma`` is outside of [0, 1).
+
+    Example:
+        >>> estimator = Targets(gamma=0.98, reward_range=(-1.0, 0.0)).estimator()
+        >>> round(estimator.low), round(estimator.high)
+        (-50, 0)
     """
-    if not 0.0 <= gamma < 1.0:
-        raise ValueError(f"gamma must be in [0, 1), got {gamma}")
-    least, greatest = reward_range or (-math.inf, math.inf)
-    return ClampedTD0(
-        low=min(least, least / (1.0 - gamma)),  # least reward: once, if the episode ends there, or forever
-        high=max(greatest, greatest / (1.0 - gamma)),
-        gamma=gamma,
-        value_network=value_network,
-    )
+
+    gamma: float = 0.98
+    reward_range: tuple[float, float] | None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.gamma < 1.0:
+            raise ValueError(f"gamma must be in [0, 1), got {self.gamma}")
+
+    def estimator(
+        self, value_network: TensorDictModule | None = None, *, value_key: NestedKey = "state_action_value"
+    ) -> ClampedTD0:
+        """Makes the targets for ``loss.make_value_estimator`` of any loss of TorchRL.
+
+        Args:
+            value_network: gives the value of the next state; None if the loss passes it.
+            value_key: key of that value.
+        """
+        least, greatest = self.reward_range or (-math.inf, math.inf)
+        estimator = ClampedTD0(
+            low=min(least, least / (1.0 - self.gamma)),  # once, if the episode ends there, or forever
+            high=max(greatest, greatest / (1.0 - self.gamma)),
+            gamma=self.gamma,
+            value_network=value_network,
+        )
+        estimator.set_keys(value=value_key)
+        return estimator
 
 
 class _BuffersToo(TargetNetUpdater):

@@ -14,14 +14,13 @@ from torchrl.objectives import TD3Loss
 from torchrl.objectives.utils import distance_loss
 
 from torchrl_her.modules.noise import RunNoise
-from torchrl_her.objectives.action_cost import action_cost
-from torchrl_her.objectives.cloning import Cloning, with_cloning
+from torchrl_her.objectives.actor_terms import ActorTerms
 from torchrl_her.objectives.critics import as_critics, checked_subset, keep_weights, least_of_some
-from torchrl_her.objectives.targets import clamped_td0
+from torchrl_her.objectives.targets import Targets
 
 
 class PenalizedTD3Loss(TD3Loss):
-    """TorchRL's TD3 loss with a cost of actions, and with separate random numbers for each run.
+    """TorchRL's TD3 loss with more terms in the loss of its actor, and separate random numbers for each run.
 
     Targets have the least value of all critics, or of some that are drawn at random in each gradient step, as
     in REDQ (Chen et al., 2021). In the second case the actor follows the mean of all critics instead of the
@@ -30,7 +29,7 @@ class PenalizedTD3Loss(TD3Loss):
     Args:
         *args: arguments of :class:`torchrl.objectives.TD3Loss`.
         **kwargs: keyword arguments of the same class, without ``policy_noise`` and ``noise_clip``.
-        action_penalty, saturation_penalty, cloning: see :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
+        terms: these terms.
         target_critics: number of critics that are drawn for targets; 0 for all.
         target_noise: standard deviation of the noise on the target's actions.
         target_noise_clip: the greatest noise.
@@ -43,9 +42,7 @@ class PenalizedTD3Loss(TD3Loss):
     def __init__(
         self,
         *args: Any,
-        action_penalty: float = 0.0,
-        saturation_penalty: float = 0.0,
-        cloning: Cloning | None = None,
+        terms: ActorTerms = ActorTerms(),
         target_critics: int = 0,
         target_noise: float = 0.2,
         target_noise_clip: float = 0.5,
@@ -53,8 +50,7 @@ class PenalizedTD3Loss(TD3Loss):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, policy_noise=0.0, noise_clip=0.0, **kwargs)
-        self.action_penalty, self.saturation_penalty = action_penalty, saturation_penalty
-        self.cloning = cloning
+        self.terms = terms
         self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
         self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
         self.noise = noise or RunNoise()
@@ -65,11 +61,8 @@ class PenalizedTD3Loss(TD3Loss):
         values = self._values(acted, self._cached_detach_qvalue_network_params)
         value = values.mean(0) if self.target_critics else values[0]
         loss = self._reduce_loss(-value, tensordict=tensordict, weights=weights)
-        action = acted.get(self.tensor_keys.action)
-        cost = action_cost(action, l2=self.action_penalty, saturation=self.saturation_penalty)
-        metadata = {"state_action_value_actor": values.detach()}
-        loss = loss + (cost if loss.ndim else cost.mean())
-        return with_cloning(self, loss, tensordict), metadata
+        loss = self.terms.add_to(loss, self, acted.get(self.tensor_keys.action), tensordict)
+        return loss, {"state_action_value_actor": values.detach()}
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         weights = self._maybe_get_priority_weight(tensordict)
@@ -116,15 +109,11 @@ def make_td3_loss(
     critic: TensorDictModule | Sequence[TensorDictModule],
     *,
     action_spec: Bounded,
-    critics: int = 2,
     target_critics: int = 0,
-    gamma: float = 0.98,
-    reward_range: tuple[float, float] | None = (-1.0, 0.0),
-    action_penalty: float = 0.0,
-    saturation_penalty: float = 0.0,
+    targets: Targets = Targets(reward_range=(-1.0, 0.0)),
+    terms: ActorTerms = ActorTerms(),
     generators: Sequence[torch.Generator] | None = None,
     reduction: Literal["mean", "none"] = "mean",
-    cloning: Cloning | None = None,
 ) -> TD3Loss:
     """Makes TorchRL's TD3 loss: several critics, and targets smoothed by noise and clamped.
 
@@ -134,23 +123,18 @@ def make_td3_loss(
 
     Args:
         actor: from :func:`~torchrl_her.make_actor`.
-        critic: from :func:`~torchrl_her.make_critic`, the others are made like it; or all critics in a list.
+        critic: from :func:`~torchrl_her.make_critic`, a second one is made like it; or all critics in a list.
+            Targets use the least of their values.
         action_spec: least and greatest actions, of one environment.
-        critics: number of critics; targets use the least of their values.
         target_critics: number of critics drawn at random in each gradient step: targets use the least of
             their values alone; 0 for all. Chen et al., Randomized ensembled double Q-learning, 2021.
-        gamma: discount, in [0, 1).
-        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
-            leave them as they are.
-        action_penalty, saturation_penalty: weights of the costs of actions, see
-            :func:`~torchrl_her.objectives.action_cost`.
+        targets: discount, and the rewards whose returns targets are clamped to.
+        terms: further terms of the actor's loss.
         generators: generators of the random numbers of each run; None for torch's own.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
-        cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 
     Raises:
-        ValueError: ``gamma`` is outside of [0, 1), ``critics`` is below 1 or not their number, or
-            ``target_critics`` is not from 0 to ``critics``.
+        ValueError: the list of critics is empty, or ``target_critics`` is not from 0 to their number.
 
     Example:
         >>> from torchrl_her import make_actor, make_critic
@@ -160,24 +144,20 @@ def make_td3_loss(
         >>> loss.num_qvalue_nets
         2
     """
-    networks = as_critics(critic, critics)
+    networks, number = as_critics(critic)
     loss = PenalizedTD3Loss(
         actor,
         networks,
         action_spec=action_spec,
-        num_qvalue_nets=critics,
+        num_qvalue_nets=number,
         loss_function="l2",
-        action_penalty=action_penalty,
-        saturation_penalty=saturation_penalty,
+        terms=terms,
         target_critics=target_critics,
         noise=RunNoise(generators),
         reduction=reduction,
-        cloning=cloning,
     )
     keep_weights(loss, critic)
-    key = (networks[0] if isinstance(networks, list) else networks).out_keys[0]
-    estimator = clamped_td0(gamma, reward_range)
+    key = loss.qvalue_network.out_keys[0]
     loss.set_keys(state_action_value=key)
-    estimator.set_keys(value=key)
-    loss.make_value_estimator(estimator)
+    loss.make_value_estimator(targets.estimator(value_key=key))
     return loss

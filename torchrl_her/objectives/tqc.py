@@ -1,4 +1,4 @@
-"""TQC from TorchRL's loss, with an action L2 penalty."""
+"""TQC from TorchRL's loss, with more terms in the loss of its actor."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import TQCLoss
 
 from torchrl_her.modules.noise import RunNoise
-from torchrl_her.objectives.cloning import Cloning
+from torchrl_her.objectives.actor_terms import ActorTerms
 from torchrl_her.objectives.critics import as_critics, keep_weights
-from torchrl_her.objectives.sac import PenalizedSACLoss, positive_temperature, set_soft_targets
+from torchrl_her.objectives.sac import PenalizedSACLoss, positive_temperature
+from torchrl_her.objectives.targets import Targets
 
 
 class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
-    """TorchRL's TQC loss with an action L2 penalty, for one run or several.
+    """TorchRL's TQC loss with more terms in the loss of its actor, for one run or several.
 
     Critics give quantiles of the return instead of its mean. Targets are the quantiles of all critics without
     the greatest ones, and each critic learns all of them. The actor follows the mean of all quantiles.
@@ -70,17 +70,11 @@ def make_tqc_loss(
     actor: ProbabilisticActor,
     critic: TensorDictModule | Sequence[TensorDictModule],
     *,
-    action_spec: Bounded,
-    critics: int = 2,
     dropped_quantiles: int = 2,
-    gamma: float = 0.98,
-    reward_range: tuple[float, float] | None = None,
+    targets: Targets = Targets(reward_range=None),
     temperature: float = 0.1,
-    action_penalty: float = 0.0,
-    runs: int = 1,
-    generators: Sequence[torch.Generator] | None = None,
+    terms: ActorTerms = ActorTerms(),
     reduction: Literal["mean", "none"] = "mean",
-    cloning: Cloning | None = None,
 ) -> TQCLoss:
     """Makes TorchRL's TQC loss: critics give quantiles, and targets leave out the greatest ones.
 
@@ -88,38 +82,31 @@ def make_tqc_loss(
     quantile critics, 2020.
 
     Args:
-        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`.
-        critic: from ``make_critic(..., outputs=M)`` with M quantiles, the others are made like it; or all
+        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators. Each run that its
+            networks are stacked for has a temperature of its own.
+        critic: from ``make_critic(..., outputs=M)`` with M quantiles, a second one is made like it; or all N
             critics in a list.
-        action_spec: least and greatest actions, of one environment.
-        critics: N, how many there are.
         dropped_quantiles: D; targets leave out the D * N greatest of all N * M quantiles.
-        gamma: discount, in [0, 1).
-        reward_range: least and greatest reward; targets are clamped to the returns that these allow. None to
-            leave them as they are, since they contain entropy: see
-            :func:`~torchrl_her.objectives.make_sac_loss`.
+        targets: discount, and the rewards whose returns targets are clamped to; none by default, since they
+            contain entropy: see :func:`~torchrl_her.objectives.make_sac_loss`.
         temperature: first value of the temperature.
-        action_penalty: weight of the action L2 penalty, see
-            :class:`~torchrl_her.objectives.PenalizedDDPGLoss`.
-        runs: R, how many runs the networks are stacked for; each has a temperature of its own.
-        generators: generators of the random numbers of each run; None for torch's own.
+        terms: further terms of the actor's loss, without a saturation penalty.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
-        cloning: adds behavior cloning on rows that are marked as demonstrations; None for none.
 
     Raises:
-        ValueError: ``gamma`` is outside of [0, 1), ``temperature`` is not positive, ``critics`` is below 1 or
-            not their number, critics do not say how many quantiles they have, as those of ``make_critic``
-            do, or ``dropped_quantiles`` is negative or leaves none.
+        ValueError: ``temperature`` is not positive, the list of critics is empty, critics do not say how many
+            quantiles they have, as those of ``make_critic`` do, or ``dropped_quantiles`` is negative or
+            leaves none.
 
     Example:
+        >>> from torchrl.data import Bounded
         >>> from torchrl_her import make_critic
         >>> from torchrl_her.modules import make_stochastic_actor
-        >>> spec = Bounded(-1.0, 1.0, (3,))
-        >>> actor, critic = make_stochastic_actor((9, 2), spec), make_critic((9, 2), 3, outputs=25)
-        >>> make_tqc_loss(actor, critic, action_spec=spec).top_quantiles_to_drop_per_net
+        >>> actor = make_stochastic_actor((9, 2), Bounded(-1.0, 1.0, (3,)))
+        >>> make_tqc_loss(actor, make_critic((9, 2), 3, outputs=25)).top_quantiles_to_drop_per_net
         2
     """
-    networks = as_critics(critic, critics)
+    networks, number = as_critics(critic)
     first = networks[0] if isinstance(networks, list) else networks
     quantiles = getattr(first.module, "outputs", None)
     if not isinstance(quantiles, int):
@@ -136,18 +123,15 @@ def make_tqc_loss(
     loss = PenalizedTQCLoss(
         actor,
         networks,
-        action_spec=action_spec,
-        num_qvalue_nets=critics,
+        num_qvalue_nets=number,
         top_quantiles_to_drop_per_net=dropped_quantiles,
         alpha_init=positive_temperature(temperature),
-        action_penalty=action_penalty,
-        runs=runs,
-        noise=RunNoise(generators),
+        terms=terms,
+        noise=RunNoise(getattr(actor, "generators", None)),
         reduction=reduction,
         scalar_output_mode="exclude" if reduction == "none" else None,
-        cloning=cloning,
     )
     keep_weights(loss, critic)
     loss.set_keys(state_action_value=first.out_keys[0])
-    set_soft_targets(loss, gamma, reward_range)
+    loss.make_value_estimator(targets.estimator(value_key=loss.tensor_keys.value))
     return loss

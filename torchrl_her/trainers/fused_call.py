@@ -110,8 +110,8 @@ class FusedCall:
         job, loss, estimator = self.job, self._loss, self._loss.value_estimator
         job.gamma = float(estimator.gamma)
         job.least, job.greatest = getattr(estimator, "low", -math.inf), getattr(estimator, "high", math.inf)
-        job.penalty = getattr(loss, "action_penalty", 0.0)
-        job.saturation = getattr(loss, "saturation_penalty", 0.0)
+        if (terms := getattr(loss, "terms", None)) is not None:
+            job.penalty, job.saturation = terms.action_penalty, terms.saturation_penalty
         job.target_critics = getattr(loss, "target_critics", 0)
         if self._algorithm is Algorithm.TQC:
             dropped, quantiles = loss.top_quantiles_to_drop_per_net, loss.qvalue_network.module.outputs

@@ -32,8 +32,8 @@ def layers_of(net: nn.Module) -> list[Layer] | None:
         net: exactly one of this library's types, since a subclass may compute something else.
 
     Example:
-        >>> [(layer.inputs, layer.outputs, layer.joined) for layer in layers_of(CriticNet(4, 2, hidden=8))]
-        [(4, 8, 0), (10, 8, 2), (8, 8, 0), (8, 1, 0)]
+        >>> [(layer.inputs, layer.outputs, layer.joined) for layer in layers_of(CriticNet(4, 2))]
+        [(4, 64, 0), (66, 64, 2), (64, 64, 0), (64, 1, 0)]
     """
     if type(net) not in _NETWORKS:
         return None
@@ -62,7 +62,9 @@ def tensor_shapes(layers: Sequence[Layer]) -> list[tuple[int, int]]:
     """Returns the last two dimensions of the parameters and running statistics of layers, in order.
 
     Example:
-        >>> tensor_shapes(layers_of(ActorNet(4, 2, hidden=8, depth=2, norm="layer")))[:4]
+        >>> from torchrl_her.modules import NetworkShape
+        >>> shape = NetworkShape(hidden=8, depth=2, norm="layer")
+        >>> tensor_shapes(layers_of(ActorNet(4, 2, shape=shape)))[:4]
         [(4, 8), (1, 8), (1, 8), (1, 8)]
     """
     shapes = []

@@ -117,7 +117,7 @@ def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | Non
         >>> why_not_fused(loss, SoftUpdate(loss, tau=0.01))
         "reduction='sum'"
     """
-    if getattr(loss, "cloning", None) is not None:
+    if getattr(getattr(loss, "terms", None), "cloning", None) is not None:
         return "behavior cloning of demonstrations, which the C++ steps do not have"
     if type(loss) not in FUSED:
         return f"a {type(loss).__name__}, which is not a loss that this library makes"

@@ -204,7 +204,7 @@ def why_not_recorded(loss: LossModule, target: TargetNetUpdater | None = None) -
         loss: any of TorchRL's.
         target: moves its target networks.
     """
-    if getattr(loss, "cloning", None) is not None:
+    if getattr(getattr(loss, "terms", None), "cloning", None) is not None:
         return "behavior cloning of demonstrations, whose places in a batch are read from the GPU"
     devices = {parameter.device for parameter in loss.parameters()}
     if any(device.type != "cuda" for device in devices) or len(devices) != 1:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -10,33 +10,17 @@ from torchrl.envs import EnvBase
 from torchrl_her_envs.common.live import LiveEpisodes, Policy
 
 
-def record_episodes(
-    env: EnvBase,
-    policy: Policy,
-    *,
-    worlds: Sequence[int] | None = None,
-    size: int = 240,
-    columns: int | None = None,
-    trail: bool = True,
-    hold: int = 25,
-    caption: str = "",
-) -> list[Tensor]:
+def record_episodes(env: EnvBase, policy: Policy, *, hold: int = 25, **options: Any) -> list[Tensor]:
     """Plays one greedy episode in each of several environments and films them side by side.
-
-    All environments are reset before. The picture of an environment whose episode is over stays as it was,
-    with a green border if it achieved its goal in some step and a red one if not. The environment itself
-    begins a new episode, which is not filmed, as long as others are.
 
     Args:
         env: an environment with goals that gives pictures (``can_render``), transformed or not.
-        policy: takes a tensordict and writes the action into it; called for all environments, without
-            gradients and with the exploration type ``DETERMINISTIC``.
-        worlds: indices of the environments to film; None for all.
-        size: longer side of the picture of one environment in pixels.
-        columns: pictures in a row; None for a grid that is at least as wide as high.
-        trail: whether to draw where the balls were, in throwing tasks.
+        policy: takes a tensordict and writes the action into it.
+
+    Keyword Args:
         hold: number of repetitions of the last frame: 25 are one second at 25 frames a second.
-        caption: a line of text in each picture.
+        **options: ``worlds``, ``size``, ``columns``, ``trail`` and ``caption`` of
+            :class:`~torchrl_her_envs.LiveEpisodes`.
 
     Returns:
         Frames [height, width, 3] of uint8: the start, one for each step, and the last one repeated.
@@ -53,15 +37,7 @@ def record_episodes(
         >>> frames[0].shape  # a grid of 2 by 2, of which three are used
         torch.Size([64, 64, 3])
     """
-    live = LiveEpisodes(
-        env,
-        policy,
-        worlds=worlds,
-        size=size,
-        columns=columns,
-        trail=trail,
-        caption=caption,
-    )
+    live = LiveEpisodes(env, policy, **options)
     live.start()
     frames = [live.frame]
     while live.running:

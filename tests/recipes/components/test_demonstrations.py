@@ -65,7 +65,7 @@ def test_each_batch_has_its_share_of_them(file: str) -> None:
 )
 def test_cloning_is_learned_without_compiled_steps(options: dict[str, Any], learner: type, file: str) -> None:
     components = build(small(**{**asked(file), **options}))
-    assert (components.loss.cloning is not None) is (learner is LossLearner)
+    assert (components.loss.terms.cloning is not None) is (learner is LossLearner)
     assert type(components.trainer().learner) is learner  # and nothing warns
 
 

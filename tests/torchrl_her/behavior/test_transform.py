@@ -13,7 +13,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_her import GoalReward, GoalWeights, HERSampleUnit, HERWriter
+from torchrl_her import EnvKeys, GoalReward, GoalWeights, HERSampleUnit, HERWriter
 from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalCandidates, GoalFactor, ValueCutoff
 from torchrl_her.goals import RareGoals
 from torchrl_her.trainers import collector_state_dict, load_collector_state_dict
@@ -456,7 +456,7 @@ def test_without_a_time_limit() -> None:
         REWARD,
         real_share=0.0,
         weights=Told(2.0),
-        truncated_key=None,
+        keys=EnvKeys(truncated=None),
         continues_after_termination=True,
         generators=[torch.Generator()],
     )
@@ -465,8 +465,8 @@ def test_without_a_time_limit() -> None:
     env.reset()
     rows = played(env, 3)
     assert rows["next", "done"].flatten().tolist() == [False, True, False]
-    with pytest.raises(ValueError, match="continues_after_termination=False needs a truncated_key"):
-        BehaviorGoals(REWARD, truncated_key=None)
+    with pytest.raises(ValueError, match="continues_after_termination=False needs a key for truncated"):
+        BehaviorGoals(REWARD, keys=EnvKeys(truncated=None))
 
 
 def test_goals_that_are_not_finite_are_not_remembered() -> None:

@@ -18,10 +18,11 @@ WIDTHS = (3, 2)
 
 def agent(*, runs: int = 1, critics: int = 1) -> tuple[LossModule, TensorDictBase]:
     torch.manual_seed(0)
-    actor, critic = make_actor(WIDTHS, 1, runs=runs), make_critic(WIDTHS, 1, runs=runs)
+    actor = make_actor(WIDTHS, 1, runs=runs)
+    every = [make_critic(WIDTHS, 1, runs=runs) for _ in range(critics)]
     if critics == 1:
-        return make_ddpg_loss(actor, critic), actor
-    return make_td3_loss(actor, critic, action_spec=Bounded(-1.0, 1.0, (1,)), critics=critics), actor
+        return make_ddpg_loss(actor, every[0]), actor
+    return make_td3_loss(actor, every, action_spec=Bounded(-1.0, 1.0, (1,))), actor
 
 
 def by_hand(loss: LossModule, actor: TensorDictBase, observation: Tensor, goals: Tensor) -> Tensor:

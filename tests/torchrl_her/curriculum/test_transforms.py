@@ -32,6 +32,7 @@ from torchrl_her import (
     Curriculum,
     CurriculumProgress,
     CurriculumStage,
+    EnvKeys,
     GoalReward,
     HERWriter,
     StateToObs,
@@ -327,7 +328,7 @@ def test_the_time_limit_is_kept() -> None:
 
 def test_no_time_limit_below() -> None:
     progress = at(make_three(), 0)
-    transform = StateToObs(progress.curriculum, progress, truncated_key=None)
+    transform = StateToObs(progress.curriculum, progress, keys=EnvKeys(truncated=None))
     env = TransformedEnv(TinyEnv((2,), horizon=1), transform)
     assert act(env, [10.0, 0.0])["done"].flatten().tolist() == [True, False]
 
@@ -632,7 +633,6 @@ def test_clones_follow_the_same_progress() -> None:
 def test_nested_keys() -> None:
     progress = at(make_three(), 0, 2)
     names = (
-        "state",
         "observation",
         "achieved_goal",
         "desired_goal",
@@ -645,7 +645,7 @@ def test_nested_keys() -> None:
     env = TransformedEnv(
         TinyEnv((2,), group="agent"),
         Compose(
-            StateToObs(progress.curriculum, progress, **{f"{name}_key": own[name] for name in names}),
+            StateToObs(progress.curriculum, progress, state_key=("agent", "state"), keys=EnvKeys(**own)),
             ZeroPad(
                 progress.curriculum,
                 progress,
@@ -691,7 +691,7 @@ def test_missing_entries_are_named() -> None:
     progress = at(make_three(), 0)
     for options, message in (
         ({"state_key": "words"}, "StateToObs needs the (entry|observation) 'words'"),
-        ({"truncated_key": "cut"}, "StateToObs needs the flag 'cut' of the environment"),
+        ({"keys": EnvKeys(truncated="cut")}, "StateToObs needs the flag 'cut' of the environment"),
     ):
         with pytest.raises(KeyError, match=message):
             check_env_specs(TransformedEnv(TinyEnv(), StateToObs(progress.curriculum, progress, **options)))
@@ -827,5 +827,7 @@ def test_where_the_environment_can_go_on_so_does_the_stage() -> None:
 
 def test_an_end_needs_a_flag_to_be_noted_in() -> None:
     progress = at(make_three(), 0)
-    with pytest.raises(ValueError, match="continues_after_termination=False needs a truncated_key"):
-        StateToObs(progress.curriculum, progress, continues_after_termination=False, truncated_key=None)
+    with pytest.raises(ValueError, match="continues_after_termination=False needs a key for truncated"):
+        StateToObs(
+            progress.curriculum, progress, continues_after_termination=False, keys=EnvKeys(truncated=None)
+        )

@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule
 from torchrl_her import make_actor, make_critic, make_ddpg_loss, make_target_updater
 from torchrl_her.modules import make_stochastic_actor, stack_runs
 from torchrl_her.objectives import (
+    ActorTerms,
     Cloning,
     PenalizedDDPGLoss,
     cloning_terms,
@@ -86,7 +87,7 @@ def linear_loss(slope: float, **options: Any) -> PenalizedDDPGLoss:
     actor = TensorDictModule(Constant(0.5), ["observation"], ["action"])
     critic = TensorDictModule(Slope(slope), ["observation", "action"], ["state_action_value"])
     return PenalizedDDPGLoss(
-        actor, critic, delay_actor=True, delay_value=True, action_penalty=0.0, cloning=Cloning(**options)
+        actor, critic, delay_actor=True, delay_value=True, terms=ActorTerms(cloning=Cloning(**options))
     )
 
 
@@ -164,14 +165,14 @@ def make_loss(name: str, runs: int, cloning: Cloning | None, *, seed: int = 0) -
     for network, own in zip(every, zip(*alone, strict=True), strict=True):
         network.load_state_dict(stack_runs([single.state_dict() for single in own]))
     generators = [torch.Generator().manual_seed(seed + run) for run in range(runs)]
-    options: dict[str, Any] = {"reduction": "none", "cloning": cloning}
+    options: dict[str, Any] = {"reduction": "none", "terms": ActorTerms(cloning=cloning)}
     if name == "ddpg":
         return make_ddpg_loss(*every, **options)
-    options |= {"action_spec": SPEC, "generators": generators}
     if name == "td3":
-        return make_td3_loss(every[0], every[1:], **options)
+        return make_td3_loss(every[0], every[1:], action_spec=SPEC, generators=generators, **options)
     maker = make_sac_loss if name == "sac" else make_tqc_loss
-    return maker(every[0], every[1:], runs=runs, **options)
+    every[0].generators = generators
+    return maker(every[0], every[1:], **options)
 
 
 def learner(loss: LossModule, runs: int) -> LossLearner:

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.objectives import ClipPPOLoss, LossModule, SoftUpdate
 
 from torchrl_her import make_actor, make_critic, make_ddpg_loss
-from torchrl_her.modules import RunNoise, make_q_actor, make_stochastic_actor
+from torchrl_her.modules import NetworkShape, RunNoise, make_q_actor, make_stochastic_actor
 from torchrl_her.objectives import critic_value, make_dqn_loss, make_sac_loss, make_td3_loss
 from torchrl_her.objectives.critics import least_of_some
 
@@ -16,13 +16,13 @@ from ..lost_game import SPEC, rows, say
 
 
 def make_loss(kind: str, *, normalize: bool = False) -> LossModule:
-    critic = make_critic((4, 2), 3, norm="batch" if normalize else "none")
+    critic = make_critic((4, 2), 3, shape=NetworkShape(norm="batch" if normalize else "none"))
     if kind == "ddpg":
         return make_ddpg_loss(make_actor((4, 2), 3), critic)
     if kind == "td3":
         return make_td3_loss(make_actor((4, 2), 3), critic, action_spec=SPEC)
     if kind == "sac":
-        return make_sac_loss(make_stochastic_actor((4, 2), SPEC), critic, action_spec=SPEC)
+        return make_sac_loss(make_stochastic_actor((4, 2), SPEC), critic)
     return make_dqn_loss(make_q_actor((4, 2), 3)[0])
 
 
@@ -55,13 +55,13 @@ def test_it_is_the_least_of_the_critics_that_are_trained(
 
 @pytest.mark.parametrize("kind", ["td3", "sac"])
 def test_it_is_the_mean_of_critics_of_which_targets_take_some(kind: str) -> None:
-    critic = make_critic((4, 2), 3)
+    critics = [make_critic((4, 2), 3) for _ in range(3)]
     if kind == "td3":
         actor = make_actor((4, 2), 3)
-        loss = make_td3_loss(actor, critic, action_spec=SPEC, critics=3, target_critics=2)
+        loss = make_td3_loss(actor, critics, action_spec=SPEC, target_critics=2)
     else:
         drawing = make_stochastic_actor((4, 2), SPEC)
-        loss = make_sac_loss(drawing, critic, action_spec=SPEC, critics=3, target_critics=2)
+        loss = make_sac_loss(drawing, critics, target_critics=2)
     SoftUpdate(loss, tau=0.1)
     say(loss, [-1.0, -2.0, -6.0], [0.0, 0.0, 0.0])
     assert critic_value(loss, make_rows(kind)).tolist() == [[-3.0]] * 5

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
 from torchrl_her import make_actor, make_critic, make_ddpg_loss
-from torchrl_her.objectives import PenalizedDDPGLoss
+from torchrl_her.objectives import ActorTerms, PenalizedDDPGLoss
 
 from ..ddpg_data import batch, networks
 from ..her_data import make_batch
@@ -30,7 +30,7 @@ def penalized_loss(
     actor: TensorDictModule, critic: TensorDictModule, penalty: float, **options: Any
 ) -> DDPGLoss:
     loss = PenalizedDDPGLoss(
-        actor, critic, delay_actor=True, delay_value=True, action_penalty=penalty, **options
+        actor, critic, delay_actor=True, delay_value=True, terms=ActorTerms(action_penalty=penalty), **options
     )
     loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
     return loss

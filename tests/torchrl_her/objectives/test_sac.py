@@ -10,15 +10,24 @@ from torchrl.objectives import LossModule, SACLoss, SoftUpdate
 
 from torchrl_her import LossLearner, make_critic
 from torchrl_her.modules import make_stochastic_actor
-from torchrl_her.objectives import make_sac_loss
+from torchrl_her.objectives import ActorTerms, Targets, make_sac_loss
 from torchrl_her.trainers import RunsAdam
 
 from ..lost_game import SPEC, rows, say
 
 
-def make_loss(*, runs: int = 1, **options: Any) -> LossModule:
-    actor, critic = make_stochastic_actor((4, 2), SPEC, runs=runs), make_critic((4, 2), 3, runs=runs)
-    loss = make_sac_loss(actor, critic, action_spec=SPEC, runs=runs, **{"gamma": 0.5, **options})
+def make_loss(
+    *,
+    runs: int = 1,
+    critics: int = 2,
+    generators: list[torch.Generator] | None = None,
+    gamma: float = 0.5,
+    reward_range: tuple[float, float] | None = None,
+    **options: Any,
+) -> LossModule:
+    actor = make_stochastic_actor((4, 2), SPEC, runs=runs, generators=generators)
+    every = [make_critic((4, 2), 3, runs=runs) for _ in range(critics)]
+    loss = make_sac_loss(actor, every, targets=Targets(gamma=gamma, reward_range=reward_range), **options)
     SoftUpdate(loss, tau=0.1)
     return loss
 
@@ -42,12 +51,11 @@ def test_two_critics_learn_the_value_of_a_lost_game() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"gamma": -0.1}, r"gamma must be in \[0, 1\), got -0.1"),
-        ({"gamma": 1.0}, r"gamma must be in \[0, 1\), got 1.0"),
         ({"temperature": 0.0}, "temperature must be positive, got 0"),
+        ({"terms": ActorTerms(saturation_penalty=0.1)}, "saturation_penalty is for deterministic actors"),
     ],
 )
-def test_what_cannot_be_is_named(options: dict[str, float], message: str) -> None:
+def test_what_cannot_be_is_named(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_loss(**options)
 
@@ -117,7 +125,7 @@ def test_without_a_penalty_it_is_torchrls_loss() -> None:
 
 
 def test_the_penalty_is_the_mean_square_of_the_drawn_actions() -> None:
-    ours, plain = own_and_torchrls(action_penalty=0.7)
+    ours, plain = own_and_torchrls(terms=ActorTerms(action_penalty=0.7))
     batch = rows(4_000, action=torch.rand(1, 4_000, 3))[0]
     with ours.actor_network_params.to_module(ours.actor_network):
         action = ours.actor_network.get_dist(batch).rsample((10,))

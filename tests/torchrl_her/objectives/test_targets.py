@@ -8,6 +8,8 @@ from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
 from torchrl_her import LossLearner, make_actor, make_critic, make_ddpg_loss, make_target_updater
+from torchrl_her.modules import NetworkShape
+from torchrl_her.objectives import Targets
 
 from ..ddpg_data import batch, constant_loss, make_loss, rows, weights
 
@@ -79,7 +81,7 @@ def test_rows_of_several_steps_are_clamped_to_the_same_bounds() -> None:
 @pytest.mark.parametrize("gamma", [1.0, -0.1])
 def test_a_discount_out_of_range_is_named(gamma: float) -> None:
     with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):
-        make_loss(gamma=gamma)
+        Targets(gamma=gamma, reward_range=None)
 
 
 def test_the_priority_is_the_square_of_the_error() -> None:
@@ -135,7 +137,7 @@ MEAN = ("module", "first", "0", "running_mean")
 def test_statistics_move_once_a_step_and_those_of_the_target_follow(
     hard_interval: int, expected: list[tuple[float, float]]
 ) -> None:
-    loss = make_ddpg_loss(make_actor((4, 2), 3), make_critic((4, 2), 3, norm="batch"))
+    loss = make_ddpg_loss(make_actor((4, 2), 3), make_critic((4, 2), 3, shape=NetworkShape(norm="batch")))
     target = make_target_updater(loss, tau=0.5, hard_interval=hard_interval)
     learner = LossLearner(loss, torch.optim.SGD(loss.parameters(), lr=0.0), target)
     data = rows([-1.0, -1.0])

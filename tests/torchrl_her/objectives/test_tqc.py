@@ -12,16 +12,25 @@ from torchrl.objectives import LossModule, SoftUpdate, TQCLoss
 
 from torchrl_her import LossLearner, make_critic
 from torchrl_her.modules import make_stochastic_actor
-from torchrl_her.objectives import critic_value, make_tqc_loss
+from torchrl_her.objectives import ActorTerms, Targets, critic_value, make_tqc_loss
 from torchrl_her.objectives.tqc import PenalizedTQCLoss
 
 from ..lost_game import SPEC, rows, say
 
 
-def make_loss(*, quantiles: int = 3, runs: int = 1, **options: Any) -> LossModule:
-    actor = make_stochastic_actor((4, 2), SPEC, runs=runs)
-    critic = make_critic((4, 2), 3, outputs=quantiles, runs=runs)
-    loss = make_tqc_loss(actor, critic, action_spec=SPEC, runs=runs, **{"gamma": 0.5, **options})
+def make_loss(
+    *,
+    quantiles: int = 3,
+    runs: int = 1,
+    critics: int = 2,
+    generators: list[torch.Generator] | None = None,
+    gamma: float = 0.5,
+    reward_range: tuple[float, float] | None = None,
+    **options: Any,
+) -> LossModule:
+    actor = make_stochastic_actor((4, 2), SPEC, runs=runs, generators=generators)
+    every = [make_critic((4, 2), 3, runs=runs, outputs=quantiles) for _ in range(critics)]
+    loss = make_tqc_loss(actor, every, targets=Targets(gamma=gamma, reward_range=reward_range), **options)
     SoftUpdate(loss, tau=0.1)
     return loss
 
@@ -107,7 +116,7 @@ def test_without_a_penalty_it_is_torchrls_loss() -> None:
 
 
 def test_the_penalty_is_the_mean_square_of_the_drawn_actions() -> None:
-    ours, plain = own_and_torchrls(action_penalty=0.7)
+    ours, plain = own_and_torchrls(terms=ActorTerms(action_penalty=0.7))
     batch = rows(4_000, action=torch.rand(1, 4_000, 3))[0]
     with ours.actor_network_params.to_module(ours.actor_network):
         action = ours.actor_network.get_dist(batch).rsample((10,))
@@ -166,7 +175,7 @@ def test_critics_without_quantiles_are_told_how_to_get_them() -> None:
     keys = ["observation", "desired_goal", "action"]
     own = TensorDictModule(OwnCritic(), in_keys=keys, out_keys=["state_action_value"])
     with pytest.raises(ValueError, match=r"from make_critic\(\.\.\., outputs=M\) .* got OwnCritic"):
-        make_tqc_loss(actor, own, action_spec=SPEC)
+        make_tqc_loss(actor, own)
     one = make_critic((4, 2), 3)
     with pytest.raises(ValueError, match=r"critics have 1 quantile, .*make_critic\(\.\.\., outputs=M\)"):
-        make_tqc_loss(actor, one, action_spec=SPEC)
+        make_tqc_loss(actor, one)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,8 +13,15 @@ from torchrl.data import Bounded
 from torchrl.objectives import LossModule
 
 from torchrl_her import make_actor, make_critic, make_ddpg_loss
-from torchrl_her.modules import RunNoise, make_q_actor, make_stochastic_actor
-from torchrl_her.objectives import make_dqn_loss, make_sac_loss, make_td3_loss, make_tqc_loss
+from torchrl_her.modules import NetworkShape, RunNoise, make_q_actor, make_stochastic_actor
+from torchrl_her.objectives import (
+    ActorTerms,
+    Targets,
+    make_dqn_loss,
+    make_sac_loss,
+    make_td3_loss,
+    make_tqc_loss,
+)
 
 WIDTHS, ACTIONS = (4, 2), 3
 ALGORITHMS = ("ddpg", "normalized", "td3", "sac", "redq", "tqc", "dqn")
@@ -38,41 +46,38 @@ def make_loss(
     with targets of two critics at random, ``normalized`` DDPG with batch normalization in the critic.
     """
     usual = algorithm in ("ddpg", "normalized", "td3", "dqn")
-    clamped: dict[str, Any] = {
-        "reward_range": (-0.02, 0.0) if (usual if bounded is None else bounded) else None
+    clamped = usual if bounded is None else bounded
+    shared: dict[str, Any] = {
+        "targets": Targets(reward_range=(-0.02, 0.0) if clamped else None),
+        "reduction": "none",
     }
+    if algorithm != "dqn":
+        saturation = saturation_penalty if usual else 0.0
+        shared["terms"] = ActorTerms(action_penalty=penalty, saturation_penalty=saturation)
     if algorithm == "redq":
         critics, target_critics = critics + 1, 2
     low, high = (torch.tensor(own, dtype=dtype) for own in ((-1.0, -2.0, 0.0), (1.0, 2.0, 3.0)))
     spec = Bounded(low, high, dtype=dtype)
-    options: dict[str, Any] = {"hidden": 16, "runs": runs, **network}
+    shape = NetworkShape(**{"hidden": 16, **network})
+    options: dict[str, Any] = {"shape": shape, "runs": runs}
     if algorithm == "dqn":
         actor = make_q_actor(WIDTHS, ACTIONS, **options)[0].to(dtype)
-        return make_dqn_loss(actor, reduction="none", **clamped)
+        return make_dqn_loss(actor, **shared)
     outputs = QUANTILES if algorithm == "tqc" else 1
-    of_critic = options | ({"norm": "batch"} if algorithm == "normalized" else {})
-    critic = make_critic(WIDTHS, ACTIONS, outputs=outputs, **of_critic).to(dtype)
+    of_critic = options | ({"shape": replace(shape, norm="batch")} if algorithm == "normalized" else {})
+    every = [make_critic(WIDTHS, ACTIONS, outputs=outputs, **of_critic).to(dtype) for _ in range(critics)]
     if algorithm in ("ddpg", "normalized"):
         actor = make_actor(WIDTHS, ACTIONS, **options).to(dtype)
-        costs = {"action_penalty": penalty, "saturation_penalty": saturation_penalty}
-        return make_ddpg_loss(actor, critic, reduction="none", **costs, **clamped)
+        return make_ddpg_loss(actor, every[0], **shared)
     generators = [torch.Generator().manual_seed(run) for run in range(runs)]
-    shared: dict[str, Any] = {
-        "critics": critics,
-        "action_penalty": penalty,
-        "generators": generators,
-        "reduction": "none",
-        **clamped,
-    }
     if algorithm == "td3":
         actor = make_actor(WIDTHS, ACTIONS, **options).to(dtype)
-        shared |= {"action_spec": spec, "saturation_penalty": saturation_penalty}
-        return make_td3_loss(actor, critic, target_critics=target_critics, **shared).to(dtype)
-    actor = make_stochastic_actor(WIDTHS, spec, **options).to(dtype)
-    shared |= {"action_spec": spec, "runs": runs}
+        shared |= {"action_spec": spec, "generators": generators}
+        return make_td3_loss(actor, every, target_critics=target_critics, **shared).to(dtype)
+    actor = make_stochastic_actor(WIDTHS, spec, generators=generators, **options).to(dtype)
     if algorithm == "tqc":
-        return make_tqc_loss(actor, critic, dropped_quantiles=1, **shared).to(dtype)
-    return make_sac_loss(actor, critic, target_critics=target_critics, **shared).to(dtype)
+        return make_tqc_loss(actor, every, dropped_quantiles=1, **shared).to(dtype)
+    return make_sac_loss(actor, every, target_critics=target_critics, **shared).to(dtype)
 
 
 def twin(loss: LossModule) -> LossModule:

@@ -24,6 +24,7 @@ from torchrl_her import (
     make_ddpg_loss,
     make_target_updater,
 )
+from torchrl_her.objectives import ActorTerms
 from torchrl_her.trainers import Learner, RunsAdam
 from torchrl_her.trainers.runs import run_dims
 
@@ -268,7 +269,7 @@ def test_numbers_may_change_during_training() -> None:
     first, second = both(make_loss("ddpg"))
     for learner in (first, second):
         learner.update(make_rows("ddpg", (1, 8)))
-        learner.loss.action_penalty = 3.0
+        learner.loss.terms = ActorTerms(action_penalty=3.0)
         learner.loss.value_estimator.gamma.fill_(0.5)
         learner.loss.value_estimator.low = -2.0
         learner.target.eps = 0.5

@@ -14,7 +14,7 @@ from torchrl.objectives import DDPGLoss, LossModule, SoftUpdate, ValueEstimators
 from tests.torchrl_her.trainers.fused_cases import ALGORITHMS, make_loss
 from torchrl_her import FusedLearner, make_actor, make_critic, make_target_updater
 from torchrl_her.modules import make_stochastic_actor
-from torchrl_her.objectives import PenalizedDDPGLoss, clamped_td0, make_sac_loss, make_tqc_loss
+from torchrl_her.objectives import PenalizedDDPGLoss, Targets, make_sac_loss, make_tqc_loss
 from torchrl_her.trainers import is_plain_adam, why_not_fused
 
 
@@ -143,9 +143,9 @@ def test_what_they_do_not_know_they_refuse(
 def test_critics_of_quantiles_are_those_of_tqc_alone() -> None:
     spec = Bounded(-1.0, 1.0, (3,))
     critic = make_critic((4, 2), 3, outputs=5)
-    loss = make_sac_loss(make_stochastic_actor((4, 2), spec), critic, action_spec=spec)
+    loss = make_sac_loss(make_stochastic_actor((4, 2), spec), critic)
     assert why_not_fused(loss, SoftUpdate(loss, tau=0.1)) == "critics with 5 outputs"
-    loss = make_tqc_loss(make_stochastic_actor((4, 2), spec), critic, action_spec=spec)
+    loss = make_tqc_loss(make_stochastic_actor((4, 2), spec), critic)
     assert why_not_fused(loss, SoftUpdate(loss, tau=0.1)) is None
 
 
@@ -167,7 +167,7 @@ def test_other_networks_targets_and_losses_are_refused() -> None:
     plain = DDPGLoss(make_actor((4, 2), 3), make_critic((4, 2), 3), delay_actor=True, delay_value=True)
     assert "a DDPGLoss" in str(why_not_fused(plain, SoftUpdate(plain, tau=0.1)))
     for delays in ({"delay_actor": False}, {"delay_value": False}):
-        options = {"delay_actor": True, "delay_value": True, "action_penalty": 0.0} | delays
+        options = {"delay_actor": True, "delay_value": True} | delays
         loss = PenalizedDDPGLoss(make_actor((4, 2), 3), make_critic((4, 2), 3), **options)
-        loss.make_value_estimator(clamped_td0(0.9, (-1.0, 0.0), loss.actor_critic))
+        loss.make_value_estimator(Targets(reward_range=(-1.0, 0.0)).estimator(loss.actor_critic))
         assert why_not_fused(loss, SoftUpdate(loss, tau=0.1)) is not None

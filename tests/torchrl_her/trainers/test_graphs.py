@@ -14,7 +14,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_her import make_actor, make_critic, make_ddpg_loss, make_target_updater
 from torchrl_her.modules import make_stochastic_actor
-from torchrl_her.objectives import make_sac_loss, make_td3_loss, make_tqc_loss
+from torchrl_her.objectives import Targets, make_sac_loss, make_td3_loss, make_tqc_loss
 from torchrl_her.trainers import GraphLearner, LossLearner, RunsAdam, why_not_recorded
 
 from ...emulated import DEVICE, emulated_device
@@ -62,12 +62,15 @@ def parts(
     stochastic = make in (make_sac_loss, make_tqc_loss)
     actor = make_stochastic_actor((4, 2), spec, runs=runs) if stochastic else make_actor((4, 2), 3, runs=runs)
     critic = make_critic((4, 2), 3, runs=runs, outputs=outputs)
-    options: dict[str, Any] = {"reduction": "none" if runs > 1 else "mean", "gamma": 0.9}
-    if make in NOISY:
-        options["generators"] = [torch.Generator(device).manual_seed(run) for run in range(runs)]
-        options["action_spec"] = spec
+    options: dict[str, Any] = {
+        "reduction": "none" if runs > 1 else "mean",
+        "targets": Targets(gamma=0.9, reward_range=None if stochastic else (-1.0, 0.0)),
+    }
+    generators = [torch.Generator(device).manual_seed(run) for run in range(runs)]
     if stochastic:
-        options["runs"] = runs
+        actor.generators = generators
+    elif make is make_td3_loss:
+        options |= {"generators": generators, "action_spec": spec}
     loss = make(actor.to(device), critic.to(device), **options).to(device)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
     target = make_target_updater(loss, tau=0.1, hard_interval=0)

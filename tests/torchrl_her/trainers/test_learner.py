@@ -15,6 +15,7 @@ from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import DDPGLoss, LossModule, SACLoss, SoftUpdate, TD3Loss, ValueEstimators
 
 from torchrl_her import FusedLearner, LossLearner, make_actor, make_critic, make_ddpg_loss
+from torchrl_her.modules import NetworkShape
 
 from ..ddpg_data import WEIGHT, batch, constant_loss, make_loss, rows, step, weights
 from ..her_data import make_batch
@@ -107,10 +108,11 @@ def stochastic_actor() -> ProbabilisticActor:
 
 
 def make_other(kind: str) -> LossModule:
-    critic = make_critic((4, 2), 3, hidden=16)
+    shape = NetworkShape(hidden=16)
+    critic = make_critic((4, 2), 3, shape=shape)
     action = Bounded(-1.0, 1.0, shape=(3,))
     if kind == "td3":
-        loss = TD3Loss(make_actor((4, 2), 3, hidden=16), critic, action_spec=action)
+        loss = TD3Loss(make_actor((4, 2), 3, shape=shape), critic, action_spec=action)
     else:
         loss = SACLoss(stochastic_actor(), critic, action_spec=action)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=0.98)

@@ -29,7 +29,8 @@ from torchrl_her import (
     make_target_updater,
     success,
 )
-from torchrl_her.objectives import PenalizedDDPGLoss
+from torchrl_her.modules import NetworkShape
+from torchrl_her.objectives import PenalizedDDPGLoss, Targets
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, empty_run
 from torchrl_her.trainers import RunsAdam
 
@@ -96,10 +97,11 @@ def make_trainer(
 ) -> tuple[Trainer, TensorDictSequential]:
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
-    actor, critic = make_actor((1, 1), 1, hidden=32), make_critic((1, 1), 1, hidden=32)
+    small = NetworkShape(hidden=32)
+    actor, critic = make_actor((1, 1), 1, shape=small), make_critic((1, 1), 1, shape=small)
     exploration = DecayingEpsilon(-torch.ones(1), torch.ones(1), decay=0.8, generators=[generator])
     policy = TensorDictSequential(actor, exploration)
-    loss = make_ddpg_loss(actor, critic, gamma=0.9)
+    loss = make_ddpg_loss(actor, critic, targets=Targets(gamma=0.9, reward_range=(-1.0, 0.0)))
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(20_000), writer=HERWriter(GoalReward(0.1), filter_achieved=True)
     )
@@ -242,8 +244,8 @@ def test_a_run_whose_buffer_is_empty_waits_and_holds_no_other_back() -> None:
     def make() -> tuple[Trainer, PenalizedDDPGLoss]:
         torch.manual_seed(0)
         loss = make_ddpg_loss(
-            make_actor((1, 1), 1, hidden=8, runs=runs),
-            make_critic((1, 1), 1, hidden=8, runs=runs),
+            make_actor((1, 1), 1, shape=NetworkShape(hidden=8), runs=runs),
+            make_critic((1, 1), 1, shape=NetworkShape(hidden=8), runs=runs),
             reduction="none",
         )
         optimizer = RunsAdam(loss, lr=1e-2, runs=runs)

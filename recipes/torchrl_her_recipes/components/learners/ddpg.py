@@ -8,8 +8,10 @@ from typing import Any
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import LossModule
 
-from torchrl_her.modules.networks import make_actor, make_critic
+from torchrl_her.modules.networks import NetworkShape, make_actor, make_critic
+from torchrl_her.objectives.actor_terms import ActorTerms
 from torchrl_her.objectives.ddpg import make_ddpg_loss
+from torchrl_her.objectives.targets import Targets
 from torchrl_her_recipes.components.learner import LearnerBuilder, Networks
 
 
@@ -29,9 +31,9 @@ class DDPGBuilder(LearnerBuilder):
         return make_actor(
             self.widths,
             self.action_spec.shape[-1],
+            shape=NetworkShape(**self.options.actor_shape),
             runs=runs,
             in_keys=self.in_keys,
-            **self.options.actor_shape,
         )
 
     @property
@@ -44,26 +46,23 @@ class DDPGBuilder(LearnerBuilder):
         return make_critic(
             self.widths,
             self.action_spec.shape[-1],
+            shape=NetworkShape(**self.options.critic_shape),
             runs=runs,
             outputs=self.outputs,
             in_keys=self.in_keys,
-            **self.options.critic_shape,
         )
 
     def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
-        return make_ddpg_loss(
-            actor,
-            critics[0],
-            saturation_penalty=self.options.saturation_penalty,
-            **self.loss_options(),
-        )
+        return make_ddpg_loss(actor, critics[0], **self.loss_options())
 
     def loss_options(self) -> dict[str, Any]:
         """Returns the options that losses of learners with continuous actions share."""
         return {
-            "gamma": self.options.gamma,
-            "reward_range": self.bounds,
-            "action_penalty": self.options.action_penalty,
+            "targets": Targets(gamma=self.options.gamma, reward_range=self.bounds),
+            "terms": ActorTerms(
+                action_penalty=self.options.action_penalty,
+                saturation_penalty=getattr(self.options, "saturation_penalty", 0.0),
+                cloning=self.cloning,
+            ),
             "reduction": "none",
-            "cloning": self.cloning,
         }

@@ -11,8 +11,10 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import LossModule
 
 from torchrl_her.modules.exploration import DecayingEpsilonGreedy, Exploration
+from torchrl_her.modules.networks import NetworkShape
 from torchrl_her.modules.q_actor import BestAction, QNet, make_q_actor
 from torchrl_her.objectives.dqn import make_dqn_loss
+from torchrl_her.objectives.targets import Targets
 from torchrl_her_recipes.components.learner import LearnerBuilder, Networks
 
 
@@ -23,9 +25,9 @@ class DQNBuilder(LearnerBuilder):
         actor, critic = make_q_actor(
             self.widths,
             self.action_spec.n,
+            shape=NetworkShape(**self.options.critic_shape),
             runs=runs,
             in_keys=self.in_keys,
-            **self.options.critic_shape,
         )
         return actor.to(self.dtype), [critic]  # the critic shares the actor's weights
 
@@ -35,8 +37,7 @@ class DQNBuilder(LearnerBuilder):
     def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_dqn_loss(
             cast(QValueActor, actor),
-            gamma=self.options.gamma,
-            reward_range=self.bounds,
+            targets=Targets(gamma=self.options.gamma, reward_range=self.bounds),
             reduction="none",
         )
 

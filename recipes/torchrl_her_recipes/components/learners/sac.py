@@ -10,13 +10,13 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import LossModule
 
+from torchrl_her.modules.networks import NetworkShape
 from torchrl_her.modules.stochastic_actor import (
     SquashedLocation,
     StochasticActorNet,
     make_stochastic_actor,
 )
 from torchrl_her.objectives.sac import make_sac_loss
-from torchrl_her_recipes.components.devices import place_of
 from torchrl_her_recipes.components.learners.ddpg import DDPGBuilder
 
 
@@ -27,10 +27,10 @@ class SACBuilder(DDPGBuilder):
         return make_stochastic_actor(
             self.widths,
             self.action_spec,
+            shape=NetworkShape(**self.options.actor_shape),
             runs=runs,
             in_keys=self.in_keys,
             generators=self.generators,
-            **self.options.actor_shape,
         )
 
     def greedy(self, actor: TensorDictModule) -> nn.Module:
@@ -40,21 +40,11 @@ class SACBuilder(DDPGBuilder):
 
     def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_sac_loss(
-            actor,
-            critics,
-            target_critics=self.options.target_critics,
-            **self.soft(actor),
+            actor, critics, target_critics=self.options.target_critics, **self.loss_options()
         )
 
-    def soft(self, actor: TensorDictModule) -> dict[str, Any]:
-        """Returns the options that losses with a stochastic policy share."""
-        return self.loss_options() | {
-            "action_spec": self.action_spec.to(place_of(actor)),
-            "critics": self.options.critics,
-            "temperature": self.options.temperature,
-            "runs": self.shape.runs,
-            "generators": self.generators,
-        }
+    def loss_options(self) -> dict[str, Any]:
+        return super().loss_options() | {"temperature": self.options.temperature}
 
     @property
     def bounds(self) -> tuple[float, float] | None:

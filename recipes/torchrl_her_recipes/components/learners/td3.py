@@ -20,9 +20,7 @@ class TD3Builder(DDPGBuilder):
             actor,
             critics,
             action_spec=self.action_spec.to(place_of(actor)),
-            critics=self.options.critics,
             target_critics=self.options.target_critics,
-            saturation_penalty=self.options.saturation_penalty,
             generators=self.generators,
             **self.loss_options(),
         )

@@ -20,8 +20,5 @@ class TQCBuilder(SACBuilder):
 
     def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_tqc_loss(
-            actor,
-            critics,
-            dropped_quantiles=self.options.dropped_quantiles,
-            **self.soft(actor),
+            actor, critics, dropped_quantiles=self.options.dropped_quantiles, **self.loss_options()
         )

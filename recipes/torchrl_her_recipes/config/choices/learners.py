@@ -97,12 +97,12 @@ class LearnerConfig(Choice):
 
     @property
     def critic_shape(self) -> dict[str, Any]:
-        """Arguments for the hidden layers of critics in the functions that make networks."""
+        """Arguments of :class:`~torchrl_her.NetworkShape` for critics."""
         return {"hidden": self.hidden, "depth": self.depth, "activation": self.activation, "norm": self.norm}
 
     @property
     def actor_shape(self) -> dict[str, Any]:
-        """Arguments for the hidden layers of actors, which have no batch normalization."""
+        """Arguments of :class:`~torchrl_her.NetworkShape` for actors, which have no batch normalization."""
         return self.critic_shape | ({"norm": "none"} if self.norm == "batch" else {})
 
 

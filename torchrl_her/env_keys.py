@@ -1,0 +1,37 @@
+"""Keys of an environment's entries, for the transforms that change goals, rewards and ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tensordict import NestedKey
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvKeys:
+    """Keys of the entries of an environment with goals that a transform reads or writes.
+
+    Args:
+        observation, achieved_goal, desired_goal, reward, terminated, done: keys of these entries.
+        truncated: key of the flag of the time limit; None if there is none.
+
+    Example:
+        >>> EnvKeys(reward=("agent", "reward")).reward
+        ('agent', 'reward')
+    """
+
+    observation: NestedKey = "observation"
+    achieved_goal: NestedKey = "achieved_goal"
+    desired_goal: NestedKey = "desired_goal"
+    reward: NestedKey = "reward"
+    terminated: NestedKey = "terminated"
+    truncated: NestedKey | None = "truncated"
+    done: NestedKey = "done"
+
+    def check_ends(self, *, continues_after_termination: bool) -> None:
+        """Raises a ValueError if an environment that stops when it terminates has no flag to truncate at."""
+        if self.truncated is None and not continues_after_termination:
+            raise ValueError(
+                "continues_after_termination=False needs a key for truncated, to say where the environment "
+                "ended"
+            )
