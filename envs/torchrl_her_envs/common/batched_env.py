@@ -74,9 +74,9 @@ class BatchedEnv(GoalEnv):
     def _check_action(self, action: Tensor) -> None:
         """Raises a ValueError for invalid actions."""
 
-    def _is_achieved(self, shown: dict[str, Tensor]) -> Tensor:
+    def _is_achieved(self, entries: dict[str, Tensor]) -> Tensor:
         """Returns whether each environment is at its goal: [N, 1] of bool."""
-        return self.compute_terminated(shown["achieved_goal"], shown["desired_goal"])
+        return self.compute_terminated(entries["achieved_goal"], entries["desired_goal"])
 
     # Methods that subclasses inherit
 
@@ -160,21 +160,21 @@ class BatchedEnv(GoalEnv):
         for name in entries:
             if name not in states:
                 raise ValueError(f"the states of {self.task_name} lack {name!r}, got {', '.join(states)}")
-            wanted = (len(chosen), *getattr(self.worlds, name).shape[1:])
-            if states[name].shape != wanted:
+            expected = (len(chosen), *getattr(self.worlds, name).shape[1:])
+            if states[name].shape != expected:
                 got = list(states[name].shape)
-                raise ValueError(f"{name!r} of the states must be of shape {list(wanted)}, got {got}")
+                raise ValueError(f"{name!r} of the states must be of shape {list(expected)}, got {got}")
 
     def _check_state(self, state: dict[str, Tensor]) -> None:
         """Raises a ValueError for a state whose entries are of other shapes than these environments'."""
         shapes = {field.name: getattr(self.worlds, field.name).shape for field in fields(self.worlds)}
         for name, shape in (shapes | {"key": torch.Size(self._keys.shape)}).items():
-            given = state[name].shape
-            if given[:1] != shape[:1]:
-                count = given[0] if given else 0
+            actual = state[name].shape
+            if actual[:1] != shape[:1]:
+                count = actual[0] if actual else 0
                 raise ValueError(f"the state must be of {shape[0]} environments, got {name!r} of {count}")
-            if given != shape:
-                raise ValueError(f"{name!r} of the state must be of shape {list(shape)}, got {list(given)}")
+            if actual != shape:
+                raise ValueError(f"{name!r} of the state must be of shape {list(shape)}, got {list(actual)}")
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
         """Seeds R equal blocks of environments, each as if it were alone.
@@ -196,9 +196,9 @@ class BatchedEnv(GoalEnv):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         which = torch.arange(self.batch_size[0]) if mask is None else mask.view(-1).nonzero().squeeze(-1)
-        shown = self._begin(which)
+        entries = self._begin(which)
         return self._pack(
-            {**shown, **{key: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for key in _ENDS}}
+            {**entries, **{key: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for key in _ENDS}}
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -217,22 +217,22 @@ class BatchedEnv(GoalEnv):
         """Takes a step with checked actions; returns observations, rewards and ends."""
         self.worlds.step = self.worlds.step + 1
         cut = self._advance(action)
-        shown = self._show()
-        terminated = self._is_achieved(shown)
+        entries = self._show()
+        terminated = self._is_achieved(entries)
         truncated = (self.worlds.step >= self.max_steps).unsqueeze(-1)
         if cut is not None:
             truncated = truncated | cut.unsqueeze(-1)
-        shown["reward"] = terminated.to(self.dtype_shown) - 1.0
-        return {**shown, "terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        entries["reward"] = terminated.to(self.dtype_shown) - 1.0
+        return {**entries, "terminated": terminated, "truncated": truncated, "done": terminated | truncated}
 
     def _pack(self, entries: dict[str, Tensor]) -> TensorDictBase:
         # With the device that it has anyway: otherwise TorchRL copies every entry.
-        made = {"batch_size": self.batch_size, "device": self.device}
+        options = {"batch_size": self.batch_size, "device": self.device}
         if not self._packed:
             self._packed = True
-            return TensorDict(entries, **made)
+            return TensorDict(entries, **options)
         # TensorDict's checks take longer than a step does, and once is enough: shapes do not change.
-        return TensorDict._new_unsafe(entries, **made)
+        return TensorDict._new_unsafe(entries, **options)
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """Skips TorchRL's completion of missing entries and shapes, which these steps do not need."""

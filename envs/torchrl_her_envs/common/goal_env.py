@@ -129,8 +129,8 @@ class GoalEnv(EnvBase):
             >>> make_env("hand_v1").state_names()["hole"], make_env("bit_flip", bits=2).state_names()
             ([9, 10], {'observation': [0, 1], 'desired_goal': [2, 3]})
         """
-        seen, goal = (self.observation_spec[key].shape[-1] for key in ("observation", "desired_goal"))
-        return {"observation": list(range(seen)), "desired_goal": list(range(seen, seen + goal))}
+        observed, goal = (self.observation_spec[key].shape[-1] for key in ("observation", "desired_goal"))
+        return {"observation": list(range(observed)), "desired_goal": list(range(observed, observed + goal))}
 
     def action_limits(self) -> tuple[Tensor, Tensor]:
         """The least and the greatest action, [entries] each, of the type that the task itself takes.

@@ -132,11 +132,11 @@ class GoalEnds:
         by, where = "reward", "the reward is that of an achieved goal"
         if self.tells_success:
             by, where = "success", "info['is_success'] is true"
-        seen = f"in {self.steps:,} random steps it"
+        during = f"in {self.steps:,} random steps it"
         if self.went_on:
-            why = f"{seen} went on after a goal was achieved, so goals never end an episode"
+            why = f"{during} went on after a goal was achieved, so goals never end an episode"
         elif self.ended:
-            why = f"{seen} ended where a goal was achieved, so goals end an episode, where {where}"
+            why = f"{during} ended where a goal was achieved, so goals end an episode, where {where}"
         else:
             why = (
                 f"no goal was achieved in {self.steps:,} random steps, and goals are assumed to end no "
@@ -292,8 +292,8 @@ def is_dense(equal: float, others: Sequence[float] | np.ndarray) -> bool:
 
 def _missed(equal: float, others: Sequence[float] | np.ndarray) -> np.ndarray:
     """Returns the distinct rewards of unequal pairs of goals below that of equal ones, ascending."""
-    seen = np.unique(np.round(others, _DIGITS) + 0.0)
-    return seen[seen < equal]
+    rewards = np.unique(np.round(others, _DIGITS) + 0.0)
+    return rewards[rewards < equal]
 
 
 def check_same_rewards(name: str, stepped: np.ndarray, computed: np.ndarray) -> str:

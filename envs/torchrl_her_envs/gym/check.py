@@ -90,10 +90,10 @@ def _wrong_options(id: str, options: dict[str, Any]) -> str:
     if known is None or known.entry_point is None:
         return ""
     entry = known.entry_point
-    taken = inspect.signature(load_env_creator(entry) if isinstance(entry, str) else entry).parameters
-    if any(param.kind is inspect.Parameter.VAR_KEYWORD for param in taken.values()):
+    parameters = inspect.signature(load_env_creator(entry) if isinstance(entry, str) else entry).parameters
+    if any(param.kind is inspect.Parameter.VAR_KEYWORD for param in parameters.values()):
         return ""
-    allowed = [*_OUR_OPTIONS, *(name for name in taken if name not in known.kwargs)]
+    allowed = [*_OUR_OPTIONS, *(name for name in parameters if name not in known.kwargs)]
     wrong = [name for name in options if name not in (*allowed, *known.kwargs, "max_episode_steps")]
     if not wrong:
         return ""
@@ -132,45 +132,45 @@ def check_goal_env(id: str, env: gymnasium.Env) -> None:
         raise ValueError(f"{id}'s actions must have bounds, got {env.action_space}")
 
 
-def _check_shown(id: str, shown: spaces.Space) -> None:
-    if not isinstance(shown, spaces.Dict):
-        raise ValueError(f"{id} shows no dict of {', '.join(KEYS)}, but a {type(shown).__name__}")
+def _check_shown(id: str, space: spaces.Space) -> None:
+    if not isinstance(space, spaces.Dict):
+        raise ValueError(f"{id} shows no dict of {', '.join(KEYS)}, but a {type(space).__name__}")
     for key in KEYS:
-        if key not in shown.spaces:
-            raise ValueError(f"{id} lacks {key!r} in what it shows: {', '.join(shown.spaces)}")
-    achieved, desired = (Layout(shown[key], f"{id} must show {key!r}").shapes for key in KEYS[1:])
-    Layout(shown[KEYS[0]], f"{id} must show {KEYS[0]!r}")
+        if key not in space.spaces:
+            raise ValueError(f"{id} lacks {key!r} in what it shows: {', '.join(space.spaces)}")
+    achieved, desired = (Layout(space[key], f"{id} must show {key!r}").shapes for key in KEYS[1:])
+    Layout(space[KEYS[0]], f"{id} must show {KEYS[0]!r}")
     if achieved != desired:
-        one, other = (shown[key] if achieved[0][0] else shown[key].shape for key in KEYS[1:])
+        one, other = (space[key] if achieved[0][0] else space[key].shape for key in KEYS[1:])
         raise ValueError(f"{id}'s achieved and desired goals must have one shape, got {one} and {other}")
 
 
 def check_methods(id: str, env: gymnasium.Env) -> None:
     """Raises a ValueError if ``reset`` or ``step`` of an environment or its wrappers are those of old gym."""
-    stages = [env]
-    while isinstance(stages[-1], gymnasium.Wrapper):
-        stages.append(stages[-1].env)
-    for stage in reversed(stages):  # the innermost first: those around it fail, too
-        name = type(stage).__name__
+    wrappers = [env]
+    while isinstance(wrappers[-1], gymnasium.Wrapper):
+        wrappers.append(wrappers[-1].env)
+    for wrapper in reversed(wrappers):  # the innermost first: those around it fail, too
+        name = type(wrapper).__name__
         reset, step = f"{id}: reset of {name} must", f"{id}: step of {name} must"
-        taken = inspect.signature(stage.reset).parameters
-        missing = [key for key in ("seed", "options") if key not in taken]
-        if missing and not any(param.kind is inspect.Parameter.VAR_KEYWORD for param in taken.values()):
+        parameters = inspect.signature(wrapper.reset).parameters
+        missing = [key for key in ("seed", "options") if key not in parameters]
+        if missing and not any(param.kind is inspect.Parameter.VAR_KEYWORD for param in parameters.values()):
             raise ValueError(f"{reset} take seed and options, as in gymnasium; it lacks {missing[0]!r}")
-        stage.action_space.seed(0)
-        given = stage.reset(seed=0)
-        if not isinstance(given, tuple) or len(given) != 2:
-            raise ValueError(f"{reset} give (observation, info), as in gymnasium, got {_form(given)}")
-        given = stage.step(stage.action_space.sample())
-        if not isinstance(given, tuple) or len(given) != 5:
+        wrapper.action_space.seed(0)
+        answer = wrapper.reset(seed=0)
+        if not isinstance(answer, tuple) or len(answer) != 2:
+            raise ValueError(f"{reset} give (observation, info), as in gymnasium, got {_form(answer)}")
+        answer = wrapper.step(wrapper.action_space.sample())
+        if not isinstance(answer, tuple) or len(answer) != 5:
             raise ValueError(
                 f"{step} give (observation, reward, terminated, truncated, info), as in gymnasium, got "
-                f"{_form(given)}"
+                f"{_form(answer)}"
             )
 
 
-def _form(given: object) -> str:
-    return f"{len(given)} values" if isinstance(given, tuple) else f"a {type(given).__name__}"
+def _form(answer: object) -> str:
+    return f"{len(answer)} values" if isinstance(answer, tuple) else f"a {type(answer).__name__}"
 
 
 def has_compute_terminated(env: gymnasium.Env, achieved: Any, desired: Any) -> bool:
@@ -188,8 +188,8 @@ def has_compute_terminated(env: gymnasium.Env, achieved: Any, desired: Any) -> b
 
 def goals_to_try(env: gymnasium.Env, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Collects goals [M, g] of first states: equal pairs, then each achieved with the desired one."""
-    shown = [env.reset(seed=seed)[0] for seed in range(EPISODES)]
-    achieved, desired = (np.stack([layout.flatten(obs[key]) for obs in shown]) for key in KEYS[1:])
+    observations = [env.reset(seed=seed)[0] for seed in range(EPISODES)]
+    achieved, desired = (np.stack([layout.flatten(obs[key]) for obs in observations]) for key in KEYS[1:])
     pairs = np.repeat(achieved, EPISODES, 0), np.tile(desired, (EPISODES, 1))
     # M must be no dimension of a goal, see GoalFunction.
     last = max(m for m in range(EPISODES * (EPISODES + 1) + 1) if m not in layout.sizes)
@@ -287,8 +287,8 @@ def find_achieved_reward(
         return None
     for _ in range(_HALVINGS):
         middle = (near + far) / 2
-        there = met(middle)
-        near, far = np.where(there, middle, near), np.where(there, far, middle)
+        inside = met(middle)
+        near, far = np.where(inside, middle, near), np.where(inside, far, middle)
     least = reward(goals(near), desired)
     return float(least.min()) if np.allclose(least, least.min(), rtol=1e-3) else None
 
@@ -301,9 +301,9 @@ def try_steps(env: gymnasium.Env, layout: Layout) -> Trial:
     for step in range(_TRIED_STEPS):
         if done:
             env.reset(seed=step)
-        shown, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
         done = terminated or truncated
-        goals = (layout.flatten(shown[key]) for key in KEYS[1:])
+        goals = (layout.flatten(observation[key]) for key in KEYS[1:])
         rows.append((*goals, float(reward), bool(terminated), bool(truncated), info.get(SUCCESS), info))
     achieved, desired, rewards, terminations, truncations, success, infos = zip(*rows, strict=True)
     known = any(flag is not None for flag in success)

@@ -44,8 +44,8 @@ def fetch_names(id: str) -> dict[str, list[int]]:
         >>> fetch_names("FetchPush-v4")["object"], fetch_names("FetchReach-v4")["place"]
         ([3, 4, 5], [10, 11, 12])
     """
-    shown, names, first = _shown(id), {}, 0
-    for name, width in ({} if shown is None else shown | {"place": 3}).items():
+    widths, names, first = _shown(id), {}, 0
+    for name, width in ({} if widths is None else widths | {"place": 3}).items():
         names[name], first = list(range(first, first + width)), first + width
     return names
 
@@ -63,14 +63,14 @@ def fetch_stages(id: str) -> list[dict[str, Any]]:
         >>> [stage["name"] for stage in fetch_stages("FetchPush-v4")]
         ['reach', 'move']
     """
-    shown = _shown(id)
-    if shown is None:
+    widths = _shown(id)
+    if widths is None:
         return []
     gripper = list(_GRIPPER)
     reach = {"name": "reach", "observation": gripper, "achieved_goal": "grip"}
-    if shown is _GRIPPER:
+    if widths is _GRIPPER:
         return [reach | {"desired_goal": "place"}]
-    rest = [name for name in shown if name not in (*gripper, "object")]
+    rest = [name for name in widths if name not in (*gripper, "object")]
     move = {
         "name": "move",
         "observation": [*gripper, "object", *rest],

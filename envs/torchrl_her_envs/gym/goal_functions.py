@@ -22,10 +22,10 @@ class _OneInfo(dict[str, Any]):
         self._lacking = lacking
 
     def __contains__(self, key: object) -> bool:
-        there = super().__contains__(key)
-        if not there and isinstance(key, str):  # and no row of a batch
+        present = super().__contains__(key)
+        if not present and isinstance(key, str):  # and no row of a batch
             self._lacking.add(key)
-        return there
+        return present
 
     def __missing__(self, key: str) -> Any:
         _ = key in self

@@ -32,23 +32,23 @@ class Infos:
         [[2.0], [3.0]]
     """
 
-    def __init__(self, names: Sequence[str], seen: Sequence[Mapping[str, Any]], env: str) -> None:
+    def __init__(self, names: Sequence[str], examples: Sequence[Mapping[str, Any]], env: str) -> None:
         if isinstance(names, str) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"info_keys must be a list of keys of info, as in [cost], got {names!r}")
         self._env = env
-        self._kinds = {name: self._kind(name, seen) for name in names}
+        self._kinds = {name: self._kind(name, examples) for name in names}
 
-    def _kind(self, name: str, seen: Sequence[Mapping[str, Any]]) -> tuple[tuple[int, ...], np.dtype]:
+    def _kind(self, name: str, examples: Sequence[Mapping[str, Any]]) -> tuple[tuple[int, ...], np.dtype]:
         """Returns shape and type of an entry."""
-        lacking = [info for info in seen if name not in info]
+        lacking = [info for info in examples if name not in info]
         if lacking:
             raise ValueError(self._lacks(name, lacking[0]))
-        values = [np.asarray(info[name]) for info in seen]
+        values = [np.asarray(info[name]) for info in examples]
         shape, dtype = values[0].shape, np.result_type(*values)
         if any(value.shape != shape for value in values) or dtype.kind not in "fiub":
             raise ValueError(
                 f"{self._env}: info[{name!r}] must be a number, or an array of numbers of one shape, got "
-                f"{seen[0][name]!r}"
+                f"{examples[0][name]!r}"
             )
         return shape, np.dtype(np.int64) if dtype.kind == "u" else dtype
 
@@ -84,11 +84,11 @@ class Infos:
         """
         out = {}
         for name, (shape, dtype) in self._kinds.items():
-            there = infos.get(f"_{name}", np.zeros(count, np.bool_))
-            if not (reset or there.all()):
+            present = infos.get(f"_{name}", np.zeros(count, np.bool_))
+            if not (reset or present.all()):
                 raise ValueError(self._lacks(name, infos))
             out[name] = np.zeros((count, *shape), dtype)
-            for index in there.nonzero()[0]:
+            for index in present.nonzero()[0]:
                 out[name][index] = infos[name][index]
         return out
 

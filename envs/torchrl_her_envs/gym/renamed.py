@@ -31,15 +31,15 @@ class RenamedKeys(gymnasium.ObservationWrapper):
         super().__init__(env)
         self._names = names
         known = list(env.observation_space) if isinstance(env.observation_space, spaces.Dict) else []
-        for wanted in names.values():
-            for name in [wanted] if isinstance(wanted, str) else wanted:
+        for sources in names.values():
+            for name in [sources] if isinstance(sources, str) else sources:
                 if name not in known:
                     env.close()
                     id = env.spec.id if env.spec else type(env).__name__
                     raise ValueError(f"{id} lacks {name!r} in what it shows: {', '.join(known) or 'no dict'}")
-        taken = self.observation(env.observation_space)
+        entries = self.observation(env.observation_space)
         inner = {
-            key: spaces.Dict(entry) if isinstance(entry, dict) else entry for key, entry in taken.items()
+            key: spaces.Dict(entry) if isinstance(entry, dict) else entry for key, entry in entries.items()
         }
         self.observation_space = spaces.Dict(inner)
         for method in ("compute_reward", "compute_terminated", "_is_success"):

@@ -130,12 +130,12 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         """
         core = self._core
         core.advance(np.asarray(action, np.float32)[None])
-        shown = self._observation()
-        achieved = core.achieved(shown["achieved_goal"], shown["desired_goal"])
+        observation = self._observation()
+        achieved = core.achieved(observation["achieved_goal"], observation["desired_goal"])
         terminated = bool(achieved)
         if self.render_mode == "human":
             self._show()
-        return shown, reward_of(terminated), terminated, False, {"is_success": terminated}
+        return observation, reward_of(terminated), terminated, False, {"is_success": terminated}
 
     def render(self) -> np.ndarray | None:
         """Renders a picture [size, size, 3] of uint8; None if a window shows it, or without a render mode."""
@@ -204,10 +204,10 @@ def spaces_of(core: ThrowingCore) -> tuple[spaces.Dict, spaces.Box]:
     """Returns the spaces of observations and actions of a single environment."""
     limit = _largest(core)
     widths = dict(zip(KEYS, (core.observation_size, 2, 2), strict=True))
-    shown: dict[str, spaces.Space] = {
+    entries: dict[str, spaces.Space] = {
         key: spaces.Box(-limit, limit, (width,), np.float32) for key, width in widths.items()
     }
-    return spaces.Dict(shown), spaces.Box(-1.0, 1.0, (core.effector.num_joints + 1,), np.float32)
+    return spaces.Dict(entries), spaces.Box(-1.0, 1.0, (core.effector.num_joints + 1,), np.float32)
 
 
 def _largest(core: ThrowingCore) -> float:

@@ -178,11 +178,11 @@ def _dict(shown: Shown) -> Observation:
     return {"observation": observation, "achieved_goal": achieved_goal, "desired_goal": desired_goal}
 
 
-def _ended(shown: Observation, terminated: np.ndarray, over: np.ndarray) -> dict[str, Any]:
+def _ended(observation: Observation, terminated: np.ndarray, over: np.ndarray) -> dict[str, Any]:
     """Returns the info about ended episodes, in the form of gymnasium's own vectors."""
     final = np.full(len(over), None, object)
     for index in over.nonzero()[0]:
-        final[index] = {key: values[index] for key, values in shown.items()}
+        final[index] = {key: values[index] for key, values in observation.items()}
     return {
         "is_success": np.zeros_like(over),
         "_is_success": ~over,

@@ -143,18 +143,18 @@ class ThrowingCore:
             "goal": (2, 1.0, 0.0),
             "joints": (joints, 1.0, 0.0),
         }
-        seen = [*self.effector.shown, *(["ball", "ball_velocity"] if task.throws else []), "goal"]
-        kept = [name for name in _BODIES if name not in seen]
+        observed = [*self.effector.shown, *(["ball", "ball_velocity"] if task.throws else []), "goal"]
+        hidden = [name for name in _BODIES if name not in observed]
         if task.effector == "hand":  # its joints are its grip, and are kept there
-            kept = [name for name in kept if not name.startswith("joint")]
+            hidden = [name for name in hidden if not name.startswith("joint")]
         rows: dict[str, slice] = {}
         end = 0
-        for name in [*seen, *kept]:
+        for name in [*observed, *hidden]:
             rows[name] = slice(end, end + quantities[name][0])
             end += quantities[name][0]
         self._matrix = np.zeros((end, self.num_envs))
         self._seen = self._matrix[: rows["goal"].stop]
-        heights, *scaling = zip(*(quantities[name] for name in seen), strict=True)
+        heights, *scaling = zip(*(quantities[name] for name in observed), strict=True)
         self._scale, self._shift = (np.repeat(values, heights)[:, None] for values in scaling)
         if task.effector == "hand":
             rows |= {"joints": rows["grip"], "joint_velocity": rows["grip_velocity"]}
@@ -278,9 +278,9 @@ class ThrowingCore:
             cosines, sines = self._angles
             np.cos(self._joints, out=cosines)
             np.sin(self._joints, out=sines)
-        shown = self._seen * self._scale
-        shown += self._shift
-        return shown.T.astype(self.dtype, order="C")
+        state = self._seen * self._scale
+        state += self._shift
+        return state.T.astype(self.dtype, order="C")
 
     def achieved(self, achieved_goal: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
         """Returns where observed goals [..., 2] are nearer to each other than the threshold: [...]."""

@@ -87,17 +87,17 @@ class ThrowingEnv(BatchedEnv):
         threshold: float | None = None,
         dtype: torch.dtype | str = "float32",
     ) -> None:
-        shown = _as_dtype(dtype)
+        shown_dtype = _as_dtype(dtype)
         core = ThrowingCore(
             task,
             num_envs,
             world=world,
             num_links=num_links,
             threshold=threshold,
-            dtype=_OF_NUMPY.get(shown, np.float64),
+            dtype=_OF_NUMPY.get(shown_dtype, np.float64),
         )
         super().__init__(num_envs)
-        self.dtype_shown, self._native = shown, shown in _OF_NUMPY
+        self.dtype_shown, self._native = shown_dtype, shown_dtype in _OF_NUMPY
         self._core = core
         self.task, self.world, self.effector, self.threshold = task, core.world, core.effector, core.threshold
         self.max_steps = self.world.max_steps
@@ -153,12 +153,12 @@ class ThrowingEnv(BatchedEnv):
         """
         if not self.task.throws:
             raise ValueError(f"{self.task_name} has no curriculum: it has one stage; choose a throwing task")
-        seen = self.effector.observation_size
-        ball = [seen, seen + 1]
+        observed = self.effector.observation_size
+        ball = [observed, observed + 1]
         return [
             {
                 "name": "reach",
-                "observation": list(range(seen)),
+                "observation": list(range(observed)),
                 "achieved_goal": list(self.effector.grip_index),
                 "desired_goal": ball,
                 "threshold": self.world.shown(self.world.ball_radius),
@@ -166,9 +166,9 @@ class ThrowingEnv(BatchedEnv):
             },
             {
                 "name": "throw",
-                "observation": list(range(seen + 4)),
+                "observation": list(range(observed + 4)),
                 "achieved_goal": ball,
-                "desired_goal": [seen + 4, seen + 5],
+                "desired_goal": [observed + 4, observed + 5],
                 "instructive": True,
             },
         ]
@@ -179,11 +179,11 @@ class ThrowingEnv(BatchedEnv):
         They are ``hand`` or ``arm`` (all that is seen of it), ``grip`` (where its end is), ``ball`` and, if
         it is thrown, ``ball_speed`` and ``hole``; besides ``observation`` and ``desired_goal``.
         """
-        seen = self.effector.observation_size
-        names = {self.task.effector: list(range(seen)), "grip": list(self.effector.grip_index)}
+        observed = self.effector.observation_size
+        names = {self.task.effector: list(range(observed)), "grip": list(self.effector.grip_index)}
         pairs = ("ball", "ball_speed", "hole") if self.task.throws else ("ball",)
         for place, name in enumerate(pairs):
-            names[name] = [seen + 2 * place, seen + 2 * place + 1]
+            names[name] = [observed + 2 * place, observed + 2 * place + 1]
         return names | super().state_names()
 
     def goal_box(self) -> Box:
@@ -266,16 +266,16 @@ class ThrowingEnv(BatchedEnv):
         self._advance(action)
         core = self._core
         arrays = core.show()
-        shown = self._tensors(**arrays._asdict())
+        entries = self._tensors(**arrays._asdict())
         # Goals are compared in observed coordinates, so that rewards are those of compute_reward.
         if self._native:
             achieved = core.achieved(arrays.achieved_goal, arrays.desired_goal)[:, None]
         else:
-            achieved = self._is_achieved(shown).numpy()
+            achieved = self._is_achieved(entries).numpy()
         truncated = core.out_of_time()[:, None]
         ends = {"terminated": achieved, "truncated": truncated, "done": achieved | truncated}
         return {
-            **shown,
+            **entries,
             **self._tensors(reward=reward_of(achieved).astype(core.dtype)),
             **{key: torch.from_numpy(end) for key, end in ends.items()},
         }

@@ -82,10 +82,10 @@ class WorldConfig:
         if self.friction < 0.0:
             raise ValueError(f"friction must be at least 0, got {self.friction}")
         for name in _WHOLE:
-            given = getattr(self, name)
-            if given != int(given):
-                raise ValueError(f"{name} must be a whole number, got {given}")
-            object.__setattr__(self, name, int(given))  # 4.0, as from a file, counts as 4
+            value = getattr(self, name)
+            if value != int(value):
+                raise ValueError(f"{name} must be a whole number, got {value}")
+            object.__setattr__(self, name, int(value))  # 4.0, as from a file, counts as 4
 
     def fastest_ball(self, thrown: float) -> float:
         """Upper bound on the speed of a ball, in meters a second.

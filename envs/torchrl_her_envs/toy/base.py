@@ -165,7 +165,7 @@ class ToyEnv(BatchedEnv):
         self.worlds.place, ended = self._move(action)
         return ended
 
-    def _is_achieved(self, shown: dict[str, Tensor]) -> Tensor:
+    def _is_achieved(self, entries: dict[str, Tensor]) -> Tensor:
         return (self.worlds.place == self.worlds.goal).all(-1, keepdim=True)
 
     def _uniform(self, which: Tensor, count: int) -> Tensor:

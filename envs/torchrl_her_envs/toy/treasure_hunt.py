@@ -78,8 +78,8 @@ class TreasureHunt(ToyEnv):
     def _start(self, which: Tensor) -> tuple[Tensor, Tensor]:
         u = self._uniform(which, 2)
         goal = (u[:, :1] * (self._last + 1)).to(torch.int64)
-        other = (u[:, 1:] * self._last).to(torch.int64)
-        return other + (other >= goal), goal
+        start = (u[:, 1:] * self._last).to(torch.int64)
+        return start + (start >= goal), goal
 
     def _move(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
         return (self.worlds.place + 2 * action.unsqueeze(-1) - 1).clamp(0, self._last), None

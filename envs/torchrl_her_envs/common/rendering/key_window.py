@@ -102,16 +102,16 @@ class KeyWindow:
 
     def commands(self) -> list[Command]:
         """Returns the requests since the last call; closing the window is ``QUIT``."""
-        pygame, asked = self._pygame, []
+        pygame, commands = self._pygame, []
         for event in pygame.event.get():
             if event.type == pygame.QUIT:
-                asked.append(Command.QUIT)
+                commands.append(Command.QUIT)
             elif event.type == pygame.KEYDOWN:
                 # On some keyboards plus is no key of its own, and only its letter tells.
                 typed = {"+": Command.FASTER, "-": Command.SLOWER}.get(getattr(event, "unicode", ""))
                 command = typed or self._commands.get(event.key)
-                asked += [] if command is None else [command]
-        return asked
+                commands += [] if command is None else [command]
+        return commands
 
     def wait(self, rate: float) -> None:
         """Waits so that calls return ``rate`` times a second."""

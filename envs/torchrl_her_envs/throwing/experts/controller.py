@@ -85,8 +85,8 @@ class Controller(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.task, self.world = task, world
-        shown = world.shown(world.hole_radius) if threshold is None else threshold
-        self._threshold = shown * world.size / 2.0  # in meters
+        distance = world.shown(world.hole_radius) if threshold is None else threshold
+        self._threshold = distance * world.size / 2.0  # in meters
         self.skill: Skill = (
             HandSkill(world, wall=task.wall)
             if task.effector == "hand"
@@ -133,8 +133,8 @@ class Controller(TensorDictModuleBase):
         gap = self.skill.effector.grip(joints) - ball
         return gap.square().sum(-1) < (self.world.ball_radius * self.world.size) ** 2
 
-    def _meters(self, shown: Tensor) -> Tensor:
-        return (shown + 1.0) * (self.world.size / 2.0)
+    def _meters(self, places: Tensor) -> Tensor:
+        return (places + 1.0) * (self.world.size / 2.0)
 
 
 def make_controller(env: EnvBase) -> Controller:

@@ -64,10 +64,10 @@ class Canvas:
 
     def copy(self) -> Canvas:
         """Returns a canvas with a copy of this one's shapes."""
-        other = object.__new__(Canvas)
-        other.size, other._scale = self.size, self._scale
-        other._use(self._image.copy())
-        return other
+        copy = object.__new__(Canvas)
+        copy.size, copy._scale = self.size, self._scale
+        copy._use(self._image.copy())
+        return copy
 
     def finish(self) -> Tensor:
         """Returns the picture as [size, size, 3] of uint8."""
