@@ -161,14 +161,14 @@ class GuidedExploration(TensorDictModuleBase):
         guided = self._begin(torch.ones_like(begun) if self.per == "step" else begun, top)
         if not bool((guided >= 0).any()):
             return tensordict
-        seen, achieved, desired = self._look(state, guided)
+        inputs, achieved, desired = self._look(state, guided)
         squares = self._squares.to(state)[guided.clamp(min=0)].view(achieved.shape[:-1])
-        there = ((achieved - desired).square().sum(-1) < squares).view(guided.shape)
+        reached = ((achieved - desired).square().sum(-1) < squares).view(guided.shape)
         after = torch.full_like(guided, -1) if top is None else torch.where(guided + 1 < top, guided + 1, -1)
-        guided.copy_(torch.where(there & (guided >= 0), after, guided))
-        if top is not None and bool((there & (guided >= 0)).any()):
-            seen, *_ = self._look(state, guided)  # some act as in the next stage from now on
-        rows = TensorDict({self.input_key: seen}, tensordict.batch_size)
+        guided.copy_(torch.where(reached & (guided >= 0), after, guided))
+        if top is not None and bool((reached & (guided >= 0)).any()):
+            inputs, *_ = self._look(state, guided)  # some act as in the next stage from now on
+        rows = TensorDict({self.input_key: inputs}, tensordict.batch_size)
         policy_action = tensordict.get(action_key)
         acts = guided >= 0 if policy_action.ndim == guided.ndim else (guided >= 0).squeeze(-1)
         # Greedy: whether it is called depends on other runs, so it must not draw numbers for this one.
@@ -203,6 +203,6 @@ class GuidedExploration(TensorDictModuleBase):
         return entries.split([self.curriculum.input_width, goal, goal], -1)
 
     def _columns_of(self, stage: CurriculumStage) -> list[int]:
-        shown = [*stage.observation, *stage.desired_goal]
-        zeros = [self.curriculum.state_width] * (self.curriculum.input_width - len(shown))
-        return [*shown, *zeros, *stage.achieved_goal, *stage.desired_goal]
+        inputs = [*stage.observation, *stage.desired_goal]
+        zeros = [self.curriculum.state_width] * (self.curriculum.input_width - len(inputs))
+        return [*inputs, *zeros, *stage.achieved_goal, *stage.desired_goal]

@@ -57,10 +57,10 @@ def count_inputs(
             which = run_rows.get(stage_key).squeeze(-1)
             parts = [(stage, run_rows[which == place]) for place, stage in enumerate(stages)]
         for stage, part in parts:
-            shown = len(stage.observation)
-            seen = (part.get(observation_key)[..., :shown], part.get(desired_goal_key))
+            width = len(stage.observation)
+            inputs = (part.get(observation_key)[..., :width], part.get(desired_goal_key))
             if len(part) > 0:
-                norm.count(input_key, torch.cat(seen, -1), run=run)
+                norm.count(input_key, torch.cat(inputs, -1), run=run)
     return undo
 
 

@@ -68,8 +68,8 @@ class EpisodeStages(CurriculumProgress):
             raise ValueError(f"task_share must be in [0, 1], got {task_share}")
         self.stages = (below,) * runs
         self.generators: Generators = check_generators(runs, generators) or [None]
-        each = [(1 - share) / below] * below if below else []
-        self._shares = torch.tensor([[*each, share if below else 1.0]] * runs, dtype=torch.float64)
+        lower_shares = [(1 - share) / below] * below if below else []
+        self._shares = torch.tensor([[*lower_shares, share if below else 1.0]] * runs, dtype=torch.float64)
 
     @property
     def shares(self) -> Tensor:

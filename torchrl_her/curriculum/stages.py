@@ -69,8 +69,8 @@ class CurriculumStage:
             )
         self._check_constant_goal()
         for key in _LISTS:
-            given = getattr(self, key)
-            entries = [given] if isinstance(given, str) else list(given)
+            value = getattr(self, key)
+            entries = [value] if isinstance(value, str) else list(value)
             if not entries and not (key == "desired_goal" and self.constant_goal):
                 raise ValueError(f"stage {self.name!r}: {key} must not be empty")
             object.__setattr__(
@@ -269,15 +269,15 @@ def _resolve(stage: CurriculumStage, names: Mapping[str, Sequence[int]]) -> Curr
     """Returns a stage with indices in place of names, checked on its own."""
 
     def indices(key: str) -> list[int]:
-        found: list[int] = []
+        resolved_indices: list[int] = []
         for entry in getattr(stage, key):
             if isinstance(entry, str) and entry not in names:
                 raise ValueError(
                     f"stage {stage.name!r}: {key} has the unknown name {entry!r}; "
                     f"known are {', '.join(map(repr, names)) or 'none'}"
                 )
-            found += names[entry] if isinstance(entry, str) else [entry]
-        return found
+            resolved_indices += names[entry] if isinstance(entry, str) else [entry]
+        return resolved_indices
 
     return replace(stage, **{key: indices(key) for key in _LISTS})  # type: ignore[arg-type]
 

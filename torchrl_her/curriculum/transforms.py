@@ -35,8 +35,8 @@ def take_columns(rows: Tensor, index: Tensor) -> Tensor:
     if len(index) == 1:
         return rows.index_select(-1, index[0])
     blocks = rows.reshape(len(index), -1, rows.shape[-1])
-    taken = blocks.gather(-1, index.unsqueeze(1).expand(-1, blocks.shape[1], -1))
-    return taken.view(*rows.shape[:-1], index.shape[-1])
+    columns = blocks.gather(-1, index.unsqueeze(1).expand(-1, blocks.shape[1], -1))
+    return columns.view(*rows.shape[:-1], index.shape[-1])
 
 
 class _StageTransform(Transform):
@@ -101,9 +101,9 @@ class _StageTransform(Transform):
         again = self._call(root.select(*self.in_keys, strict=False))
         differs = torch.zeros(root.shape, dtype=torch.bool, device=device_of(root))
         for key in self.out_keys:
-            shown, new = root.get(key), again.get(key)
-            differs |= (shown != new).any(-1)
-            shown.copy_(new)  # in place, as the collector keeps this tensor but not this TensorDict
+            entry, new = root.get(key), again.get(key)
+            differs |= (entry != new).any(-1)
+            entry.copy_(new)  # in place, as the collector keeps this tensor but not this TensorDict
         return differs
 
     def _get(self, tensordict: TensorDictBase, key: NestedKey, width: int) -> Tensor:
@@ -205,8 +205,8 @@ class StateToObs(_StageTransform):
         continues_after_termination: bool = True,
     ) -> None:
         keys.check_ends(continues_after_termination=continues_after_termination)
-        shown = [keys.observation, keys.achieved_goal, keys.desired_goal]
-        super().__init__(curriculum, progress, None, [state_key], shown, stage_key)
+        out_keys = [keys.observation, keys.achieved_goal, keys.desired_goal]
+        super().__init__(curriculum, progress, None, [state_key], out_keys, stage_key)
         self.keys, self.continues_after_termination = keys, continues_after_termination
         goal = curriculum.goal_width
         self._widths = [curriculum.observation_width, goal, goal]
@@ -255,9 +255,9 @@ class StateToObs(_StageTransform):
             if rows is None:
                 reward, terminated = result[0].to(reward.dtype), result[1]
             else:
-                here = (rows == stage).unsqueeze(-1)
-                reward = torch.where(here, result[0].to(reward.dtype), reward)
-                terminated = torch.where(here, result[1], terminated)
+                in_stage = (rows == stage).unsqueeze(-1)
+                reward = torch.where(in_stage, result[0].to(reward.dtype), reward)
+                terminated = torch.where(in_stage, result[1], terminated)
         done = terminated.clone()
         if self.keys.truncated is not None:
             truncated = tensordict.get(self.keys.truncated)
@@ -276,17 +276,17 @@ class StateToObs(_StageTransform):
         )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        seen = self._seen(observation_spec, self.in_keys[0], self.curriculum.state_width)
+        state_spec = self._seen(observation_spec, self.in_keys[0], self.curriculum.state_width)
         for key, width in zip(self.out_keys, self._widths, strict=True):
-            shape = (*seen.shape[:-1], width)
-            observation_spec[key] = Unbounded(shape=shape, dtype=seen.dtype, device=seen.device)
+            shape = (*state_spec.shape[:-1], width)
+            observation_spec[key] = Unbounded(shape=shape, dtype=state_spec.dtype, device=state_spec.device)
         if self.progress.by_episode:
             observation_spec[self.stage_key] = Bounded(
                 low=0,
                 high=len(self.curriculum) - 1,
-                shape=(*seen.shape[:-1], 1),
+                shape=(*state_spec.shape[:-1], 1),
                 dtype=torch.int64,
-                device=seen.device,
+                device=state_spec.device,
             )
         return observation_spec
 
@@ -467,9 +467,9 @@ class ZeroPad(_StageTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         widths = (self.curriculum.observation_width, self.curriculum.goal_width)
         for key, width in zip(self.in_keys, widths, strict=False):
-            seen = self._seen(observation_spec, key, width)
-        shape = (*seen.shape[:-1], self.curriculum.input_width)
-        observation_spec[self.out_keys[0]] = Unbounded(shape=shape, dtype=seen.dtype, device=seen.device)
+            spec = self._seen(observation_spec, key, width)
+        shape = (*spec.shape[:-1], self.curriculum.input_width)
+        observation_spec[self.out_keys[0]] = Unbounded(shape=shape, dtype=spec.dtype, device=spec.device)
         return observation_spec
 
     def _pad(self, observation: Tensor, goal: Tensor, stage: Tensor | None) -> Tensor:

@@ -76,11 +76,11 @@ class StageView:
         played = entry_of(rows, keys.stage).reshape(-1, 1) == self.stage
         out = rows.copy()
         out.set("next", rows.get("next").copy())
-        here = (self.observation_key, keys.achieved, keys.goals[0])
-        there = (under_next(self.observation_key), keys.next_achieved, keys.goals[1])
-        for state_key, names in ((self.state_key, here), (under_next(self.state_key), there)):
-            shown = self.curriculum.show(entry_of(rows, state_key), self.stage)
-            for key, entry in zip(names, shown, strict=True):  # goals that were proposed stay
+        current_keys = (self.observation_key, keys.achieved, keys.goals[0])
+        next_keys = (under_next(self.observation_key), keys.next_achieved, keys.goals[1])
+        for state_key, names in ((self.state_key, current_keys), (under_next(self.state_key), next_keys)):
+            entries = self.curriculum.show(entry_of(rows, state_key), self.stage)
+            for key, entry in zip(names, entries, strict=True):  # goals that were proposed stay
                 out.set(key, torch.where(played, entry_of(rows, key), entry))
         for key in (keys.stage, under_next(keys.stage)):
             if (stages := out.get(key, None)) is not None:

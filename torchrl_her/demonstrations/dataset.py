@@ -130,8 +130,8 @@ class Demonstrations:
             rows: [n], of which they are taken; those that there are if None.
         """
         states = None if self.states is None else {name: entry[index] for name, entry in self.states.items()}
-        taken = (self.rows if rows is None else rows)[index]
-        return replace(self, rows=taken, lengths=lengths, states=states)
+        rows_taken = (self.rows if rows is None else rows)[index]
+        return replace(self, rows=rows_taken, lengths=lengths, states=states)
 
     def first(self, count: int) -> Demonstrations:
         """Returns the first episodes.

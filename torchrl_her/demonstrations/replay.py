@@ -161,10 +161,10 @@ class MixedReplay:
             rows: [n], with ``index`` and the new priorities.
         """
         behind = self.collected.storage.max_size
-        shown = rows.get("index").reshape(len(rows)) >= behind
-        if not bool(shown.all()):
-            self.collected.update_tensordict_priority(rows[~shown])
-        if bool(shown.any()):
-            demo_rows = rows[shown]
+        demonstrated = rows.get("index").reshape(len(rows)) >= behind
+        if not bool(demonstrated.all()):
+            self.collected.update_tensordict_priority(rows[~demonstrated])
+        if bool(demonstrated.any()):
+            demo_rows = rows[demonstrated]
             demo_rows.set("index", demo_rows.get("index") - behind)
             self.demonstrations.update_tensordict_priority(demo_rows)

@@ -85,19 +85,19 @@ def in_stage(
                 f"the curriculum needs states of width {curriculum.state_width}, demonstrations of "
                 f"{demonstrations.task} have {state.shape[-1]}"
             )
-        shown = curriculum.show(state, stage)
-        tensordict.update(dict(zip(("observation", "achieved_goal", "desired_goal"), shown, strict=True)))
+        entries = curriculum.show(state, stage)
+        tensordict.update(dict(zip(("observation", "achieved_goal", "desired_goal"), entries, strict=True)))
     if stage < len(curriculum) - 1:
         after["terminated"] = torch.zeros_like(after["terminated"])
     rows.set("next", after)
-    seen, rule = replace(demonstrations, rows=rows), curriculum.stages[stage].reward_fn or task_reward
-    return seen if rule is None else with_reward(seen, rule)
+    staged, rule = replace(demonstrations, rows=rows), curriculum.stages[stage].reward_fn or task_reward
+    return staged if rule is None else with_reward(staged, rule)
 
 
 def _until_first(end: Tensor, demonstrations: Demonstrations) -> tuple[Tensor, Tensor]:
     """Returns the rows [m] up to the first end [n] of each episode, and the number of these, [E]."""
-    of, rows = demonstrations.episode, torch.arange(len(end))
+    episode, rows = demonstrations.episode, torch.arange(len(end))
     first = torch.full_like(demonstrations.lengths, len(end))
-    first = first.scatter_reduce(0, of[end], rows[end], "amin")
-    kept = rows <= first[of]
-    return rows[kept], of[kept].bincount(minlength=len(demonstrations))
+    first = first.scatter_reduce(0, episode[end], rows[end], "amin")
+    kept = rows <= first[episode]
+    return rows[kept], episode[kept].bincount(minlength=len(demonstrations))

@@ -73,11 +73,11 @@ class DemonstrationStarts(Transform):
         if not 0.0 <= share <= 1.0:
             raise ValueError(f"share must be in [0, 1], got {share}")
         single = isinstance(demonstrations, Demonstrations)
-        given = [demonstrations] * runs if isinstance(demonstrations, Demonstrations) else demonstrations
-        if len(given) != runs or (generators is not None and len(generators) != runs):
-            raise ValueError(f"{runs} runs need demonstrations and a generator for each, got {len(given)}")
-        first = usable(given[0])
-        self._shown = [first if single else usable(demos) for demos in given]
+        per_run = [demonstrations] * runs if isinstance(demonstrations, Demonstrations) else demonstrations
+        if len(per_run) != runs or (generators is not None and len(generators) != runs):
+            raise ValueError(f"{runs} runs need demonstrations and a generator for each, got {len(per_run)}")
+        first = usable(per_run[0])
+        self._shown = [first if single else usable(demos) for demos in per_run]
         self.share, self.runs = share, runs
         self._generators = [None] * runs if generators is None else list(generators)
         self.walk = WalkBack([int(demos.lengths.max()) for demos in self._shown], **walk)
@@ -135,7 +135,7 @@ class DemonstrationStarts(Transform):
     def _draw(self, begun: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Draws which of the environments [N] start at demonstrations, and their states."""
         assert self._back is not None
-        each = len(begun) // self.runs
+        envs_per_run = len(begun) // self.runs
         chosen: list[Tensor] = []
         parts: list[dict[str, Tensor]] = []
         for run, (run_begun, generator) in enumerate(
@@ -146,17 +146,17 @@ class DemonstrationStarts(Transform):
                 continue  # draws nothing, as when the run is trained alone
             u = torch.rand(len(new), 3, generator=generator, dtype=torch.float64)
             started = u[:, 0] < self.share
-            shown, (least, most) = self._shown[run], self.walk.window(run)
+            demonstrations, (least, most) = self._shown[run], self.walk.window(run)
             u = u[started]
-            episode = (u[:, 1] * len(shown)).long()
+            episode = (u[:, 1] * len(demonstrations)).long()
             back = least + (u[:, 2] * (most - least + 1)).long()
-            lengths = shown.lengths[episode]
+            lengths = demonstrations.lengths[episode]
             back = torch.minimum(back, lengths)
-            rows = shown.begins[episode] + lengths - back
-            which = new[started] + run * each
+            rows = demonstrations.begins[episode] + lengths - back
+            which = new[started] + run * envs_per_run
             self._back[which] = back
             chosen.append(which)
-            parts.append({name: entry[rows] for name, entry in (shown.states or {}).items()})
+            parts.append({name: entry[rows] for name, entry in (demonstrations.states or {}).items()})
         if not chosen:
             return torch.empty(0, dtype=torch.int64), {}
         return torch.cat(chosen), {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

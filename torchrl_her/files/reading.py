@@ -148,8 +148,8 @@ def _check_description(description: bytes) -> None:
     for step, value, _ in genops(description):
         name, before = step.name, step.stack_before
         if name == "GLOBAL" and value not in _NAMES:
-            shown = ".".join(str(value).split())[:80].encode("unicode_escape").decode()
-            raise MoreThanDataError(f"more than tensors and plain data: {shown}")
+            excerpt = ".".join(str(value).split())[:80].encode("unicode_escape").decode()
+            raise MoreThanDataError(f"more than tensors and plain data: {excerpt}")
         if name == "PROTO" and value != 2:
             raise _RefusedError(f"it is written in protocol {value} of pickle, not in 2")
         place = marks.pop() - before.index(markobject) if markobject in before else len(stack) - len(before)

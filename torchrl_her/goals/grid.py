@@ -171,12 +171,12 @@ def _log_mass(x: Tensor, low: float, high: float, sigma: float) -> Tensor:
 
 
 def _sigmas(grid: GoalGrid, sigma: Numbers, label: str = "") -> list[float]:
-    given, d = _floats(sigma), len(grid.shape)
-    if len(given) not in (1, d) or not all(0 < s < math.inf for s in given):
+    sigmas, d = _floats(sigma), len(grid.shape)
+    if len(sigmas) not in (1, d) or not all(0 < s < math.inf for s in sigmas):
         raise ValueError(f"{label}sigma must be positive and finite, one number or {d}, got {sigma}")
     # Beyond these bounds nothing changes but that squares overflow: q* is one cell, or uniform.
-    each = zip(given * d if len(given) == 1 else given, grid.cell_size, grid.shape, strict=True)
-    return [min(max(s, 1e-12 * size), 1e12 * size * n) for s, size, n in each]
+    dimensions = zip(sigmas * d if len(sigmas) == 1 else sigmas, grid.cell_size, grid.shape, strict=True)
+    return [min(max(s, 1e-12 * size), 1e12 * size * n) for s, size, n in dimensions]
 
 
 def sampled_target(grid: GoalGrid, samples: Tensor, sigma: Numbers) -> Tensor:

@@ -133,9 +133,9 @@ class RareGoals(GoalWeights):
         scale = goal_scale(samples)
         samples = samples / scale
         # Densities of some goals among the others: a goal must not be its own neighbor.
-        asked = torch.arange(len(samples), device=samples.device) % max(2, len(samples) // _LEVEL) == 0
-        others = samples if len(samples) == 1 else samples[~asked]
-        return _Reference(samples, scale, float(self._log_density(samples[asked], others).median()))
+        held_out = torch.arange(len(samples), device=samples.device) % max(2, len(samples) // _LEVEL) == 0
+        others = samples if len(samples) == 1 else samples[~held_out]
+        return _Reference(samples, scale, float(self._log_density(samples[held_out], others).median()))
 
     def _log_density(self, goals: Tensor, samples: Tensor) -> Tensor:
         if self.estimator == "kernel":

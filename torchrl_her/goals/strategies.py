@@ -60,8 +60,8 @@ def register_strategy(name: str, function: StrategyFunction) -> None:
     if not name:
         raise ValueError(f"a goal strategy needs a name, got {name!r}")
     if name in STRATEGIES or name in RECENT:
-        taken = ", ".join([*STRATEGIES, *RECENT])
-        raise ValueError(f"the name {name!r} is taken by another goal strategy; taken are {taken}")
+        names = ", ".join([*STRATEGIES, *RECENT])
+        raise ValueError(f"the name {name!r} is taken by another goal strategy; taken are {names}")
     if not callable(function):
         raise TypeError(f"goal strategy {name!r} must be a function, got {function!r}")
     STRATEGIES[name] = function

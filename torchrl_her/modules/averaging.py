@@ -75,16 +75,16 @@ class PolicyAverage(nn.Module):
             steps: number of gradient steps since the last call.
             idle: the runs that made none.
         """
-        made = [0 if run in idle else steps for run in range(len(self.steps))]
-        self.steps += torch.tensor(made, device=self.steps.device)
-        kept = [self._kept(done) ** count for done, count in zip(self.steps.tolist(), made, strict=True)]
+        updates = [0 if run in idle else steps for run in range(len(self.steps))]
+        self.steps += torch.tensor(updates, device=self.steps.device)
+        decays = [self._kept(done) ** count for done, count in zip(self.steps.tolist(), updates, strict=True)]
         averaged, learned = self._weights
-        if len(set(kept)) == 1:
-            torch._foreach_lerp_(averaged, learned, 1.0 - kept[0])
+        if len(set(decays)) == 1:
+            torch._foreach_lerp_(averaged, learned, 1.0 - decays[0])
         else:
             for average, now in zip(averaged, learned, strict=True):
                 share = torch.tensor(
-                    [1.0 - each for each in kept], dtype=average.dtype, device=average.device
+                    [1.0 - each for each in decays], dtype=average.dtype, device=average.device
                 )
                 average.lerp_(now, share.view(-1, *[1] * (average.ndim - 1)))
         if self._copies:

@@ -138,7 +138,7 @@ class NormalizedPolicy(TensorDictModuleBase):
         Raises:
             KeyError: an entry that the actor reads normalized is missing.
         """
-        seen = tensordict.copy()
+        normalized = tensordict.copy()
         for key in self._normalized:
-            seen.set(key, self.norm.normalize(key, entry_to_normalize(tensordict, key)))
-        return tensordict.update(self.actor(seen).select(*self.out_keys, strict=False))
+            normalized.set(key, self.norm.normalize(key, entry_to_normalize(tensordict, key)))
+        return tensordict.update(self.actor(normalized).select(*self.out_keys, strict=False))

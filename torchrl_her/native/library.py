@@ -155,15 +155,15 @@ def _compile(compiler: Sequence[str], source: Path, real: str, library: Path) ->
     library.parent.mkdir(parents=True, exist_ok=True)
     errors: list[Exception] = []
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-        made = Path(folder) / library.name
+        compiled = Path(folder) / library.name
         for extras in _EXTRAS:
             try:
-                compile_library(compiler, source, made, real=real, extras=extras)
-                loaded = ctypes.CDLL(str(made))
+                compile_library(compiler, source, compiled, real=real, extras=extras)
+                loaded = ctypes.CDLL(str(compiled))
             except (CannotCompile, OSError) as error:
                 errors.append(error)
             else:
-                os.replace(made, library)  # at once: other processes may be compiling the same
+                os.replace(compiled, library)  # at once: other processes may be compiling the same
                 return loaded
     raise errors[0]
 
@@ -174,11 +174,11 @@ def find_compiler() -> list[str]:
     Raises:
         CannotCompile: there is none.
     """
-    wanted = os.environ.get("CXX", "").split()
-    for name, *options in [wanted] if wanted else [["g++"], ["clang++"], ["c++"]]:
+    command = os.environ.get("CXX", "").split()
+    for name, *options in [command] if command else [["g++"], ["clang++"], ["c++"]]:
         if path := shutil.which(name):
             return [path, *options]
-    named = f" {wanted[0]}" if wanted else " (g++ or clang++; `pip install ziglang` brings one)"
+    named = f" {command[0]}" if command else " (g++ or clang++; `pip install ziglang` brings one)"
     raise CannotCompile(f"there is no C++ compiler{named}")
 
 

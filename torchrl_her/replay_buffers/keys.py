@@ -133,8 +133,8 @@ def failures(
     failed, cost = terminated & (reward < achieved_reward), torch.zeros_like(reward)
     at = failed.nonzero().squeeze(-1)
     if len(at) > 0:  # an end by the reward function is a success, even with another reward
-        reached, wanted = keys.after(transitions, reward_fn)[at], entry_of(transitions, keys.goals[1])[at]
-        own_reward, own_end = (answer.flatten() for answer in ask_reward(reward_fn, reached, wanted))
+        reached, desired = keys.after(transitions, reward_fn)[at], entry_of(transitions, keys.goals[1])[at]
+        own_reward, own_end = (answer.flatten() for answer in ask_reward(reward_fn, reached, desired))
         failed[at] = ~own_end
         less = (reward[at] - own_reward).to(cost.dtype)
         cost[at] = less.where(

@@ -138,13 +138,13 @@ class HindsightOptions:
         if self.goal_sources is not None:
             sources = check_goal_sources(self.goal_sources)
             k = sum(sources.values())
-            given: dict[str, Any] = {}
+            repeated: dict[str, Any] = {}
             if not isinstance(self.k, _NotGiven) and self.k != k:
-                given["k"] = self.k
+                repeated["k"] = self.k
             if self.strategy != HindsightOptions.strategy:
-                given["strategy"] = self.strategy
-            if given:
-                raise ValueError(_twice(self.goal_sources, **given))
+                repeated["strategy"] = self.strategy
+            if repeated:
+                raise ValueError(_twice(self.goal_sources, **repeated))
             object.__setattr__(self, "goal_sources", sources)
             object.__setattr__(self, "k", k)
 
@@ -180,9 +180,9 @@ class HindsightOptions:
                 hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
                 raise TypeError(f"there is no option {name!r}{hint} The options are {', '.join(known)}")
         sources = changes.get("goal_sources", self.goal_sources)
-        given = {name: changes[name] for name in ("k", "strategy") if name in changes}
-        if sources is not None and given:
-            raise ValueError(_twice(sources, **given))
+        repeated = {name: changes[name] for name in ("k", "strategy") if name in changes}
+        if sources is not None and repeated:
+            raise ValueError(_twice(sources, **repeated))
         if sources is not None or self.goal_sources is not None:  # then k is the sum of the sources
             changes = {"k": HindsightOptions.k, "strategy": HindsightOptions.strategy, **changes}
         return replace(self, **changes)
@@ -204,10 +204,10 @@ class HindsightOptions:
         )
 
 
-def _twice(sources: GoalSources, **given: Any) -> str:
+def _twice(sources: GoalSources, **repeated: Any) -> str:
     """Returns the message about goal sources that are given together with ``k`` or ``strategy``."""
-    shown = " and ".join(f"{name}={value!r}" for name, value in given.items())
-    return f"{shown} and goal_sources={{{sources_name(sources)}}} say the same: give one of them"
+    assignments = " and ".join(f"{name}={value!r}" for name, value in repeated.items())
+    return f"{assignments} and goal_sources={{{sources_name(sources)}}} say the same: give one of them"
 
 
 class _Option(Generic[T]):

@@ -391,9 +391,9 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         reward = entry_of(stored.rows, self._keys.reward).reshape(-1, 1)[window]
         end = entry_of(stored.rows, self._keys.done).reshape(-1, 1)[window]
         if len(virtual) > 0:
-            wanted = goals.unsqueeze(1).expand(-1, window.shape[1], -1)
+            desired = goals.unsqueeze(1).expand(-1, window.shape[1], -1)
             reached = self._keys.after(stored.rows, self.reward_fn)[window[virtual]]
-            own_reward, own_end = ask_reward(self.reward_fn, reached, wanted)
+            own_reward, own_end = ask_reward(self.reward_fn, reached, desired)
             failed, cost = failures(stored.rows, self._keys, self.reward_fn, self.achieved_reward)
             own_reward = own_reward + cost[window[virtual]]
             reward[virtual] = stored_as(own_reward, reward[0], self._keys.reward).view_as(own_reward)

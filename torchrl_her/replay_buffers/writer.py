@@ -457,13 +457,15 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         entries = max(1, min(_ROWS, self.capacity) // most), _ROWS // most
         episode_runs = None if run is None else run[episodes.rows[:, :1]].flatten()
         recent, settings, drafts, first_id = list(self._recent), self._settings(), [], self._episodes
-        for stage, shown, part, run_of in self._by_stage(rows, episodes, episode_runs):
-            lately = recent[stage].after(shown, part, run_of, self._keys, sizes=self.options.remembered)
-            recent[stage] = lately
+        for stage, stage_rows, part, run_of in self._by_stage(rows, episodes, episode_runs):
+            recent_goals = recent[stage].after(
+                stage_rows, part, run_of, self._keys, sizes=self.options.remembered
+            )
+            recent[stage] = recent_goals
             for piece in split_runs(part, run_of, settings, each=entries[0], together=entries[1]):
                 rule = self._rule(stage, piece.runs[0])
-                chunk = Chunk(shown, run, piece, rule.reward_fn, self.options, self._keys)
-                drafts.append(self._draft(chunk, lately, weighted=rule.weighted, first_id=first_id))
+                chunk = Chunk(stage_rows, run, piece, rule.reward_fn, self.options, self._keys)
+                drafts.append(self._draft(chunk, recent_goals, weighted=rule.weighted, first_id=first_id))
                 first_id += drafts[-1].ids
         self._commit(drafts, places)
         self._episodes = first_id
@@ -529,12 +531,12 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             virtual_key = self.options.virtual_key
             return join_rows(draft.rows, draft.virtual, draft.real, exclude=exclude, virtual_key=virtual_key)
 
-        shown: list[TensorDictBase] = []
+        joined: list[TensorDictBase] = []
         undo: list[Callable[[], None] | None] = []
         try:
             if self.on_write is not None:
-                shown = [join(draft) for draft in drafts]
-                for out, draft in zip(shown, drafts, strict=True):
+                joined = [join(draft) for draft in drafts]
+                for out, draft in zip(joined, drafts, strict=True):
                     undo.append(self.on_write(out, draft.runs, draft.counts))
             for draft in drafts:
                 if draft.virtual is not None and self.goal_weights and draft.weighted:
@@ -542,7 +544,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
                     self._weights_of_runs().update(goals, draft.runs, draft.virtual.counts)
             for place, draft in enumerate(drafts):
                 # Not all at once unless ``on_write`` needs them: that would touch fresh memory.
-                self._store(shown[place] if shown else join(draft), draft.runs, draft.counts)
+                self._store(joined[place] if joined else join(draft), draft.runs, draft.counts)
                 self._counts.add(draft.runs, **draft.numbers)
                 places.note(draft.runs, draft.real.root.split(draft.real.counts), draft.counts)
         except Exception:

@@ -219,8 +219,8 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
         return
     collector.load_state_dict(collector_state, strict=False)  # the collector keeps its policy
     carrier: Any = carrier_of(collector)
-    shown = TensorDict.from_dict(state["carrier"], batch_size=carrier.batch_size)
-    set_carrier(collector, carrier.empty().update(shown))
+    collected = TensorDict.from_dict(state["carrier"], batch_size=carrier.batch_size)
+    set_carrier(collector, carrier.empty().update(collected))
     if "traj_pool" in collector_state:  # TorchRL has drawn new ids, but the episodes have theirs
         set_next_ids(collector, collector_state["traj_pool"])
 

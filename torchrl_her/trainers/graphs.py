@@ -93,11 +93,11 @@ class GraphLearner(LossLearner):
                 return super().update(rows, steps, idle=idle)
         check_rows(rows, steps, self.runs)
         last, batch = rows.ndim - 1, rows.shape[-1] // steps
-        seen = rows.select(*self._keys, strict=False).split(self.steps_per_graph * batch, last)
-        made = [self._recorded_for(part, part.shape[-1] // batch)(part) for part in seen]
-        if self._priority is not None and "priority" in made[0]:
-            rows.set(self._priority, torch.cat([result["priority"] for result in made], last))
-        measured: TensorDictBase = torch.cat([result["measured"] for result in made])
+        parts = rows.select(*self._keys, strict=False).split(self.steps_per_graph * batch, last)
+        results = [self._recorded_for(part, part.shape[-1] // batch)(part) for part in parts]
+        if self._priority is not None and "priority" in results[0]:
+            rows.set(self._priority, torch.cat([result["priority"] for result in results], last))
+        measured: TensorDictBase = torch.cat([result["measured"] for result in results])
         return dict(measured.items())
 
     def _recorded_for(self, rows: TensorDictBase, steps: int) -> _Recorded:

@@ -122,8 +122,8 @@ class LossLearner:
         last = rows.ndim - 1
         parts = rows.split(rows.shape[last] // steps, last)
         check_idle(self.optimizer, self.target, idle)
-        kept = keep_runs(self.loss, self.optimizer, idle, runs=self.runs)
-        with kept, idle_runs(self.loss, self.target, idle):
+        keeping = keep_runs(self.loss, self.optimizer, idle, runs=self.runs)
+        with keeping, idle_runs(self.loss, self.target, idle):
             measured = [self._update(part) for part in parts]
         key = getattr(self.loss.tensor_keys, "priority", None)
         priorities = [] if key is None else [part.get(key, None) for part in parts]

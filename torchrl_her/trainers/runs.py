@@ -67,9 +67,9 @@ def _entries(loss: nn.Module, optimizer: torch.optim.Optimizer, runs: int) -> li
     """Yields all tensors that are divided among R runs: a key, the tensor, and the dimension of the runs."""
     dims = run_dims(loss)
     entries = [(entry, dims[name]) for name, entry in loss.state_dict().items()]
-    of = {id(parameter): dims.get(name, 0) for name, parameter in loss.named_parameters()}
+    dim_of = {id(parameter): dims.get(name, 0) for name, parameter in loss.named_parameters()}
     for parameter, state in optimizer.state.items():
-        entries += [(entry, of.get(id(parameter), 0)) for entry in state.values()]
+        entries += [(entry, dim_of.get(id(parameter), 0)) for entry in state.values()]
     return [
         (entry.data_ptr(), entry.data, dim)
         for entry, dim in entries

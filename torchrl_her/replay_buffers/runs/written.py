@@ -119,8 +119,8 @@ def _virtual_transitions(chunk: Chunk, source: Tensor, goals: Tensor, _first_id:
         changes = keys.changes(goals, reward, terminated, truncated.index_select(0, source))
         return source, source, changes, reward
     window, inside = _windows(chunk, source)
-    wanted = goals.unsqueeze(1).expand(-1, window.shape[1], -1)
-    reward, terminated = ask_reward(chunk.reward_fn, achieved[window], wanted)
+    desired = goals.unsqueeze(1).expand(-1, window.shape[1], -1)
+    reward, terminated = ask_reward(chunk.reward_fn, achieved[window], desired)
     reward = reward + cost[window]
     out = n_step_return(reward, terminated | failed[window], inside, options.gamma)
     last = _at(window, out.last)
@@ -132,8 +132,8 @@ def _virtual_episodes(chunk: Chunk, source: Tensor, goals: Tensor, first_id: int
     rows, episodes, keys = chunk.rows, chunk.episodes, chunk.keys
     number = _by_row(chunk, _episode_numbers(episodes))[source]
     table, inside = episodes.rows[number], episodes.inside[number]
-    wanted = goals.unsqueeze(1).expand(-1, table.shape[1], -1)
-    reward, terminated = ask_reward(chunk.reward_fn, chunk.after()[table], wanted)
+    desired = goals.unsqueeze(1).expand(-1, table.shape[1], -1)
+    reward, terminated = ask_reward(chunk.reward_fn, chunk.after()[table], desired)
     failed, cost = chunk.failures()
     reward, terminated = reward + cost[table], terminated | failed[table]
     ended = terminated.squeeze(-1).cumsum(-1) - terminated.squeeze(-1).to(torch.int64)
@@ -143,7 +143,7 @@ def _virtual_episodes(chunk: Chunk, source: Tensor, goals: Tensor, first_id: int
     root, reward, terminated = table[used], reward[used].view(-1, 1), terminated[used].view(-1, 1)
     truncated = entry_of(rows, keys.truncated)[root].view(-1, 1) | (stop[used].view(-1, 1) & ~terminated)
     copy = torch.arange(len(source), device=table.device).unsqueeze(-1).expand_as(table)
-    changes = keys.changes(wanted[used], reward, terminated, truncated)
+    changes = keys.changes(desired[used], reward, terminated, truncated)
     changes |= {keys.truncated: truncated, keys.trajectory: copy[used] + first_id}
     return root, root, changes, reward
 
