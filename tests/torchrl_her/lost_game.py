@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
@@ -31,3 +32,31 @@ def say(loss: LossModule, values: Sequence[object], target_values: Sequence[obje
         for value in params.values(True, True):
             value.data.zero_()
         params["module", "rest", "2", "bias"].data.copy_(torch.tensor(bias).view(len(bias), 1, 1, -1))
+
+
+def without_entropy(loss: LossModule) -> LossModule:
+    loss.log_alpha.data.fill_(-50.0)
+    return loss
+
+
+def check_same_loss(ours: LossModule, plain: LossModule, batch: TensorDict) -> None:
+    """Two losses of stochastic actors that draw the same give the same numbers and priorities."""
+    batches = [batch.clone(), batch.clone()]
+    first, second = (_seeded(loss, own) for loss, own in zip((ours, plain), batches, strict=True))
+    for name in ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy"):
+        torch.testing.assert_close(first[name], second[name], msg=name)
+    torch.testing.assert_close(batches[0]["td_error"], batches[1]["td_error"])
+
+
+def check_penalty(ours: LossModule, plain: LossModule, *, penalty: float) -> None:
+    """The first of two losses adds to the actor's loss a multiple of the mean square of drawn actions."""
+    batch = rows(4_000, action=torch.rand(1, 4_000, 3))[0]
+    with ours.actor_network_params.to_module(ours.actor_network):
+        action = ours.actor_network.get_dist(batch).rsample((10,))
+    added = _seeded(ours, batch.clone())["loss_actor"] - _seeded(plain, batch.clone())["loss_actor"]
+    assert added.item() == pytest.approx(penalty * action.square().mean().item(), rel=0.05)
+
+
+def _seeded(loss: LossModule, batch: TensorDict) -> TensorDict:
+    torch.manual_seed(3)
+    return loss(batch)

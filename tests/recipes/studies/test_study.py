@@ -61,16 +61,6 @@ def runs(*seeds: int) -> dict[str, Recipe]:
     return {f"seed_{seed}": small(seed=seed) for seed in seeds}
 
 
-@pytest.mark.parametrize("name", study_names())
-def test_every_study_is_made_of_recipes_that_work_and_can_be_shrunk(name: str) -> None:
-    cells = dict(load_study(name).cells())
-    assert len(cells) >= 2
-    assert all(recipe.run.num_runs >= 3 for recipe in cells.values())
-    quick = dict(load_study(name, quick=True).cells())
-    assert quick.keys() == cells.keys()
-    assert sum(recipe.total_frames * recipe.run.num_runs for recipe in quick.values()) < 300_000
-
-
 @pytest.mark.long
 def test_seeds_and_frames_take_the_place_of_the_study_s() -> None:
     recipe = next(recipe for _, recipe in load_study("ibs", seeds=3, frames=20_000).cells())

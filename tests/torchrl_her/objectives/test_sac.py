@@ -13,7 +13,7 @@ from torchrl_her.modules import make_stochastic_actor
 from torchrl_her.objectives import ActorTerms, Targets, make_sac_loss
 from torchrl_her.trainers import RunsAdam
 
-from ..lost_game import SPEC, rows, say
+from ..lost_game import SPEC, check_penalty, check_same_loss, rows, say, without_entropy
 
 
 def make_loss(
@@ -29,11 +29,6 @@ def make_loss(
     every = [make_critic((4, 2), 3, runs=runs) for _ in range(critics)]
     loss = make_sac_loss(actor, every, targets=Targets(gamma=gamma, reward_range=reward_range), **options)
     SoftUpdate(loss, tau=0.1)
-    return loss
-
-
-def without_entropy(loss: LossModule) -> LossModule:
-    loss.log_alpha.data.fill_(-50.0)
     return loss
 
 
@@ -110,27 +105,12 @@ def own_and_torchrls(**options: Any) -> tuple[LossModule, SACLoss]:
     return ours, plain
 
 
-def seeded(loss: LossModule, batch: Any) -> Any:
-    torch.manual_seed(3)
-    return loss(batch)
-
-
 def test_without_a_penalty_it_is_torchrls_loss() -> None:
-    batches = [rows(16, action=torch.rand(1, 16, 3))[0] for _ in range(2)]
-    batches[1] = batches[0].clone()
-    ours, plain = (seeded(loss, own) for loss, own in zip(own_and_torchrls(), batches, strict=True))
-    for name in ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy"):
-        torch.testing.assert_close(ours[name], plain[name], msg=name)
-    torch.testing.assert_close(batches[0]["td_error"], batches[1]["td_error"])
+    check_same_loss(*own_and_torchrls(), rows(16, action=torch.rand(1, 16, 3))[0])
 
 
 def test_the_penalty_is_the_mean_square_of_the_drawn_actions() -> None:
-    ours, plain = own_and_torchrls(terms=ActorTerms(action_penalty=0.7))
-    batch = rows(4_000, action=torch.rand(1, 4_000, 3))[0]
-    with ours.actor_network_params.to_module(ours.actor_network):
-        action = ours.actor_network.get_dist(batch).rsample((10,))
-    added = seeded(ours, batch.clone())["loss_actor"] - seeded(plain, batch.clone())["loss_actor"]
-    assert added.item() == pytest.approx(0.7 * action.square().mean().item(), rel=0.05)
+    check_penalty(*own_and_torchrls(terms=ActorTerms(action_penalty=0.7)), penalty=0.7)
 
 
 def test_each_run_has_a_temperature_of_its_own() -> None:

@@ -15,7 +15,7 @@ from torchrl_her.modules import make_stochastic_actor
 from torchrl_her.objectives import ActorTerms, Targets, critic_value, make_tqc_loss
 from torchrl_her.objectives.tqc import PenalizedTQCLoss
 
-from ..lost_game import SPEC, rows, say
+from ..lost_game import SPEC, check_penalty, check_same_loss, rows, say, without_entropy
 
 
 def make_loss(
@@ -32,11 +32,6 @@ def make_loss(
     every = [make_critic((4, 2), 3, runs=runs, outputs=quantiles) for _ in range(critics)]
     loss = make_tqc_loss(actor, every, targets=Targets(gamma=gamma, reward_range=reward_range), **options)
     SoftUpdate(loss, tau=0.1)
-    return loss
-
-
-def without_entropy(loss: LossModule) -> LossModule:
-    loss.log_alpha.data.fill_(-50.0)
     return loss
 
 
@@ -99,29 +94,15 @@ def own_and_torchrls(**options: Any) -> tuple[LossModule, TQCLoss]:
     return ours, plain
 
 
-def seeded(loss: LossModule, batch: Any) -> Any:
-    torch.manual_seed(3)
-    return loss(batch)
-
-
 def test_without_a_penalty_it_is_torchrls_loss() -> None:
     batch = rows(16, action=torch.rand(1, 16, 3))[0]
     batch["next", "terminated"][::3] = True
     batch["priority_weight"] = torch.rand(16) + 0.1
-    batches = [batch.clone(), batch.clone()]
-    ours, plain = (seeded(loss, own) for loss, own in zip(own_and_torchrls(), batches, strict=True))
-    for name in ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy"):
-        torch.testing.assert_close(ours[name], plain[name], msg=name)
-    torch.testing.assert_close(batches[0]["td_error"], batches[1]["td_error"])
+    check_same_loss(*own_and_torchrls(), batch)
 
 
 def test_the_penalty_is_the_mean_square_of_the_drawn_actions() -> None:
-    ours, plain = own_and_torchrls(terms=ActorTerms(action_penalty=0.7))
-    batch = rows(4_000, action=torch.rand(1, 4_000, 3))[0]
-    with ours.actor_network_params.to_module(ours.actor_network):
-        action = ours.actor_network.get_dist(batch).rsample((10,))
-    added = seeded(ours, batch.clone())["loss_actor"] - seeded(plain, batch.clone())["loss_actor"]
-    assert added.item() == pytest.approx(0.7 * action.square().mean().item(), rel=0.05)
+    check_penalty(*own_and_torchrls(terms=ActorTerms(action_penalty=0.7)), penalty=0.7)
 
 
 @pytest.mark.parametrize("runs", [1, 2])

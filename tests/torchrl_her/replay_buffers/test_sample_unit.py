@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import pickle
 import re
+from functools import partial
 from inspect import signature
 from itertools import chain
 from typing import Any
@@ -49,6 +50,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:the reward function gives")  # m
 REWARD = GoalReward(0.5)  # tags differ by at least 1
 
 
+IDS = ("collector", "traj_ids")
 NEVER_REAL = 10**6  # as k: practically all rows are virtual
 
 
@@ -71,6 +73,13 @@ def make_buffer(
     )
     buffer.set_rng(torch.Generator().manual_seed(seed))
     return buffer
+
+
+def make_beside(unit: HERSampleUnit | None = None, **parts: Any) -> TensorDictReplayBuffer:
+    """A unit in a buffer of other parts."""
+    unit = unit or HERSampleUnit(REWARD)
+    usual = {"storage": LazyTensorStorage(100), "collate_fn": unit.relabel, "batch_size": 4}
+    return TensorDictReplayBuffer(sample_unit=unit, **{**usual, **parts})
 
 
 def make_torchrl(capacity: int = 1_000, *, ndim: int = 1, **options: Any) -> HERReplayBuffer:
@@ -366,28 +375,14 @@ def test_a_prioritized_buffer_of_torchrls() -> None:
 
 
 def test_rows_drawn_without_replacement_are_each_drawn_once() -> None:
-    unit = HERSampleUnit(REWARD)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(50),
-        sampler=SamplerWithoutReplacement(),
-        sample_unit=unit,
-        collate_fn=unit.relabel,
-        batch_size=5,
-    )
+    buffer = make_beside(sampler=SamplerWithoutReplacement(), batch_size=5)
     buffer.extend(flat([[4, 6]]))
     seen = [tags(batch["observation"]) for batch in buffer]
     assert sorted(chain.from_iterable(seen)) == [0, 1, 2, 3, 100, 101, 102, 103, 104, 105]
 
 
 def test_batches_that_are_prefetched_by_threads() -> None:
-    unit = HERSampleUnit(REWARD)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(1_000),
-        sample_unit=unit,
-        collate_fn=unit.relabel,
-        batch_size=64,
-        prefetch=4,
-    )
+    buffer = make_beside(storage=LazyTensorStorage(1_000), batch_size=64, prefetch=4)
     buffer.extend(flat([[7] * 20] * 4))
     for _ in range(40):
         rows = buffer.sample()
@@ -399,10 +394,7 @@ def test_batches_that_are_prefetched_by_threads() -> None:
 
 
 def test_rows_on_disk() -> None:
-    unit = HERSampleUnit(REWARD)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyMemmapStorage(20), sample_unit=unit, collate_fn=unit.relabel, batch_size=100
-    )
+    buffer = make_beside(storage=LazyMemmapStorage(20), batch_size=100)
     batch = flat([[4, 6]])
     buffer.extend(batch.clone())
     assert buffer.sample()["virtual"].any()
@@ -410,20 +402,14 @@ def test_rows_on_disk() -> None:
 
 
 def test_a_data_set_that_nobody_writes() -> None:
-    unit = HERSampleUnit(REWARD, strategy="final")
-    buffer = TensorDictReplayBuffer(
-        storage=TensorStorage(flat([[4, 6]])),
-        writer=ImmutableDatasetWriter(),
-        sample_unit=unit,
-        collate_fn=unit.relabel,
-        batch_size=300,
-    )
+    unit, stored = HERSampleUnit(REWARD, strategy="final"), TensorStorage(flat([[4, 6]]))
+    buffer = make_beside(unit, storage=stored, writer=ImmutableDatasetWriter(), batch_size=300)
     assert pairs(buffer.sample()) == {*((t, 4) for t in range(4)), *((100 + t, 106) for t in range(6))}
 
 
 def test_a_buffer_that_only_reads_asks_the_one_that_writes() -> None:
-    storage, unit = LazyTensorStorage(5), HERSampleUnit(REWARD, strategy="final")
-    reads = TensorDictReplayBuffer(storage=storage, sample_unit=unit, collate_fn=unit.relabel, batch_size=200)
+    storage = LazyTensorStorage(5)
+    reads = make_beside(HERSampleUnit(REWARD, strategy="final"), storage=storage, batch_size=200)
     writes = TensorDictReplayBuffer(storage=storage)
     rows = flat([[3, 4]]).exclude("collector")  # only the cursor keeps the two apart
     writes.extend(rows[:3].clone())
@@ -491,9 +477,7 @@ def test_a_generator_of_its_own() -> None:
 
 def test_a_used_unit_can_be_copied_to_another_process() -> None:
     unit = HERSampleUnit(REWARD, k=2, generator=torch.Generator())
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(9), sample_unit=unit, collate_fn=unit.relabel, batch_size=4
-    )
+    buffer = make_beside(unit)
     buffer.extend(flat([[9]]))
     buffer.sample()
     copy = pickle.loads(pickle.dumps(unit))
@@ -516,8 +500,8 @@ def test_a_missing_entry_is_named(key: Any) -> None:
 
 def test_a_storage_without_tensordicts_is_refused() -> None:
     unit = HERSampleUnit(REWARD)
-    buffer = TensorDictReplayBuffer(
-        storage=ListStorage(9), sample_unit=unit, collate_fn=lambda rows: unit.relabel(torch.stack(rows))
+    buffer = make_beside(
+        unit, storage=ListStorage(9), collate_fn=lambda rows: unit.relabel(torch.stack(rows))
     )
     buffer.extend(flat([[4]]))
     with pytest.raises(
@@ -527,21 +511,14 @@ def test_a_storage_without_tensordicts_is_refused() -> None:
 
 
 def test_a_unit_without_its_other_half_is_noticed() -> None:
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(9), sample_unit=HERSampleUnit(REWARD), batch_size=4
-    )
+    buffer = make_beside(collate_fn=None)
     buffer.extend(flat([[4]]))
     with pytest.raises(RuntimeError, match="nothing puts into batches; make the buffer with collate_fn=unit"):
         buffer.sample()
     buffer.append_transform(RewardScaling(0.0, 1.0))  # TorchRL's own, which does not relabel either
     with pytest.raises(RuntimeError, match="nothing puts into batches"):
         buffer.sample()
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(9),
-        sample_unit=HERSampleUnit(REWARD),
-        collate_fn=lambda rows: rows,
-        batch_size=4,
-    )
+    buffer = make_beside(collate_fn=lambda rows: rows)
     buffer.extend(flat([[4]]))
     buffer.sample()  # the function may have relabeled
     with pytest.raises(RuntimeError, match="nothing puts into batches"):
@@ -568,7 +545,6 @@ def test_a_batch_of_another_size_is_refused() -> None:
 
 # Slices
 
-IDS = ("collector", "traj_ids")
 SLICES = {
     "slices": lambda: SliceSampler(slice_len=4, traj_key=IDS),
     "without replacement": lambda: SliceSamplerWithoutReplacement(slice_len=4, traj_key=IDS),
@@ -640,8 +616,7 @@ def test_the_filter_looks_at_all_of_a_slice() -> None:
 
 
 def test_whole_episodes_need_slices() -> None:
-    unit = HERSampleUnit(REWARD, per="episode")
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), sample_unit=unit, collate_fn=unit.relabel)
+    buffer = make_beside(HERSampleUnit(REWARD, per="episode"))
     buffer.extend(flat([[5]]))
     with pytest.raises(ValueError, match="needs a sampler of slices"):
         buffer.sample(4)
@@ -801,12 +776,8 @@ def test_an_ensemble_is_refused_at_its_first_sample() -> None:
 
 def test_unit_and_relabel_may_be_copied_one_by_one() -> None:
     unit = HERSampleUnit(REWARD)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100),
-        sample_unit=pickle.loads(pickle.dumps(unit)),
-        collate_fn=pickle.loads(pickle.dumps(unit.relabel)),
-        batch_size=50,
-    )
+    copies = (pickle.loads(pickle.dumps(part)) for part in (unit, unit.relabel))
+    buffer = make_beside(next(copies), collate_fn=next(copies), batch_size=50)
     buffer.extend(flat([[5]]))
     assert buffer.sample()["virtual"].any()
 
@@ -821,79 +792,76 @@ def test_two_units_do_not_mix_up_their_batches() -> None:
     assert one._sample_unit.relabel(one.storage[index])["virtual"].any()
 
 
-def make_beside(**parts: Any) -> TensorDictReplayBuffer:
-    unit = HERSampleUnit(REWARD)
-    return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100), sample_unit=unit, collate_fn=unit.relabel, batch_size=4, **parts
-    )
-
-
-def test_a_buffer_that_consumes_is_refused() -> None:
-    buffer = make_beside(consume_after_n_samples=1)
-    buffer.extend(flat([[5]]))
-    with pytest.raises(ValueError, match="HERSampleUnit cannot work in a buffer that consumes"):
+@pytest.mark.parametrize(
+    ("parts", "batch", "error", "message"),
+    [
+        (
+            {"consume_after_n_samples": 1},
+            flat([[5]]),
+            ValueError,
+            "HERSampleUnit cannot work in a buffer that consumes",
+        ),
+        (
+            {"writer": partial(TensorDictMaxValueWriter, rank_key=("next", "reward"))},
+            flat([[5]]),
+            ValueError,
+            "order of time, which TensorDictMaxValueWriter does not keep",
+        ),
+        (
+            {"writer": partial(HERWriter, REWARD)},
+            flat([[5]]),
+            ValueError,
+            "but a HERWriter with k=4 relabels them: use one of the two",
+        ),
+        (
+            {"transform": partial(MultiStepTransform, n_steps=2, gamma=0.9)},
+            flat([[5]]),
+            ValueError,
+            "HERSampleUnit got transitions that span several steps",
+        ),
+        (
+            {},
+            make_batch([[5], [5]]),
+            ValueError,
+            r"each item of this storage \(ndim=1\) holds 5: .*ndim=2",
+        ),
+        (
+            {},
+            flat([[5]]).set(("collector", "mask"), torch.ones(5, dtype=torch.bool)),
+            ValueError,
+            "HERSampleUnit needs batches that are not split and padded",
+        ),
+        (
+            {"sampler": partial(SliceSampler, slice_len=4, traj_key=IDS, truncated_key=("next", "cut"))},
+            flat([[5]]),
+            ValueError,
+            r"under \('next', 'cut'\), and relabeling reads",
+        ),
+        (
+            {"shared": True},
+            flat([[5]]),
+            RuntimeError,
+            "shared between processes: workers send episodes",
+        ),
+        (
+            {
+                "storage": partial(LazyTensorStorage, 100, ndim=2),
+                "sampler": partial(PrioritizedSliceSampler, 100, 0.7, 0.5, slice_len=2, traj_key=IDS),
+            },
+            make_batch([[5], [5]]),
+            ValueError,
+            "PrioritizedSliceSampler over a storage of 2 dimensions",
+        ),
+    ],
+)
+def test_parts_that_cannot_work_beside_it_are_named(
+    parts: dict[str, Any], batch: TensorDict, error: type[Exception], message: str
+) -> None:
+    made = {name: part() if callable(part) else part for name, part in parts.items()}
+    buffer = make_beside(**made)
+    buffer.extend(batch.clone())
+    with pytest.raises(error, match=message):
         buffer.sample()
-
-
-def test_writers_that_keep_no_order_are_refused() -> None:
-    buffer = make_beside(writer=TensorDictMaxValueWriter(rank_key=("next", "reward")))
-    buffer.extend(flat([[5]]))
-    with pytest.raises(ValueError, match="order of time, which TensorDictMaxValueWriter does not keep"):
-        buffer.sample()
-
-
-def test_a_writer_that_relabels_is_refused() -> None:
-    buffer = make_beside(writer=HERWriter(REWARD))
-    buffer.extend(flat([[5]]))
-    with pytest.raises(ValueError, match="but a HERWriter with k=4 relabels them: use one of the two"):
-        buffer.sample()
-
-
-def test_rows_over_several_steps_are_refused() -> None:
-    buffer = make_beside()
-    buffer.append_transform(MultiStepTransform(n_steps=2, gamma=0.9))
-    buffer.extend(make_batch([[5]]).squeeze(0))
-    with pytest.raises(ValueError, match="HERSampleUnit got transitions that span several steps"):
-        buffer.sample()
-
-
-def test_batches_in_a_storage_of_one_dimension_are_refused() -> None:
-    buffer = make_beside()
-    buffer.extend(make_batch([[5], [5]]))
-    with pytest.raises(ValueError, match=r"each item of this storage \(ndim=1\) holds 5: .*ndim=2"):
-        buffer.sample()
-
-
-def test_padded_trajectories_are_refused() -> None:
-    buffer = make_beside()
-    batch = flat([[5]])
-    batch["collector", "mask"] = torch.ones(5, dtype=torch.bool)
-    buffer.extend(batch)
-    with pytest.raises(ValueError, match="HERSampleUnit needs batches that are not split and padded"):
-        buffer.sample()
-
-
-def test_ends_of_slices_under_another_key_are_refused() -> None:
-    sampler = SliceSampler(slice_len=4, traj_key=IDS, truncated_key=("next", "cut"))
-    buffer = make_buffer(sampler=sampler)
-    buffer.extend(flat([[5]]))
-    with pytest.raises(ValueError, match=r"under \('next', 'cut'\), and relabeling reads"):
-        buffer.sample(4)
-
-
-def test_a_buffer_that_is_shared_between_processes_is_refused() -> None:
-    buffer = make_beside(shared=True)
-    buffer.extend(flat([[5]]))
-    with pytest.raises(RuntimeError, match="shared between processes: workers send episodes"):
-        buffer.sample()
-
-
-def test_prioritized_slices_of_two_dimensions_are_refused() -> None:
-    sampler = PrioritizedSliceSampler(100, 0.7, 0.5, slice_len=2, traj_key=IDS)
-    buffer = make_buffer(100, ndim=2, sampler=sampler)
-    buffer.extend(make_batch([[5], [5]]))
-    with pytest.raises(ValueError, match="PrioritizedSliceSampler over a storage of 2 dimensions"):
-        buffer.sample(4)
 
 
 def test_excluding_a_nested_entry_excludes_no_other_one() -> None:

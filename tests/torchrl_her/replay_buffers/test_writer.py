@@ -82,11 +82,12 @@ def test_an_input_made_of_the_goal_follows_the_virtual_goal_when_made_after_samp
 # The filter
 
 
-def test_an_episode_in_which_nothing_moved_writes_real_rows_only() -> None:
+@pytest.mark.parametrize("per", ["transition", "episode"])
+def test_an_episode_in_which_nothing_moved_writes_real_rows_only(per: str) -> None:
     batch = make_batch([[4]])
     batch["achieved_goal"].zero_()
     batch["next", "achieved_goal"].zero_()
-    buffer = make_buffer(filter_achieved=True)
+    buffer = make_buffer(per=per, filter_achieved=True)
     index = buffer.extend(batch)
     real, virtual = split(buffer)
     assert (len(real), len(virtual)) == (4, 0)
@@ -500,14 +501,6 @@ def test_totals_outlive_an_emptied_buffer() -> None:
 # Options
 
 
-def test_a_storage_of_two_dimensions_is_refused() -> None:
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100, ndim=2), writer=HERWriter(REWARD), batch_size=4
-    )
-    with pytest.raises(ValueError, match="storage of 1 dimension, got one of 2"):
-        buffer.extend(make_batch([[3]]))
-
-
 def test_one_key_is_no_list_of_keys() -> None:
     with pytest.raises(TypeError, match=r"keys must be given as a list, got 'state': write \['state'\]"):
         HERWriter(REWARD, exclude="state")
@@ -553,12 +546,6 @@ def test_rows_of_several_stages_are_refused_where_one_reward_relabels_them(unit:
         refused()
     make_buffer(stage_key="floor").extend(batch)
     make_buffer(k=0).extend(batch)
-
-
-def test_rows_that_wait_in_vain_are_noticed() -> None:
-    buffer = make_buffer(capacity=5)
-    with pytest.warns(UserWarning, match="6 transitions of open episodes wait .* than the buffer's 5"):
-        buffer.extend(make_batch([[9]], steps=6))
 
 
 # Beside other collectors
@@ -707,15 +694,6 @@ def test_goals_of_whole_episodes_follow_weights_and_filter() -> None:
     assert (counts / 4_000).tolist() == pytest.approx([0.25, 0.75], abs=0.04)
 
 
-def test_an_episode_in_which_nothing_moved_has_no_virtual_copy() -> None:
-    batch = make_batch([[4]])
-    batch["achieved_goal"].zero_()
-    batch["next", "achieved_goal"].zero_()
-    buffer = make_buffer(per="episode", filter_achieved=True)
-    buffer.extend(batch)
-    assert [len(rows) for rows in split(buffer)] == [4, 0]
-
-
 @pytest.mark.filterwarnings("ignore:all [0-9]+ episodes have one step")  # of an example, it may be so
 @pytest.mark.filterwarnings("ignore:SliceSampler returned a short flat batch:UserWarning")
 @settings(max_examples=30, deadline=None)
@@ -795,12 +773,30 @@ def test_rows_over_several_steps_are_refused() -> None:
         buffer.extend(make_batch([[5]]))
 
 
-def test_a_buffer_that_consumes_is_refused() -> None:
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100), writer=HERWriter(REWARD), batch_size=4, consume_after_n_samples=1
-    )
-    with pytest.raises(ValueError, match="cannot work in a buffer that consumes"):
-        buffer.extend(make_batch([[5]]))
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"storage": partial(LazyTensorStorage, 100, ndim=2)}, "storage of 1 dimension, got one of 2"),
+        ({"consume_after_n_samples": 1}, "cannot work in a buffer that consumes"),
+        (
+            {"sample_unit": partial(Sequence, length=2)},
+            "under a sampler of slices, HERWriter needs per='episode'",
+        ),
+        (
+            {
+                "storage": partial(LazyStackStorage, 100),  # TorchRL writes its marks into the list
+                "writer": partial(HERWriter, REWARD, per="episode"),
+                "sampler": partial(SliceSampler, slice_len=2, traj_key=("collector", "traj_ids")),
+            },
+            "slices of a LazyStackStorage, .* use a LazyTensorStorage",
+        ),
+    ],
+)
+def test_parts_that_cannot_work_beside_it_are_named(parts: dict[str, Any], message: str) -> None:
+    made = {name: part() if callable(part) else part for name, part in parts.items()}
+    usual = {"storage": LazyTensorStorage(100), "writer": HERWriter(REWARD)}
+    with pytest.raises(ValueError, match=message):
+        TensorDictReplayBuffer(**{**usual, **made}, batch_size=4).extend(make_batch([[5]]))
 
 
 def test_a_copy_in_another_process_is_refused() -> None:
@@ -833,18 +829,6 @@ def test_flat_rows_of_two_environments_without_ids_are_refused_at_once() -> None
 # Ends that have nothing to do with the goal
 
 
-def test_slices_of_a_list_are_refused() -> None:
-    """TorchRL writes its marks into the list."""
-    buffer = TensorDictReplayBuffer(
-        storage=LazyStackStorage(100),
-        writer=HERWriter(REWARD, per="episode"),
-        sampler=SliceSampler(slice_len=2, traj_key=("collector", "traj_ids")),
-        batch_size=4,
-    )
-    with pytest.raises(ValueError, match="slices of a LazyStackStorage, .* use a LazyTensorStorage"):
-        buffer.extend(make_batch([[5]]))
-
-
 def test_a_success_with_another_reward_is_no_fall() -> None:
     """As with dense rewards: the reward function's end is that of the goal."""
     dense = EnvReward(lambda a, d: REWARD(a, d)[0] - 0.1, lambda a, d: REWARD(a, d)[1])
@@ -859,17 +843,6 @@ def test_a_success_with_another_reward_is_no_fall() -> None:
 
 
 # Found by a reviewer
-
-
-def test_sequences_of_a_sample_unit_are_slices_too() -> None:
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100),
-        writer=HERWriter(REWARD),
-        sample_unit=Sequence(length=2),
-        batch_size=4,
-    )
-    with pytest.raises(ValueError, match="under a sampler of slices, HERWriter needs per='episode'"):
-        buffer.extend(make_batch([[5]]))
 
 
 def test_real_episodes_that_are_ended_from_outside_are_truncated_for_slices() -> None:

@@ -339,25 +339,37 @@ def test_masked_rows_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "width", "message"),
+    ("algorithm", "key", "value", "message"),
     [
-        ("action", 2, "'action' must have 3 columns"),
-        ("observation", 5, r"\['observation', 'desired_goal'\] must have 6 columns together, got 7"),
-        (("next", "reward"), 2, r"\('next', 'reward'\) must have 1 columns"),
+        ("ddpg", "action", torch.zeros(1, 8, 2), "'action' must have 3 columns"),
+        (
+            "ddpg",
+            "observation",
+            torch.zeros(1, 8, 5),
+            r"\['observation', 'desired_goal'\] must have 6 columns together, got 7",
+        ),
+        ("ddpg", ("next", "reward"), torch.zeros(1, 8, 2), r"\('next', 'reward'\) must have 1 columns"),
+        (
+            "ddpg",
+            "action",
+            torch.zeros(1, 8, 3, device="meta"),
+            "'action' must be on the CPU to be fused, got it on meta",
+        ),
+        ("dqn", "action", torch.tensor([[0, 1, 2, 3, 0, 1, 2, 0]]), r"actions must be from 0 to 2, got \["),
+        (
+            "dqn",
+            "action",
+            torch.eye(8, 3).long()[None],
+            "'action' must be the number of an action in each row",
+        ),
     ],
 )
-def test_rows_of_other_widths_are_refused(key: Any, width: int, message: str) -> None:
-    rows = make_rows("ddpg", (1, 8))
-    rows[key] = torch.zeros(1, 8, width)
+def test_rows_of_another_kind_are_refused(
+    algorithm: str, key: Any, value: torch.Tensor, message: str
+) -> None:
+    rows = make_rows(algorithm, (1, 8)).set(key, value)
     with pytest.raises(ValueError, match=message):
-        make_learner(FusedLearner, make_loss("ddpg")).update(rows)
-
-
-def test_actions_that_there_are_not_are_refused() -> None:
-    rows = make_rows("dqn", (1, 8))
-    rows["action"][0, 3] = 3
-    with pytest.raises(ValueError, match=r"actions must be from 0 to 2, got \["):
-        make_learner(FusedLearner, make_loss("dqn")).update(rows)
+        make_learner(FusedLearner, make_loss(algorithm)).update(rows)
 
 
 def test_a_batch_of_one_row_has_no_statistics() -> None:
@@ -420,20 +432,6 @@ def test_counts_of_steps_that_differ_are_refused() -> None:
     list(learner.optimizer.state.values())[-1]["step"] = torch.tensor(1000.0)
     with pytest.raises(ValueError, match=r"as many steps for each parameter, got \[\(1.0,\), \(1000.0,\)\]"):
         learner.update(make_rows("ddpg", (1, 8)))
-
-
-def test_rows_that_are_not_on_the_cpu_are_refused() -> None:
-    rows = make_rows("ddpg", (1, 8))
-    rows["action"] = rows["action"].to("meta")
-    with pytest.raises(ValueError, match="'action' must be on the CPU to be fused, got it on meta"):
-        make_learner(FusedLearner, make_loss("ddpg")).update(rows)
-
-
-def test_one_hot_actions_are_refused() -> None:
-    rows = make_rows("dqn", (1, 8))
-    rows["action"] = torch.nn.functional.one_hot(rows["action"], 3)
-    with pytest.raises(ValueError, match="'action' must be the number of an action in each row"):
-        make_learner(FusedLearner, make_loss("dqn")).update(rows)
 
 
 def test_a_reward_that_is_not_a_number_is_not_hidden() -> None:

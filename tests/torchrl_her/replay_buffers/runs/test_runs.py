@@ -114,6 +114,20 @@ def assert_same_state(one: Any, other: Any) -> None:
         assert one == other
 
 
+def make_both(**options: Any) -> tuple[TensorDictReplayBuffer, list[TensorDictReplayBuffer]]:
+    """A buffer of all runs, and one of each."""
+    alone = [make_buffer(range(run, run + 1), **options) for run in range(RUNS)]
+    return make_buffer(range(RUNS), **options), alone
+
+
+def extend(
+    together: TensorDictReplayBuffer, alone: list[TensorDictReplayBuffer], batch: TensorDict
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Writes a batch of all runs; returns where its rows are, in the buffer of all and in each."""
+    index = together.extend(batch.clone())
+    return index, [own.extend(block(batch, run)) for run, own in enumerate(alone)]
+
+
 def check_alone(together: TensorDictReplayBuffer, alone: list[TensorDictReplayBuffer]) -> None:
     """Everything that is known of each run is what its own buffer knows."""
     writer = together.writer
@@ -198,14 +212,11 @@ def test_each_run_is_the_run_that_it_is_alone(options: dict[str, Any], data: st.
             st.lists(st.integers(1, 15), min_size=30, max_size=30), min_size=RUNS * ENVS, max_size=RUNS * ENVS
         )
     )
-    together = make_buffer(range(RUNS), **options)
-    alone = [make_buffer(range(run, run + 1), **options) for run in range(RUNS)]
+    together, alone = make_both(**options)
     for batch in batches(lengths, 6):
         with warnings.catch_warnings():  # the smallest buffer holds less than is held back
             warnings.filterwarnings("ignore", ".* wait for their end")
-            index, singles = together.extend(batch.clone()), []
-            for run, own in enumerate(alone):
-                singles.append(own.extend(block(batch, run)))
+            index, singles = extend(together, alone, batch)
         for run, single in enumerate(singles):
             block_index = index[run * ENVS : (run + 1) * ENVS]
             shifted = block_index - run * together.writer.capacity
@@ -242,28 +253,22 @@ def test_rows_stay_in_their_block_when_it_is_full() -> None:
 
 
 def test_environments_are_known_by_ids_that_come_in_any_order() -> None:
-    together = make_buffer(range(RUNS), filter_achieved=True)
-    alone = [make_buffer(range(run, run + 1), filter_achieved=True) for run in range(RUNS)]
+    together, alone = make_both(filter_achieved=True)
     ids = torch.randperm(1_000, generator=torch.Generator().manual_seed(0))[: RUNS * ENVS]
     lengths = [[3, 8, 30], [9, 30], [30, 2], [5, 5, 30], [4, 30], [11, 30]]
     for batch in batches(lengths, 6):
         batch = batch.clone().set("env_ids", ids.unsqueeze(-1).expand(-1, STEPS))
-        together.extend(batch.clone())
-        for run, own in enumerate(alone):
-            own.extend(block(batch, run))
+        extend(together, alone, batch)
         check_alone(together, alone)
 
 
 def test_episodes_are_ended_for_all_runs() -> None:
-    together = make_buffer(range(RUNS))
-    alone = [make_buffer(range(run, run + 1)) for run in range(RUNS)]
+    together, alone = make_both()
     first, second = batches([[30]] * (RUNS * ENVS), 2)
     for batch in (first, second):
         for own in (together, *alone):
             own.writer.end_episodes()
-        together.extend(batch.clone())
-        for run, own in enumerate(alone):
-            own.extend(block(batch, run))
+        extend(together, alone, batch)
     check_alone(together, alone)
     assert together.writer.totals.real == RUNS * ENVS * STEPS
 
@@ -273,8 +278,7 @@ def test_emptying_a_run_empties_it_alone(weights: str) -> None:
     """Rows, priorities, q, counts and open episodes; the others go on as if nothing were the matter."""
     options: dict[str, Any] = {"filter_achieved": True, "weights": weights, "capacity": 50}
     options["goal_sources"] = {"future": 2, "achieved": 2}
-    together = make_buffer(range(RUNS), **options)
-    alone = [make_buffer(range(run, run + 1), **options) for run in range(RUNS)]
+    together, alone = make_both(**options)
     for step, batch in enumerate(batches([[3, 6, 5, 7, 30], [11, 4, 30]] * RUNS, 8)):
         if step == 4:
             empty_run(together, 1)
@@ -282,9 +286,7 @@ def test_emptying_a_run_empties_it_alone(weights: str) -> None:
             assert sizes_of(together)[1] == 0
             assert together.writer.totals_of(1).real > together.writer.counts_of(1).real == 0
             learn(together, alone)
-        together.extend(batch.clone())
-        for run, own in enumerate(alone):
-            own.extend(block(batch, run))
+        extend(together, alone, batch)
         check_alone(together, alone)
         learn(together, alone)
     with pytest.raises(ValueError, match=r"run must be in \[0, 2\], got 3"):
@@ -294,17 +296,14 @@ def test_emptying_a_run_empties_it_alone(weights: str) -> None:
 def test_runs_relabel_with_rewards_and_weights_of_their_own() -> None:
     """As in a curriculum, where runs are in several stages."""
     options: dict[str, Any] = {"filter_achieved": True, "weights": "ibs"}
-    together = make_buffer(range(RUNS), **options)
-    alone = [make_buffer(range(run, run + 1), **options) for run in range(RUNS)]
+    together, alone = make_both(**options)
     wide = GoalReward(2.5)
     for run, (reward, alike) in enumerate(((NEAR, True), (wide, False), (NEAR, True))):
         for buffer, place in ((together, run), (alone[run], 0)):
             buffer.writer.set_reward(reward, run=place)
             buffer.writer.goal_weights[place].alike = alike
     for batch in batches([[9, 12, 30], [8, 30]] * RUNS, 6):
-        together.extend(batch.clone())
-        for run, own in enumerate(alone):
-            own.extend(block(batch, run))
+        extend(together, alone, batch)
         check_alone(together, alone)
     assert together.writer.reward_of(1) is wide
     assert together.writer.reward_of(2) is NEAR
@@ -317,13 +316,10 @@ def test_pieces_do_not_change_what_a_run_writes(
 ) -> None:
     monkeypatch.setattr("torchrl_her.replay_buffers.writer._ROWS", pieces)
     options: dict[str, Any] = {"filter_achieved": True, "weights": "ibs", "goal_sources": sources}
-    together = make_buffer(range(RUNS), **options)
-    alone = [make_buffer(range(run, run + 1), **options) for run in range(RUNS)]
+    together, alone = make_both(**options)
     lengths = [[2] * 20, [3] * 12, [20, 30], [7, 9, 2, 30], [1] * 30, [24]]
     batch = make_batch(lengths, steps=24)
-    together.extend(batch.clone())
-    for run, own in enumerate(alone):
-        own.extend(block(batch, run))
+    extend(together, alone, batch)
     check_alone(together, alone)
 
 
@@ -386,8 +382,7 @@ def test_what_cannot_be_is_refused() -> None:
 
 @pytest.mark.parametrize("weights", ["none", "ibs"])
 def test_whole_episodes_of_one_run_are_written_as_if_it_were_alone(weights: str) -> None:
-    together = make_buffer(range(RUNS), weights=weights, filter_achieved=True)
-    alone = [make_buffer(range(run, run + 1), weights=weights, filter_achieved=True) for run in range(RUNS)]
+    together, alone = make_both(weights=weights, filter_achieved=True)
     collected = next(batches([[4], [4]] * RUNS, 1))
     shown = make_batch([[3, 2, 5]], steps=10)[0].exclude("collector")
     together.extend(collected)
