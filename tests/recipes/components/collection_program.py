@@ -230,7 +230,6 @@ def _killed() -> dict[str, Any]:
 JOBS = {
     "sync": _sync,
     "often": _often,
-    "again": _sync,
     "resumed": _resumed,
     "stopped": _stopped,
     "async": _async,
