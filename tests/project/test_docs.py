@@ -55,6 +55,7 @@ def conf() -> ModuleType:
         ("devices.md", 1),
         ("from_torchrl.md", 2),
         ("index.md", 1),
+        ("learners.md", 3),
         ("loggers.md", 2),
         ("normalization.md", 2),
         ("novelty.md", 4),
