@@ -30,7 +30,7 @@ from tensordict import TensorDictBase
 from torchrl_her import evaluate, success
 from torchrl_her_envs import goal_env
 from torchrl_her_recipes import Recipe, build, make_recipe
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.config.shipped import load_preset
 from torchrl_her_recipes.config.shortcuts import merge
 
@@ -91,7 +91,7 @@ CONTENDERS = {"this": ours, "Stable-Baselines3": ddpg, "SBX-SAC": sac}
 
 def race(name: str, recipe: Recipe, *, noise: float, aim: float) -> list[Point]:
     """The curve until the aim, or until the recipe's last epoch."""
-    test = make_task_envs(recipe, recipe.evaluation.episodes, [recipe.run.seed + (1 << 32)])
+    test = TaskEnvs.of(recipe).make(recipe.evaluation.episodes, [recipe.run.seed + (1 << 32)])
     curve: list[Point] = []
     training, seconds = CONTENDERS[name](recipe, noise), 0.0
     for epoch in range(1, recipe.run.epochs + 1):

@@ -26,9 +26,10 @@ from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_envs.toy.bit_flip import BitFlip
 from torchrl_her_envs.toy.treasure_hunt import TreasureHunt
 from torchrl_her_recipes import Callback, RunFolder, RunView, Study, build, load_study, run
-from torchrl_her_recipes.components.agents import make_player
+from torchrl_her_recipes.components.agents import find_builder, shape_of
 from torchrl_her_recipes.components.devices import place_of
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs
+from torchrl_her_recipes.components.learner import acting
 from torchrl_her_recipes.runs.plots import colors, count_frames, draw_curve, save_figure
 from torchrl_her_recipes.runs.policy_file import read_policy
 from torchrl_her_recipes.studies.seed_batches import Batches
@@ -197,7 +198,7 @@ def plot_values(runs: Sequence[Batches], path: Path) -> None:
     for axes, own in zip(grid, runs, strict=True):
         recipe = own.homes[0].recipe()
         actors = [_load_actor(home, run) for home in own.homes for run in range(home.recipe().run.num_runs)]
-        _draw(goal_env(make_task_envs(recipe, 1, [0])), axes, actors, recipe.learner.gamma)
+        _draw(goal_env(TaskEnvs.of(recipe).make(1, [0])), axes, actors, recipe.learner.gamma)
         home = own.homes[0].path
         axes.set_title((home.parent if home.name.startswith("seeds_") else home).name)
     save_figure(figure, path)
@@ -206,7 +207,9 @@ def plot_values(runs: Sequence[Batches], path: Path) -> None:
 def _load_actor(home: RunFolder, run: int) -> TensorDictModuleBase:
     """Returns the actor of a run of DQN, which gives the values of all actions."""
     recipe = home.recipe()
-    actor = make_player(recipe.replace(num_runs=1), make_task_envs(recipe, 1, [0]))
+    shape = shape_of(recipe.task.name, recipe.replace(num_runs=1).run, TaskEnvs.of(recipe).make(1, [0]))
+    builder = find_builder(recipe.learner, shape)
+    actor = acting(builder.player(1), builder.norm())
     actor.load_state_dict(take_run(read_policy(home.policy)[1], run, recipe.run.num_runs))
     return actor
 

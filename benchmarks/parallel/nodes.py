@@ -24,7 +24,7 @@ from ray.cluster_utils import Cluster
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_her_recipes import Components, build, make_recipe
-from torchrl_her_recipes.components.cluster import join, resource
+from torchrl_her_recipes.components.collection.cluster import join, resource
 from torchrl_her_recipes.config.shipped import load_preset
 
 BATCHES = 30  # of a piece

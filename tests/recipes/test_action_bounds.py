@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchrl_her_recipes import build, export_policy, load_policy, play, record_demonstrations, run
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs
 
 from .small import small
 
@@ -29,7 +29,7 @@ def test_an_exported_policy_acts_in_the_units_of_the_task(folder: Path) -> None:
     info = export_policy(folder / "run", file).info
     assert (info.low, info.high) == (tuple(LOW.tolist()), tuple(HIGH.tolist()))
     assert info.success > 0.9
-    env = make_task_envs(small(task=TASK), 20, [3], scaled=False)
+    env = TaskEnvs.of(small(task=TASK)).make(20, [3], scaled=False)
     action = env.rollout(8, load_policy(file), break_when_any_done=False)["action"]
     assert (action.amin((0, 1)) < LOW + 3).all()
     assert (action.amax((0, 1)) > HIGH - 3).all()

@@ -148,7 +148,7 @@ def test_every_preset_runs(preset: Path) -> None:
         ("train -x", "No such option '-x'"),
         ("train --dry", "No such option '--dry'\n"),
         ("train --folde x", "No such option '--folde'. Did you mean '--folder'?"),
-        ("train frames=1000 epochs=3", "frames=1000 and epochs=3 say the same: give one of them"),
+        ("train frames=1000 epochs=3", "epochs=3 and frames=1000 say the same: give one of them"),
         ("train strategy=mine", "one of your own must be registered by a module, as in torchrl-her --import"),
         ("train --resume", "Option '--resume' requires an argument"),
         ("play hand_v0 --goals 0", "0 is not in the range x>=1"),

@@ -15,7 +15,6 @@ from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.stages import Curriculum, zero_unused_inputs
 from torchrl_her.modules.averaging import PolicyAverage
 from torchrl_her.modules.networks import StackedLinear, stack_runs
-from torchrl_her.objectives.cloning import Cloning
 from torchrl_her.objectives.targets import make_target_updater
 from torchrl_her.trainers.adam import RunsAdam
 from torchrl_her_recipes.components.curricula import CurriculumState, is_guided
@@ -24,45 +23,36 @@ from torchrl_her_recipes.components.learner import Agent, AgentShape, LearnerBui
 from torchrl_her_recipes.config.choices.learners import BY_ACTIONS, LEARNERS, Actions, LearnerConfig
 from torchrl_her_recipes.config.groups import CurriculumConfig, RunConfig
 from torchrl_her_recipes.config.options import AUTO
-from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
 
 
 def make_agent(
-    recipe: Recipe,
-    env: EnvBase,
-    generators: Sequence[torch.Generator],
+    builder: LearnerBuilder,
+    seeds: Sequence[int],
     *,
-    rewards: tuple[float, float] = (-1.0, 0.0),
+    curriculum: CurriculumConfig,
     state: CurriculumState | None = None,
     device: torch.device = CPU,
 ) -> Agent:
-    """The agent that a recipe asks for.
+    """Makes the agent of some runs side by side.
 
     Args:
-        recipe: of the run, or of several.
-        env: tells the widths of observations and actions.
-        generators: of the exploration of each run, on the device.
-        rewards: the least and the greatest that there can be.
+        builder: Builder of its networks, exploration and loss.
+        seeds: Seeds of each run's weights.
+        curriculum: Options of the curriculum.
         state: Curriculum whose stages the networks see, or None.
-        device: where it learns.
+        device: Device on which it learns.
     """
-    curriculum = None if state is None else state.curriculum
-    cloning, shown = None, recipe.demonstrations
-    if shown.in_batches and shown.bc_weight > 0:
-        cloning = Cloning(weight=shown.bc_weight, q_filter=shown.q_filter)
-    shape = shape_of(recipe.task.name, recipe.run, env, curriculum, rewards=rewards)
-    builder = find_builder(recipe.learner, shape, generators=generators, cloning=cloning)
     # The same on all devices.
-    actor, critics = _networks(builder, recipe.seeds, recipe.curriculum, curriculum)
+    actor, critics = _networks(builder, seeds, curriculum, None if state is None else state.curriculum)
     actor, critics = actor.to(device), [critic.to(device) for critic in critics]
     exploration = builder.exploration().to(device)
-    options, runs = recipe.learner, shape.runs
+    options, runs = builder.options, len(seeds)
     loss = builder.loss(actor, critics)
     norm = builder.norm()
     norm = None if norm is None else norm.to(device)
     player = acting(actor, norm)
-    guide = _guide_of(player, recipe.curriculum, state, generators)
+    guide = _guide_of(player, curriculum, state, builder.generators, runs)
     return Agent(
         actor=player,
         critic=critics[0],
@@ -137,21 +127,12 @@ def find_builder(options: LearnerConfig, shape: AgentShape, **given: Any) -> Lea
     return load_name(find_learner(options, shape).maker)(options, shape, **given)
 
 
-def make_player(
-    recipe: Recipe, env: EnvBase, *, curriculum: Curriculum | None = None
-) -> TensorDictModuleBase:
-    """The greedy policy with its normalization, whose weights and statistics can be loaded."""
-    shape = shape_of(recipe.task.name, recipe.run, env, curriculum)
-    builder = find_builder(recipe.learner, shape)
-    actor, _ = _networks(builder, recipe.seeds, recipe.curriculum, curriculum)
-    return acting(actor, builder.norm())
-
-
 def _guide_of(
     policy: TensorDictModuleBase,
     options: CurriculumConfig,
     state: CurriculumState | None,
-    generators: Sequence[torch.Generator],
+    generators: Sequence[torch.Generator] | None,
+    runs: int,
 ) -> GuidedExploration | None:
     if state is None or not is_guided(options, state.progress):
         return None
@@ -161,7 +142,7 @@ def _guide_of(
         share=options.guided_share,
         per=cast(Literal["episode", "step"], options.guided_per),
         stage_key="stage" if state.progress.by_episode else None,
-        runs=len(generators),
+        runs=runs,
         generators=generators,
     )
     return guide.to(place_of(policy))

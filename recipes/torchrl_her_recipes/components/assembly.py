@@ -10,22 +10,25 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from torchrl_her_envs.common.goal_env import goal_env, reward_bounds, reward_range
-from torchrl_her_recipes.components.agents import make_agent
-from torchrl_her_recipes.components.behavior import make_asking, make_behavior
+from torchrl_her_recipes.components.agents import find_builder, make_agent, shape_of
 from torchrl_her_recipes.components.buffers import make_buffer
-from torchrl_her_recipes.components.collection import ProcessCollector
+from torchrl_her_recipes.components.collection.processes import ProcessCollector
+from torchrl_her_recipes.components.collection.worker import make_worker_env
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import (
+    check_order,
     in_stages,
     is_guided,
     make_curriculum_state,
     make_played_env,
+    make_progress,
 )
-from torchrl_her_recipes.components.demonstrations import load_demonstrations, rows_needed
+from torchrl_her_recipes.components.demonstrations import load_demonstrations, make_cloning, rows_needed
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices, devices_of, make_generators
-from torchrl_her_recipes.components.envs import evaluation_envs, make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs, evaluation_envs
 from torchrl_her_recipes.components.first_look import resolved
-from torchrl_her_recipes.components.goal_space import GoalSpace, goal_space
+from torchrl_her_recipes.components.goals.behavior import make_asking, make_behavior
+from torchrl_her_recipes.components.goals.space import GoalSpace, goal_space
 from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -41,55 +44,65 @@ def build(recipe: Recipe) -> Components:
             must not be imported.
     """
     recipe = resolved(recipe)
-    processes = recipe.collection.processes > 0  # then those here only tell what the others are like
-    task = make_task_envs(recipe, 1 if processes else recipe.collection.num_envs, recipe.seeds)
-    seeds = eval_seeds(recipe.seeds, 0)
-    state, space = make_curriculum_state(recipe, task, seeds), goal_space(recipe, task, recipe.weights)
-    rewards, bounds = reward_range(goal_env(task)), reward_bounds(goal_env(task))
-    shown = load_demonstrations(recipe, task, state)
-    played = partial(make_played_env, recipe, evaluation_envs(recipe), seeds)
+    envs, seeds, collection = TaskEnvs.of(recipe), recipe.seeds, recipe.collection
+    processes = (
+        collection.processes
+    )  # where there are any, the environments here only show what theirs are like
+    task = envs.make(1 if processes else collection.num_envs, seeds)
+    progress = make_progress(recipe.order, envs.curriculum, task, seeds)
+    check_order(recipe.order, progress, recipe.weights, processes, recipe.demonstrations.episodes)
+    tests, test_seeds = evaluation_envs(recipe.task.name, recipe.evaluation.episodes), eval_seeds(seeds, 0)
+    state = make_curriculum_state(progress, envs, tests, test_seeds)
+    space = goal_space(recipe.weights, envs, task, collection.num_envs)
+    demonstrations = load_demonstrations(recipe.demonstrations, envs, task, seeds, state)
+    played = partial(make_played_env, envs, tests, test_seeds)
     eval_env = played()
-    devices = devices_of(recipe.learner, recipe.replay, recipe.run.num_runs)
-    generators = make_generators(recipe.seeds, devices.replay)
-    learner_generators = (
-        generators if devices.learner == devices.replay else make_generators(recipe.seeds, devices.learner)
+
+    devices = devices_of(recipe.learner, recipe.replay, len(seeds))
+    generators = make_generators(seeds, devices.replay)
+    same_device = devices.learner == devices.replay
+    learner_generators = generators if same_device else make_generators(seeds, devices.learner)
+    curriculum, bounds = None if state is None else state.curriculum, reward_bounds(goal_env(task))
+    shape = shape_of(recipe.task.name, recipe.run, eval_env, curriculum, rewards=bounds)
+    cloning = make_cloning(recipe.demonstrations)
+    builder = find_builder(recipe.learner, shape, generators=learner_generators, cloning=cloning)
+    agent = make_agent(builder, seeds, curriculum=recipe.curriculum, state=state, device=devices.learner)
+
+    goals = goal_space(recipe.behavior, envs, task, collection.num_envs)
+    behavior = make_behavior(
+        recipe.behavior, recipe.learner, task, agent, seeds=seeds, space=goals, state=state
     )
-    agent = make_agent(
-        recipe, eval_env, learner_generators, rewards=bounds, state=state, device=devices.learner
-    )
-    behavior = make_behavior(recipe, task, agent, rewards=rewards, state=state)
-    progress = None if state is None else state.progress
-    env = in_stages(
-        task,
-        progress,
-        begins=is_guided(recipe.curriculum, progress),
-        behavior=behavior,
-        starts=None if shown is None else shown.starts,
-    )
+    begins = is_guided(recipe.curriculum, progress)
+    starts = None if demonstrations is None else demonstrations.starts
+    env = in_stages(task, progress, begins=begins, behavior=behavior, starts=starts)
     if processes:
-        collector = ProcessCollector(recipe, agent.policy, progress, storing_device=devices.replay)
+        make_env = partial(make_worker_env, envs, recipe.order, collection, seeds)
+        collector = ProcessCollector(
+            collection, make_env, agent.policy, seeds=seeds, progress=progress, storing_device=devices.replay
+        )
     else:
-        collector = make_collector(env, agent.policy, recipe.collection.steps_per_batch, devices)
+        collector = make_collector(env, agent.policy, collection.steps_per_batch, devices)
     replay = partial(
-        make_buffer, recipe, task, generators, rewards=rewards, space=space, state=state, norm=agent.norm
+        make_buffer, recipe, task, generators, space=space, state=state, norm=agent.norm, devices=devices
     )
-    if shown is not None and recipe.demonstrations.in_batches:
-        shown.fill(replay(devices=devices, capacity=rows_needed(recipe, shown)), recipe.run.num_runs)
+    if demonstrations is not None and recipe.demonstrations.in_batches:
+        capacity = rows_needed(recipe.hindsight, demonstrations.recorded)
+        demonstrations.fill(replay(capacity=capacity), len(seeds))
     virtual = recipe.evaluation.virtual_goals
     return Components(
         recipe=recipe,
         env=env,
         eval_env=eval_env,
         collector=collector,
-        buffer=replay(devices=devices),
+        buffer=replay(),
         goal_target=space.target if isinstance(space, GoalSpace) else None,
-        generators=generators if learner_generators is generators else [*generators, *learner_generators],
-        rewards=rewards,
+        generators=generators if same_device else [*generators, *learner_generators],
+        rewards=reward_range(goal_env(task)),
         bounds=bounds,
         curriculum=state,
         behavior=behavior,
-        virtual_env=played(behavior=make_asking(recipe, task, rewards=rewards)) if virtual else None,
-        demonstrations=shown,
+        virtual_env=played(behavior=make_asking(seeds, task, memory=tests)) if virtual else None,
+        demonstrations=demonstrations,
         **vars(agent),
     )
 

@@ -22,11 +22,11 @@ from torchrl_her.modules.normalized import NormalizeBatch
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler
 from torchrl_her.replay_buffers.stage_rules import StageRule
 from torchrl_her.replay_buffers.writer import HERWriter
-from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
 from torchrl_her_recipes.components.envs import task_reward
-from torchrl_her_recipes.components.goal_space import GoalSpace, KernelSpace
+from torchrl_her_recipes.components.goals.space import GoalSpace, KernelSpace
 from torchrl_her_recipes.components.memory import check_buffer_size
 from torchrl_her_recipes.config.groups import HindsightConfig, ReplayConfig
 from torchrl_her_recipes.config.recipe import Recipe
@@ -51,7 +51,6 @@ def make_buffer(
     env: EnvBase,
     generators: Sequence[torch.Generator],
     *,
-    rewards: tuple[float, float] = (-1.0, 0.0),
     space: GoalSpace | KernelSpace | None = None,
     state: CurriculumState | None = None,
     norm: RunningNorm | None = None,
@@ -66,7 +65,6 @@ def make_buffer(
         generators: sources of random numbers, one of each run, where the buffer is.
 
     Keyword Args:
-        rewards: of a missed goal and of an achieved one.
         space: of the goals; None where they are not counted.
         state: the curriculum, if there is one.
         norm: counts what is written and normalizes what is sampled; None for raw transitions.
@@ -74,6 +72,7 @@ def make_buffer(
         capacity: in transitions of each run; the recipe's if None.
     """
     size, task, runs = recipe.replay.buffer_size, goal_env(env), len(generators)
+    algorithm = recipe.hindsight.algorithm
     check_buffer_size(size, runs, env, devices.replay, not_stored=_NOT_STORED)
     size = size if capacity is None else capacity
     rule = task_reward(env)
@@ -81,18 +80,18 @@ def make_buffer(
     if norm is not None:
         counted = norm.update if state is None else partial(count_inputs, norm, state.progress)
     make = partial(load_name(recipe.weights.maker), recipe.weights, env=task, space=space)
-    weights = [make(seed=seed) for seed in recipe.seeds if recipe.relabels]
+    weights = [make(seed=seed) for seed in recipe.seeds if algorithm.virtual]
     buffer = TensorDictReplayBuffer(
         storage=PackedStorage(runs * size, device=devices.replay),
         writer=HERWriter(
             rule,
-            **(_goals(recipe.hindsight) if recipe.relabels else {"k": 0}),
+            **(_goals(recipe.hindsight) if algorithm.virtual else {"k": 0}),
             n_steps=recipe.hindsight.n_steps,
             gamma=recipe.learner.gamma,
-            filter_achieved=recipe.filters,
+            filter_achieved=algorithm.filter,
             redraw=recipe.hindsight.redraw,
-            refill=recipe.hindsight.refill if recipe.filters else 1,
-            achieved_reward=rewards[1],
+            refill=recipe.hindsight.refill if algorithm.filter else 1,
+            achieved_reward=reward_range(task)[1],
             weights=[weight for weight in weights if weight is not None] or None,
             exclude=_NOT_STORED,
             runs=runs,

@@ -24,7 +24,7 @@ from torchrl_her.trainers.graphs import GraphLearner, why_not_recorded
 from torchrl_her.trainers.learner import Learner, LossLearner
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_recipes.components.buffers import rising_beta
-from torchrl_her_recipes.components.collection import ProcessCollector
+from torchrl_her_recipes.components.collection.processes import ProcessCollector
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.demonstrations import RunDemonstrations
 from torchrl_her_recipes.components.devices import CPU, place_of

@@ -14,12 +14,11 @@ from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress, Curric
 from torchrl_her.curriculum.transforms import StageOutcomes, StateToObs, ZeroPad
 from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
-from torchrl_her_recipes.components.envs import evaluation_envs, judging, make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs, judging
 from torchrl_her_recipes.components.streams import Stream, generators_of
-from torchrl_her_recipes.config.choices.order import AllAtOnce, Teacher, Threshold
-from torchrl_her_recipes.config.choices.weights import Equal
+from torchrl_her_recipes.config.choices.order import AllAtOnce, Order, Teacher, Threshold
+from torchrl_her_recipes.config.choices.weights import Equal, Weights
 from torchrl_her_recipes.config.groups import CurriculumConfig
-from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
 
 _STATE = ["observation", "desired_goal"]  # what the state is made of, in this order
@@ -47,14 +46,12 @@ class CurriculumState:
         return self.progress.stages[run] == len(self.curriculum) - 1
 
 
-def make_curriculum(recipe: Recipe, env: EnvBase) -> Curriculum | None:
-    """The curriculum that the recipe asks for: its own stages, or those of its task."""
-    if not recipe.in_stages:
+def make_curriculum(options: CurriculumConfig | None, env: EnvBase) -> Curriculum | None:
+    """Returns the curriculum of the stages in the options, or of the task's own; None without options."""
+    if options is None:
         return None
     task = goal_env(env)
-    return read_curriculum(
-        task.stages() if recipe.curriculum.stages is None else recipe.curriculum.stages, task
-    )
+    return read_curriculum(task.stages() if options.stages is None else options.stages, task)
 
 
 def read_curriculum(stages: object, env: GoalEnv) -> Curriculum:
@@ -99,39 +96,53 @@ def _read_stage(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumStage
         raise ValueError(f"{options!r} is no stage of a curriculum: {error}") from error
 
 
-def make_curriculum_state(recipe: Recipe, env: EnvBase, seeds: Sequence[int]) -> CurriculumState | None:
-    """Returns the curriculum of the recipe's runs at its beginning; None if it has no curriculum.
-
-    Raises:
-        ValueError: Processes collect, each of which would have to know how the episodes of the others ended;
-            or the weights cannot tell stages apart.
-    """
-    progress, order = make_progress(recipe, env), recipe.order
+def make_curriculum_state(
+    progress: CurriculumProgress | None, envs: TaskEnvs, num_envs: int, seeds: Sequence[int]
+) -> CurriculumState | None:
+    """Returns the curriculum of some runs, and ``num_envs`` environments to evaluate each in its stage."""
     if progress is None:
         return None
+    by_run = not isinstance(progress, EpisodeStages)
+    return CurriculumState(progress, in_stages(envs.make(num_envs, seeds), progress) if by_run else None)
+
+
+def check_order(
+    order: Order, progress: CurriculumProgress | None, weights: Weights, processes: int, demonstrations: int
+) -> None:
+    """Refuses what cannot be used where each episode has a stage of its own.
+
+    Raises:
+        ValueError: The weights cannot tell stages apart; processes collect, each of which would have to know
+            how the episodes of the others ended; or there are demonstrations, which are shown in a run's
+            stage.
+    """
     if not isinstance(progress, EpisodeStages):
-        stage_env = in_stages(make_task_envs(recipe, evaluation_envs(recipe), seeds), progress)
-        return CurriculumState(progress, stage_env)
-    if not isinstance(recipe.weights, Equal):
+        return
+    if not isinstance(weights, Equal):
         raise ValueError(
-            f"weights={recipe.weights.name} must not be used with order={order.name}: they would take the "
+            f"weights={weights.name} must not be used with order={order.name}: they would take the "
             "goals of all stages for one kind; choose order=threshold"
         )
-    if progress.adapts and recipe.collection.processes > 0:
+    if progress.adapts and processes > 0:
         raise ValueError(
             f"order={order.name} draws stages by how all episodes have ended: it needs processes=0, "
-            f"got processes={recipe.collection.processes}"
+            f"got processes={processes}"
         )
-    return CurriculumState(progress, None)
+    if demonstrations > 0:
+        raise ValueError(
+            f"demonstrations are shown in a run's stage, and with order={order.name} "
+            "it has none: choose order=threshold"
+        )
 
 
-def make_progress(recipe: Recipe, env: EnvBase) -> CurriculumProgress | None:
-    """Returns the stages of the recipe's runs at their beginning; None if it has no curriculum."""
-    if (curriculum := make_curriculum(recipe, env)) is None:
+def make_progress(
+    order: Order, options: CurriculumConfig | None, env: EnvBase, seeds: Sequence[int]
+) -> CurriculumProgress | None:
+    """Returns the stages of some runs at their beginning; None without a curriculum."""
+    if (curriculum := make_curriculum(options, env)) is None:
         return None
-    generators, order = generators_of(recipe.seeds, Stream.STAGES), recipe.order
     progress: CurriculumProgress = load_name(order.maker)(
-        order, curriculum, runs=recipe.run.num_runs, generators=generators
+        order, curriculum, runs=len(seeds), generators=generators_of(seeds, Stream.STAGES)
     )
     return progress
 
@@ -164,7 +175,7 @@ def make_teacher(options: Teacher, curriculum: Curriculum, **runs: Any) -> Teach
 
 
 def make_played_env(
-    recipe: Recipe,
+    envs: TaskEnvs,
     num_envs: int,
     seeds: Sequence[int],
     *,
@@ -172,15 +183,17 @@ def make_played_env(
     behavior: BehaviorGoals | None = None,
 ) -> EnvBase:
     """Environments as a trained policy sees them: at the top of the curriculum, if there is one."""
-    env = make_task_envs(recipe, num_envs, seeds, pictures=pictures)
-    curriculum = make_curriculum(recipe, env)
+    env = envs.make(num_envs, seeds, pictures=pictures)
+    curriculum = make_curriculum(envs.curriculum, env)
     progress = None if curriculum is None else at_the_top(curriculum, len(seeds))
     return in_stages(env, progress, behavior=behavior)
 
 
-def is_guided(options: CurriculumConfig, progress: CurriculumProgress | None) -> bool:
+def is_guided(options: CurriculumConfig | None, progress: CurriculumProgress | None) -> bool:
     """Whether some episodes are begun by what was learned in the stage below."""
-    return progress is not None and options.guided_share > 0 and len(progress.curriculum) > 1
+    if options is None or progress is None:
+        return False
+    return options.guided_share > 0 and len(progress.curriculum) > 1
 
 
 def in_stages(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,12 +15,13 @@ from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.demonstrations.replay import MixedReplay, write_demonstrations
 from torchrl_her.demonstrations.shown import in_stage, with_reward
 from torchrl_her.demonstrations.starts import DemonstrationStarts
+from torchrl_her.objectives.cloning import Cloning
 from torchrl_her.trainers.checkpoint import buffer_state_dict, load_buffer_state_dict
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
-from torchrl_her_recipes.components.envs import action_bounds, task_reward
+from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds, task_reward
 from torchrl_her_recipes.components.streams import Stream, generators_of
-from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.groups import DemonstrationsConfig, HindsightConfig
 
 
 @dataclass
@@ -87,49 +89,43 @@ class RunDemonstrations:
 
 
 def load_demonstrations(
-    recipe: Recipe, env: EnvBase, state: CurriculumState | None
+    options: DemonstrationsConfig,
+    envs: TaskEnvs,
+    env: EnvBase,
+    seeds: Sequence[int],
+    state: CurriculumState | None,
 ) -> RunDemonstrations | None:
-    """The demonstrations that a recipe asks for, without a buffer yet; None if it asks for none.
+    """Returns the demonstrations of some runs, without a buffer yet; None if options ask for no episode.
 
     Raises:
         ValueError: another option cannot be beside them, the file cannot be read, is of another task, holds
             too few episodes, or has nothing that episodes could start at.
     """
-    options = recipe.demonstrations
     if options.episodes == 0:
         return None
-    if state is not None and state.progress.by_episode:
-        raise ValueError(
-            f"demonstrations are shown in a run's stage, and with order={recipe.order.name} "
-            "it has none: choose order=threshold"
-        )
+    task = envs.task.name
     try:
         every = Demonstrations.load(str(options.file))
     except OSError as error:
         raise ValueError(
             f"demonstrations.file={options.file} cannot be read ({str(error.strerror).lower()}): "
-            f"`torchrl-her record {recipe.task.name} --out {options.file}` writes it"
+            f"`torchrl-her record {task} --out {options.file}` writes it"
         ) from error
-    _check(every, str(options.file), recipe.task.name, env)
-    recorded = _scaled(every.first(options.episodes), env).to(getattr(torch, recipe.run.dtype))
+    _check(every, str(options.file), task, env)
+    recorded = _scaled(every.first(options.episodes), env).to(getattr(torch, envs.dtype))
     demonstrations = RunDemonstrations(recorded, env, state)
     if options.as_starts:
-        if recipe.behavior.maker:
-            raise ValueError(
-                f"demonstrations.starts_share={options.starts_share} and behavior={recipe.behavior.name} "
-                "both choose the goals of episodes: leave one of them out"
-            )
         if not callable(getattr(goal_env(env), "start_at", None)):
             raise ValueError(
-                f"demonstrations.starts_share={options.starts_share} cannot be on {recipe.task.name}, whose "
+                f"demonstrations.starts_share={options.starts_share} cannot be on {task}, whose "
                 "environments cannot be started at given states: leave it out"
             )
-        runs = recipe.run.num_runs
+        runs = len(seeds)
         demonstrations.starts = DemonstrationStarts(
             [demonstrations.shown(run) for run in range(runs)],
             share=options.starts_share,
             runs=runs,
-            generators=generators_of(recipe.seeds, Stream.DEMONSTRATED_STARTS),
+            generators=generators_of(seeds, Stream.DEMONSTRATED_STARTS),
             width=options.starts_width,
             stride=options.starts_stride,
             threshold=options.starts_threshold,
@@ -168,7 +164,14 @@ def _scaled(recorded: Demonstrations, env: EnvBase) -> Demonstrations:
     )
 
 
-def rows_needed(recipe: Recipe, own: RunDemonstrations) -> int:
-    """How many rows of a run the demonstrations have at most, virtual ones among them."""
-    copies = sum(recipe.hindsight.sources.values()) * recipe.hindsight.refill if recipe.relabels else 0
-    return len(own.recorded.rows) * (1 + copies)
+def make_cloning(options: DemonstrationsConfig) -> Cloning | None:
+    """Returns how losses clone demonstrations; None if they do not."""
+    if not options.in_batches or options.bc_weight == 0:
+        return None
+    return Cloning(weight=options.bc_weight, q_filter=options.q_filter)
+
+
+def rows_needed(hindsight: HindsightConfig, demonstrations: Demonstrations) -> int:
+    """Returns how many rows a run needs at most for demonstrations, virtual ones among them."""
+    copies = sum(hindsight.sources.values()) * hindsight.refill if hindsight.algorithm.virtual else 0
+    return len(demonstrations.rows) * (1 + copies)

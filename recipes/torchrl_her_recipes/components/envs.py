@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,74 +16,84 @@ from torchrl_her.goals.rewards import EnvReward
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_envs.registry import GYM, get_task_spec, make_env
 from torchrl_her_recipes.components.failures import Failures
+from torchrl_her_recipes.config.groups import CurriculumConfig, TaskConfig
 from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
 
 _AT_ONCE = 20  # most of gymnasium's environments in an evaluation, since each takes 10 MB and more
 
 
-def evaluation_envs(recipe: Recipe) -> int:
-    """How many environments each run is evaluated in, some of them several times.
+def evaluation_envs(task: str, episodes: int) -> int:
+    """Returns the number of environments in which each run is evaluated, some of them several times.
 
     Example:
-        >>> from torchrl_her_recipes import make_recipe
-        >>> evaluation_envs(make_recipe(episodes=45))
-        45
-        >>> evaluation_envs(make_recipe(task="gym:FetchPush-v4", episodes=45))
-        15
+        >>> evaluation_envs("hand_v0", 45), evaluation_envs("gym:FetchPush-v4", 45)
+        (45, 15)
     """
-    episodes = recipe.evaluation.episodes
-    rounds = math.ceil(episodes / _AT_ONCE) if recipe.task.name.startswith(GYM) else 1
+    rounds = math.ceil(episodes / _AT_ONCE) if task.startswith(GYM) else 1
     return math.ceil(episodes / rounds)
 
 
-def make_task_envs(
-    recipe: Recipe,
-    num_envs: int,
-    seeds: Sequence[int],
-    *,
-    pictures: bool = False,
-    scaled: bool = True,
-) -> EnvBase:
-    """Environments of the recipe's task: ``num_envs`` for each seed.
+@dataclass(frozen=True)
+class TaskEnvs:
+    """Makes all environments of a recipe, and imports or refuses the modules that its task names.
 
-    All environments of recipes are made here, so this is also where modules that recipes name are imported,
-    or refused.
-
-    Args:
-        recipe: of a run.
-        num_envs: number of environments for each seed.
-        seeds: of the environments.
-
-    Keyword Args:
-        pictures: whether they are to give pictures, if they can.
-        scaled: whether continuous actions are from -1 to 1, whatever the task's own bounds are, and failures
-            are worth what the recipe says, as learners take them. Exported policies and recorded
-            demonstrations have the task's own.
+    Attributes:
+        task: Task and its options.
+        dtype: Name of the type of observations and rewards.
+        gamma: Discount factor, which defines the worth of never achieving the goal.
+        curriculum: Options of the curriculum; None without one.
     """
-    task = recipe.task
-    if foreign_module(task.name):
-        check_permitted(task.name)
-        look_here()
-    options: dict[str, Any] = dict(task.options or {})
-    if task.threshold is not None:
-        options["threshold"] = task.threshold
-    if recipe.run.dtype != "float32":
-        options["dtype"] = getattr(torch, recipe.run.dtype)
-    if pictures:
-        options = {**get_task_spec(task.name).for_pictures, **options}
-    env = make_env(task.name, num_envs=num_envs * len(seeds), seed=seeds, **options)
-    if not scaled:
-        return env
-    transforms: list[Transform] = []
-    if "termination" in get_task_spec(task.name).options and task.failure != "environment":
-        missed = reward_range(goal_env(env))[0]
-        worth = missed / (1 - recipe.learner.gamma) if task.failure == "never_pays" else None
-        transforms.append(Failures(worth, judging(env)))
-    low, high = action_bounds(env)
-    if not (low.eq(-1).all() and high.eq(1).all()):
-        transforms.append(ActionScaling())
-    return TransformedEnv(env, Compose(*transforms)) if transforms else env
+
+    task: TaskConfig
+    dtype: str
+    gamma: Any
+    curriculum: CurriculumConfig | None = None
+
+    @classmethod
+    def of(cls, recipe: Recipe) -> TaskEnvs:
+        """Returns the maker of a recipe's environments."""
+        curriculum = recipe.curriculum if recipe.hindsight.algorithm.curriculum else None
+        return cls(recipe.task, recipe.run.dtype, recipe.learner.gamma, curriculum)
+
+    def make(
+        self, num_envs: int, seeds: Sequence[int], *, pictures: bool = False, scaled: bool = True
+    ) -> EnvBase:
+        """Makes environments of the full task: ``num_envs`` for each seed.
+
+        Args:
+            num_envs: Number of environments for each seed.
+            seeds: Seeds of the environments.
+
+        Keyword Args:
+            pictures: Whether they are to give pictures, if they can.
+            scaled: Whether continuous actions are from -1 to 1, whatever the task's own bounds are, and
+                failures are worth what ``task.failure`` says, as learners take them. Exported policies and
+                recorded demonstrations have the task's own.
+        """
+        task = self.task
+        if foreign_module(task.name):
+            check_permitted(task.name)
+            look_here()
+        options: dict[str, Any] = dict(task.options or {})
+        if task.threshold is not None:
+            options["threshold"] = task.threshold
+        if self.dtype != "float32":
+            options["dtype"] = getattr(torch, self.dtype)
+        if pictures:
+            options = {**get_task_spec(task.name).for_pictures, **options}
+        env = make_env(task.name, num_envs=num_envs * len(seeds), seed=seeds, **options)
+        if not scaled:
+            return env
+        transforms: list[Transform] = []
+        if "termination" in get_task_spec(task.name).options and task.failure != "environment":
+            missed = reward_range(goal_env(env))[0]
+            worth = missed / (1 - self.gamma) if task.failure == "never_pays" else None
+            transforms.append(Failures(worth, judging(env)))
+        low, high = action_bounds(env)
+        if not (low.eq(-1).all() and high.eq(1).all()):
+            transforms.append(ActionScaling())
+        return TransformedEnv(env, Compose(*transforms)) if transforms else env
 
 
 def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:

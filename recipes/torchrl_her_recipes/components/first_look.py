@@ -15,8 +15,7 @@ from torch import Tensor
 from torchrl_her.goals.rewards import Outcome, ask_reward, is_achieved, missed, outcomes
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_envs.common.goal_rules import GoalEnds, say_once
-from torchrl_her_envs.registry import get_task_spec
-from torchrl_her_recipes.components.envs import action_bounds, judging, make_task_envs, task_reward
+from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds, judging, task_reward
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_options, ends_open, resolve
@@ -85,32 +84,31 @@ def resolved(recipe: Recipe) -> Recipe:
     if it is open what ends an episode at its goal. What is found then is in the recipe, so that nobody who
     has it looks again.
     """
-    if not auto_options(recipe) and not ends_open(recipe):
+    if not auto_options(recipe) and not ends_open(recipe.task):
         return recipe
     needs_stages = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
     known = f"{recipe.task} {needs_stages}"
     if (facts := _FACTS.get(known)) is None:
-        with closing(make_task_envs(_watched(recipe), 1, [0])) as env:
+        with closing(_watched(TaskEnvs.of(recipe)).make(1, [0])) as env:
             task = goal_env(env)
             facts = EnvFacts(max_steps=task.max_steps, batched=task.batched)
             ends: GoalEnds | None = getattr(task, "goal_ends", None)
-        open_ends = ends is not None and ends.env_ends is None and ends_open(recipe)
+        open_ends = ends is not None and ends.env_ends is None and ends_open(recipe.task)
         if (needs_stages or open_ends) and not facts.batched:
             look = look_at(recipe.replace(seed=0), seconds=None)
             facts, ends = replace(facts, stages=_needed_stages(look) if needs_stages else None), look.ends
-        if ends is not None and ends_open(recipe):
+        if ends is not None and ends_open(recipe.task):
             facts = replace(facts, ends=ends.found() or "never")
             say_once(ends.line())
         _FACTS[known] = facts
     return resolve(recipe, facts)
 
 
-def _watched(recipe: Recipe) -> Recipe:
-    """The recipe with its environment as it is: what failures give, and all ends if they are still open."""
-    values = {f"task.options.{TERMINATION}": "watch"} if ends_open(recipe) else {}
-    if TERMINATION in get_task_spec(recipe.task.name).options:
-        values["failure"] = "environment"
-    return recipe.replace(**values)
+def _watched(envs: TaskEnvs) -> TaskEnvs:
+    """Returns a maker of environments with their own rewards of failures, and all ends if they are open."""
+    ends = {TERMINATION: "watch"} if ends_open(envs.task) else {}
+    options = {**(envs.task.options or {}), **ends} or None
+    return replace(envs, task=replace(envs.task, options=options, failure="environment"))
 
 
 def _needed_stages(facts: Facts) -> list[dict[str, Any]] | None:
@@ -141,7 +139,7 @@ def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SEC
         True
     """
     with (
-        closing(make_task_envs(_watched(recipe), _AT_ONCE, [recipe.run.seed])) as env,
+        closing(_watched(TaskEnvs.of(recipe)).make(_AT_ONCE, [recipe.run.seed])) as env,
         torch.random.fork_rng(devices=[]),
     ):
         torch.manual_seed(recipe.run.seed)

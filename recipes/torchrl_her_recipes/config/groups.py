@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from torchrl_her_envs.registry import check_options as check_task_options
 from torchrl_her_envs.registry import check_task, get_task_spec
-from torchrl_her_recipes.config.algorithms import check_goal_sources, check_strategy, get_algorithm
+from torchrl_her_recipes.config.algorithms import Algorithm, check_goal_sources, check_strategy, get_algorithm
 from torchrl_her_recipes.config.loggers import check_loggers
 from torchrl_her_recipes.config.options import AUTO, Needs, check_options, option
 from torchrl_her_recipes.config.plain_files import read_yaml
@@ -194,6 +194,11 @@ class HindsightConfig(Group):
             object.__setattr__(self, "goal_sources", check_goal_sources(self.goal_sources))
         elif (self.k, self.strategy) != (4, "future"):  # given by the user, in place of auto
             object.__setattr__(self, "goal_sources", None)
+
+    @property
+    def algorithm(self) -> Algorithm:
+        """The algorithm whose name is ``algo``."""
+        return get_algorithm(self.algo)
 
     @property
     def sources(self) -> dict[str, int]:

@@ -10,7 +10,7 @@ from typing import Any
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config import groups
 from torchrl_her_recipes.config.algorithms import get_algorithm
-from torchrl_her_recipes.config.choices.behavior import BEHAVIOR, Behavior
+from torchrl_her_recipes.config.choices.behavior import BEHAVIOR, Behavior, Proposed
 from torchrl_her_recipes.config.choices.learners import BY_ACTIONS, LEARNERS, LearnerConfig
 from torchrl_her_recipes.config.choices.order import ORDER, Order
 from torchrl_her_recipes.config.choices.weights import WEIGHTS, Weights
@@ -21,6 +21,13 @@ from torchrl_her_recipes.config.without_effect import without_effect
 
 # Options that may change when a run resumes, since they do not affect training so far.
 EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints", "keep_buffer", "pictures", "log")
+
+# By group, an option and others that say the same.
+_ALTERNATIVES = {
+    "run": ("frames", ("epochs",)),
+    "curriculum": ("stages", ("name",)),
+    "hindsight": ("goal_sources", ("k", "strategy")),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,29 +67,31 @@ class Recipe:
         if self.run.frames is not None and self.collection.epoch_frames != AUTO:
             epochs = -(-self.run.frames // self.collection.epoch_frames)
             object.__setattr__(self, "run", replace(self.run, frames=None, epochs=epochs))
-        if (given := get_algorithm(self.hindsight.algo).weights) not in (None, self.weights.name):
+        if (given := self.hindsight.algorithm.weights) not in (None, self.weights.name):
             problem = f"weights must be {given} with algo={self.hindsight.algo}, got {self.weights.name}"
             raise ValueError(f"{problem}; choose another algo, as in algo=her weights=rare")
+        self._check_proposed()
         changed = self.changed()
         for (group, name), why in without_effect(self).items():
             if (value := changed.get(group, {}).get(name)) is not None:
                 shown = group if name == "name" else getattr(self, group).prefix + name
                 raise ValueError(f"{shown}={value} has no effect {why}: leave it out")
 
-    @property
-    def relabels(self) -> bool:
-        """Whether virtual transitions are written."""
-        return get_algorithm(self.hindsight.algo).virtual
-
-    @property
-    def filters(self) -> bool:
-        """Whether virtual goals that were achieved already are left out."""
-        return get_algorithm(self.hindsight.algo).filter
-
-    @property
-    def in_stages(self) -> bool:
-        """Whether runs learn the stages of a curriculum."""
-        return get_algorithm(self.hindsight.algo).curriculum
+    def _check_proposed(self) -> None:
+        """Refuses what cannot be used where behavior goals are proposed."""
+        proposed, num_envs = self.behavior, self.collection.num_envs
+        if not isinstance(proposed, Proposed):
+            return
+        if self.collection.processes > 0:
+            raise ValueError(
+                f"behavior={proposed.name} proposes goals that this process has collected: it needs "
+                f"processes=0, got processes={self.collection.processes}"
+            )
+        if num_envs != AUTO and proposed.goal_memory < num_envs:
+            raise ValueError(
+                f"goal_memory={proposed.goal_memory} must be at least num_envs={num_envs}, "
+                "whose goals come at once"
+            )
 
     @property
     def total_frames(self) -> int:
@@ -120,7 +129,7 @@ class Recipe:
     def to_dict(self) -> Nested:
         """Returns all values by group and name, except the name of weights that the algorithm implies."""
         named = {group: {"name": getattr(self, group).name} for group in KINDS}
-        if get_algorithm(self.hindsight.algo).weights is not None:
+        if self.hindsight.algorithm.weights is not None:
             del named["weights"]
         return {group: named.get(group, {}) | asdict(options) for group, options in vars(self).items()}
 
@@ -201,17 +210,7 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
         below.get("weights", {}).pop("name", None)
     _drop_options_of_other_choices(below, given)
     _drop_options_of_another_task(below, given)
-    _drop_another_curriculum(below, given)
-    drop_other_goal_sources(given)
-    if "goal_sources" not in below.get("hindsight", {}):
-        drop_other_goal_sources(below)
-    asked = given.get("run", {})
-    if asked.get("frames") is not None and "epochs" in asked:
-        raise ValueError(
-            f"frames={asked['frames']} and epochs={asked['epochs']} say the same: give one of them"
-        )
-    if "epochs" in asked:
-        below.get("run", {}).pop("frames", None)
+    drop_alternatives(below, given)
     for group, option in without_effect(SimpleNamespace(**_groups(over(below, given)))):
         if option not in given.get(group, {}) and option in below.get(group, {}):
             del below[group][option]
@@ -258,29 +257,24 @@ def _drop_options_of_another_task(below: Nested, given: Nested) -> None:
     below["task"]["options"] = {option: value for option, value in options.items() if option in takes} or None
 
 
-def _drop_another_curriculum(below: Nested, given: Nested) -> None:
-    asked = given.get("curriculum", {})
-    if asked.get("name", "task") != "task" and asked.get("stages") is not None:
-        raise ValueError(f"curriculum={asked['name']} and stages={asked['stages']!r}: give one of them")
-    if "name" in asked or "stages" in asked:
-        below.get("curriculum", {}).pop("stages", None)
-        below.get("curriculum", {}).pop("name", None)
-
-
-def drop_other_goal_sources(given: Nested) -> None:
-    """Sets ``goal_sources`` to None, in place of the base's, if k or the strategy is given.
+def drop_alternatives(below: Nested, given: Nested) -> None:
+    """Drops values of the base where the same is given by other options.
 
     Raises:
-        ValueError: ``goal_sources`` is given, too.
+        ValueError: The same is given twice.
     """
-    asked = given.get("hindsight", {})
-    short = {name: asked[name] for name in ("k", "strategy") if name in asked}
-    if not short:
-        return
-    if asked.get("goal_sources", AUTO) not in (None, AUTO):
-        shown = " and ".join(f"{name}={value}" for name, value in short.items())
-        raise ValueError(f"{shown} and goal_sources={asked['goal_sources']} say the same: give one of them")
-    asked["goal_sources"] = None
+    for group, (option, others) in _ALTERNATIVES.items():
+        asked, base = given.get(group, {}), below.get(group, {})
+        named = [f"{name}={asked[name]}" for name in others if name in asked]
+        if named and asked.get(option, AUTO) not in (None, AUTO):
+            shown = " and ".join([*named, f"{option}={asked[option]}"])
+            raise ValueError(f"{shown} say the same: give one of them")
+        if named:
+            asked[option] = None
+        elif asked.get(option) is not None:
+            below[group] = {name: value for name, value in base.items() if name not in others}
+        elif base.keys() & others:
+            base.setdefault(option, None)
 
 
 def _groups(values: Nested) -> dict[str, Any]:

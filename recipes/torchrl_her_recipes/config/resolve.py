@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
+from torchrl_her_recipes.config.groups import CollectionConfig, RunConfig, TaskConfig
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.without_effect import without_effect
@@ -37,18 +38,17 @@ class EnvFacts:
     ends: str | None = None
 
 
-def _num_envs(recipe: Recipe, facts: EnvFacts) -> int:
+def _num_envs(processes: int, facts: EnvFacts) -> int:
     """Returns the number of environments: fewer if they are slow, to learn from each episode soon."""
-    processes = max(recipe.collection.processes, 1)
+    processes = max(processes, 1)
     return math.ceil((64 if facts.batched else 8) / processes) * processes
 
 
-def _epoch_frames(recipe: Recipe, facts: EnvFacts) -> int:
-    collection = recipe.collection
+def _epoch_frames(collection: CollectionConfig, run: RunConfig, facts: EnvFacts) -> int:
     episodes = _EPISODES if not facts.batched else 4 * collection.num_envs
     frames = episodes * facts.max_steps
-    if recipe.run.frames is not None:  # a run shorter than an epoch is one epoch of its own length
-        frames = min(frames, recipe.run.frames)
+    if run.frames is not None:  # a run shorter than an epoch is one epoch of its own length
+        frames = min(frames, run.frames)
     return max(frames, collection.num_envs * collection.steps_per_batch)
 
 
@@ -58,9 +58,9 @@ _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
     "goal_sources": lambda recipe, _facts: recipe.hindsight.sources,
     # a horizon of half an episode
     "gamma": lambda _recipe, facts: round(min(max(1 - 2 / facts.max_steps, 0.9), 0.99), 4),
-    "num_envs": _num_envs,
+    "num_envs": lambda recipe, facts: _num_envs(recipe.collection.processes, facts),
     "frames_per_update": lambda _recipe, facts: 5.0 if facts.batched else 1.0,
-    "epoch_frames": _epoch_frames,
+    "epoch_frames": lambda recipe, facts: _epoch_frames(recipe.collection, recipe.run, facts),
     # until each environment has ended an episode, no transition is stored
     "warmup_frames": lambda recipe, facts: max(recipe.collection.num_envs * facts.max_steps, _WARMUP),
 }
@@ -81,17 +81,17 @@ def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
     return [pair for pair in names if getattr(getattr(recipe, pair[0]), pair[1]) == AUTO and pair not in idle]
 
 
-def ends_open(recipe: Recipe) -> bool:
+def ends_open(task: TaskConfig) -> bool:
     """Returns whether the environment decides what ends an episode at its goal.
 
     Example:
-        >>> task = "gym:FetchPush-v4"
-        >>> never = {"task.options": {"termination": "never"}}
-        >>> [ends_open(Recipe().replace(task=task, **values)) for values in ({}, never)], ends_open(Recipe())
-        ([True, False], False)
+        >>> push = TaskConfig(name="gym:FetchPush-v4")
+        >>> never = TaskConfig(name="gym:FetchPush-v4", options={"termination": "never"})
+        >>> ends_open(push), ends_open(never), ends_open(TaskConfig())
+        (True, False, False)
     """
-    known = get_task_spec(recipe.task.name).options
-    return TERMINATION in known and (recipe.task.options or {}).get(TERMINATION, AUTO) == AUTO
+    known = get_task_spec(task.name).options
+    return TERMINATION in known and (task.options or {}).get(TERMINATION, AUTO) == AUTO
 
 
 def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
@@ -102,7 +102,7 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
         >>> recipe.learner.gamma, recipe.collection.num_envs, recipe.collection.epoch_frames
         (0.96, 8, 5000)
     """
-    if facts.ends is not None and ends_open(recipe):
+    if facts.ends is not None and ends_open(recipe.task):
         recipe = recipe.replace(**{f"task.options.{TERMINATION}": facts.ends})
     for group, name in auto_options(recipe):
         values = {f"{group}.{name}": _VALUES[name](recipe, facts)}

@@ -11,7 +11,7 @@ from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.choices.learners import BY_ACTIONS
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.plain_files import read_yaml, shown
-from torchrl_her_recipes.config.recipe import Recipe, compose, drop_other_goal_sources
+from torchrl_her_recipes.config.recipe import Recipe, compose, drop_alternatives
 from torchrl_her_recipes.config.shipped import find_file, shipped_names
 from torchrl_her_recipes.config.shortcuts import locate, merge, place, split_name
 from torchrl_her_recipes.config.values import as_kind
@@ -109,7 +109,7 @@ class Space:
             ValueError: values that cannot go together.
         """
         given = place(values, base.to_dict())
-        drop_other_goal_sources(given)
+        drop_alternatives({}, given)
         return compose(merge(base.to_dict(), given), {})
 
     def values_of(self, recipe: Recipe) -> dict[str, Any]:

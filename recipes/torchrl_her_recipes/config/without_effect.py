@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
-from torchrl_her_recipes.config.algorithms import get_algorithm
+from torchrl_her_recipes.config.choices.behavior import Proposed
 from torchrl_her_recipes.config.options import AUTO, idle_options
 
 
@@ -30,7 +30,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
 
 def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     """Yields conditions on other options: whether one holds, its text, and options without effect."""
-    algorithm = get_algorithm(groups.hindsight.algo)
+    algorithm = groups.hindsight.algorithm
     learner, sources = groups.learner, groups.hindsight.sources
     takes, with_task = get_task_spec(groups.task.name).options, f"with task={groups.task.name}"
     yield "threshold" not in takes, with_task, ["task.threshold"]
@@ -56,8 +56,9 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     yield not learner.clones, f"with learner={learner.name}", cloning
     others = set(_options(groups, "behavior")) - {"behavior.real_share"}
     yield getattr(groups.behavior, "real_share", 0.0) == 1.0, "with real_share=1", others
-    processes = groups.collection.processes
+    processes, behavior = groups.collection.processes, groups.behavior
     yield processes > 0, f"with processes={processes}", ["demonstrations.starts_share"]
+    yield isinstance(behavior, Proposed), f"with behavior={behavior.name}", ["demonstrations.starts_share"]
     on_gpu = not learner.device.startswith(("cpu", "auto"))
     yield on_gpu, f"with learner.device={learner.device}", ["learner.matmul_dtype"]
     yield groups.run.dtype == "float64", "with dtype=float64", ["learner.matmul_dtype"]

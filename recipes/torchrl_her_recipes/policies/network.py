@@ -16,7 +16,7 @@ from torchrl_her.modules.normalization import RunningNorm, normalize
 from torchrl_her.modules.normalized import NormalizedPolicy
 from torchrl_her_recipes.components.agents import find_builder
 from torchrl_her_recipes.components.learner import AgentShape, LearnerBuilder, acting
-from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.choices.learners import LearnerConfig
 from torchrl_her_recipes.policies.info import KEYS, PolicyInfo
 
 _CONSTANTS = ("mean", "std", "limit")  # buffers of an entry's normalization
@@ -28,12 +28,14 @@ def _action_spec(info: PolicyInfo) -> TensorSpec:
     return Bounded(-1.0, 1.0, shape=info.action_shape, dtype=torch.float32)  # arguments of learners
 
 
-def load_network(info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor]) -> TensorDictModuleBase:
+def load_network(
+    info: PolicyInfo, options: LearnerConfig, weights: Mapping[str, Tensor]
+) -> TensorDictModuleBase:
     """Makes the greedy policy of given weights, from ``observation`` and ``desired_goal`` to ``action``.
 
     Args:
         info: says the widths.
-        recipe: recipe of a single run, which defines the network.
+        options: options of the learner, which define the network.
         weights: ``state_dict()`` of its actor, with its normalization if there is one.
 
     Raises:
@@ -43,9 +45,9 @@ def load_network(info: PolicyInfo, recipe: Recipe, weights: Mapping[str, Tensor]
         task=info.task,
         widths={key: info.widths[key] for key in KEYS},
         action_spec=_action_spec(info),
-        dtype=getattr(torch, recipe.run.dtype),
+        dtype=getattr(torch, info.dtype),
     )
-    builder = find_builder(recipe.learner, shape)
+    builder = find_builder(options, shape)
     check_weights(builder, weights)
     actor = builder.player(1)
     player = acting(actor, builder.norm())

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_her.files.writing import written
-from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.policies.info import KEYS, PolicyInfo
 from torchrl_her_recipes.policies.network import TensorPolicy
 
@@ -50,7 +49,7 @@ def need_onnx() -> ModuleType:
 def write_onnx(
     policy: TensorDictModuleBase,
     info: PolicyInfo,
-    recipe: Recipe,
+    recipe: Mapping[str, Any],
     path: str | Path,
     *,
     states: TensorDictBase,
@@ -66,7 +65,7 @@ def write_onnx(
     Args:
         policy: The network of :func:`~torchrl_her_recipes.policies.network.load_network`.
         info: Facts about the policy.
-        recipe: Recipe of the run that trained it.
+        recipe: Values of the recipe of the run that trained it.
         path: The file.
         states: Rows of ``observation`` and ``desired_goal`` on which the actions are compared.
 
@@ -82,7 +81,7 @@ def write_onnx(
     path, module = Path(path), TensorPolicy(policy)
     info = replace(info, dtype="float32", action_dtype="int64" if info.discrete else "float32")
     proto = _graph_of(module, info)
-    for name, facts in (("card", info.to_dict()), ("recipe", recipe.to_dict())):
+    for name, facts in (("card", info.to_dict()), ("recipe", recipe)):
         proto.metadata_props.add(key=f"torchrl_her.{name}", value=json.dumps(facts))
     seen = {key: states[key].reshape(-1, info.widths[key]).float() for key in KEYS}
     with written(path) as part:

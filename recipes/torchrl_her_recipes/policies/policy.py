@@ -22,7 +22,7 @@ from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.agents import find_learner, shape_of
 from torchrl_her_recipes.components.curricula import make_curriculum
-from torchrl_her_recipes.components.envs import judging, make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs, judging
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
@@ -73,7 +73,7 @@ class Policy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.in_keys, self.out_keys = list(KEYS), ["action"]
-        self.module = load_network(info, recipe, weights)
+        self.module = load_network(info, recipe.learner, weights)
         self.info, self.recipe, self.source = info, recipe, source
         self._weights = dict(weights)
 
@@ -135,7 +135,8 @@ class Policy(TensorDictModuleBase):
         runs = recipe.run.num_runs
         if chosen not in range(runs):
             raise ValueError(f"there is no run {chosen} in {home.path}; it has runs 0 to {runs - 1}")
-        env = make_task_envs(recipe, 1, [0], scaled=False)
+        envs = TaskEnvs.of(recipe)
+        env = envs.make(1, [0], scaled=False)
         shown = describe_env(env)
         info = PolicyInfo(
             task=recipe.task.name,
@@ -148,7 +149,7 @@ class Policy(TensorDictModuleBase):
             frames=int(rows[-1]["frames"]),
             versions=present_versions(),
         )
-        curriculum, width = make_curriculum(recipe, env), sum(info.widths.values())
+        curriculum, width = make_curriculum(envs.curriculum, env), sum(info.widths.values())
         # positions of the network's inputs in the observation and the desired goal behind it
         places = torch.arange(width)
         if curriculum is not None:
@@ -210,8 +211,8 @@ class Policy(TensorDictModuleBase):
             ValueError: They differ from what the policy was trained on, or the task names a module that must
                 not be imported.
         """
-        recipe = self.recipe.replace(task=self.info.task)
-        env = make_task_envs(recipe, number, [seed], pictures=pictures, scaled=False)
+        envs = TaskEnvs.of(self.recipe.replace(task=self.info.task))
+        env = envs.make(number, [seed], pictures=pictures, scaled=False)
         self.info.check_plays(env, self.info.task)
         return env
 
@@ -246,7 +247,7 @@ class Policy(TensorDictModuleBase):
         if path.suffix == SUFFIX:
             with closing(self.envs(16, seed=_COMPARED)) as env:
                 states = evaluate(env, self, max_steps=goal_env(env).max_steps).select(*KEYS).flatten()
-            info = write_onnx(self.module, info, self.recipe, path, states=states)
+            info = write_onnx(self.module, info, self.recipe.to_dict(), path, states=states)
         else:
             write_policy(path, self._weights, {"info": info.to_dict(), "recipe": self.recipe.to_dict()})
         if card:
@@ -295,7 +296,7 @@ def export_policy(
     info = replace(policy.info, task=task or policy.info.task, versions=present_versions())
     if task is not None:
         permit_task(task)  # named by the caller
-        with closing(make_task_envs(policy.recipe.replace(task=task), 1, [0], scaled=False)) as env:
+        with closing(TaskEnvs.of(policy.recipe.replace(task=task)).make(1, [0], scaled=False)) as env:
             policy.info.check_plays(env, task)
     measured = info.task == policy.info.task and not math.isnan(info.success)
     policy.info = info

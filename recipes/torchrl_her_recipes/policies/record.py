@@ -17,8 +17,8 @@ from torchrl_her.demonstrations.play import demonstrate
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_envs.registry import GYM
 from torchrl_her_envs.throwing.experts.controller import make_controller
-from torchrl_her_recipes.components.envs import make_task_envs
-from torchrl_her_recipes.config.recipe import Recipe, make_recipe
+from torchrl_her_recipes.components.envs import TaskEnvs
+from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.policies.policy import Policy
 
 EXPERT = "expert"
@@ -78,19 +78,18 @@ def record_demonstrations(
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     check_free(out, force=force)
-    recipe = make_recipe(task=task, seed=seed)
+    envs = TaskEnvs.of(make_recipe(task=task, seed=seed))
     most = _OF_GYM_AT_ONCE if task.startswith(GYM) else _AT_ONCE
-    with closing(make_task_envs(recipe, min(episodes, most), [seed], scaled=False)) as env:
-        player, who = _find_policy(recipe, env, policy)
+    with closing(envs.make(min(episodes, most), [seed], scaled=False)) as env:
+        player, who = _find_policy(task, env, policy)
         facts = {"policy": who, "seed": seed, "torchrl_her": __version__}
         recorded = _play(env, player, task, episodes, keep_all=keep_all, facts=facts)
     recorded.demonstrations.save(out, force=force)
     return recorded
 
 
-def _find_policy(recipe: Recipe, env: EnvBase, policy: str | Path | None) -> tuple[Player, str]:
+def _find_policy(task: str, env: EnvBase, policy: str | Path | None) -> tuple[Player, str]:
     """Finds a policy that plays in some environments, and its name."""
-    task = recipe.task.name
     if policy is None or str(policy) == EXPERT:
         try:
             return make_controller(env), "the scripted controller"

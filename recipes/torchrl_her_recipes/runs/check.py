@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from torchrl_her_recipes.components.first_look import Facts, resolved
+from torchrl_her_recipes.config.algorithms import Algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
 _SELDOM = 0.5  # fraction of the episodes
@@ -38,9 +41,8 @@ def advice(facts: Facts, recipe: Recipe, stages_file: str = "stages.yaml") -> li
             "goal, which relabeling cannot change there: leave them out of the observation"
         )
     if facts.moved < _SELDOM:
-        lines.append(
-            f"{_STILL.format(facts=facts, moved=_percent(facts.moved))} {_remedy(facts, recipe, stages_file)}"
-        )
+        remedy = _remedy(facts, recipe.hindsight.algorithm, recipe.curriculum.stages, stages_file)
+        lines.append(f"{_STILL.format(facts=facts, moved=_percent(facts.moved))} {remedy}")
     if not facts.moved:
         lines.append("by the reward, achieved_goal never changed: does it hold what the goal is about?")
     if facts.fallen and recipe.task.failure == "environment":
@@ -67,16 +69,13 @@ def _percent(share: float) -> str:
     return "less than 1%" if 0 < share < _ROUNDED else f"{share:.0%}"
 
 
-def _remedy(facts: Facts, recipe: Recipe, stages_file: str) -> str:
+def _remedy(facts: Facts, algorithm: Algorithm, stages: Any, stages_file: str) -> str:
     shown = "demonstrations (demonstrations.file=FILE)"
-    if recipe.in_stages and recipe.filters:
-        stages = recipe.curriculum.stages
-        first = (
-            f", whose first goals are for entries {stages[0]['achieved_goal']} of the observation"
-            if stages
-            else ""
+    if algorithm.curriculum and algorithm.filter:
+        goals = (
+            stages and f", whose first goals are for entries {stages[0]['achieved_goal']} of the observation"
         )
-        return f"This recipe has a curriculum{first}; {shown} help, too"
+        return f"This recipe has a curriculum{goals or ''}; {shown} help, too"
     if facts.own_stages:
         return f"What helps: the task's own curriculum (algo=cher) or {shown}"
     if facts.stages:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -13,31 +14,28 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_envs.common.recording import record_episodes
 from torchrl_her_envs.common.rendering.video import write_video
 from torchrl_her_envs.registry import get_task_spec
-from torchrl_her_recipes.components.assembly import eval_seeds
 from torchrl_her_recipes.components.curricula import make_played_env
-from torchrl_her_recipes.components.envs import evaluation_envs
-from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.components.envs import TaskEnvs
 
 FPS = 12  # half the true speed of the throwing tasks, as a throw takes half a second
 _FILMED = 6  # environments
 
 
 def film_policy(
-    recipe: Recipe, env: EnvBase, player: TensorDictModuleBase, out: Path, *, run: int, epoch: int
+    envs: TaskEnvs, env: EnvBase, player: TensorDictModuleBase, out: Path, *, seeds: Sequence[int], run: int
 ) -> None:
     """Makes a video of greedy episodes of one of the runs, if its environment can be rendered.
 
     Environments that only give pictures if they are made for it are made anew. Drawing them may need what a
     machine lacks, such as a display: then there is a warning instead of a film.
     """
-    worlds = evaluation_envs(recipe)
-    shown = min(_FILMED, worlds)
+    count = env.numel() // len(seeds)
+    shown = min(_FILMED, count)
     if goal_env(env).can_render:
-        _film(player, env, out, run * worlds, shown)
-    elif get_task_spec(recipe.task.name).for_pictures:
+        _film(player, env, out, run * count, shown)
+    elif get_task_spec(envs.task.name).for_pictures:
         try:
-            drawn = make_played_env(recipe, shown, eval_seeds(recipe.seeds, epoch), pictures=True)
-            with closing(drawn):
+            with closing(make_played_env(envs, shown, seeds, pictures=True)) as drawn:
                 if goal_env(drawn).can_render:
                     _film(player, drawn, out, run * shown, shown)
         except Exception as error:  # a renderer may raise any error; the run itself is done

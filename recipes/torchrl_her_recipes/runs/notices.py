@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 
 from torch import Tensor
 
+from torchrl_her_recipes.config.algorithms import Algorithm
+from torchrl_her_recipes.config.choices.learners import LearnerConfig
 from torchrl_her_recipes.config.recipe import Recipe
 
 Row = dict[str, float]  # row of the table of metrics: one epoch of one run
-Rule = Callable[[Sequence[Row], Recipe], str | None]  # a rule: returns a problem of a run, given its rows
 
 _AT_BOUND = 0.99  # fraction of the way from the middle of the range to its end
 _NEARLY_ALL = 0.95  # fraction of the entries of all actions, or of virtual rows
@@ -57,12 +59,19 @@ def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) ->
     runs: dict[float, list[Row]] = {}
     for row in rows:
         runs.setdefault(row["run"], []).append(row)
-    rules = [_nothing_achieved, _nothing_to_relabel, _saturated, _beyond(bounds), _fallen]
+    task, learner = recipe.task.name, recipe.learner
+    rules = [  # each returns a problem of a run, given its rows
+        partial(_nothing_achieved, task),
+        partial(_nothing_to_relabel, task, recipe.hindsight.algorithm),
+        partial(_saturated, learner),
+        partial(_beyond, learner, bounds),
+        partial(_fallen, learner),
+    ]
     lines = [
         f"seed {run[-1]['seed']:.0f}: {said}"
         for run in runs.values()
         for rule in rules
-        if (said := rule(run, recipe)) and not any(rule(run[:end], recipe) for end in range(1, len(run)))
+        if (said := rule(run)) and not any(rule(run[:end]) for end in range(1, len(run)))
     ]
     every = list(runs.values())
     if _differ(every) and not any(
@@ -76,19 +85,19 @@ def _success(row: Row) -> float:
     return row.get("stage_success", row["success"])  # in a curriculum, at the goals of the present stage
 
 
-def _nothing_achieved(rows: Sequence[Row], recipe: Recipe) -> str | None:
+def _nothing_achieved(task: str, rows: Sequence[Row]) -> str | None:
     if len(rows) < _LONG or rows[-1].get("rows_real_positive", 1) or any(map(_success, rows)):
         return None
     return (
         f"no goal has been achieved in {rows[-1]['frames']:,.0f} environment steps. What helps: "
         "a curriculum (algo=cher), goals within reach (behavior=uniform_achieved) or demonstrations; "
-        f"`torchrl-her check task={recipe.task.name}` looks for the cause"
+        f"`torchrl-her check task={task}` looks for the cause"
     )
 
 
-def _nothing_to_relabel(rows: Sequence[Row], recipe: Recipe) -> str | None:
+def _nothing_to_relabel(task: str, algorithm: Algorithm, rows: Sequence[Row]) -> str | None:
     row = rows[-1]
-    if len(rows) < _STREAK or _success(row) >= _LITTLE or "rows_virtual" not in row or not recipe.relabels:
+    if len(rows) < _STREAK or _success(row) >= _LITTLE or "rows_virtual" not in row or not algorithm.virtual:
         return None
     if row["rows_virtual_positive"] > _NEARLY_ALL * row["rows_virtual"] > 0:
         return (
@@ -96,23 +105,22 @@ def _nothing_to_relabel(rows: Sequence[Row], recipe: Recipe) -> str | None:
             "before the action: nothing can be learned from them. What helps: the filter "
             "(algo=filtered_her), a curriculum (algo=cher) or demonstrations"
         )
-    if recipe.filters and row["rows_relabeled"] <= _FEW * row["rows_real"]:
+    if algorithm.filter and row["rows_relabeled"] <= _FEW * row["rows_real"]:
         return (
             f"the filter has left {row['rows_relabeled']:,.0f} of {row['rows_real']:,.0f} transitions with "
             "goals of their own episode: the achieved goal hardly changes. What helps: a curriculum "
             "(algo=cher), longer episodes (task.options.max_steps) or demonstrations; "
-            f"`torchrl-her check task={recipe.task.name}` looks for the cause"
+            f"`torchrl-her check task={task}` looks for the cause"
         )
     return None
 
 
-def _saturated(rows: Sequence[Row], recipe: Recipe) -> str | None:
+def _saturated(learner: LearnerConfig, rows: Sequence[Row]) -> str | None:
     """An actor that ends in tanh gets almost no gradient where its actions are at their bounds."""
     last = rows[-_STREAK:]
     stuck = [row.get("saturation", 0.0) >= _NEARLY_ALL and _success(row) < _LITTLE for row in last]
     if len(last) < _STREAK or not all(stuck):
         return None
-    learner = recipe.learner
     helps = [f"learning_rate below {learner.learning_rate:g}", "a larger batch_size"]
     if (penalty := getattr(learner, "saturation_penalty", None)) is not None:
         helps.insert(0, f"saturation_penalty above {penalty:g}")
@@ -123,35 +131,31 @@ def _saturated(rows: Sequence[Row], recipe: Recipe) -> str | None:
     )
 
 
-def _beyond(bounds: tuple[float, float]) -> Rule:
-    """Makes a rule for values of critics that no return can have."""
-
-    def rule(rows: Sequence[Row], recipe: Recipe) -> str | None:
-        gamma = float(recipe.learner.gamma)
-        horizon = 1 / (1 - gamma) if gamma < 1 else math.inf
-        low, high = min(0.0, horizon * bounds[0]), max(0.0, horizon * bounds[1])
-        margin = _BEYOND * (high - low)
-        last = rows[-_STREAK:]
-        outside = [not low - margin <= row.get("q", low) <= high + margin for row in last]
-        if math.isinf(margin) or len(last) < _STREAK or not all(outside):
-            return None
-        helps = [f"tau below {recipe.learner.tau:g}", f"learning_rate below {recipe.learner.learning_rate:g}"]
-        if not getattr(recipe.learner, "clamp_targets", True):
-            helps.insert(0, "clamp_targets=true")
-        return (
-            f"the value of the starts is {last[-1]['q']:.4g}, and returns are from {low:.4g} to {high:.4g}: "
-            f"the critic diverges. What helps: {' or '.join(helps)}"
-        )
-
-    return rule
+def _beyond(learner: LearnerConfig, bounds: tuple[float, float], rows: Sequence[Row]) -> str | None:
+    """No return can have such values as the critic gives."""
+    gamma = float(learner.gamma)
+    horizon = 1 / (1 - gamma) if gamma < 1 else math.inf
+    low, high = min(0.0, horizon * bounds[0]), max(0.0, horizon * bounds[1])
+    margin = _BEYOND * (high - low)
+    last = rows[-_STREAK:]
+    outside = [not low - margin <= row.get("q", low) <= high + margin for row in last]
+    if math.isinf(margin) or len(last) < _STREAK or not all(outside):
+        return None
+    helps = [f"tau below {learner.tau:g}", f"learning_rate below {learner.learning_rate:g}"]
+    if not getattr(learner, "clamp_targets", True):
+        helps.insert(0, "clamp_targets=true")
+    return (
+        f"the value of the starts is {last[-1]['q']:.4g}, and returns are from {low:.4g} to {high:.4g}: "
+        f"the critic diverges. What helps: {' or '.join(helps)}"
+    )
 
 
-def _fallen(rows: Sequence[Row], recipe: Recipe) -> str | None:
+def _fallen(learner: LearnerConfig, rows: Sequence[Row]) -> str | None:
     means = _means([row["success"] for row in rows])
     stages = {row.get("stage", 0.0) for row in rows[-2 * _STREAK :]}
     if len(means) <= _STREAK or len(stages) > 1 or max(means) < _LITTLE or means[-1] > max(means) / 2:
         return None
-    learner, helps = recipe.learner, [f"learning_rate below {recipe.learner.learning_rate:g}"]
+    helps = [f"learning_rate below {learner.learning_rate:g}"]
     if learner.norm != "layer":
         helps.insert(0, "norm=layer")
     if not getattr(learner, "ema_decay", 1.0):

@@ -16,8 +16,9 @@ import torch
 from torchrl_her.trainers.checkpoint import load_newest_checkpoint, save_checkpoint
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_envs.common.goal_env import goal_env
-from torchrl_her_recipes.components.assembly import build
+from torchrl_her_recipes.components.assembly import build, eval_seeds
 from torchrl_her_recipes.components.components import Components
+from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.config.loggers import check_installed
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe
@@ -284,7 +285,7 @@ class _Run:
         """Runs an epoch and its evaluation; returns new rows of the table, one for each run."""
         components, trainer, state = self.components, self.trainer, self.components.curriculum
         began = time.perf_counter()
-        seed_epoch(components.env, self.recipe, trainer)
+        seed_epoch(components.env, self.recipe.seeds, self.recipe.collection.processes, trainer)
         measured = trainer.epoch(on_batch)
         rollout = play_greedily(components, components.eval_env, trainer.epochs)
         measured |= measure(components, rollout)
@@ -386,5 +387,5 @@ class _Run:
         if goals is not None and goals.target.ndim == 2 and task.goal_box() is not None:
             plot_goals(goals, task, home.goals, title=f"virtual goals: {title}")
         run, epoch = (median_run(rows), int(rows[-1]["epoch"])) if rows else (0, 0)
-        components = self.components
-        film_policy(recipe, components.eval_env, components.player, home.video, run=run, epoch=epoch)
+        env, player, seeds = self.components.eval_env, self.components.player, eval_seeds(recipe.seeds, epoch)
+        film_policy(TaskEnvs.of(recipe), env, player, home.video, seeds=seeds, run=run)

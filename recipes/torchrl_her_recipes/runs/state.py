@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,10 +24,9 @@ from torchrl_her.trainers.checkpoint import (
 from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_envs.common.batched_env import BatchedEnv
 from torchrl_her_envs.common.goal_env import goal_env
-from torchrl_her_recipes.components.collection_worker import derive_seed
+from torchrl_her_recipes.components.collection.worker import derive_seed
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
-from torchrl_her_recipes.config.recipe import Recipe
 
 _NETWORKS = ("loss", "optimizer", "target", "exploration", "norm", "average", "guide")
 _ROWS = ("buffer", "demonstrations")  # the largest part of a checkpoint
@@ -123,11 +122,11 @@ def load_run_state(parts: dict[str, Any], state: dict[str, Any]) -> None:
             part.load_state_dict(state[name])
 
 
-def seed_epoch(env: EnvBase, recipe: Recipe, trainer: Trainer) -> None:
+def seed_epoch(env: EnvBase, seeds: Sequence[int], processes: int, trainer: Trainer) -> None:
     """Seeds environments whose state no checkpoint holds, so that a resumed run plays the same epoch."""
-    begins, processes = trainer.epochs > 0 and not trainer.in_epoch, recipe.collection.processes
+    begins = trainer.epochs > 0 and not trainer.in_epoch
     if begins and processes == 0 and _worlds(env, processes) is None:
-        goal_env(env).set_seeds([derive_seed(seed, trainer.epochs) for seed in recipe.seeds])
+        goal_env(env).set_seeds([derive_seed(seed, trainer.epochs) for seed in seeds])
 
 
 def _worlds(env: EnvBase, processes: int) -> BatchedEnv | None:

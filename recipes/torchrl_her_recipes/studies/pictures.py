@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from torchrl_her_envs.common.goal_env import goal_env
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.runs.plots import plot_goals
 from torchrl_her_recipes.studies.seed_batches import Batches
 
@@ -29,7 +29,7 @@ def plot_virtual_goals(folder: Path, out: Path) -> None:
     if goals is None:
         raise ValueError(f"{folder} has no map of goals: {_missing(runs, recipe.task.name)}")
     task, algo = recipe.task.name, recipe.hindsight.algo
-    plot_goals(goals, goal_env(make_task_envs(recipe, 1, [0])), out, title=f"virtual goals: {task}, {algo}")
+    plot_goals(goals, goal_env(TaskEnvs.of(recipe).make(1, [0])), out, title=f"virtual goals: {task}, {algo}")
 
 
 def _missing(runs: Batches, task: str) -> str:

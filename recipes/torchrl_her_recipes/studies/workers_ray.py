@@ -19,7 +19,7 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from torchrl_her_recipes.components.cluster import gpus, join, one_line, resource
+from torchrl_her_recipes.components.collection.cluster import gpus, join, one_line, resource
 from torchrl_her_recipes.studies.jobs import (
     Job,
     Outcome,

@@ -11,8 +11,8 @@ import torch
 from torchrl.envs import EnvBase
 
 from torchrl_her_recipes import Recipe, build, load_preset, make_recipe, run
-from torchrl_her_recipes.components.agents import find_learner, make_agent, make_player, shape_of
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.agents import find_builder, find_learner, make_agent, shape_of
+from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.config.choices.learners import LearnerConfig, SACConfig
 
 from ..small import SMALL, small
@@ -32,7 +32,7 @@ def learner_of(recipe: Recipe, env: EnvBase) -> type[LearnerConfig]:
 )
 def test_auto_follows_the_actions(options: dict[str, Any], name: str) -> None:
     recipe = small(**options)
-    assert learner_of(recipe, make_task_envs(recipe, 1, [0])).name == name
+    assert learner_of(recipe, TaskEnvs.of(recipe).make(1, [0])).name == name
 
 
 @pytest.mark.parametrize(
@@ -51,21 +51,19 @@ def test_auto_follows_the_actions(options: dict[str, Any], name: str) -> None:
 def test_what_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:
     recipe = small(**options)
     with pytest.raises(ValueError, match=message):
-        learner_of(recipe, make_task_envs(recipe, 1, [0]))
+        learner_of(recipe, TaskEnvs.of(recipe).make(1, [0]))
 
 
 def test_an_option_of_ddpg_is_refused_where_auto_turns_out_to_be_dqn() -> None:
     """Where the name of the task does not tell its actions, this is known when the environment is made."""
     recipe = Recipe.from_dict({"task": {"name": "bit_flip"}, "learner": {"action_penalty": 0.5}})
     with pytest.raises(ValueError, match="action_penalty=0.5 has no effect with learner=dqn: leave it out$"):
-        learner_of(recipe, make_task_envs(recipe, 1, [0]))
+        learner_of(recipe, TaskEnvs.of(recipe).make(1, [0]))
 
 
 def test_the_weights_of_a_run_depend_on_its_own_seed_alone() -> None:
     recipe = small(task="hand_v0", num_runs=2, seed=3)
-    env = make_task_envs(recipe, 1, recipe.seeds)
-    both = make_player(recipe, env)
-    alone = make_player(small(task="hand_v0", seed=4), env)
+    both, alone = build(recipe).actor, build(small(task="hand_v0", seed=4)).actor
     for stacked, own in zip(both.parameters(), alone.parameters(), strict=True):
         assert torch.equal(stacked[1], own.view_as(stacked[1]))
 
@@ -122,16 +120,17 @@ def test_with_the_preset_of_throwing_exploration_is_that_of_the_thesis() -> None
 
 def test_targets_cannot_be_clamped_where_rewards_have_no_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = small(task="hand_v0", learner="sac", clamp_targets=True)
-    env, draw = make_task_envs(recipe, 1, [0]), [torch.Generator()]
+    env = TaskEnvs.of(recipe).make(1, [0])
+    shape = shape_of("hand_v0", recipe.run, env, rewards=(-math.inf, 0.0))
     with pytest.raises(ValueError, match="clamp_targets=true has no effect on hand_v0, whose rewards have"):
-        make_agent(recipe, env, draw, rewards=(-math.inf, 0.0))
+        make_agent(find_builder(recipe.learner, shape), [0], curriculum=recipe.curriculum)
 
 
 def test_a_learner_may_be_for_one_run_only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SACConfig, "stacks", False)
     recipe = small(task="hand_v0", learner="sac", num_runs=2)
     with pytest.raises(ValueError, match="num_runs must be 1 with learner=sac"):
-        learner_of(recipe, make_task_envs(recipe, 2, [0, 1]))
+        learner_of(recipe, TaskEnvs.of(recipe).make(2, [0, 1]))
 
 
 @pytest.mark.parametrize("compile", ["always", "never"])

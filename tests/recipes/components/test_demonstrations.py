@@ -297,7 +297,7 @@ def test_a_few_demonstrations_teach_what_no_reward_has_taught_yet(tmp_path: Path
         ),
         (
             {"behavior": "mega", "demonstrations.starts_share": 0.5},
-            "starts_share=0.5 and behavior=mega both choose the goals of episodes",
+            "starts_share=0.5 has no effect with behavior=mega: leave it out",
         ),
     ],
 )

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from tensordict.nn import TensorDictModule
 
 from torchrl_her_recipes import build, make_recipe
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.runs.evaluation import measure
 
 TASK = "gym:tests/Cliff-v0"
@@ -70,7 +70,7 @@ gymnasium.register("tests/Cliff-v0", Cliff, max_episode_steps=12)
 def walked(steps: list[float], **options: Any) -> Any:
     """What a walk of one environment showed, [T]."""
     recipe = make_recipe(task=TASK, **{**OPTIONS, **options})
-    env = make_task_envs(recipe, 1, [0])
+    env = TaskEnvs.of(recipe).make(1, [0])
     seen = env.reset()
     rows = []
     for step in steps:
@@ -109,7 +109,7 @@ def test_an_achieved_goal_is_no_failure() -> None:
 
 
 def test_tasks_of_this_package_have_no_failures() -> None:
-    assert type(make_task_envs(make_recipe(task="hand_v0"), 1, [0])).__name__ == "ThrowingEnv"
+    assert type(TaskEnvs.of(make_recipe(task="hand_v0")).make(1, [0])).__name__ == "ThrowingEnv"
     with pytest.raises(ValueError, match="failure=truncate has no effect with task=hand_v0"):
         make_recipe(task="hand_v0", failure="truncate")
 

@@ -84,4 +84,4 @@ def test_an_algorithm_of_ones_own_names_its_weights(monkeypatch: pytest.MonkeyPa
     monkeypatch.setitem(ALGORITHMS, "own", Algorithm(name="own", weights="rare", curriculum=True))
     recipe = make_recipe(algo="own", memory=50)
     assert recipe.weights == Rare(memory=50)
-    assert (recipe.relabels, recipe.filters, recipe.in_stages) == (True, False, True)
+    assert recipe.hindsight.algorithm == ALGORITHMS["own"]

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_her_recipes.components.agents import make_player
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.policies.network import TensorPolicy, load_network
 
-from .tiny import LEARNERS, states, tiny_policy
+from .tiny import LEARNERS, make_player, states, tiny_policy
 
 
 @pytest.mark.parametrize("options", LEARNERS, ids=lambda options: options["learner"])
 def test_the_policy_is_the_learner_s_own_greedy_one(options: dict[str, Any]) -> None:
     policy = tiny_policy(**options)
     seen = states(policy.info, 50)
-    env = make_task_envs(policy.recipe, 1, [0])
+    env = TaskEnvs.of(policy.recipe).make(1, [0])
     own = make_player(policy.recipe, env)
     with torch.no_grad():
         for weight in own.parameters():
             weight.copy_(0.5 * torch.randn_like(weight))
-        loaded = load_network(policy.info, policy.recipe, own.state_dict())
+        loaded = load_network(policy.info, policy.recipe.learner, own.state_dict())
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             wanted = own(seen.clone())["action"]
         with set_exploration_type(ExplorationType.RANDOM):  # it stays greedy
@@ -69,12 +67,12 @@ def test_integers_deviate_by_their_value() -> None:
 
 def test_weights_of_something_else_are_refused_before_memory_is_taken() -> None:
     policy = tiny_policy()
-    env = make_task_envs(policy.recipe, 1, [0])
+    env = TaskEnvs.of(policy.recipe).make(1, [0])
     weights = make_player(policy.recipe, env).state_dict()
     wide = policy.recipe.replace(hidden=10_000_000)
     with pytest.raises(ValueError, match=r"layers.0.0.weight must be \(1, 11, 10000000\), got \(1, 11, 8\)"):
-        load_network(policy.info, wide, weights)
+        load_network(policy.info, wide.learner, weights)
     with pytest.raises(ValueError, match="not the weights of an actor of learner=auto"):
-        load_network(policy.info, policy.recipe.replace(depth=1_000_000), weights)
+        load_network(policy.info, policy.recipe.replace(depth=1_000_000).learner, weights)
     with pytest.raises(ValueError, match="is no option|actions"):
-        load_network(replace(policy.info), policy.recipe.replace(learner="dqn", task="bit_flip"), weights)
+        load_network(policy.info, policy.recipe.replace(learner="dqn", task="bit_flip").learner, weights)

@@ -37,7 +37,7 @@ def played(path: Path, seen: TensorDictBase) -> np.ndarray:
 def test_onnxruntime_gives_the_policy_s_actions(options: dict[str, Any], tmp_path: Path) -> None:
     policy = tiny_policy(**options)
     path = tmp_path / "mine.onnx"
-    write_onnx(policy.module, policy.info, policy.recipe, path, states=states(policy.info, 20))
+    write_onnx(policy.module, policy.info, policy.recipe.to_dict(), path, states=states(policy.info, 20))
     assert [file.name for file in tmp_path.iterdir()] == ["mine.onnx"]
     for rows in (1, 2, 333):
         seen = states(policy.info, rows, mean=2.0)
@@ -52,7 +52,13 @@ def test_onnxruntime_alone_plays_it(tmp_path: Path) -> None:
     import onnxruntime  # noqa: PLC0415
 
     policy = tiny_policy(normalize=True)
-    write_onnx(policy.module, policy.info, policy.recipe, tmp_path / "a.onnx", states=states(policy.info, 20))
+    write_onnx(
+        policy.module,
+        policy.info,
+        policy.recipe.to_dict(),
+        tmp_path / "a.onnx",
+        states=states(policy.info, 20),
+    )
     session = onnxruntime.InferenceSession(str(tmp_path / "a.onnx"), providers=["CPUExecutionProvider"])
     shapes = {each.name: each.shape for each in (*session.get_inputs(), *session.get_outputs())}
     assert shapes == {"observation": ["batch", 9], "desired_goal": ["batch", 2], "action": ["batch", 3]}
@@ -71,7 +77,7 @@ def test_a_file_says_what_it_expects_and_what_made_it(tmp_path: Path) -> None:
 
     policy = tiny_policy(learner="sac", normalize=True)
     path = tmp_path / "mine.onnx"
-    write_onnx(policy.module, policy.info, policy.recipe, path, states=states(policy.info, 20))
+    write_onnx(policy.module, policy.info, policy.recipe.to_dict(), path, states=states(policy.info, 20))
     metadata = {each.key: each.value for each in onnx.load(path).metadata_props}
     assert set(metadata) == {"torchrl_her.card", "torchrl_her.recipe"}
     plain = json.loads(metadata["torchrl_her.card"])
@@ -94,7 +100,7 @@ def test_a_file_that_acts_otherwise_is_not_left_behind(
     )
     path = tmp_path / "mine.onnx"
     with pytest.raises(ValueError, match="on 20 states of the task, onnxruntime's actions differ by up to"):
-        write_onnx(policy.module, policy.info, policy.recipe, path, states=states(policy.info, 20))
+        write_onnx(policy.module, policy.info, policy.recipe.to_dict(), path, states=states(policy.info, 20))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -103,4 +109,4 @@ def test_actions_that_are_no_numbers_are_no_match(tmp_path: Path) -> None:
     seen = states(policy.info, 20)
     seen["observation"][3] = torch.nan
     with pytest.raises(ValueError, match="differ by up to inf"):
-        write_onnx(policy.module, policy.info, policy.recipe, tmp_path / "mine.onnx", states=seen)
+        write_onnx(policy.module, policy.info, policy.recipe.to_dict(), tmp_path / "mine.onnx", states=seen)

@@ -20,6 +20,7 @@ from torchrl_her_envs import TASKS, make_env
 from torchrl_her_recipes import build, export_policy, load_policy, run
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.curricula import make_played_env
+from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.config.shipped import policy_files
 from torchrl_her_recipes.policies import policy
 from torchrl_her_recipes.policies.network import ScaledActions
@@ -61,7 +62,7 @@ def test_an_exported_policy_acts_as_its_run_does(options: dict[str, Any], tmp_pa
     assert written.recipe.run.seed == 1
     assert written.info.frames == 800
     seen = make_env(recipe.task.name, num_envs=4, seed=7).reset()
-    shown = make_played_env(recipe, 4, [7]).reset()
+    shown = make_played_env(TaskEnvs.of(recipe), 4, [7]).reset()
     played = components.greedy(torch.cat((shown, shown)))["action"][4:]  # of the second of two runs
     for own in (load_policy(tmp_path / "run", run=1), load_policy(tmp_path / "policy.safetensors"), written):
         torch.testing.assert_close(own(seen.clone())["action"], played)
@@ -289,7 +290,7 @@ def test_a_policy_that_no_longer_fits_its_task_is_not_played(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot = make_env("robot_v0", num_envs=2)
-    monkeypatch.setattr(policy, "make_task_envs", lambda *_args, **_options: robot)
+    monkeypatch.setattr(policy.TaskEnvs, "make", lambda *_args, **_options: robot)
     assert main(["play", "hand_reach", "--out", str(tmp_path / "a.gif")]) == 2
     assert "a policy of hand_reach cannot play hand_reach: it has other widths" in capsys.readouterr().err
 

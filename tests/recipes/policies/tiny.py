@@ -9,11 +9,14 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
 
 from torchrl_her.modules import RunningNorm
-from torchrl_her_recipes import Policy, PolicyInfo, make_recipe
-from torchrl_her_recipes.components.agents import make_player
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes import Policy, PolicyInfo, Recipe, make_recipe
+from torchrl_her_recipes.components.agents import find_builder, shape_of
+from torchrl_her_recipes.components.envs import TaskEnvs
+from torchrl_her_recipes.components.learner import acting
 from torchrl_her_recipes.policies.info import describe_env
 
 needs_onnx = pytest.mark.skipif(
@@ -31,10 +34,17 @@ LEARNERS: list[dict[str, Any]] = [
 ]
 
 
+def make_player(recipe: Recipe, env: EnvBase) -> TensorDictModuleBase:
+    """The greedy policy that a run of the recipe trains, with its normalization."""
+    builder = find_builder(recipe.learner, shape_of(recipe.task.name, recipe.run, env))
+    with torch.random.fork_rng(devices=[]):
+        return acting(builder.player(recipe.run.num_runs), builder.norm())
+
+
 def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, **options: Any) -> Policy:
     """A policy whose actions differ from state to state, with statistics of inputs if it normalizes."""
     recipe = make_recipe(task=task, algo="her", hidden=8, **options)
-    env = make_task_envs(recipe, 1, [0])
+    env = TaskEnvs.of(recipe).make(1, [0])
     player = make_player(recipe, env)
     with torch.no_grad():
         for weight in player.parameters():
@@ -48,6 +58,7 @@ def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, **options: Any) ->
         learner=recipe.learner.name,
         seed=0,
         frames=100,
+        dtype=recipe.run.dtype,
         success=0.5,
         reached=0.75,
         versions={"torchrl-her": "0.1.0"},

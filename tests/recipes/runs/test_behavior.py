@@ -15,7 +15,7 @@ from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalFactor, Inver
 from torchrl_her.curriculum import EpisodeStages, StageOutcomes, TeacherStudent
 from torchrl_her.replay_buffers import rows_of_run
 from torchrl_her_recipes import Components, Recipe, RunResult, build, make_recipe, resume, run
-from torchrl_her_recipes.components.behavior import scaled_cutoffs
+from torchrl_her_recipes.components.goals.behavior import scaled_cutoffs
 from torchrl_her_recipes.runs.curriculum import move_on
 
 from ..small import assert_same_runs, small, stop_after

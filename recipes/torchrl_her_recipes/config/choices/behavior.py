@@ -1,4 +1,4 @@
-"""Behavior goals by name: the options of each, whose makers are in :mod:`..components.behavior`."""
+"""Behavior goals by name: the options of each, whose makers are in :mod:`..components.goals.behavior`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torchrl_her_recipes.config.choices.kind import Choice, Kind
 from torchrl_her_recipes.config.choices.weights import IBS as IBSWeights
 from torchrl_her_recipes.config.options import option
 
-_MAKERS = "torchrl_her_recipes.components.behavior"
+_MAKERS = "torchrl_her_recipes.components.goals.behavior"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Weights of virtual goals by name: the options of each, whose makers are in :mod:`..components.weights`."""
+"""Weights of virtual goals by name: their options; the makers are in :mod:`..components.goals.weights`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import ClassVar
 from torchrl_her_recipes.config.choices.kind import Choice, Kind
 from torchrl_her_recipes.config.options import Needs, option
 
-_MAKERS = "torchrl_her_recipes.components.weights"
+_MAKERS = "torchrl_her_recipes.components.goals.weights"
 
 
 @dataclass(frozen=True, kw_only=True)

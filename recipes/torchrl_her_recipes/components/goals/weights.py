@@ -1,4 +1,4 @@
-"""Makers of the weights of virtual goals, which the choices in :mod:`..config.choices.weights` name."""
+"""Makers of the weights of virtual goals, which the choices in :mod:`...config.choices.weights` name."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.kernel_ibs import KernelInstructiveness
 from torchrl_her.goals.rare import RareGoals
 from torchrl_her.goals.rnd import NetworkNovelty
-from torchrl_her_recipes.components.goal_space import MOST_DIMENSIONS, GoalSpace, KernelSpace, goal_width
+from torchrl_her_recipes.components.goals.space import MOST_DIMENSIONS, GoalSpace, KernelSpace, goal_width
 from torchrl_her_recipes.config.choices.weights import IBS, RND, Equal, Rare, SequentialIBS
 
 

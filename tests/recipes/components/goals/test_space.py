@@ -15,11 +15,12 @@ from torchrl_her.goals import GoalHistogram
 from torchrl_her_envs import TASKS, make_env
 from torchrl_her_recipes import build, run
 from torchrl_her_recipes.cli import main
-from torchrl_her_recipes.components.goal_space import GoalSpace, goal_space
+from torchrl_her_recipes.components.envs import TaskEnvs
+from torchrl_her_recipes.components.goals.space import GoalSpace, goal_space
 from torchrl_her_recipes.config.choices.weights import Equal
 from torchrl_her_recipes.runs.goal_map import GoalMap
 
-from ..small import small
+from ...small import small
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_has_a_target(task: str) -> None:
-    space = goal_space(small(task=task), make_env(task), Equal())
+    space = goal_space(Equal(), TaskEnvs.of(small(task=task)), make_env(task), 8)
     assert isinstance(space, GoalSpace)
     target = space.target
     assert target.shape == (400,)

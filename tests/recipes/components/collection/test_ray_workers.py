@@ -16,13 +16,13 @@ from ray._private.node import Node
 from ray.cluster_utils import Cluster
 
 from torchrl_her_recipes import Components, build, run
-from torchrl_her_recipes.components.cluster import join, resource
+from torchrl_her_recipes.components.collection.cluster import join, resource
 from torchrl_her_recipes.config.groups import CollectionConfig
 
-from ..ray_cluster import cluster as cluster
+from ...ray_cluster import cluster as cluster
 from .collection_program import shown, tagged
 from .tagged_task import LENGTH
-from .test_collection import ENVS, EPOCHS, FRAMES, audit, audit_run, each_once
+from .test_processes import ENVS, EPOCHS, FRAMES, audit, audit_run, each_once
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore::ResourceWarning")]  # Ray's own files
 

@@ -29,22 +29,20 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from torchrl_her.curriculum.stages import CurriculumProgress
-from torchrl_her_recipes.components.collection_worker import (
+from torchrl_her_recipes.components.collection.worker import (
     Beginning,
     WorkerCollector,
     begin_process,
     derive_seed,
     drawing_modules,
-    make_worker_env,
     share_of_envs,
 )
 from torchrl_her_recipes.components.devices import CPU
 from torchrl_her_recipes.config.groups import CollectionConfig
 from torchrl_her_recipes.config.imports import imported_modules
-from torchrl_her_recipes.config.recipe import Recipe
 
 if TYPE_CHECKING:
-    from torchrl_her_recipes.components.collection_ray import NodeWorkers
+    from torchrl_her_recipes.components.collection.ray_workers import NodeWorkers
 
 _SECONDS = 1.0  # between two looks at whether processes still run
 _FAILED = "a process failed: worker {} (exit code {})"
@@ -122,7 +120,7 @@ Workers: TypeAlias = "SyncWorkers | AsyncWorkers | NodeWorkers"
 
 
 class ProcessCollector(BaseCollector):
-    """Collects in the processes that a recipe asks for, each with its share of the environments of every run.
+    """Collects in processes of their own, each with its share of the environments of every run.
 
     The processes start when they are first needed and end with :meth:`shutdown`; after that, they start again
     when needed.
@@ -134,14 +132,16 @@ class ProcessCollector(BaseCollector):
     process that was ready first, and rows carry ids of their environments.
 
     With ``ray=ADDRESS`` the processes are on the nodes of a Ray cluster, see
-    :class:`~torchrl_her_recipes.components.collection_ray.NodeWorkers`.
+    :class:`~torchrl_her_recipes.components.collection.ray_workers.NodeWorkers`.
 
     All random numbers of a process follow from the seed of each run, the process's number and the number of
     resets.
 
     Args:
-        recipe: of the runs.
+        options: Options of collecting.
+        make_env: Makes the environments of a process; takes names of modules to import first, as ``modules``.
         policy: whose weights, epsilon of exploration included, are sent to the processes.
+        seeds: Seeds of the runs.
         progress: the stages of the runs, which are sent with each reset; None without a curriculum.
         storing_device: where batches come. The processes are on the CPU.
 
@@ -151,18 +151,18 @@ class ProcessCollector(BaseCollector):
 
     def __init__(
         self,
-        recipe: Recipe,
+        options: CollectionConfig,
+        make_env: Callable[..., EnvBase],
         policy: TensorDictModuleBase,
-        progress: CurriculumProgress | None = None,
         *,
+        seeds: Sequence[int],
+        progress: CurriculumProgress | None = None,
         storing_device: torch.device = CPU,
     ) -> None:
         super().__init__()
-        self.recipe, self.policy, self.progress = recipe, policy, progress
-        self.storing_device = storing_device
-        self.requested_frames_per_batch = (
-            len(recipe.seeds) * recipe.collection.num_envs * recipe.collection.steps_per_batch
-        )
+        self.options, self.make_env, self.policy = options, make_env, policy
+        self.seeds, self.progress, self.storing_device = seeds, progress, storing_device
+        self.requested_frames_per_batch = len(seeds) * options.num_envs * options.steps_per_batch
         self.total_frames = -1
         self.resets = 0
         self._workers: Workers | None = None
@@ -173,7 +173,7 @@ class ProcessCollector(BaseCollector):
             self.reset()
         assert self._workers is not None
         with self._ended_by_errors():
-            batch = _in_blocks(self._workers.take(self._weights()), len(self.recipe.seeds))
+            batch = _in_blocks(self._workers.take(self._weights()), len(self.seeds))
         return batch if self.storing_device == CPU else batch.to(self.storing_device)
 
     def collect_ahead(self) -> None:
@@ -188,9 +188,7 @@ class ProcessCollector(BaseCollector):
             if self._workers is None:
                 self._workers = self._start()
             self.resets += 1
-            self._workers.begin(
-                [self._beginning(process) for process in range(self.recipe.collection.processes)]
-            )
+            self._workers.begin([self._beginning(process) for process in range(self.options.processes)])
 
     def shutdown(
         self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True
@@ -217,9 +215,9 @@ class ProcessCollector(BaseCollector):
 
     def _start(self) -> Workers:
         """Starts the processes, which takes seconds: each of them imports torch."""
-        recipe, config = self.recipe, self.recipe.collection
-        make = partial(make_worker_env, recipe, imported_modules())
-        frames = len(recipe.seeds) * share_of_envs(config) * config.steps_per_batch
+        config = self.options
+        make = partial(self.make_env, modules=imported_modules())
+        frames = len(self.seeds) * share_of_envs(config) * config.steps_per_batch
         if config.ray is not None:
             return _start_on_cluster(config, make, _to_send(self.policy), frames)
         _check_main_script(f"processes={config.processes}")
@@ -244,7 +242,7 @@ class ProcessCollector(BaseCollector):
 
     def _beginning(self, process: int) -> Beginning:
         def seeds(kind: int) -> list[int]:
-            return [derive_seed(seed, process, self.resets, kind) for seed in self.recipe.seeds]
+            return [derive_seed(seed, process, self.resets, kind) for seed in self.seeds]
 
         return Beginning(
             env_seeds=seeds(0),
@@ -291,7 +289,7 @@ def _start_on_cluster(
 ) -> Workers:
     """Starts the processes on the nodes of a Ray cluster."""
     try:
-        module = import_module("torchrl_her_recipes.components.collection_ray")  # needs an extra
+        module = import_module("torchrl_her_recipes.components.collection.ray_workers")  # needs an extra
     except ModuleNotFoundError as error:
         raise ImportError(f"ray={config.ray} needs Ray: pip install '.[cluster]'") from error
     return module.NodeWorkers(

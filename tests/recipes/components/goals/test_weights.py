@@ -17,10 +17,11 @@ from torchrl_her.replay_buffers.runs import rows_of_run
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import Components, Recipe, build, resume, run
 from torchrl_her_recipes.cli import main
-from torchrl_her_recipes.components.goal_space import KernelSpace, goal_space
+from torchrl_her_recipes.components.envs import TaskEnvs
+from torchrl_her_recipes.components.goals.space import KernelSpace, goal_space
 from torchrl_her_recipes.config.choices.weights import IBS
 
-from ..small import assert_same_runs, small, stop_after
+from ...small import assert_same_runs, small, stop_after
 
 CASES: dict[str, dict[str, Any]] = {
     "rare": {"algo": "filtered_her_rare"},
@@ -109,18 +110,19 @@ def test_the_options_arrive() -> None:
 
 
 def test_the_kernel_s_sigma_is_the_grid_s_and_grows_with_the_root_of_the_numbers() -> None:
-    space = goal_space(small(), make_env("hand_v0"), IBS(estimator="kernel"))
+    throwing = TaskEnvs.of(small()), make_env("hand_v0"), 8
+    space = goal_space(IBS(estimator="kernel"), *throwing)
     assert isinstance(space, KernelSpace)
-    grid = goal_space(small(), make_env("hand_v0"), IBS())
+    grid = goal_space(IBS(), *throwing)
     assert grid is not None
     assert space.sigma == pytest.approx(grid.sigma) == pytest.approx(0.4)
     assert space.goals.shape[1] == 2
-    env = make_env("bit_flip", bits=12)
-    bits = small(**{"task": "bit_flip", "task.options.bits": 12})
-    many = goal_space(bits, env, IBS())
+    flipping = small(**{"task": "bit_flip", "task.options.bits": 12})
+    bits = TaskEnvs.of(flipping), make_env("bit_flip", bits=12), 8
+    many = goal_space(IBS(), *bits)
     assert isinstance(many, KernelSpace)
     assert many.sigma == pytest.approx(0.2 * math.sqrt(12 / 3))
-    given = goal_space(bits, env, IBS(sigma=0.3))
+    given = goal_space(IBS(sigma=0.3), *bits)
     assert given is not None
     assert given.sigma == pytest.approx(0.3)
 

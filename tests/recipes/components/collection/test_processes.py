@@ -21,10 +21,10 @@ from torch import Tensor
 
 from torchrl_her import load_checkpoint
 from torchrl_her_recipes import build, cli
-from torchrl_her_recipes.components.collection import ProcessCollector
+from torchrl_her_recipes.components.collection.processes import ProcessCollector
 
-from ...forks import fork
-from ..small import overrides, small
+from ....forks import fork
+from ...small import overrides, small
 from .collection_program import RUNS, SECONDS, results_of
 from .tagged_task import LENGTH, wanted
 

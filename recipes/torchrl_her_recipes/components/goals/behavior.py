@@ -1,4 +1,4 @@
-"""Makers of the goals that training proposes before an episode, for :mod:`..config.choices.behavior`."""
+"""Makers of the goals that training proposes before an episode, for :mod:`...config.choices.behavior`."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from torchrl.envs import EnvBase
 
 from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalValues, InverseDensity, ValueCutoff
 from torchrl_her.curriculum.transforms import ZeroPad
-from torchrl_her_envs.common.goal_env import goal_env
+from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top
-from torchrl_her_recipes.components.envs import evaluation_envs, task_reward
-from torchrl_her_recipes.components.goal_space import goal_space
+from torchrl_her_recipes.components.envs import task_reward
+from torchrl_her_recipes.components.goals.space import GoalSpace, KernelSpace
+from torchrl_her_recipes.components.goals.weights import make_instructive
 from torchrl_her_recipes.components.learner import Agent
 from torchrl_her_recipes.components.streams import Stream, generators_of
-from torchrl_her_recipes.components.weights import make_instructive
-from torchrl_her_recipes.config.choices.behavior import IBS, Discover, Mega, Proposed, UniformAchieved
+from torchrl_her_recipes.config.choices.behavior import IBS, Behavior, Discover, Mega, Proposed
 from torchrl_her_recipes.config.choices.learners import LearnerConfig
-from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
 
 MakeGoals = Callable[..., BehaviorGoals]
@@ -27,27 +26,19 @@ MakeValues = Callable[[], GoalValues]
 
 
 def make_behavior(
-    recipe: Recipe,
+    options: Behavior,
+    learner: LearnerConfig,
     env: EnvBase,
     agent: Agent,
     *,
-    rewards: tuple[float, float],
+    seeds: Sequence[int],
+    space: GoalSpace | KernelSpace | None,
     state: CurriculumState | None,
 ) -> BehaviorGoals | None:
     """Returns the transform that proposes goals; None if episodes ask for the task's goals alone."""
-    options, runs = recipe.behavior, recipe.run.num_runs
     if not isinstance(options, Proposed):
         return None
-    if recipe.collection.processes > 0:
-        raise ValueError(
-            f"behavior={options.name} proposes goals that this process has collected: it needs processes=0, "
-            f"got processes={recipe.collection.processes}"
-        )
-    if options.goal_memory < recipe.collection.num_envs:
-        raise ValueError(
-            f"goal_memory={options.goal_memory} must be at least num_envs={recipe.collection.num_envs}, "
-            "whose goals come at once"
-        )
+    runs, rewards = len(seeds), reward_range(goal_env(env))
     given: dict[str, Any] = {"real_share": options.real_share, "memory": options.goal_memory}
     if state is not None and state.progress.by_episode:
         given |= {"stage_key": "stage", "stage": len(state.curriculum) - 1}
@@ -55,15 +46,9 @@ def make_behavior(
     values = partial(
         GoalValues, agent.loss, agent.actor, runs=runs, before_actor=pad, before_critic=agent.norm
     )
-    goals = partial(_goals, recipe.seeds, env, rewards, **given)
+    goals = partial(_goals, seeds, env, **given)
     behavior: BehaviorGoals = load_name(options.maker)(
-        options,
-        goals,
-        learner=recipe.learner,
-        runs=runs,
-        rewards=rewards,
-        space=goal_space(recipe, env, options),
-        values=values,
+        options, goals, learner=learner, runs=runs, rewards=rewards, space=space, values=values
     )
     if state is not None:
         for run in range(runs):
@@ -71,24 +56,23 @@ def make_behavior(
     return behavior
 
 
-def make_asking(recipe: Recipe, env: EnvBase, *, rewards: tuple[float, float] = (-1.0, 0.0)) -> BehaviorGoals:
-    """The transform that lets episodes ask for any goals that are put into its memory, for evaluation."""
-    memory = evaluation_envs(recipe)
-    return _goals(recipe.seeds, env, rewards, remember=False, real_share=0.0, candidates=1, memory=memory)
+def make_asking(seeds: Sequence[int], env: EnvBase, *, memory: int) -> BehaviorGoals:
+    """Returns the transform that lets episodes ask for any goals put into its memory, for evaluation."""
+    return _goals(seeds, env, remember=False, real_share=0.0, candidates=1, memory=memory)
 
 
-def _goals(seeds: Sequence[int], env: EnvBase, rewards: tuple[float, float], **options: Any) -> BehaviorGoals:
+def _goals(seeds: Sequence[int], env: EnvBase, **options: Any) -> BehaviorGoals:
     return BehaviorGoals(
         task_reward(env),
         runs=len(seeds),
         generators=generators_of(seeds, Stream.PROPOSED_GOALS),
-        achieved_reward=rewards[1],
+        achieved_reward=reward_range(goal_env(env))[1],
         continues_after_termination=goal_env(env).continues_after_termination,
         **options,
     )
 
 
-def make_uniform(_options: UniformAchieved, goals: MakeGoals, **_: Any) -> BehaviorGoals:
+def make_uniform(_options: Proposed, goals: MakeGoals, **_: Any) -> BehaviorGoals:
     """Proposes any achieved goal."""
     return goals()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,11 +15,10 @@ from torchrl.envs import EnvBase
 
 from torchrl_her.goals.grid import GoalGrid, box_target, sampled_target
 from torchrl_her_envs.common.goal_env import Box, goal_env
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.choices.weights import Equal, SequentialIBS
 from torchrl_her_recipes.config.groups import Group
-from torchrl_her_recipes.config.recipe import Recipe
 
 _SAMPLES = 10_000  # goals, if they do not fill a box
 _RESETS = 1_000  # episodes whose goals are collected, if the environment has no distribution of goals
@@ -58,11 +58,17 @@ class KernelSpace:
     sigma: float
 
 
-def goal_space(recipe: Recipe, env: EnvBase, options: Group) -> GoalSpace | KernelSpace | None:
+def goal_space(options: Group, envs: TaskEnvs, env: EnvBase, num_envs: int) -> GoalSpace | KernelSpace | None:
     """The space of a task's goals: the range that the task states, or else a box around goals of it.
 
     For kernel densities it is goals of the task. None if the options (of weights or of behavior goals) need
     none, or if goals are merely counted and the task states no range.
+
+    Args:
+        options: Options of weights or of behavior goals.
+        envs: Maker of the task's environments.
+        env: Environments of the task.
+        num_envs: Number of environments that are reset to collect goals, if the task states no distribution.
 
     Raises:
         ValueError: instructive goals are preferred, but the goals of the task lie around its start states, or
@@ -70,19 +76,19 @@ def goal_space(recipe: Recipe, env: EnvBase, options: Group) -> GoalSpace | Kern
     """
     if not isinstance(options, Equal):
         return None
-    task, box = goal_env(env), goal_env(env).goal_box()
+    name, task, box = envs.task.name, goal_env(env), goal_env(env).goal_box()
     if not isinstance(options, SequentialIBS):
-        return None if box is None else _given(recipe.task.name, task, options, *box)
+        return None if box is None else _given(name, task, options, *box)
     if task.starts_near_goals:
         raise ValueError(
-            f"IBS must not be used on {recipe.task.name}: its goals lie around its start states, so "
+            f"IBS must not be used on {name}: its goals lie around its start states, so "
             "the goals that it would prefer are achieved without doing anything; choose a throwing task"
         )
-    if _without_grid(recipe.task.name, options.estimator, goal_width(task)):
-        return _kernel(recipe.task.name, task, options, box, _desired_goals(recipe, task))
+    if _without_grid(name, options.estimator, goal_width(task)):
+        return _kernel(name, task, options, box, _desired_goals(envs, task, num_envs))
     if box is None:
-        return _sampled(task, options, _desired_goals(recipe, task))
-    return _given(recipe.task.name, task, options, *box)
+        return _sampled(task, options, _desired_goals(envs, task, num_envs))
+    return _given(name, task, options, *box)
 
 
 def goal_width(env: Any) -> int:
@@ -135,16 +141,14 @@ def _sampled(env: Any, options: SequentialIBS, goals: Tensor) -> GoalSpace:
     return GoalSpace(grid, partial(sampled_target, grid, goals), _share(options, env) * width)
 
 
-def _desired_goals(recipe: Recipe, env: Any) -> Tensor:
+def _desired_goals(envs: TaskEnvs, env: Any, num_envs: int) -> Tensor:
     """Goals [n, g] of float64, as episodes have them."""
     distribution = getattr(env, "goal_distribution", None)
     if distribution is not None:
         return distribution.sample(_SAMPLES, generator=torch.Generator().manual_seed(0)).double()
-    envs = make_task_envs(recipe, recipe.collection.num_envs, [Stream.GOAL_SPACE])
-    resets = -(-_RESETS // recipe.collection.num_envs)
-    goals = torch.cat([envs.reset()["desired_goal"] for _ in range(resets)])
-    envs.close()
-    return goals.double()
+    with closing(envs.make(num_envs, [Stream.GOAL_SPACE])) as fresh:
+        goals = [fresh.reset()["desired_goal"] for _ in range(-(-_RESETS // num_envs))]
+    return torch.cat(goals).double()
 
 
 def _share(options: Equal, env: Any) -> float:

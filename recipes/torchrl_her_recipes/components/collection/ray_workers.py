@@ -14,8 +14,8 @@ from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
-from torchrl_her_recipes.components.cluster import join, one_line, resource
-from torchrl_her_recipes.components.collection_worker import Beginning, NodeCollector
+from torchrl_her_recipes.components.collection.cluster import join, one_line, resource
+from torchrl_her_recipes.components.collection.worker import Beginning, NodeCollector
 
 _SECONDS = 1.0  # between two looks at whether there still are nodes
 _DEATHS = 3  # of a process without a batch in between, until the run ends

@@ -15,10 +15,10 @@ import torch
 from torch import multiprocessing
 
 from torchrl_her_recipes import Components, Recipe, RunResult, build, resume, run
-from torchrl_her_recipes.components.collection import ProcessCollector
+from torchrl_her_recipes.components.collection.processes import ProcessCollector
 
-from ...forks import call_in_session
-from ..small import small, stop_after
+from ....forks import call_in_session
+from ...small import small, stop_after
 from .tagged_task import TASK, block_of
 
 SECONDS = 300  # until it is ended

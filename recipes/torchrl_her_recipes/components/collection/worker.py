@@ -25,11 +25,11 @@ from torchrl_her.replay_buffers.env_ids import EnvIds
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import in_stages, is_guided, make_progress
 from torchrl_her_recipes.components.devices import CPU, make_generators
-from torchrl_her_recipes.components.envs import make_task_envs
+from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.components.streams import Stream
+from torchrl_her_recipes.config.choices.order import Order
 from torchrl_her_recipes.config.groups import CollectionConfig
 from torchrl_her_recipes.config.imports import import_modules, permit_task
-from torchrl_her_recipes.config.recipe import Recipe
 
 
 def share_of_envs(options: CollectionConfig) -> int:
@@ -37,20 +37,26 @@ def share_of_envs(options: CollectionConfig) -> int:
     return options.num_envs // options.processes
 
 
-def make_worker_env(recipe: Recipe, modules: Sequence[str] = ()) -> EnvBase:
-    """A process's share of the environments of all runs: R equal blocks, as the stages of the runs see them.
+def make_worker_env(
+    envs: TaskEnvs, order: Order, options: CollectionConfig, seeds: Sequence[int], modules: Sequence[str] = ()
+) -> EnvBase:
+    """Makes a process's share of the environments of all runs: R equal blocks, as their stages see them.
 
     Args:
-        recipe: of the runs. The process that sends it was permitted to import what its task names.
-        modules: to import first, since they may register tasks.
+        envs: Maker of the environments. The process that sends it was permitted to import what its task
+            names.
+        order: Order of the stages, if there is a curriculum.
+        options: Options of collecting.
+        seeds: Seeds of the runs.
+        modules: Modules to import first, since they may register tasks.
     """
-    permit_task(recipe.task.name)
+    permit_task(envs.task.name)
     import_modules(modules)
-    env = make_task_envs(recipe, share_of_envs(recipe.collection), recipe.seeds)
-    progress = make_progress(recipe, env)
-    env = in_stages(env, progress, begins=is_guided(recipe.curriculum, progress))
+    env = envs.make(share_of_envs(options), seeds)
+    progress = make_progress(order, envs.curriculum, env, seeds)
+    env = in_stages(env, progress, begins=is_guided(envs.curriculum, progress))
     # Only ids tell there which environment a row belongs to: batches come one by one, or a node is replaced.
-    if not recipe.collection.sync or recipe.collection.ray is not None:
+    if not options.sync or options.ray is not None:
         env = env if isinstance(env, TransformedEnv) else TransformedEnv(env)
         env.append_transform(EnvIds())
     return env

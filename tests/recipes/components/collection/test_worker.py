@@ -6,20 +6,27 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes import build
-from torchrl_her_recipes.components.collection_worker import Beginning, WorkerCollector, make_worker_env
+from torchrl_her_recipes.components.collection.worker import Beginning, WorkerCollector, make_worker_env
+from torchrl_her_recipes.components.envs import TaskEnvs
 
-from ..small import small
+from ...small import small
+
+
+def worker_env(**options: Any) -> EnvBase:
+    recipe = small(**options)
+    return make_worker_env(TaskEnvs.of(recipe), recipe.order, recipe.collection, recipe.seeds)
 
 
 def collect(env_seeds: list[int], seeds: list[int], **options: Any) -> TensorDictBase:
-    recipe = small(processes=2, num_runs=2, **options)
-    components = build(recipe)
+    options = {"processes": 2, "num_runs": 2, **options}
+    components = build(small(**options))
     collector = WorkerCollector(
-        make_worker_env(recipe),
+        worker_env(**options),
         components.policy,
         frames_per_batch=320,
         total_frames=-1,
@@ -32,14 +39,14 @@ def collect(env_seeds: list[int], seeds: list[int], **options: Any) -> TensorDic
 
 
 def test_it_has_its_share_of_the_environments_of_each_run() -> None:
-    env = make_worker_env(small(processes=4, num_runs=3))  # 8 of each run
+    env = worker_env(processes=4, num_runs=3)  # 8 of each run
     assert env.batch_size == torch.Size([6])
     assert "env_ids" not in env.observation_spec
-    check_env_specs(make_worker_env(small(processes=4, sync=False, algo="cher", task="hand_v1")))
+    check_env_specs(worker_env(processes=4, sync=False, algo="cher", task="hand_v1"))
 
 
 def test_rows_carry_ids_where_batches_come_from_any_process() -> None:
-    env = make_worker_env(small(processes=4, num_runs=3, sync=False))
+    env = worker_env(processes=4, num_runs=3, sync=False)
     assert len(env.reset()["env_ids"].unique()) == 6
     assert goal_env(env).batch_size == torch.Size([6])
 
