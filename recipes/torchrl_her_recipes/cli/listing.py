@@ -7,9 +7,9 @@ import click
 from torchrl_her_envs.registry import GYM, get_task_spec, task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.policy_header import read_header
+from torchrl_her_recipes.config.searches.spaces import space_names, space_summary
 from torchrl_her_recipes.config.shipped import policy_files, preset_names, preset_summary
 from torchrl_her_recipes.config.shortcuts import KINDS
-from torchrl_her_recipes.config.spaces import space_names, space_summary
 from torchrl_her_recipes.config.study import load_study, study_names
 
 

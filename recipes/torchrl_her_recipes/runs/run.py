@@ -29,7 +29,7 @@ from torchrl_her_recipes.runs.film import film_policy
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap, goal_map
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
-from torchrl_her_recipes.runs.log_to import LogByName
+from torchrl_her_recipes.runs.loggers.log_to import LogByName
 from torchrl_her_recipes.runs.notices import notices
 from torchrl_her_recipes.runs.plots import plot_curves, plot_goals
 from torchrl_her_recipes.runs.policy_file import write_policy

@@ -18,7 +18,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from optuna.visualization import matplotlib as figures
 
 from torchrl_her.files.writing import write_text
-from torchrl_her_recipes.config.search import Search
+from torchrl_her_recipes.config.searches.search import Search
 from torchrl_her_recipes.runs.plots import save_figure
 
 _FEWEST = 5  # complete trials, from which importances are estimated

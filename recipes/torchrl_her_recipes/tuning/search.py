@@ -25,7 +25,7 @@ from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.plain_files import naming, parse_yaml, read_mapping
-from torchrl_her_recipes.config.search import Search, difference
+from torchrl_her_recipes.config.searches.search import Search, difference
 from torchrl_her_recipes.runs.callbacks import Callback, RunView
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt

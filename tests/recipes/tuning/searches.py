@@ -9,7 +9,7 @@ from unittest import mock
 import pytest
 
 from torchrl_her_recipes import Search, make_recipe
-from torchrl_her_recipes.config.spaces import Space
+from torchrl_her_recipes.config.searches.spaces import Space
 from torchrl_her_recipes.tuning import search as module
 from torchrl_her_recipes.tuning.search import SearchResult, tune
 

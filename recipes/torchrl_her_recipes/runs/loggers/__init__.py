@@ -1,1 +1,1 @@
-"""The loggers for ``log=NAME``: each opens one of TorchRL's so that a resumed run continues in it."""
+"""Loggers of TorchRL for ``log=NAME``, opened so that a resumed run continues in them, and what they get."""

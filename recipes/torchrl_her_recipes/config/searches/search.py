@@ -8,8 +8,8 @@ from typing import Any, Literal, get_args
 
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.searches.spaces import Space
 from torchrl_her_recipes.config.shortcuts import LONG_ONLY
-from torchrl_her_recipes.config.spaces import Space
 
 Sampler = Literal["tpe", "random", "cmaes"]
 Pruner = Literal["median", "halving", "none"]

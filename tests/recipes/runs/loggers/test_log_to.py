@@ -18,11 +18,11 @@ from torchrl_her_recipes import Callback, LogTo, RunView, build, resume, run
 from torchrl_her_recipes.config import loggers as known
 from torchrl_her_recipes.config.loggers import LoggerSpec, check_installed, register_logger
 from torchrl_her_recipes.config.recipe import make_recipe
-from torchrl_her_recipes.runs import log_to
-from torchrl_her_recipes.runs.show import read_film
+from torchrl_her_recipes.runs.loggers import log_to
+from torchrl_her_recipes.runs.loggers.show import read_film
 
-from ...forks import fork
-from ..small import small
+from ....forks import fork
+from ...small import small
 
 SHORT: dict[str, Any] = {"epoch_frames": 480, "epochs": 5, "checkpoint_interval": 2}
 STEPS = [480, 960, 1_440, 1_920, 2_400]
@@ -212,5 +212,5 @@ def test_importing_what_draws_leaves_matplotlib_s_backend_as_it_is(
 ) -> None:
     monkeypatch.setattr(matplotlib, "use", None)
     before = matplotlib.rcParams["backend"]
-    assert "Figure" in runpy.run_path(str(Path(log_to.__file__).parents[1] / name))
+    assert "Figure" in runpy.run_path(str(Path(log_to.__file__).parents[2] / name))
     assert matplotlib.rcParams["backend"] == before

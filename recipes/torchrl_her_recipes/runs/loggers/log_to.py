@@ -12,7 +12,7 @@ from torchrl.record.loggers.common import Logger
 from torchrl_her_recipes.config.loggers import LOGGERS
 from torchrl_her_recipes.config.values import load_name
 from torchrl_her_recipes.runs.callbacks import Callback, RunView
-from torchrl_her_recipes.runs.show import show_file
+from torchrl_her_recipes.runs.loggers.show import show_file
 
 _OF_A_ROW = ("run", "seed")  # columns that identify a row, and are no metrics
 

@@ -18,8 +18,8 @@ from torchrl_her_recipes import LogTo, build, resume, run
 from torchrl_her_recipes.runs.callbacks import RunView
 from torchrl_her_recipes.runs.folder import RunFolder
 
-from ...forks import fork
-from ..small import small
+from ....forks import fork
+from ...small import small
 from .test_log_to import SHORT, STEPS, DiesAt
 
 wandb = pytest.importorskip("wandb", reason="needs the extra wandb")

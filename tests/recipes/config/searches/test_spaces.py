@@ -8,8 +8,8 @@ import pytest
 
 from torchrl_her_recipes import LEARNERS, Search, load_preset, load_space, make_recipe, space_for
 from torchrl_her_recipes.config.groups import HindsightConfig
+from torchrl_her_recipes.config.searches.spaces import Space, space_names
 from torchrl_her_recipes.config.shipped import preset_names
-from torchrl_her_recipes.config.spaces import Space, space_names
 
 
 @pytest.mark.parametrize("learner", sorted(LEARNERS.keys() - {"auto"}))

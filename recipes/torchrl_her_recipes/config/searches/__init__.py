@@ -1,0 +1,1 @@
+"""Searches for good options: their settings, and the options that they vary."""
