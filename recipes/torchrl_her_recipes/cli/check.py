@@ -21,11 +21,11 @@ def check(options: tuple[str, ...], steps: int) -> int:
     Options are those of `torchrl-her train`. Nothing is trained. In half a minute, prints what hindsight can
     learn from, and suggests options.
     """
-    (wanted,) = requests(options, multirun=False)
-    facts = recipes.look_at(wanted.recipe, steps=steps)
-    file = Path(f"{file_name(wanted.recipe.task.name)}_stages.yaml")
+    (request,) = requests(options, multirun=False)
+    facts = recipes.look_at(request.recipe, steps=steps)
+    file = Path(f"{file_name(request.recipe.task.name)}_stages.yaml")
     click.echo("\n".join(_table(facts)))
-    lines = recipes.advice(facts, wanted.recipe, str(file))
+    lines = recipes.advice(facts, request.recipe, str(file))
     if any(str(file) in line for line in lines):
         if not file.exists():
             file.write_text(yaml.safe_dump(facts.stages, sort_keys=False, default_flow_style=None))
@@ -49,4 +49,4 @@ def _table(facts: recipes.Facts) -> list[str]:
         "the achieved goal": f"changes, by the reward, in {facts.moved:.0%} of the episodes",
         "the filter": f"keeps later goals of the episode for {facts.kept:.1%} of the transitions",
     }
-    return [f"  {name:<20}  {said}" for name, said in rows.items()]
+    return [f"  {name:<20}  {text}" for name, text in rows.items()]

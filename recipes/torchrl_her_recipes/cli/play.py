@@ -72,9 +72,9 @@ def play(
     if film is not None and film.suffix.lower() not in _SUFFIXES:
         raise ValueError(f"cannot write {film.name!r}: its suffix must be one of {', '.join(_SUFFIXES)}")
     view = {"goals": goals or (1 if window else 6), "size": size or (480 if window else 240), "seed": seed}
-    seen = recipes.play(*sources, out=film, run=run, best=best, **view)
+    counts = recipes.play(*sources, out=film, run=run, best=best, **view)
     alone = film is not None and not others
-    for name, (achieved, ended) in zip([str(film)] if alone else sources, seen, strict=True):
+    for name, (achieved, ended) in zip([str(film)] if alone else sources, counts, strict=True):
         click.echo(f"{achieved} of {ended} goals achieved: {name}")
     if film is not None and others:
         click.echo(film)

@@ -62,37 +62,37 @@ def train(
         click.echo(f"run: {resume}")
         _say_finished(recipes.RunFolder(resume), changes)
         return _say_end(recipes.resume(resume, options=changes))
-    wanted = list(requests(options, multirun=multirun))  # all are checked before the first one starts
+    run_requests = list(requests(options, multirun=multirun))  # all are checked before the first one starts
     if show:
-        shown = [yaml.safe_dump(each.recipe.to_dict(), sort_keys=False) for each in wanted]
-        click.echo("---\n".join(shown), nl=False)
+        documents = [yaml.safe_dump(request.recipe.to_dict(), sort_keys=False) for request in run_requests]
+        click.echo("---\n".join(documents), nl=False)
         return 0
     if multirun:
-        return _sweep(wanted, jobs, anew=not any(option.startswith("folder=") for option in options))
-    return _say_end(_train(wanted[0]))
+        return _sweep(run_requests, jobs, anew=not any(option.startswith("folder=") for option in options))
+    return _say_end(_train(run_requests[0]))
 
 
-def _train(wanted: RunRequest) -> recipes.RunResult:
-    components = recipes.build(wanted.recipe)
-    click.echo(f"run: {wanted.folder}")
-    if chosen := auto_options(wanted.recipe):
+def _train(request: RunRequest) -> recipes.RunResult:
+    components = recipes.build(request.recipe)
+    click.echo(f"run: {request.folder}")
+    if chosen := auto_options(request.recipe):
         values = (f"{name}={getattr(getattr(components.recipe, group), name)}" for group, name in chosen)
         click.echo(f"chosen for this environment (auto): {' '.join(values)}")
-    if wanted.recipe.hindsight.algo == AUTO and components.recipe.hindsight.algo == "cher":
+    if request.recipe.hindsight.algo == AUTO and components.recipe.hindsight.algo == "cher":
         inside = components.recipe.curriculum.stages[0]["achieved_goal"]
         click.echo(
             f"random actions seldom change the achieved goal: entries {inside} of the observation are first "
             "brought near it (algo=filtered_her does without)"
         )
-    if wanted.recipe.learner.device == "auto":
+    if request.recipe.learner.device == "auto":
         click.echo(f"learner.device=auto: {next(components.loss.parameters()).device}")
-    return recipes.run(components, wanted.folder)
+    return recipes.run(components, request.folder)
 
 
-def _sweep(wanted: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
+def _sweep(run_requests: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
     """Trains several runs on all cores; if one fails, the others are still trained."""
-    runs = {each.folder.name: each.recipe for each in wanted}
-    folder = wanted[0].folder.parent
+    runs = {request.folder.name: request.recipe for request in run_requests}
+    folder = run_requests[0].folder.parent
     if anew:  # the same command resumes an unfinished sweep
         folder = recipes.unfinished_sweep(runs, folder.parent) or folder
     plan, workers = recipes.plan_study(runs, folder), recipes.make_workers(jobs=jobs)

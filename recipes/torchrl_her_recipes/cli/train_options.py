@@ -53,14 +53,14 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest
         recipe = _recipe(values)
         yield RunRequest(recipe, Path(folder or f"runs/{now}_{label(recipe)}"))
         return
-    given = dict(_pairs(options))
-    root = Path(given.pop("folder", "") or f"runs/sweep_{now}")
+    values_given = dict(_pairs(options))
+    root = Path(values_given.pop("folder", "") or f"runs/sweep_{now}")
     before: list[Recipe] = []
-    for number, values in enumerate(sweep(list(given.items()))):
+    for number, values in enumerate(sweep(list(values_given.items()))):
         recipe = _recipe(values)
         if recipe in before:
-            shown = " ".join(f"{name}={value}" for name, value in values.items())
-            raise ValueError(f"the sweep has the same run twice: {shown}; give each value once")
+            written = " ".join(f"{name}={value}" for name, value in values.items())
+            raise ValueError(f"the sweep has the same run twice: {written}; give each value once")
         before.append(recipe)
         yield RunRequest(recipe, root / f"{label(recipe)}_{number}")
 
@@ -136,9 +136,9 @@ def _rows(group: str) -> Iterator[tuple[str, str]]:
 def _written(group: str, name: str, default: Any) -> str:
     """Returns an option with its default in the form of the command line."""
     key = group if name == "name" else f"{group}.{name}" if group in LONG_ONLY else name
-    shown = str(default).lower() if isinstance(default, bool) else default
-    shown = f"[{','.join(default)}]" if isinstance(default, tuple) else shown
-    return key if default is None else f"{key}={shown}"
+    text = str(default).lower() if isinstance(default, bool) else default
+    text = f"[{','.join(default)}]" if isinstance(default, tuple) else text
+    return key if default is None else f"{key}={text}"
 
 
 def complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:

@@ -64,12 +64,12 @@ def tune(
     Options are given as to train; those that are given are not varied. Each trial trains num_runs seeds side
     by side. The same command resumes a search.
     """
-    given = single(with_folder(options, folder))
-    folder, preset = (given.pop(name, None) for name in ARGUMENTS[::-1])
+    values = single(with_folder(options, folder))
+    folder, preset = (values.pop(name, None) for name in ARGUMENTS[::-1])
     base = merge({"num_runs": _SEEDS}, load_preset(preset) if preset else {})
-    recipe = make_recipe(base, **given)
+    recipe = make_recipe(base, **values)
     space = load_space(space_name) if space_name else space_for(recipe)
-    search = Search(recipe=recipe, space=space.without(given), sampler=sampler, pruner=pruner)
+    search = Search(recipe=recipe, space=space.without(values), sampler=sampler, pruner=pruner)
     home = Path(folder or f"runs/tune_{label(recipe)}")
     click.echo(f"search: {home}")
     click.echo(f"varied: {', '.join(search.space.ranges)}")

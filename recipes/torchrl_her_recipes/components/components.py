@@ -109,9 +109,9 @@ class Components(Agent):
         norm, runs = self.recipe.learner.max_grad_norm, self.recipe.run.num_runs
         if choice == "never":
             return LossLearner(*parts, max_grad_norm=norm, runs=runs)
-        here = place_of(self.loss).type == "cpu"
-        reason = self._why_not_fused() if here else why_not_recorded(self.loss, self.target)
-        if reason is None and not here:
+        on_cpu = place_of(self.loss).type == "cpu"
+        reason = self._why_not_fused() if on_cpu else why_not_recorded(self.loss, self.target)
+        if reason is None and not on_cpu:
             return GraphLearner(*parts, max_grad_norm=norm, runs=runs, compile=choice == "always")
         if reason is None:
             try:
@@ -139,14 +139,14 @@ class Components(Agent):
 
     def trainer(self) -> Trainer:
         """The training loop over these components."""
-        recipe, replay, shown = self.recipe, self.recipe.replay, self.demonstrations
+        recipe, replay, demonstrations = self.recipe, self.recipe.replay, self.demonstrations
         proposals = [] if self.behavior is None else self.behavior.weights
         weights = [*self.buffer.writer.goal_weights, *proposals]
         return Trainer(
             collector=self.collector,
             buffer=self.buffer
-            if shown is None
-            else shown.mixed_with(self.buffer, recipe.demonstrations.share, replay.batch_size),
+            if demonstrations is None
+            else demonstrations.mixed_with(self.buffer, recipe.demonstrations.share, replay.batch_size),
             learner=self.learner(),
             schedules=[
                 self.exploration,

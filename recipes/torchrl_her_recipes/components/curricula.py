@@ -219,11 +219,11 @@ def in_stages(
         chooses_goals = behavior if starts is None else starts  # a recipe has one of them at most
         return env if chooses_goals is None else TransformedEnv(env, chooses_goals, auto_unwrap=True)
     curriculum = progress.curriculum
-    shown = StateToObs(
+    state_to_obs = StateToObs(
         curriculum, progress, continues_after_termination=goal_env(env).continues_after_termination
     )
     proposes = [] if behavior is None else [behavior]
-    transforms: list[Transform] = [shown, *proposes, ZeroPad(curriculum, progress)]
+    transforms: list[Transform] = [state_to_obs, *proposes, ZeroPad(curriculum, progress)]
     if "state" not in env.observation_spec:
         transforms.insert(0, CatTensors(_STATE, "state", del_keys=False, sort=False))
     if begins:

@@ -178,24 +178,24 @@ def _facts(
         """[...] of bool."""
         return ~missed(rule, achieved, desired, achieved_reward)
 
-    moved, kept, achieved, fallen = [], [], [], []
+    moved, some_kept, achieved, fallen = [], [], [], []
     for episode in played:
         goals = episode["next", "achieved_goal"]
-        here = outcomes(rule, episode["achieved_goal"], episode)
-        there = outcomes(rule, goals, episode["next"])
-        kept.append(_kept(here, goals, meets))
+        before = outcomes(rule, episode["achieved_goal"], episode)
+        after = outcomes(rule, goals, episode["next"])
+        some_kept.append(_kept(before, goals, meets))
         if not episode["next", "done"][-1]:
             continue  # it was cut off by the end of the look
-        moved.append(not bool(meets(here[:1], goals).all()))
-        achieved.append(bool(meets(there, episode["next", "desired_goal"]).any()))
+        moved.append(not bool(meets(before[:1], goals).all()))
+        achieved.append(bool(meets(after, episode["next", "desired_goal"]).any()))
         last = episode["next"][-1:]
         fallen.append(bool(last["terminated"].all() and not is_achieved(last, **judged_by).all()))
     reached = outcomes(rule, rows["next", "achieved_goal"], rows["next"])
     computed, reward = ask_reward(rule, reached, rows["next", "desired_goal"])[0], rows["next", "reward"]
     went_on = ~rows["next", "terminated"] | (computed >= achieved_reward)  # what a failure costs is kept
     differ = went_on & ((reward - computed).abs() > _DIGITS * (1 + computed.abs()))
-    seen = rows["observation"].double()
-    spread = seen.std(0)
+    observations = rows["observation"].double()
+    spread = observations.std(0)
     moving = spread[spread > 0]
     count = len(moved)
     return Facts(
@@ -208,10 +208,10 @@ def _facts(
         disagree=float(differ.float().mean()),
         achieved=sum(achieved) / count,
         moved=sum(moved) / count,
-        kept=float(torch.cat(kept).float().mean()),
+        kept=float(torch.cat(some_kept).float().mean()),
         fallen=sum(fallen) / count,
         constant=(spread == 0).nonzero().flatten().tolist(),
-        goal_inside=_columns(seen, rows["desired_goal"].double()),
+        goal_inside=_columns(observations, rows["desired_goal"].double()),
         own_stages=_has_stages(task),
         stages=[] if task.info_keys else propose_stages(rows, meets),
         ends=getattr(task, "goal_ends", None),
@@ -225,22 +225,22 @@ def _has_stages(task: GoalEnv) -> bool:
         return False
 
 
-def _kept(here: Outcome, there: Tensor, meets: Meets) -> Tensor:
+def _kept(before: Outcome, after: Tensor, meets: Meets) -> Tensor:
     """Whether some later goal of an episode was not achieved before each transition, [T] of bool."""
-    steps = len(there)
+    steps = len(after)
     later = torch.linspace(0, 1, min(_FUTURE, steps))
     chosen = (
         torch.arange(steps)[:, None] + (later * (steps - 1 - torch.arange(steps))[:, None]).round().long()
     )
-    goals = there[chosen]  # [T, later, g]
-    return ~meets(here.unsqueeze(1), goals).all(-1)
+    goals = after[chosen]  # [T, later, g]
+    return ~meets(before.unsqueeze(1), goals).all(-1)
 
 
-def _columns(seen: Tensor, goal: Tensor) -> list[int]:
+def _columns(observations: Tensor, goal: Tensor) -> list[int]:
     """Neighboring entries of observations [n, w] that are always the goals [n, g]; none if there are none."""
     width = goal.shape[-1]
-    for first in range(seen.shape[-1] - width + 1):
-        if torch.allclose(seen[:, first : first + width], goal, rtol=1e-5, atol=1e-6):
+    for first in range(observations.shape[-1] - width + 1):
+        if torch.allclose(observations[:, first : first + width], goal, rtol=1e-5, atol=1e-6):
             return list(range(first, first + width))
     return []
 
@@ -260,16 +260,16 @@ def propose_stages(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
     Returns:
         Stages as ``curriculum=FILE.yaml`` takes them, or none if there are no such entries.
     """
-    seen, goal = rows["observation"].double(), rows["achieved_goal"].double()
-    width, wide = goal.shape[-1], seen.shape[-1]
-    place = _columns(seen, goal)
+    observations, goal = rows["observation"].double(), rows["achieved_goal"].double()
+    width, wide = goal.shape[-1], observations.shape[-1]
+    place = _columns(observations, goal)
     step = (rows["next", "achieved_goal"].double() - goal).norm(dim=-1)
     moving = step > 0.1 * step.max()
     if not place or not bool(step.max() > 0) or bool(moving.all()) or wide < 2 * width:
         return []
     gaps: dict[int, Tensor] = {}
     for first in range(wide - width + 1):
-        entries = seen[:, first : first + width]
+        entries = observations[:, first : first + width]
         if set(range(first, first + width)) & set(place) or bool((entries.std(0) == 0).any()):
             continue
         gaps[first] = (entries - goal).norm(dim=-1)

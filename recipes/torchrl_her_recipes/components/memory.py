@@ -17,11 +17,11 @@ def check_buffer_size(
     """Refuses a replay buffer that is larger than the memory of its device."""
     step = env.fake_tensordict().exclude(*in_root_and_next(not_stored))
     row = sum(entry.numel() * entry.element_size() for entry in step.values(True, True)) // env.numel()
-    there = memory_of(device)
-    if size * runs * row > there:
+    capacity = memory_of(device)
+    if size * runs * row > capacity:
         raise ValueError(
             f"buffer_size={size} needs {size * runs * row / 1e9:.0f} GB for num_runs={runs}, {row} bytes for "
-            f"each transition, but {device} has {there / 1e9:.0f} GB"
+            f"each transition, but {device} has {capacity / 1e9:.0f} GB"
         )
 
 

@@ -56,9 +56,9 @@ def imported_modules() -> list[str]:
 
 def look_here() -> None:
     """Makes modules in the current folder importable."""
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.append(here)  # at the end, so that no file in this folder hides an installed package
+    folder = str(Path.cwd())
+    if folder not in sys.path:
+        sys.path.append(folder)  # at the end, so that no file in this folder hides an installed package
 
 
 def foreign_module(task: str) -> str:

@@ -50,12 +50,12 @@ def check_options(group: Any) -> None:
         value = getattr(group, definition.name)
         if definition.default in (None, AUTO) and value == definition.default:
             continue
-        shown = _shown(group, definition)
+        long_name = _shown(group, definition)
         kind = _KINDS.get(str(definition.type).removesuffix(" | None"))
         if kind is not None:
-            value = as_kind(shown, value, kind)
+            value = as_kind(long_name, value, kind)
             object.__setattr__(group, definition.name, value)
-        _check_value(definition, shown, value)
+        _check_value(definition, long_name, value)
 
 
 def idle_options(group: Any) -> dict[str, str]:
@@ -70,13 +70,13 @@ def idle_options(group: Any) -> dict[str, str]:
         ((('processes', <class 'bool'>, 'sync'),), {'sync': 'with processes=0'})
     """
     idle: dict[str, str] = {}
-    shown = {definition.name: _shown(group, definition) for definition in fields(group)}
+    long_names = {definition.name: _shown(group, definition) for definition in fields(group)}
     for other, has_effect, names in group.needs:
         value = getattr(group, other)
         if other in idle or not has_effect(value):
             text = f"{value:g}" if isinstance(value, float) else str(value).lower()
             for name in names.split():
-                idle.setdefault(name, idle.get(other, f"with {shown[other]}={text}"))
+                idle.setdefault(name, idle.get(other, f"with {long_names[other]}={text}"))
     return idle
 
 
@@ -84,11 +84,11 @@ def _shown(group: Any, definition: Field[Any]) -> str:
     return definition.metadata.get("shown_as") or group.prefix + definition.name
 
 
-def _check_value(definition: Field[Any], shown: str, value: Any) -> None:
+def _check_value(definition: Field[Any], long_name: str, value: Any) -> None:
     choices, limits = definition.metadata.get("choices", ()), definition.metadata.get("limits", {})
     if choices and value not in choices:
         raise ValueError(
-            f"{shown} must be one of {', '.join(choices)}, got {value!r}{nearest(value, choices)}"
+            f"{long_name} must be one of {', '.join(choices)}, got {value!r}{nearest(value, choices)}"
         )
     tests = {
         "at_least": lambda limit: value >= limit,
@@ -96,12 +96,12 @@ def _check_value(definition: Field[Any], shown: str, value: Any) -> None:
         "at_most": lambda limit: value <= limit,
         "below": lambda limit: value < limit,
     }
-    given = {name: limit for name, limit in limits.items() if limit is not None}
-    if not all(tests[name](limit) for name, limit in given.items()):  # NaN fails all of them
-        allowed = " and ".join(f"{name.replace('_', ' ')} {limit}" for name, limit in given.items())
-        raise ValueError(f"{shown} must be {allowed}, got {value}")
+    bounds = {name: limit for name, limit in limits.items() if limit is not None}
+    if not all(tests[name](limit) for name, limit in bounds.items()):  # NaN fails all of them
+        allowed = " and ".join(f"{name.replace('_', ' ')} {limit}" for name, limit in bounds.items())
+        raise ValueError(f"{long_name} must be {allowed}, got {value}")
     if isinstance(value, float) and not (isfinite(value) or definition.metadata.get("infinite")):
-        raise ValueError(f"{shown} must be finite, got {value}")
+        raise ValueError(f"{long_name} must be finite, got {value}")
 
 
 REGISTERED = "; one of your own must be registered by a module, as in torchrl-her --import MODULE"
@@ -114,8 +114,8 @@ def nearest(name: object, known: Any) -> str:
         >>> nearest("lerning_rate", ["learning_rate", "gamma"])
         '; did you mean learning_rate?'
     """
-    found = get_close_matches(str(name), list(known), n=1)
-    return f"; did you mean {found[0]}?" if found else ""
+    matches = get_close_matches(str(name), list(known), n=1)
+    return f"; did you mean {matches[0]}?" if matches else ""
 
 
 def what_there_is(name: object, known: Any, kind: str) -> str:

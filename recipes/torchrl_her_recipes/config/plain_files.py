@@ -42,15 +42,15 @@ def reason(error: BaseException | str) -> str:
 
 
 @contextmanager
-def naming(path: Path, what: str = "cannot be read") -> Iterator[None]:
+def naming(path: Path, problem: str = "cannot be read") -> Iterator[None]:
     """Turns errors about the content of a file into a ValueError that names the file."""
     try:
         yield
     except _DAMAGE as error:
         if type(error).__name__ == "OutOfMemoryError":  # a RuntimeError of torch's, and no damage
             raise
-        said = reason(error) if isinstance(error, ValueError) else f"it is damaged ({type(error).__name__})"
-        raise ValueError(f"{path} {what}: {said}") from error
+        cause = reason(error) if isinstance(error, ValueError) else f"it is damaged ({type(error).__name__})"
+        raise ValueError(f"{path} {problem}: {cause}") from error
 
 
 def read_text(path: Path, *, largest: int = _LARGEST) -> str:
@@ -105,13 +105,13 @@ def parse_yaml(text: str) -> Any:
         return yaml.load(text, _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        said = ", ".join(part for part in (error.context, error.problem) if part)
-        raise ValueError(reason(f"line {mark.line + 1}: {said}" if mark else said)) from error
+        problem = ", ".join(part for part in (error.context, error.problem) if part)
+        raise ValueError(reason(f"line {mark.line + 1}: {problem}" if mark else problem)) from error
     except yaml.YAMLError as error:
         raise ValueError(reason(error)) from error
     except _DAMAGE as error:
-        said = reason(error) if isinstance(error, ValueError) else f"no value ({type(error).__name__})"
-        raise ValueError(said) from error
+        problem = reason(error) if isinstance(error, ValueError) else f"no value ({type(error).__name__})"
+        raise ValueError(problem) from error
 
 
 def read_yaml(path: Path) -> Any:

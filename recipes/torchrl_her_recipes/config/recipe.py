@@ -74,8 +74,8 @@ class Recipe:
         changed = self.changed()
         for (group, name), why in without_effect(self).items():
             if (value := changed.get(group, {}).get(name)) is not None:
-                shown = group if name == "name" else getattr(self, group).prefix + name
-                raise ValueError(f"{shown}={value} has no effect {why}: leave it out")
+                option = group if name == "name" else getattr(self, group).prefix + name
+                raise ValueError(f"{option}={value} has no effect {why}: leave it out")
 
     def _check_proposed(self) -> None:
         """Refuses what cannot be used where behavior goals are proposed."""
@@ -140,12 +140,12 @@ class Recipe:
             >>> Recipe().replace(seed=3, gamma=0.9).changed()
             {'learner': {'gamma': 0.9}, 'run': {'seed': 3}}
         """
-        kept: Nested = {}
+        changed: Nested = {}
         for group, values in self.to_dict().items():
-            defaults = {each.name: each.default for each in fields(getattr(self, group))}
+            defaults = {definition.name: definition.default for definition in fields(getattr(self, group))}
             defaults |= {"name": KINDS[group].default} if group in KINDS else {}
-            kept[group] = {name: value for name, value in values.items() if value != defaults[name]}
-        return {group: values for group, values in kept.items() if values}
+            changed[group] = {name: value for name, value in values.items() if value != defaults[name]}
+        return {group: values for group, values in changed.items() if values}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:

@@ -141,8 +141,8 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
     if len(found) > 1:
         having = [g for g in found if g not in KINDS or hasattr(KINDS[g].find(chosen(g, *values)), name)]
         if len(having) > 1:
-            shown = " or ".join(f"{group}.{name}" for group in having)
-            raise ValueError(f"several groups have an option {name!r}: write {shown}")
+            written = " or ".join(f"{group}.{name}" for group in having)
+            raise ValueError(f"several groups have an option {name!r}: write {written}")
         found = having or found
     if found:
         return found[0], name

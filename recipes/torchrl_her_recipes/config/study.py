@@ -242,8 +242,8 @@ def load_study(
         combined = dict.fromkeys(curve_label(label, recipe) for label, recipe in cells)
         named = (name for order in read_orders(study.expect) for name in (order.more, order.less))
         if strange := next((name for name in named if name not in combined), None):
-            there = ", ".join(combined)
-            raise ValueError(f"expect must name combinations, which are {there}; got {strange!r}")
+            labels = ", ".join(combined)
+            raise ValueError(f"expect must name combinations, which are {labels}; got {strange!r}")
     if name in study_names():  # this package's own files may name modules
         for _, recipe in cells:
             permit_task(recipe.task.name)

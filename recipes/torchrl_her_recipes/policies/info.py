@@ -154,9 +154,9 @@ class PolicyInfo:
             ValueError: they do; the message has both.
         """
         entries = describe_env(env)
-        wanted = {"widths": self.widths, "action_shape": self.action_shape}
+        expected = {"widths": self.widths, "action_shape": self.action_shape}
         counts = entries["high"] == self.high if self.discrete else True
-        if {name: entries[name] for name in wanted} != wanted or not counts:
+        if {name: entries[name] for name in expected} != expected or not counts:
             offered = _words(entries["widths"], entries["action_shape"], entries["high"])
             raise ValueError(
                 f"a policy of {self.task} cannot play {task}: it has other widths, {self.expects()}, and "
@@ -174,8 +174,8 @@ def describe_env(env: EnvBase) -> dict[str, Any]:
         ({'observation': 4, 'desired_goal': 4}, (), (3.0,))
     """
     task, action = goal_env(env), env.action_spec_unbatched
-    shown = task.observation_spec
-    entries = {"widths": {key: int(shown[key].shape[-1]) for key in KEYS}}
+    specs = task.observation_spec
+    entries = {"widths": {key: int(specs[key].shape[-1]) for key in KEYS}}
     if isinstance(action, Categorical):
         whole = {"action_dtype": "int64", "task_dtype": "int64"}
         return {**entries, **whole, "action_shape": (), "low": (0.0,), "high": (float(action.space.n - 1),)}
@@ -195,8 +195,8 @@ def present_versions() -> dict[str, str]:
 
 
 def _words(widths: Mapping[str, int], shape: tuple[int, ...], high: tuple[float, ...]) -> str:
-    seen = ", ".join(f"{key} [{width}]" for key, width in widths.items())
-    return f"{seen} and " + (f"action [{shape[0]}]" if shape else f"action of {int(high[0]) + 1} choices")
+    inputs = ", ".join(f"{key} [{width}]" for key, width in widths.items())
+    return f"{inputs} and " + (f"action [{shape[0]}]" if shape else f"action of {int(high[0]) + 1} choices")
 
 
 def _is_whole(value: object, *, least: int) -> bool:

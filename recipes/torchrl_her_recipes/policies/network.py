@@ -72,14 +72,14 @@ def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> Non
         raise ValueError(f"these are not the weights of an actor of learner={name}")
     with torch.device("meta"):  # without memory: only the shapes matter
         actor = builder.player(1)
-        wanted = {
+        expected = {
             key: tuple(value.shape) for key, value in acting(actor, builder.norm()).state_dict().items()
         }
-    if shapes != wanted:
-        odd = next(key for key in {**wanted, **shapes} if shapes.get(key) != wanted.get(key))
+    if shapes != expected:
+        odd = next(key for key in {**expected, **shapes} if shapes.get(key) != expected.get(key))
         raise ValueError(
             f"these are not the weights of an actor of learner={name}: {odd} must be "
-            f"{wanted.get(odd, 'missing')}, got {shapes.get(odd, 'nothing')}"
+            f"{expected.get(odd, 'missing')}, got {shapes.get(odd, 'nothing')}"
         )
     if odd := [key for key, value in weights.items() if not value.isfinite().all()]:
         raise ValueError(f"weights must be finite, got others in {odd[0]}")
@@ -156,12 +156,12 @@ class TensorPolicy(nn.Module):
         It is the greatest difference of an action's entries. For integers it is by how much the value of
         the action is below the greatest one, since two actions may have the same value.
         """
-        seen = self.normalized(observation, desired_goal)
+        inputs = self.normalized(observation, desired_goal)
         if not action.is_floating_point():
             if not hasattr(self.net, "regret"):  # a network of a user's learner
-                return (action != self.net(*seen)).float()
-            return self.net.regret(action, *seen)
-        return (action - self.net(*seen)).abs().amax(-1)
+                return (action != self.net(*inputs)).float()
+            return self.net.regret(action, *inputs)
+        return (action - self.net(*inputs)).abs().amax(-1)
 
 
 def _constants(norm: RunningNorm, key: str) -> tuple[Tensor, Tensor, Tensor]:

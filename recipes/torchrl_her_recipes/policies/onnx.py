@@ -83,21 +83,21 @@ def write_onnx(
     proto = _graph_of(module, info)
     for name, facts in (("card", info.to_dict()), ("recipe", recipe)):
         proto.metadata_props.add(key=f"torchrl_her.{name}", value=json.dumps(facts))
-    seen = {key: states[key].reshape(-1, info.widths[key]).float() for key in KEYS}
+    inputs = {key: states[key].reshape(-1, info.widths[key]).float() for key in KEYS}
     with written(path) as part:
         part.write_bytes(model := proto.SerializeToString())
         session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
-        (action,) = session.run(["action"], {key: value.numpy() for key, value in seen.items()})
-        _check_actions(module, torch.from_numpy(action), info, seen)
+        (action,) = session.run(["action"], {key: value.numpy() for key, value in inputs.items()})
+        _check_actions(module, torch.from_numpy(action), info, inputs)
     return info
 
 
-def _check_actions(module: TensorPolicy, action: Tensor, info: PolicyInfo, seen: dict[str, Tensor]) -> None:
+def _check_actions(module: TensorPolicy, action: Tensor, info: PolicyInfo, inputs: dict[str, Tensor]) -> None:
     """Raises a ValueError if actions differ from the policy's by more than :data:`TOLERANCE`.
 
     Of integers, the values are compared: two actions may have the same value.
     """
-    worst = float(module.deviation(action, *seen.values()).nan_to_num(torch.inf).max())
+    worst = float(module.deviation(action, *inputs.values()).nan_to_num(torch.inf).max())
     scale = max([1.0, *(abs(side) for side in (*info.low, *info.high) if abs(side) < float("inf"))])
     limit = TOLERANCE * (1.0 if info.discrete else scale)
     if not worst <= limit:
@@ -126,12 +126,12 @@ def _graph_of(module: TensorPolicy, info: PolicyInfo) -> Any:
         )
     assert program is not None
     proto = program.model_proto
-    for each in (*proto.graph.node, *proto.graph.initializer, *proto.graph.value_info):
-        each.ClearField("metadata_props")  # stack traces, which contain paths of files
-        each.ClearField("doc_string")
-    for each in (*proto.graph.input, *proto.graph.output, proto.graph, proto):
-        each.ClearField("metadata_props")
-        each.ClearField("doc_string")
+    for part in (*proto.graph.node, *proto.graph.initializer, *proto.graph.value_info):
+        part.ClearField("metadata_props")  # stack traces, which contain paths of files
+        part.ClearField("doc_string")
+    for part in (*proto.graph.input, *proto.graph.output, proto.graph, proto):
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
     return proto
 
 

@@ -137,10 +137,10 @@ class Policy(TensorDictModuleBase):
             raise ValueError(f"there is no run {chosen} in {home.path}; it has runs 0 to {runs - 1}")
         envs = TaskEnvs.of(recipe)
         env = envs.make(1, [0], scaled=False)
-        shown = describe_env(env)
+        description = describe_env(env)
         info = PolicyInfo(
             task=recipe.task.name,
-            **{**shown, "action_dtype": shown.get("action_dtype", recipe.run.dtype)},
+            **{**description, "action_dtype": description.get("action_dtype", recipe.run.dtype)},
             dtype=recipe.run.dtype,
             normalize_clip=recipe.learner.normalize_clip if recipe.learner.normalize else None,
             algorithm=recipe.hindsight.algo,
@@ -185,15 +185,17 @@ class Policy(TensorDictModuleBase):
             >>> env.action_space.contains(action)
             True
         """
-        seen = {key: torch.as_tensor(observation[key], dtype=getattr(torch, self.info.dtype)) for key in KEYS}
-        for key, value in seen.items():
+        inputs = {
+            key: torch.as_tensor(observation[key], dtype=getattr(torch, self.info.dtype)) for key in KEYS
+        }
+        for key, value in inputs.items():
             if value.shape[-1:] != (self.info.widths[key],):
                 raise ValueError(
                     f"{key} must have {self.info.widths[key]} numbers for a policy of {self.info.task}, "
                     f"got shape {list(value.shape)}"
                 )
-        batch = seen["observation"].shape[:-1]
-        action = self.module(TensorDict(seen, batch))["action"].numpy()
+        batch = inputs["observation"].shape[:-1]
+        action = self.module(TensorDict(inputs, batch))["action"].numpy()
         if self.info.discrete:
             return action, None
         action = np.clip(action, np.array(self.info.low), np.array(self.info.high))  # in float64

@@ -128,11 +128,11 @@ class Viewer:
         """Returns the present picture [height, width, 3] of uint8."""
         if self._labels is None:
             return beside([episodes.frame for episodes in self._episodes], gap=_GAP)
-        shown = zip(self._episodes, self._labels, self.seen, strict=True)
+        rows = zip(self._episodes, self._labels, self.seen, strict=True)
         return beside(
             [
-                underlined(episodes.frame, [label, f"{seen.achieved} of {seen.goals} achieved"])
-                for episodes, label, seen in shown
+                underlined(episodes.frame, [label, f"{counts.achieved} of {counts.goals} achieved"])
+                for episodes, label, counts in rows
             ],
             gap=_GAP,
         )
@@ -177,8 +177,8 @@ def _described(task: TaskConfig) -> str:
     options = {**usual, **(task.options or {})}
     if task.threshold is not None:
         options["threshold"] = task.threshold
-    other = [f"{name}={value}" for name, value in sorted(options.items()) if value != usual.get(name)]
-    return " ".join([task.name, *other])
+    changed = [f"{name}={value}" for name, value in sorted(options.items()) if value != usual.get(name)]
+    return " ".join([task.name, *changed])
 
 
 def _labels_of(policies: Sequence[Policy]) -> list[str]:

@@ -72,11 +72,11 @@ def play(
         return Viewer(policies, View(**{"named": out is None or bool(others), **view}))
 
     if out is not None:
-        with viewer() as shown:
-            return shown.write(out)
-    with closing(KeyWindow(f"torchrl-her: {', '.join(map(str, sources))}")) as window, viewer() as shown:
-        show(Viewing(shown), window)
-        return shown.seen
+        with viewer() as frames:
+            return frames.write(out)
+    with closing(KeyWindow(f"torchrl-her: {', '.join(map(str, sources))}")) as window, viewer() as frames:
+        show(Viewing(frames), window)
+        return frames.seen
 
 
 def show(viewing: Viewing, window: Window) -> None:

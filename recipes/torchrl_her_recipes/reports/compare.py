@@ -104,14 +104,14 @@ def compare(
     Algorithms that are at their end on all tasks of the study are compared on all of them together, too.
     Those that are not at their end have no part in differences.
     """
-    shown = [cell for cell in cells if values_of(cell, measure)]
-    samples = [values_of(cell, measure) for cell in shown]
-    keys = [(cell.task, cell.algorithm) for cell in shown]
-    groups = [[index] for index in range(len(shown))]
-    for algorithm in _complete(cells, shown):
+    measured = [cell for cell in cells if values_of(cell, measure)]
+    samples = [values_of(cell, measure) for cell in measured]
+    keys = [(cell.task, cell.algorithm) for cell in measured]
+    groups = [[index] for index in range(len(measured))]
+    for algorithm in _complete(cells, measured):
         keys.append((ALL_TASKS, algorithm))
-        groups.append([index for index, cell in enumerate(shown) if cell.algorithm == algorithm])
-    final = [all(shown[index].done for index in group) for group in groups]
+        groups.append([index for index, cell in enumerate(measured) if cell.algorithm == algorithm])
+    final = [all(measured[index].done for index in group) for group in groups]
     pairs = [
         (first, second)  # the later algorithm minus the earlier: plain HER comes first in most studies
         for second, first in combinations(range(len(keys)), 2)
@@ -122,7 +122,7 @@ def compare(
     for key, group, mean, finished in zip(keys, groups, means, final, strict=True):
         pooled = [value for index in group for value in samples[index]]
         low, middle, high = (float(value) for value in np.percentile(pooled, [33, 50, 67]))
-        frames = max(shown[index].frames for index in group)
+        frames = max(measured[index].frames for index in group)
         spread = (mean.value, mean.low, mean.high, middle, low, high, min(pooled), max(pooled))
         task, algorithm = key
         number = numbers.get(task, {}).get(algorithm)
@@ -142,14 +142,16 @@ def compare(
     return finals, differences
 
 
-def _complete(cells: Sequence[Combination], shown: Sequence[Combination]) -> list[str]:
+def _complete(cells: Sequence[Combination], measured: Sequence[Combination]) -> list[str]:
     """Returns the algorithms whose runs are finished on all tasks, if there are several."""
     tasks = {cell.task for cell in cells}
-    counts = Counter(cell.algorithm for cell in shown if cell.done)
+    counts = Counter(cell.algorithm for cell in measured if cell.done)
     return [name for name, count in counts.items() if count == len(tasks) > 1]
 
 
-def judge(cells: Sequence[Combination], orders: Sequence[Order], found: Sequence[Difference]) -> list[Judged]:
+def judge(
+    cells: Sequence[Combination], orders: Sequence[Order], differences: Sequence[Difference]
+) -> list[Judged]:
     """Judges whether expected orders hold, on each task of a study and, for success, on all tasks together.
 
     An order holds if the 95 % interval of the difference lies on its side of 0. That is less than asking
@@ -158,7 +160,7 @@ def judge(cells: Sequence[Combination], orders: Sequence[Order], found: Sequence
     Args:
         cells: combinations of the study.
         orders: the expected ones; those of algorithms that the study does not have are left out.
-        found: all differences.
+        differences: all differences.
     """
     tasks = list(dict.fromkeys(cell.task for cell in cells))
     algorithms = {cell.algorithm for cell in cells}
@@ -166,12 +168,14 @@ def judge(cells: Sequence[Combination], orders: Sequence[Order], found: Sequence
     for order in orders:
         if {order.more, order.less} <= algorithms:
             everywhere = [ALL_TASKS] if order.measure == "success" and len(tasks) > 1 else []
-            judged += [_judge(cells, order, task, found) for task in tasks + everywhere]
+            judged += [_judge(cells, order, task, differences) for task in tasks + everywhere]
     return judged
 
 
-def _judge(cells: Sequence[Combination], order: Order, task: str, found: Sequence[Difference]) -> Judged:
-    for gap in found:
+def _judge(
+    cells: Sequence[Combination], order: Order, task: str, differences: Sequence[Difference]
+) -> Judged:
+    for gap in differences:
         if (gap.measure, gap.task) == (order.measure, task) and {gap.first, gap.second} == {
             order.more,
             order.less,

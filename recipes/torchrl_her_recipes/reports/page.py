@@ -129,8 +129,8 @@ def _shares(rows: Sequence[Final]) -> dict[tuple[str, str], tuple[float, float |
     for row in rows:
         base = her.get(row.task)
         if base is not None and base is not row:
-            said = row.published / base.published if row.published is not None and base.published else None
-            shares[row.task, row.algorithm] = (row.iqm / base.iqm, said)
+            ratio = row.published / base.published if row.published is not None and base.published else None
+            shares[row.task, row.algorithm] = (row.iqm / base.iqm, ratio)
     return shares
 
 

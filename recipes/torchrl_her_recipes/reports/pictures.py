@@ -88,9 +88,9 @@ def _curve(
     ends = ", ".join(
         f"{label} {show(float(band(rows, name)[2][-1]), name)}" for label, rows in curves.items()
     )
-    what = MEASURES.get(name, "Q of the initial state")
+    quantity = MEASURES.get(name, "Q of the initial state")
     path = _save(figure, _stem(figures, name, task))
-    return Picture(path, f"{task}: {what} over environment steps. Last medians: {ends}.")
+    return Picture(path, f"{task}: {quantity} over environment steps. Last medians: {ends}.")
 
 
 def _final(
@@ -115,9 +115,9 @@ def _final(
     if any(final.published is not None for _, final in ends.values()):
         mark = Line2D([], [], marker="D", linestyle="", color=_INK, fillstyle="none", label="published")
         figure.legend(handles=[mark], loc="outside lower center", frameon=False)
-    said = ", ".join(f"{label} {show_interval(row, 'success')}" for label, (_, row) in ends.items())
+    text = ", ".join(f"{label} {show_interval(row, 'success')}" for label, (_, row) in ends.items())
     path = _save(figure, _stem(figures, "final", task))
-    return Picture(path, f"{task}: success at the end. {said}.")
+    return Picture(path, f"{task}: success at the end. {text}.")
 
 
 def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Picture]:

@@ -102,25 +102,25 @@ def read_combinations(study: Study, folder: Path) -> list[Combination]:
 
 
 def _read(label: str, planned: Recipe, options: Mapping[str, Any], batches: Batches) -> Combination:
-    made = batches.recipe or planned
-    differs = [f"{name}={value} (the study: {usual})" for name, value, usual in _differences(made, planned)]
+    used = batches.recipe or planned
+    differs = [f"{name}={value} (the study: {usual})" for name, value, usual in _differences(used, planned)]
     return _combination(
-        label, planned, made, batches, options=options, algorithm=curve_label(label, planned), differs=differs
+        label, planned, used, batches, options=options, algorithm=curve_label(label, planned), differs=differs
     )
 
 
 def read_single(label: str, batches: Batches) -> Combination:
     """Reads a single run as a combination, described by its options that differ from the defaults."""
     recipes = [home.recipe() for home in batches.homes]
-    made = recipes[0].replace(num_runs=sum(recipe.run.num_runs for recipe in recipes))
-    differs = [f"{name}={value}" for name, value, _ in _differences(made, Recipe())]
-    return _combination(label, made, made, batches, options={}, algorithm=label, differs=differs)
+    used = recipes[0].replace(num_runs=sum(recipe.run.num_runs for recipe in recipes))
+    differs = [f"{name}={value}" for name, value, _ in _differences(used, Recipe())]
+    return _combination(label, used, used, batches, options={}, algorithm=label, differs=differs)
 
 
-def _differences(made: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
+def _differences(used: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
     """Returns the options in which two recipes differ, and their values in both."""
-    left, right = dict(_flat(made.to_dict())), dict(_flat(usual.to_dict()))
-    changed = {*dict(_flat(made.changed())), *dict(_flat(usual.changed()))}
+    left, right = dict(_flat(used.to_dict())), dict(_flat(usual.to_dict()))
+    changed = {*dict(_flat(used.changed())), *dict(_flat(usual.changed()))}
     differ = [name for name, value in left.items() if name in changed and value != right.get(name)]
     return [(name, left[name], right.get(name)) for name in differ]
 
@@ -128,7 +128,7 @@ def _differences(made: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
 def _combination(
     label: str,
     planned: Recipe,
-    made: Recipe,
+    used: Recipe,
     batches: Batches,
     *,
     options: Mapping[str, Any],
@@ -143,7 +143,7 @@ def _combination(
         options=dict(_flat(options)),
         rows=rows,
         done=batches.is_done,
-        epochs=made.run.epochs,
+        epochs=used.run.epochs,
         planned=planned.run.num_runs,
         seconds=batches.seconds if rows else 0.0,
         differs=", ".join(differs),

@@ -63,18 +63,18 @@ def _newest_film(folders: Sequence[Path]) -> Picture | None:
     newest = max(whole, key=lambda path: path.stat().st_mtime, default=None)
     if newest is None:
         return None
-    made = f"{datetime.fromtimestamp(newest.stat().st_mtime):%Y-%m-%d %H:%M}"
-    return Picture(newest, f"The newest film, {newest.parent.resolve().name}/{newest.name}, {made}")
+    date = f"{datetime.fromtimestamp(newest.stat().st_mtime):%Y-%m-%d %H:%M}"
+    return Picture(newest, f"The newest film, {newest.parent.resolve().name}/{newest.name}, {date}")
 
 
 def _runs_in(folder: Path) -> list[Path]:
     """Finds the folders of runs in a folder."""
     if Batches(folder).homes:
         return [folder]
-    found = [path for path in sorted(folder.iterdir()) if path.is_dir() and Batches(path).homes]
-    if not found:
+    paths = [path for path in sorted(folder.iterdir()) if path.is_dir() and Batches(path).homes]
+    if not paths:
         raise ValueError(f"{folder} is no folder of a run: neither it nor a folder in it has a config.yaml")
-    return found
+    return paths
 
 
 def _by_recipe(paths: Sequence[Path]) -> list[list[Path]]:

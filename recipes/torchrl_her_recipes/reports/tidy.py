@@ -156,8 +156,8 @@ def read_results(folder: Path) -> Results:
             )
             for label, state in about["combinations"].items()
         ]
-        said = {name: about.get(name, {}) for name in ("expect", "published")}
-        return Results(name=about["study"], summary=about["summary"], cells=cells, **said)
+        statements = {name: about.get(name, {}) for name in ("expect", "published")}
+        return Results(name=about["study"], summary=about["summary"], cells=cells, **statements)
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error} is missing or of the wrong kind") from error
 
@@ -170,8 +170,8 @@ def _write_table(cells: Sequence[Combination], out: Path) -> None:
         for name in names
         if any(cell.options.get(name) not in (cell.task, cell.algorithm) for cell in cells)
     ]
-    found = dict.fromkeys(name for cell in cells for row in cell.rows for name in row)
-    metrics = [name for name in found if name not in (*_KEYS, "run")]
+    columns = dict.fromkeys(name for cell in cells for row in cell.rows for name in row)
+    metrics = [name for name in columns if name not in (*_KEYS, "run")]
     plain, packed = out / _RUNS, out / f"{_RUNS}.gz"
     with open(plain, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

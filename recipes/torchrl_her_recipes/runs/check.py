@@ -70,18 +70,18 @@ def _percent(share: float) -> str:
 
 
 def _remedy(facts: Facts, algorithm: Algorithm, stages: Any, stages_file: str) -> str:
-    shown = "demonstrations (demonstrations.file=FILE)"
+    demonstrations = "demonstrations (demonstrations.file=FILE)"
     if algorithm.curriculum and algorithm.filter:
         goals = (
             stages and f", whose first goals are for entries {stages[0]['achieved_goal']} of the observation"
         )
-        return f"This recipe has a curriculum{goals or ''}; {shown} help, too"
+        return f"This recipe has a curriculum{goals or ''}; {demonstrations} help, too"
     if facts.own_stages:
-        return f"What helps: the task's own curriculum (algo=cher) or {shown}"
+        return f"What helps: the task's own curriculum (algo=cher) or {demonstrations}"
     if facts.stages:
         inside = facts.stages[0]["achieved_goal"]
         return (
             f"What helps: a curriculum that first brings entries {inside[0]} to {inside[-1]} of the "
-            f"observation near it (algo=cher curriculum={stages_file}) or {shown}"
+            f"observation near it (algo=cher curriculum={stages_file}) or {demonstrations}"
         )
-    return f"What helps: a curriculum (algo=cher curriculum=FILE) or {shown}"
+    return f"What helps: a curriculum (algo=cher curriculum=FILE) or {demonstrations}"

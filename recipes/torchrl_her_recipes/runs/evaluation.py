@@ -28,13 +28,13 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     played: the average of the actor, if there is one. Both are missing if the loss has no such critics.
     """
     recipe, judged_by = components.recipe, judging(components.eval_env)
-    there = success(rollout, **judged_by)
+    succeeded = success(rollout, **judged_by)
     # An episode that is truncated at its goal is assumed to stay there.
     missed, achieved = components.rewards
-    tail = torch.where(there, achieved, missed).to(rollout["next", "reward"].dtype)
+    tail = torch.where(succeeded, achieved, missed).to(rollout["next", "reward"].dtype)
     returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=tail)
     measured = {
-        "success": there.float(),
+        "success": succeeded.float(),
         "reached": reached(rollout, **judged_by).float(),
         "distance": final_distance(rollout),
         "return": returns,

@@ -30,14 +30,14 @@ def film_policy(
     machine lacks, such as a display: then there is a warning instead of a film.
     """
     count = env.numel() // len(seeds)
-    shown = min(_FILMED, count)
+    filmed = min(_FILMED, count)
     if goal_env(env).can_render:
-        _film(player, env, out, run * count, shown)
+        _film(player, env, out, run * count, filmed)
     elif get_task_spec(envs.task.name).for_pictures:
         try:
-            with closing(make_played_env(envs, shown, seeds, pictures=True)) as drawn:
+            with closing(make_played_env(envs, filmed, seeds, pictures=True)) as drawn:
                 if goal_env(drawn).can_render:
-                    _film(player, drawn, out, run * shown, shown)
+                    _film(player, drawn, out, run * filmed, filmed)
         except Exception as error:  # a renderer may raise any error; the run itself is done
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"no {out.name}: the environment could not be drawn: {reason}", stacklevel=2)

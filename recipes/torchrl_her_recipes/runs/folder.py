@@ -226,10 +226,10 @@ def _state_file() -> Path:
 def _known() -> dict[str, str]:
     """Reads the recorded digests by path."""
     try:
-        found = json.loads(_state_file().read_text())
+        state = json.loads(_state_file().read_text())
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return state if isinstance(state, dict) else {}
 
 
 def _digest(config: Path) -> str:

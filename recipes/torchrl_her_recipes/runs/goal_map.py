@@ -91,5 +91,5 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"{odd[0][:80]!r} holds no numbers")
             return arrays
         except Exception as error:  # errors of any type: zlib's, zipfile's, those of Python's parser
-            said = str(error) if type(error) is ValueError else f"it holds no arrays ({type(error).__name__})"
-            raise ValueError(f"{path} is damaged: {said}") from error
+            why = str(error) if type(error) is ValueError else f"it holds no arrays ({type(error).__name__})"
+            raise ValueError(f"{path} is damaged: {why}") from error

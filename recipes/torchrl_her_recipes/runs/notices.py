@@ -68,10 +68,10 @@ def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) ->
         partial(_fallen, learner),
     ]
     lines = [
-        f"seed {run[-1]['seed']:.0f}: {said}"
+        f"seed {run[-1]['seed']:.0f}: {notice}"
         for run in runs.values()
         for rule in rules
-        if (said := rule(run)) and not any(rule(run[:end]) for end in range(1, len(run)))
+        if (notice := rule(run)) and not any(rule(run[:end]) for end in range(1, len(run)))
     ]
     every = list(runs.values())
     if _differ(every) and not any(

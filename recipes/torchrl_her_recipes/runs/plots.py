@@ -57,9 +57,9 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
         if limits is not None:
             axes.set_ylim(*limits)
     several = len({row["run"] for row in rows}) > 1
-    said = ["line: median, band: 33rd to 67th percentile, thin lines: single runs"] if several else []
-    said += ["dotted: a run goes on to the next stage"] if stage_changes(rows) else []
-    figure.supxlabel("; ".join(said), fontsize=9)
+    legend = ["line: median, band: 33rd to 67th percentile, thin lines: single runs"] if several else []
+    legend += ["dotted: a run goes on to the next stage"] if stage_changes(rows) else []
+    figure.supxlabel("; ".join(legend), fontsize=9)
     save_figure(figure, path)
 
 
@@ -152,9 +152,9 @@ def draw_curve(
 ) -> None:
     """Draws a metric over environment steps, on given axes: median, 33rd to 67th percentile, single runs."""
     frames, low, middle, high = band(rows, name)
-    each = by_frames(rows, name)[1]
-    if 1 < each.shape[1] <= _MOST_LINES:
-        axes.plot(frames, each, color=color, linewidth=0.6, alpha=0.4)
+    runs = by_frames(rows, name)[1]
+    if 1 < runs.shape[1] <= _MOST_LINES:
+        axes.plot(frames, runs, color=color, linewidth=0.6, alpha=0.4)
     axes.plot(frames, middle, color=color, label=label, marker="o" if len(frames) == 1 else None)
     axes.fill_between(frames, low, high, color=color, alpha=0.25, linewidth=0)
 

@@ -182,19 +182,19 @@ def resume(
             ) from None
         with naming(home.checkpoint, "is not of this run"):
             done, has_buffer = int(state["trainer"]["epochs"]), bool(state["buffer"])
-        wanted = recipe.extended(**options or {}) if components is None else components.recipe
-        check_installed(wanted.run.log)
-        if not has_buffer and (wanted.run.epochs > done or wanted.run.keep_buffer):
+        target = recipe.extended(**options or {}) if components is None else components.recipe
+        check_installed(target.run.log)
+        if not has_buffer and (target.run.epochs > done or target.run.keep_buffer):
             raise ValueError(
                 f"the run in {home.path} cannot be extended beyond {done} epochs: its checkpoint has no "
                 "replay buffer; only runs trained with keep_buffer=true keep it when they have finished"
             )
-        if options and wanted.run.epochs < done:
+        if options and target.run.epochs < done:
             raise ValueError(
                 f"epochs must be at least {done}, as many as the run in {home.path} has done, "
-                f"got {wanted.run.epochs}"
+                f"got {target.run.epochs}"
             )
-        current = _Run(components or build(wanted), home)
+        current = _Run(components or build(target), home)
         with torch.random.fork_rng(devices=[]):
             with naming(home.checkpoint, "is not of this run"):
                 load_run_state(current.parts, state)
@@ -232,28 +232,28 @@ class _Run:
         threads = torch.get_num_threads()
         torch.set_num_threads(recipe.run.threads)
         torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
-        shown = Progress(trainer, epochs=recipe.run.epochs, frames=recipe.total_frames, show=progress)
+        display = Progress(trainer, epochs=recipe.run.epochs, frames=recipe.total_frames, show=progress)
         interrupted = stopped = saved = False
         with soft_interrupt() as check, ExitStack() as opened:  # covers saving at the end
             for logger in loggers:
                 opened.callback(logger.close)
 
             def on_batch(_trainer: Trainer) -> None:
-                shown.batch()
+                display.batch()
                 check()
-                wanted = [hook.on_batch(view) for hook in hooks]  # calls all of them, also after a True
-                if any(wanted):
+                stops = [hook.on_batch(view) for hook in hooks]  # calls all of them, also after a True
+                if any(stops):
                     raise Stopped
 
             try:
                 for hook in hooks:
                     hook.on_start(view)
                 while not self.has_ended and not stopped:
-                    self.epoch(on_batch, shown)
-                    asked = [hook.on_epoch(view) for hook in hooks]
-                    stopped = any(asked)
+                    self.epoch(on_batch, display)
+                    answers = [hook.on_epoch(view) for hook in hooks]
+                    stopped = any(answers)
                     for line in notices(rows, recipe, self.components.bounds):
-                        shown.say(line)
+                        display.say(line)
                     if home is not None:
                         with self._despite_a_full_disk("table"):
                             home.write_table(rows)
@@ -264,7 +264,7 @@ class _Run:
             except Stopped:
                 stopped, saved = True, False
             finally:
-                shown.close()
+                display.close()
                 self.components.close()
                 torch.set_num_threads(threads)
                 torch.set_flush_denormal(False)
@@ -281,7 +281,7 @@ class _Run:
             stopped=stopped and not self.has_ended,
         )
 
-    def epoch(self, on_batch: Callable[[Trainer], None], shown: Progress) -> None:
+    def epoch(self, on_batch: Callable[[Trainer], None], display: Progress) -> None:
         """Runs an epoch and its evaluation; returns new rows of the table, one for each run."""
         components, trainer, state = self.components, self.trainer, self.components.curriculum
         began = time.perf_counter()
@@ -309,8 +309,8 @@ class _Run:
         self.best.see(rows, components.greedy)  # before a new stage changes it
         if state is not None:
             for line in move_on(components, state, samples, trainer.frames):
-                shown.say(line)
-        shown.epoch(rows)
+                display.say(line)
+        display.epoch(rows)
         self.rows += rows
 
     def save(self, home: RunFolder, *, goals: bool = True) -> bool:
@@ -351,8 +351,8 @@ class _Run:
         try:
             yield
         except OSError as error:
-            said = f"no {what} after {self.trainer.frames:,} frames, the run continues: {error}"
-            warnings.warn(said, stacklevel=4)
+            message = f"no {what} after {self.trainer.frames:,} frames, the run continues: {error}"
+            warnings.warn(message, stacklevel=4)
 
     def finish(self, home: RunFolder) -> None:
         """Draws the pictures and then writes the policy, whose file marks the run as finished.

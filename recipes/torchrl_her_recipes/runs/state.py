@@ -66,7 +66,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             if isinstance(buffer.writer, HERWriter):
                 buffer.writer.end_episodes()
 
-    found = {
+    parts = {
         "made_of": Part(partial(_made_of, components), check_made_of),
         **{name: getattr(components, name) for name in _NETWORKS},
         "guided": None if guide is None else Part(lambda: guide.guided, partial(setattr, guide, "guided")),
@@ -91,7 +91,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
         if worlds is None
         else Part(worlds.world_state_dict, worlds.load_world_state_dict),
     }
-    return {name: part for name, part in found.items() if part is not None}
+    return {name: part for name, part in parts.items() if part is not None}
 
 
 def run_state(parts: dict[str, Any], *, buffer: bool = True) -> dict[str, Any]:
@@ -151,10 +151,12 @@ def _made_of(components: Components) -> dict[str, str]:
         name: type(getattr(components, name)).__name__
         for name in ("actor", "critic", "loss", "optimizer", "target")
     }
-    guide, shown = components.guide, components.demonstrations
+    guide, demonstrations = components.guide, components.demonstrations
     return names | {
         "guide": type(guide).__name__,
-        "demonstrations": "none" if shown is None else f"{len(shown.recorded)}, {shown.recorded.digest}",
+        "demonstrations": "none"
+        if demonstrations is None
+        else f"{len(demonstrations.recorded)}, {demonstrations.recorded.digest}",
         "device": str(place_of(components.loss)),
         "writer": " ".join(map(str, [type(writer).__name__, *hindsight])),
         "sampler": type(components.buffer.sampler).__name__,

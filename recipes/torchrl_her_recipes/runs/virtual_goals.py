@@ -29,11 +29,15 @@ def at_virtual_goals(components: Components, epoch: int) -> dict[str, Tensor]:
     env = components.virtual_env
     if env is None:
         return {}
-    found = torch.tensor(ask_for_virtual_goals(components, env, epoch))
+    has_goals = torch.tensor(ask_for_virtual_goals(components, env, epoch))
     played = play_greedily(components, env, epoch)
     # The environment's own flag is about its own goals.
-    shown = measure(components, played.exclude(("next", "is_success")))
-    return {f"virtual_{name}": shown[name].masked_fill(~found, torch.nan) for name in _NAMES if name in shown}
+    measures = measure(components, played.exclude(("next", "is_success")))
+    return {
+        f"virtual_{name}": measures[name].masked_fill(~has_goals, torch.nan)
+        for name in _NAMES
+        if name in measures
+    }
 
 
 def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> list[bool]:
@@ -43,21 +47,21 @@ def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> l
         For each run, whether it has virtual goals of the full task. If not, its episodes ask for the
         task's own.
     """
-    asking, found = _asking(env), []
+    asking, has_goals = _asking(env), []
     widths = (env.observation_spec[key].shape[-1] for key in ("desired_goal", "observation"))
-    number, (width, seen) = asking.memory.capacity, widths
+    number, (width, observed) = asking.memory.capacity, widths
     every = torch.zeros(components.recipe.run.num_runs, number, width)
     for run, seed in enumerate(eval_seeds(components.recipe.seeds, epoch)):
         goals = _virtual_goals(components.buffer, components.curriculum, run, number, seed)
-        found.append(len(goals) > 0)
-        if found[-1]:
+        has_goals.append(len(goals) > 0)
+        if has_goals[-1]:
             every[run] = goals[torch.arange(number) % len(goals)]
-        asking.set_active(found[-1], run=run)
+        asking.set_active(has_goals[-1], run=run)
         asking.memory.clear(run)
         if (generator := asking.generators[run]) is not None:
             generator.manual_seed(seed)
-    asking.memory.add(every.flatten(0, 1), torch.zeros(every[..., 0].numel(), seen))
-    return found
+    asking.memory.add(every.flatten(0, 1), torch.zeros(every[..., 0].numel(), observed))
+    return has_goals
 
 
 def _virtual_goals(

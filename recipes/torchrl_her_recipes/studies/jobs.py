@@ -168,8 +168,8 @@ def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:
         {'config.yaml': b'...'}
     """
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    kept = [path for path in paths if path.name != ".lock" and (checkpoints or not path.match(_CHECKPOINTS))]
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in kept}
+    files = [path for path in paths if path.name != ".lock" and (checkpoints or not path.match(_CHECKPOINTS))]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def unpack(files: dict[str, bytes], folder: Path) -> None:

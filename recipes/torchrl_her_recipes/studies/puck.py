@@ -37,9 +37,9 @@ class Puck(EnvBase):
 
     def __init__(self, num_envs: int = 1, seed: int | Sequence[int] = 0) -> None:
         super().__init__(device="cpu", batch_size=(num_envs,))
-        seen = {"observation": 4, "achieved_goal": 2, "desired_goal": 2}
+        widths = {"observation": 4, "achieved_goal": 2, "desired_goal": 2}
         self.observation_spec = Composite(
-            {key: Unbounded(shape=(num_envs, width)) for key, width in seen.items()}, shape=(num_envs,)
+            {key: Unbounded(shape=(num_envs, width)) for key, width in widths.items()}, shape=(num_envs,)
         )
         self.action_spec = Bounded(-1.0, 1.0, shape=(num_envs, 2))
         self.reward_spec = Unbounded(shape=(num_envs, 1))

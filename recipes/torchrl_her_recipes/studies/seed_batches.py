@@ -32,14 +32,14 @@ class Batches:
     """
 
     def __init__(self, *paths: Path) -> None:
-        found: list[RunFolder] = []
+        folders: list[RunFolder] = []
         for path in paths:
             single = (path / "config.yaml").exists()
-            found += [
+            folders += [
                 RunFolder(folder)
                 for folder in ([path] if single else sorted(path.glob("seeds_*"), key=_seeds_of))
             ]
-        self.homes = [home for home in found if home.config.exists()]
+        self.homes = [home for home in folders if home.config.exists()]
 
     @cached_property
     def _done(self) -> list[RunFolder]:

@@ -98,8 +98,8 @@ def run_study(
                     write_text(folder / _NOTE, _note(study))
                 outcomes = run_jobs(plan, workers, progress=progress)
         except Timeout as error:
-            what = "study" if isinstance(study, Study) else "sweep"
-            raise ValueError(f"another process is running a {what} in {folder}") from error
+            kind = "study" if isinstance(study, Study) else "sweep"
+            raise ValueError(f"another process is running a {kind} in {folder}") from error
     left = [job.folder for job in plan.to_go]
     done = [label for label in runs if not any(home.is_relative_to(folder / label) for home in left)]
     return StudyResult(

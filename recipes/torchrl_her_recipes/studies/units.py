@@ -29,8 +29,8 @@ class InUnits(GoalEnv):
         self.env, self.factor = env, factor
         task = self.task = goal_env(env)
         self.max_steps = task.max_steps
-        seen = {key: Unbounded(shape=env.observation_spec[key].shape) for key in _LENGTHS}
-        self.observation_spec = Composite(seen, shape=env.batch_size)
+        specs = {key: Unbounded(shape=env.observation_spec[key].shape) for key in _LENGTHS}
+        self.observation_spec = Composite(specs, shape=env.batch_size)
         self.action_spec = env.action_spec.clone()
         self.reward_spec = env.reward_spec.clone()
         self.done_spec = env.full_done_spec.clone()
@@ -65,8 +65,8 @@ class InUnits(GoalEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._multiplied(self.env._step(tensordict))
 
-    def _multiplied(self, shown: TensorDictBase) -> TensorDictBase:
-        kept = shown.exclude("state")
+    def _multiplied(self, tensordict: TensorDictBase) -> TensorDictBase:
+        kept = tensordict.exclude("state")
         return kept.update({key: kept[key] * self.factor for key in _LENGTHS})
 
 

@@ -185,12 +185,12 @@ def make_sampler(name: str, seed: int) -> optuna.samplers.BaseSampler:
     """
     if name == "cmaes" and find_spec("cmaes") is None:
         raise ImportError("--sampler cmaes needs cmaes: pip install '.[tune]'")
-    made: dict[str, Callable[[], optuna.samplers.BaseSampler]] = {
+    makers: dict[str, Callable[[], optuna.samplers.BaseSampler]] = {
         "tpe": lambda: optuna.samplers.TPESampler(seed=seed),
         "random": lambda: optuna.samplers.RandomSampler(seed=seed),
         "cmaes": lambda: optuna.samplers.CmaEsSampler(seed=seed, warn_independent_sampling=False),
     }
-    return made[name]()
+    return makers[name]()
 
 
 def _make_pruner(name: str, epochs: int) -> optuna.pruners.BasePruner:
@@ -211,10 +211,12 @@ def _counted(study: Study) -> list[FrozenTrial]:
 
 def _repeat(study: Study, trial: FrozenTrial | Trial, *, attempt: int = 0) -> None:
     """Ends an interrupted trial; another trial with its values resumes its run."""
-    kept = {name: value for name, value in trial.user_attrs.items() if name == DEFAULT}
+    attributes = {name: value for name, value in trial.user_attrs.items() if name == DEFAULT}
     Trial(study, trial._trial_id).set_user_attr(_REPEATED, True)
     study.tell(trial.number, state=TrialState.FAIL)
-    study.enqueue_trial(trial.params, user_attrs={**kept, "folder": folder_of(trial), _ATTEMPT: attempt})
+    study.enqueue_trial(
+        trial.params, user_attrs={**attributes, "folder": folder_of(trial), _ATTEMPT: attempt}
+    )
 
 
 class _TrialRuns:

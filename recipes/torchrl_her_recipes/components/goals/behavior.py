@@ -39,14 +39,14 @@ def make_behavior(
     if not isinstance(options, Proposed):
         return None
     runs, rewards = len(seeds), reward_range(goal_env(env))
-    given: dict[str, Any] = {"real_share": options.real_share, "memory": options.goal_memory}
+    keywords: dict[str, Any] = {"real_share": options.real_share, "memory": options.goal_memory}
     if state is not None and state.progress.by_episode:
-        given |= {"stage_key": "stage", "stage": len(state.curriculum) - 1}
+        keywords |= {"stage_key": "stage", "stage": len(state.curriculum) - 1}
     pad = None if state is None else ZeroPad(state.curriculum, at_the_top(state.curriculum, runs))
     values = partial(
         GoalValues, agent.loss, agent.actor, runs=runs, before_actor=pad, before_critic=agent.norm
     )
-    goals = partial(_goals, seeds, env, **given)
+    goals = partial(_goals, seeds, env, **keywords)
     behavior: BehaviorGoals = load_name(options.maker)(
         options, goals, learner=learner, runs=runs, rewards=rewards, space=space, values=values
     )

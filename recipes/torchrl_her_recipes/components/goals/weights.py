@@ -24,11 +24,11 @@ def make_instructive(
     """Prefers goals near the real ones (IBS)."""
     shared = ("start_factor", "decay", "floor")
     names = shared if isinstance(space, KernelSpace) else (*shared, "floor_is_relative", "recent")
-    given: dict[str, Any] = {name: value for name, value in vars(options).items() if name in names}
-    given |= {"sigma": space.sigma, "subtract": isinstance(options, IBS)}
+    keywords: dict[str, Any] = {name: value for name, value in vars(options).items() if name in names}
+    keywords |= {"sigma": space.sigma, "subtract": isinstance(options, IBS)}
     if isinstance(space, KernelSpace):
-        return KernelInstructiveness(space.goals, **given)
-    return Instructiveness(space.grid, space.target_at, **given)
+        return KernelInstructiveness(space.goals, **keywords)
+    return Instructiveness(space.grid, space.target_at, **keywords)
 
 
 def make_rare(options: Rare, *, env: Any, **_: Any) -> RareGoals:

@@ -32,7 +32,7 @@ class DQNBuilder(LearnerBuilder):
         return actor.to(self.dtype), [critic]  # the critic shares the actor's weights
 
     def greedy(self, actor: TensorDictModule) -> nn.Module:
-        return BestAction(next(each for each in actor.modules() if isinstance(each, QNet)))
+        return BestAction(next(module for module in actor.modules() if isinstance(module, QNet)))
 
     def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_dqn_loss(

@@ -34,7 +34,7 @@ class SACBuilder(DDPGBuilder):
         )
 
     def greedy(self, actor: TensorDictModule) -> nn.Module:
-        net = next(each for each in actor.modules() if isinstance(each, StochasticActorNet))
+        net = next(module for module in actor.modules() if isinstance(module, StochasticActorNet))
         spec = self.action_spec
         return SquashedLocation(net, spec.low.to(self.dtype), spec.high.to(self.dtype))
 

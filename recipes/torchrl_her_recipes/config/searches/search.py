@@ -88,8 +88,8 @@ def difference(search: Mapping[str, Any], other: Mapping[str, Any]) -> str:
     first, second = _flat(search), _flat(other)
     for name in {**first, **second}:
         if first.get(name) != second.get(name):
-            said = (f"{name}={flat[name]}" if name in flat else f"no {name}" for flat in (first, second))
-            return ", not ".join(said)
+            parts = (f"{name}={flat[name]}" if name in flat else f"no {name}" for flat in (first, second))
+            return ", not ".join(parts)
     return ""
 
 

@@ -75,8 +75,8 @@ class Space:
         Example:
             >>> load_space("dqn").without({"learner.gamma": 0.9}).ranges.get("gamma")
         """
-        given = {locate(split_name(name)[0]) for name in names}
-        left = {name: values for name, values in self.ranges.items() if locate(name) not in given}
+        fixed = {locate(split_name(name)[0]) for name in names}
+        left = {name: values for name, values in self.ranges.items() if locate(name) not in fixed}
         if not left:
             raise ValueError(f"all options of the space {self.name} are given: there is nothing to search")
         return replace(self, ranges=left)

@@ -133,9 +133,9 @@ class LogByName(Callback):
             self._teller.on_start(run)
         return self._teller
 
-    def _tried(self, what: Callable[[], None], run: RunView) -> bool:
+    def _tried(self, call: Callable[[], None], run: RunView) -> bool:
         try:
-            what()
+            call()
         except Exception as error:  # a full disk, a network that is down
             after = f"after {run.trainer.frames:,} frames"
             warnings.warn(f"log={self.name} fails {after}, the run continues: {_reason(error)}", stacklevel=2)
