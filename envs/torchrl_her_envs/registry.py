@@ -126,7 +126,7 @@ def module_of(name: str) -> str:
 def check_task(name: str) -> None:
     """Raises a ValueError for an unknown task, which lists all tasks and suggests the nearest name.
 
-    Whether gymnasium knows the ID of ``gym:ID``, or a module its function, is only found out when the
+    An unknown ID in ``gym:ID``, or a function that its module lacks, raises an error only when the
     environment is made.
 
     Example:

@@ -47,7 +47,7 @@ class GoalCandidates(NamedTuple):
 class GoalFactor:
     """Factor of the probability that a goal is proposed. Subclass it for a measure of your own.
 
-    The base class finds all goals alike.
+    The base class gives all goals the same factor.
 
     Attributes:
         samples: number of achieved goals that it needs in ``GoalCandidates.known``.
@@ -73,7 +73,7 @@ class GoalFactor:
         """
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain data that :meth:`load_state_dict` takes."""
+        """Returns tensors and plain data that :meth:`load_state_dict` takes."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -160,10 +160,10 @@ class InverseDensity(GoalFactor):
 class ValueCutoff(GoalFactor):
     """Leaves out goals that the critics consider out of reach: those with a value below a cut-off.
 
-    The cut-off is each run's own and moves with the success of its proposed goals: down, by a step for as
-    many episodes as ``memory``, as long as more than ``high`` of them are achieved, and up, to its first
-    value at most, where fewer than ``low`` are. If all goals of an episode are below it, the one of the
-    highest value is left. After Pitis et al., Maximum Entropy Gain Exploration for Long Horizon Multi-goal
+    Each run has its own cut-off, which moves with the success of its proposed goals. It falls while more than
+    ``high`` of them are achieved, by one step in ``memory`` episodes. It rises while fewer than ``low`` are
+    achieved, up to its first value. If all goals of an episode are below it, the goal with the highest value
+    stays. After Pitis et al., Maximum Entropy Gain Exploration for Long Horizon Multi-goal
     RL, 2020 (arXiv 2007.02832), section 3.3.
 
     Args:
@@ -240,9 +240,9 @@ class DiscoverScore(GoalFactor):
         score = alpha (V(s0, g) + beta S(s0, g)) + (1 - alpha) (V(s_g, g*) + beta S(s_g, g*))
 
     V and S are the mean and the standard deviation of the critics' values, s0 is the beginning of the
-    episode, s_g what was observed when g was achieved, and g* the goal of the task. Each run's alpha rises,
-    so that achievable goals count more, as long as fewer than ``target`` of the proposed goals are achieved,
-    and falls otherwise.
+    episode, s_g what was observed when g was achieved, and g* the goal of the task. Each run's alpha rises
+    while fewer than ``target`` of the proposed goals are achieved, so that achievable goals count more, and
+    falls otherwise.
 
     With a single critic S is 0. :class:`InverseDensity` then takes its place.
 

@@ -108,7 +108,7 @@ class AchievedGoals:
         self._written[run] = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain data that :meth:`load_state_dict` takes."""
+        """Returns tensors and plain data that :meth:`load_state_dict` takes."""
         rows = []
         for part in self._rows or ():
             blocks = zip(part.split(self.capacity), self.sizes, strict=True)

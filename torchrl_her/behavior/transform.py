@@ -336,7 +336,7 @@ class BehaviorGoals(Transform):
         return chosen, goals
 
     def _sample(self, counts: Sequence[int]) -> Sequence[Tensor]:
-        """Draws goals of each run that has episodes, as many as the most demanding factor needs."""
+        """Draws goals of each run that has episodes: the largest number that a factor needs."""
         number = max((factor.samples for factor in self.factors), default=0)
         draws = [min(1, count) for count in counts]
         if number == 0:

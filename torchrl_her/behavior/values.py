@@ -64,7 +64,7 @@ class GoalValues:
 
     @torch.no_grad()
     def __call__(self, observation: Tensor, goals: Tensor, counts: Sequence[int]) -> Tensor:
-        """The values of goals.
+        """Returns the values of goals.
 
         Args:
             observation: [m, o], or [m, c, o] with one for each goal; run after run.

@@ -37,7 +37,7 @@ class GuidedExploration(TensorDictModuleBase):
     ``set_exploration_type(ExplorationType.DETERMINISTIC)`` it does nothing.
 
     Args:
-        policy: that learns; it reads the network's input alone. It is copied.
+        policy: the policy that learns, which is copied. It reads only the network's input.
         curriculum: the stages.
 
     Keyword Args:
@@ -50,9 +50,9 @@ class GuidedExploration(TensorDictModuleBase):
             policy reads and writes, and of the flag at the beginning of an episode.
 
     Attributes:
-        stage: [R], which stage's policy begins a run's episodes; -1 as long as there is none. It does not
-            matter if episodes have stages.
-        guided: [B, 1], the stage as in which it acts in each environment at the moment; -1 where it does not.
+        stage: [R], the stage whose policy begins a run's episodes; -1 while there is none. Not used if
+            episodes have stages of their own.
+        guided: [B, 1], the stage whose policy now acts in each environment; -1 where the guide does not act.
             None before the first step.
 
     Raises:

@@ -115,9 +115,9 @@ class EpisodeStages(CurriculumProgress):
 class TeacherStudent(EpisodeStages):
     """Prefers stages whose success rate changes, in proportion to the absolute change.
 
-    Each stage's success is averaged over its recent episodes, and over the half as many newest ones; the
-    distance between the two is its progress. A share of the episodes is drawn from all stages alike, so that
-    a stage that stood still is noticed when it moves. After Matiisen et al., Teacher-Student Curriculum
+    A stage's progress is the distance between two averages of its success: over its recent episodes, and over
+    the newer half of them. A share of the episodes draws all stages with equal probability, so that a stage
+    that stood still is noticed when it moves. After Matiisen et al., Teacher-Student Curriculum
     Learning, 2017 (arXiv 1707.00183), here with averages that forget in place of windows.
 
     Args:

@@ -367,7 +367,7 @@ class CurriculumProgress:
         return float(self.stages[self._check_run(run)])
 
     def stage_of(self, run: int) -> CurriculumStage:
-        """The present stage of a run."""
+        """Returns the present stage of a run."""
         return self.curriculum.stages[self.stages[self._check_run(run)]]
 
     def set_stage(self, run: int, stage: int) -> None:
@@ -415,7 +415,7 @@ class CurriculumProgress:
         return self._record(self._check_run(run), _samples(successes))
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain data that :meth:`load_state_dict` takes."""
+        """Returns tensors and plain data that :meth:`load_state_dict` takes."""
         return {
             "stage": self.stage,
             "expert": self.expert,

@@ -133,14 +133,15 @@ class StateToObs(_StageTransform):
     ``observation`` always has the width of the last stage: the entries of the present stage, then zeros.
 
     The last stage is the environment's own task: its reward and its ends stay as they are. In the stages
-    below, ``next`` gets the reward and ``terminated`` of the stage's ``reward_fn`` (0 and an end where the
-    goal is nearer than the stage's threshold, -1 elsewhere), and ``done``, which is
-    ``terminated | truncated``. ``truncated`` stays as it was, so the environment must set it at its time
-    limit even if its own goal is achieved. Where the environment terminates an episode by itself, the
-    stage's episode continues if the environment can be stepped further. If it cannot
-    (``continues_after_termination=False``, as with gymnasium's environments), the stage's episode ends
-    there, too: it is ``truncated`` unless the stage's goal was achieved in that step, so that the critic goes
-    on to estimate what would have come. The end says nothing about the stage's goal.
+    below, ``next`` gets the reward and ``terminated`` of the stage's ``reward_fn``: 0 and an end where the
+    goal is nearer than the stage's threshold, -1 elsewhere. ``done`` becomes ``terminated | truncated``.
+    ``truncated`` stays as it was, so the environment must set it at its time limit even if its own goal is
+    achieved.
+
+    If the environment terminates an episode by itself, the stage's episode continues, provided that the
+    environment can be stepped further. Gymnasium's cannot (``continues_after_termination=False``). Then the
+    stage's episode ends, too. It is ``truncated`` unless the stage's goal was achieved in that step: the end
+    says nothing about the stage's goal, so the critic must bootstrap there.
 
     The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
     Put the transform around a ParallelEnv and not inside of its workers: they hold copies of ``progress`` and

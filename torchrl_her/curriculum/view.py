@@ -14,15 +14,15 @@ from torchrl_her.replay_buffers.options import HindsightOptions
 class StageView:
     """Shows collected transitions as a stage would have: with its observation, goals, reward and ends.
 
-    Given to :class:`~torchrl_her.replay_buffers.StageRule`, it lets each transition train all stages and not
-    only the one that its episode was played in, as in Luo et al., Relay Hindsight Experience Replay, 2022
-    (arXiv 2208.00843). Transitions that were played in the stage stay as they are. In the others, reward and
-    end are those of the stage; where an episode ended that would have gone on in the stage, it is truncated.
+    With it, a :class:`~torchrl_her.replay_buffers.StageRule` trains a stage on the transitions of all stages.
+    Transitions that were played in the stage stay as they are. The others get the reward and the end of the
+    stage. If their episode ended where it would continue in the stage, it is truncated. Luo et al., Relay
+    Hindsight Experience Replay, 2022 (arXiv 2208.00843).
 
     Args:
         curriculum: the stages.
         stage: index of the stage, from 0.
-        reward_fn: of this stage; maps (achieved, desired) goals to (reward, terminated).
+        reward_fn: reward of this stage; maps (achieved, desired) goals to (reward, terminated).
 
     Keyword Args:
         state_key: the state vector, which :class:`~torchrl_her.StateToObs` has read.

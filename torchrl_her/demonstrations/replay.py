@@ -69,7 +69,7 @@ class MixedReplay:
 
     Args:
         collected: the buffer that is trained from; for one run or several.
-        demonstrations: buffer of demonstrations of as many runs, with the same transforms.
+        demonstrations: buffer of demonstrations for the same number of runs, with the same transforms.
 
     Keyword Args:
         share: fraction of each batch that is demonstrations.

@@ -178,7 +178,7 @@ class DemonstrationStarts(Transform):
     # Part of the state_dict, which collectors include in theirs
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The walk, the episodes under way, and the sources of random numbers."""
+        """Returns the walk, the episodes under way, and the sources of random numbers."""
         return {
             "walk": self.walk.state_dict(),
             "back": None if self._back is None else self._back.clone(),

@@ -46,7 +46,7 @@ def written(path: str | Path) -> Iterator[Path]:
         _sync(part)
         os.replace(part, path)
     except OSError as error:
-        if error.errno is None:  # an error of a library without an error number of the system
+        if error.errno is None:  # raised by a library and not by the operating system
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:

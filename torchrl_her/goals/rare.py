@@ -15,7 +15,7 @@ from torchrl_her.goals.weights import GoalWeights, normalized_weights, spread_ev
 
 Estimator = Literal["kernel", "neighbors"]
 
-_LEVEL = 128  # samples whose median density is that of an ordinary goal
+_LEVEL = 128  # number of samples; the median of their densities is the density of an ordinary goal
 _LEAST_DISTANCE = 1e-3  # in standard deviations: nearer goals count as equal
 _SHARPEST = 3.0  # dimensions from which on the default of sharpness falls
 
@@ -23,13 +23,13 @@ _SHARPEST = 3.0  # dimensions from which on the default of sharpness falls
 class RareGoals(GoalWeights):
     """Weights goals by the inverse of their density among the goals that were written most recently.
 
-    Goals at the edge of what has been reached are then drawn more often than those in its middle. MEGA
+    Goals at the edge of the reached region are then drawn more often than goals in its middle. MEGA
     (Pitis et al., Maximum entropy gain exploration for long horizon multi-goal reinforcement learning, 2020)
     sets goals of the least density for the agent to pursue; here the same preference chooses goals to
     relabel with.
 
-    Goals are divided by the standard deviations of those that are remembered, so that numbers of different
-    units count alike. Before there are any, all weights are 1, and goals that are not finite have weight 0.
+    Goals are divided by the standard deviations of the remembered goals, so that numbers of different units
+    count equally. While no goal is remembered, all weights are 1; goals that are not finite have weight 0.
 
     Keyword Args:
         estimator: ``"kernel"`` for a Gaussian kernel around each goal, for a few dimensions; ``"neighbors"``
@@ -38,7 +38,8 @@ class RareGoals(GoalWeights):
         k: number of the neighbor whose distance counts.
         sharpness: weights are ``density ** -sharpness``; None for 1 up to three dimensions and 3 / g beyond,
             since the same ratio of distances is a far greater ratio of densities there.
-        limit: a goal weighs at most so many times as much, or as little, as one of median density.
+        limit: largest ratio between the weight of a goal and the weight of a goal of median density, and the
+            inverse of the least ratio.
         memory: number of the newest goals that are remembered.
         samples: number of these from which densities are estimated; they are spread evenly over the memory.
 

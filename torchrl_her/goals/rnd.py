@@ -87,7 +87,7 @@ class NetworkNovelty(GoalWeights):
 
     @torch.no_grad()
     def error(self, goals: Tensor) -> Tensor:
-        """The squared prediction errors [...] of goals [..., g]; NaN for goals that are not finite.
+        """Returns the squared prediction errors [...] of goals [..., g]; NaN for goals that are not finite.
 
         Raises:
             RuntimeError: there were no goals to learn from yet.

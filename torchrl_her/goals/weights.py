@@ -12,7 +12,7 @@ _GOLDEN = (5**0.5 - 1) / 2
 
 
 class GoalWeights:
-    """Measure of how useful each achieved goal is as a virtual goal. Subclass it for one of your own.
+    """Measure of how useful each achieved goal is as a virtual goal. Subclass it for a measure of your own.
 
     The base class gives all goals the same weight and has no state.
 
@@ -40,7 +40,7 @@ class GoalWeights:
         """Called when the writer's buffer was emptied."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain data that :meth:`load_state_dict` takes."""
+        """Returns tensors and plain data that :meth:`load_state_dict` takes."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -53,10 +53,10 @@ class GoalWeights:
 
 
 class WeightsOfRuns:
-    """Weights of goals of several runs, each with weights of its own, which are called one after the other.
+    """Weights of the goals of several runs, from one :class:`GoalWeights` for each run.
 
     Args:
-        weights: R, of each run.
+        weights: R objects, one for each run; they are called one after the other.
 
     Example:
         >>> class Times(GoalWeights):
@@ -77,9 +77,9 @@ class WeightsOfRuns:
         """Returns the weights [n, ...] of goals of the given runs.
 
         Args:
-            goals: [n, ..., g], those of one run after those of the other.
-            runs: m numbers of runs.
-            counts: m numbers of goals, of each of these runs; they sum to n.
+            goals: [n, ..., g], run after run.
+            runs: indices of m runs.
+            counts: number of goals of each of the m runs; they sum to n.
         """
         parts = goals.split(list(counts))
         return torch.cat([self.weights[run](part) for run, part in zip(runs, parts, strict=True)])
@@ -95,7 +95,7 @@ def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: in
     """Returns the weights of R runs as a list; empty if all goals have the same weight.
 
     Raises:
-        ValueError: there are not as many as runs.
+        ValueError: the number of weights is not R.
     """
     run_weights = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
     if run_weights and len(run_weights) != runs:
@@ -109,7 +109,7 @@ def checked_weights(weight: Tensor, goals: Tensor) -> Tensor:
     """Computes weights [...] of goals [..., g] as floating-point numbers, and checks them.
 
     Raises:
-        ValueError: there is not one for each goal, or some are negative or not finite.
+        ValueError: the number of weights is not that of the goals, or some are negative or not finite.
     """
     if weight.shape != goals.shape[:-1]:
         raise ValueError(
@@ -148,9 +148,9 @@ def normalized_weights(logs: Tensor, goals: Tensor) -> Tensor:
 def spread_evenly(count: int, most: int, device: torch.device | None = None) -> Tensor:
     """Returns the indices of ``count`` items, or of ``most`` of them that are spread evenly.
 
-    There is one in each of as many equal parts, and where in its part it is changes from part to part. Always
-    at its begin, with one part for each episode or step, say, all of them would be of first transitions, or
-    of one environment.
+    The items are divided into equal parts, and one is chosen in each part, at a place that changes from part
+    to part. If it were always the first place, and if each part were one episode, all chosen items would be
+    first transitions.
 
     Example:
         >>> spread_evenly(3, 5).tolist(), spread_evenly(12, 4).tolist()

@@ -27,9 +27,9 @@ def explore(
 ) -> Tensor:
     """Replaces some greedy actions by noisy ones, and a few by uniform ones.
 
-    As in appendix B of the thesis that the method is from. With ``epsilon=1`` there is noise on every action
-    that is not uniform, as in OpenAI's HER and in MRL: a share of 0.2 of uniform actions, and noise with a
-    standard deviation of 0.1 on actions from -1 to 1, are ``epsilon=1, uniform_share=0.2, noise=0.05``.
+    This is the exploration of appendix B of the thesis. With ``epsilon=1``, every action that is not uniform
+    has noise, as in OpenAI's HER and in MRL. They use ``epsilon=1, uniform_share=0.2, noise=0.05``: 20 % of
+    the actions are uniform, and noise has a standard deviation of 0.1 on actions from -1 to 1.
 
     Args:
         greedy: [..., a], the actions of the policy.

@@ -17,7 +17,7 @@ def generator_states(generators: Iterable[torch.Generator | None]) -> list[Tenso
 def set_generator_states(
     generators: Iterable[torch.Generator | None], states: Iterable[Tensor | None]
 ) -> None:
-    """Puts back what :func:`generator_states` returned for as many generators."""
+    """Restores the states that :func:`generator_states` returned, one for each generator."""
     for generator, state in zip(generators, states, strict=True):
         if generator is not None and state is not None:
             generator.set_state(state)

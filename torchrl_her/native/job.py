@@ -64,7 +64,7 @@ class Structures:
 
 @lru_cache
 def structures(dtype: torch.dtype) -> Structures:
-    """The structures for float32 or float64.
+    """Returns the structures for float32 or float64.
 
     Example:
         >>> structures(torch.float64).real.__name__

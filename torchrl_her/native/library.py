@@ -58,7 +58,7 @@ class CannotCompile(RuntimeError):
 
 
 def load_library(source: str, *, headers: Sequence[str] = (), real: str = "float") -> ctypes.CDLL:
-    """The library of a C++ source of this package.
+    """Returns the library of a C++ source of this package.
 
     It is compiled for this processor the first time, which takes some seconds, and kept in the user's cache:
     the folder that ``TORCHRL_HER_CACHE`` names, or ``torchrl_her`` in that of ``XDG_CACHE_HOME``. The
@@ -169,7 +169,7 @@ def _compile(compiler: Sequence[str], source: Path, real: str, library: Path) ->
 
 
 def find_compiler() -> list[str]:
-    """The compiler and options of its own: ``CXX`` may say ``ccache g++``.
+    """Returns the compiler and options of its own: ``CXX`` may say ``ccache g++``.
 
     Raises:
         CannotCompile: there is none.
@@ -183,7 +183,7 @@ def find_compiler() -> list[str]:
 
 
 def find_ziglang() -> list[str]:
-    """The compiler of the package ``ziglang``, which takes a minute the first time.
+    """Returns the compiler of the package ``ziglang``, which takes a minute the first time.
 
     Raises:
         CannotCompile: it is not installed, or ``CXX`` asks for another one.

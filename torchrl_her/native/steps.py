@@ -16,7 +16,7 @@ _TYPES = {torch.float32: "float", torch.float64: "double"}
 
 @lru_cache
 def load_steps(dtype: torch.dtype) -> Any:
-    """The function that makes gradient steps with numbers of a type; it takes a job's address.
+    """Returns the function that makes gradient steps with numbers of a type; it takes a job's address.
 
     Args:
         dtype: float32 or float64.

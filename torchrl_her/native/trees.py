@@ -16,7 +16,7 @@ _ARGUMENTS = {  # levels, widths, their number, runs, then what differs
 
 @lru_cache
 def load_trees() -> Any:
-    """The library of ``trees.cpp``, compiled for this processor once; None if it cannot be compiled."""
+    """Loads the library of ``trees.cpp``, compiled once for this processor; None if that fails."""
     try:
         library = load_library("trees.cpp")
     except CannotCompile:

@@ -112,7 +112,7 @@ def with_cloning(value: Tensor, loss: Any, cloning: Cloning, transitions: Tensor
         both = [rows.copy().set(key, each) for each in (shown, action.detach())]
         q_values = critic_value(loss, torch.cat(both, -1))  # one call for both is faster
         if q_values is None:
-            raise ValueError(f"a {type(loss).__name__} has no critics for the Q filter: q_filter=False")
+            raise ValueError(f"a {type(loss).__name__} has no critics for the Q filter; set q_filter=False")
         of_shown, of_policy = q_values.squeeze(-1).chunk(2, -1)
         better = of_shown > of_policy
     terms = cloning.weight * cloning_terms(action, shown, flagged[..., at], better=better)

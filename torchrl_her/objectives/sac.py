@@ -25,11 +25,11 @@ class PenalizedSACLoss(SACLoss):
 
     Each of R runs has its own temperature and its own random numbers.
 
-    Actor and targets have the least value of all critics. Or targets have the least value of some that are
-    drawn at random in each gradient step, and the actor follows the mean of all critics: this is REDQ (Chen
-    et al., 2021). TorchRL's ``REDQLoss`` cannot be used for it: it draws one subset for all runs, from
-    torch's own generator, has one temperature for all of them, and with ``reduction="none"`` it gives a loss
-    for each critic where stacked runs need one for each transition.
+    Actor and targets use the least value of all critics. With ``target_critics`` above 0, targets use the
+    least value of some critics, drawn at random in each gradient step, and the actor follows the mean of all
+    critics: this is REDQ (Chen et al., 2021). TorchRL's ``REDQLoss`` does not serve for several runs. It
+    draws one subset of critics for all runs, from torch's own generator, and has one temperature. With
+    ``reduction="none"`` it returns a loss for each critic, not for each transition.
 
     Args:
         *args: arguments of :class:`torchrl.objectives.SACLoss`.

@@ -170,14 +170,14 @@ class RunsHardUpdate(HardUpdate, _BuffersToo):
 def make_target_updater(
     loss: LossModule, *, tau: float, hard_interval: int, runs: int = 1
 ) -> TargetNetUpdater:
-    """Returns the update of a loss's target networks, of their running statistics, too.
+    """Makes the update of a loss's target networks and of their running statistics.
 
     Args:
-        loss: with target networks.
+        loss: loss with target networks.
 
     Keyword Args:
         tau: share of the online weights in a soft update, which follows each step if ``hard_interval`` is 0.
-        hard_interval: copies the online weights every so many steps; 0 for soft updates.
+        hard_interval: number of steps after which the online weights are copied; 0 for soft updates.
         runs: number of independent runs in the loss; each has its own count of steps.
 
     Example:

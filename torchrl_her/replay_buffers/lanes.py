@@ -23,11 +23,12 @@ _REMEDY = (
 def find_lanes(data: TensorDictBase, keys: TransitionKeys) -> tuple[str, Tensor]:
     """Returns the lanes of a batch [N, T], time last, or of a flat batch [n].
 
-    Environment ids are used if there are any. Without them, a row of a batch [N, T] is an environment; a flat
-    batch is split by trajectory ids, or is a single environment's if it has none of these either.
+    A lane is the environment or the trajectory that a transition belongs to. Environment ids are used if the
+    batch has them. Without them, each row of a batch [N, T] is an environment. A flat batch is split by
+    trajectory ids; without these, it counts as one environment.
 
     Returns:
-        ``(kind, lanes)``: what lanes are known by, and the lane of each transition, int64, flat.
+        ``(kind, lanes)``: how lanes were found, and the lane of each transition, int64, flat.
 
     Example:
         >>> from tensordict import TensorDict
@@ -113,7 +114,7 @@ def ends_of_held(lanes: Tensor, order: Tensor, held: int) -> Tensor:
     """Returns which transitions are the last of a lane among those that were held back: [n] of bool.
 
     Args:
-        lanes, order, held: as for :func:`broken`.
+        lanes, order, held: arguments of :func:`broken`.
     """
     rows = order[order < held]
     last = torch.ones_like(rows, dtype=torch.bool)

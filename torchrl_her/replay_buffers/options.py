@@ -42,12 +42,11 @@ class HindsightOptions:
             two sources that look beyond the episode: ``"actual"``, goals that were really wanted in
             recent episodes, and ``"achieved"``, goals that were achieved in them. ``weights`` and filter act
             on the goals of all sources. None: ``k`` and ``strategy`` count.
-        recent_actual, recent_achieved: number of the newest goals that these two sources remember: one that
-            was wanted for each episode, and one that was achieved for each transition. Those of the episodes
-            that are just written are among them. If these alone have more, goals are taken from all of them,
-            evenly spread over environments and time. A sample unit looks at as many of the newest episodes,
-            and newest transitions, that are stored. Where the filter refuses nearly all, large numbers cost
-            time.
+        recent_actual, recent_achieved: number of the newest goals that these two sources remember: one
+            desired goal for each episode, and one achieved goal for each transition. Episodes that are being
+            written are included. If they alone have more goals, those that are kept are spread evenly over
+            environments and time. A sample unit reads the same numbers of the newest stored episodes and
+            transitions. Large numbers cost time only if the filter refuses nearly all goals.
         per: unit that gets a goal of its own. ``"transition"``: each transition, for learning from single
             transitions. ``"episode"``: each copy of a whole episode, for learning from sequences, as
             recurrent policies do; see :class:`~torchrl_her.HERWriter`.
@@ -58,14 +57,13 @@ class HindsightOptions:
         gamma: the discount of these sums; needed with ``n_steps`` above 1, and the same as the loss's.
         filter_achieved: take no goal that was already achieved in the state before the action
             (Filtered-HER). This asks the reward and not ``terminated``, since many environments never
-            terminate. Where episodes go on at their goals, such transitions teach to stay there. Then only
-            goals are left out that were achieved at the start of the episode as well, because nothing has
-            moved yet.
-        redraw: True draws another goal, among those that the filter keeps, for one that it refuses;
-            False: the goal makes no virtual transition, so there are fewer where it refuses many.
+            terminate. If episodes continue at their goals, such transitions teach to stay there. Then a goal
+            is left out only if it was also achieved at the start of the episode, when nothing had moved yet.
+        redraw: True replaces a goal that the filter refuses by one that it keeps. False writes no virtual
+            transition for it.
         achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved. A
-            transition that terminated with a lower reward failed, as by a fall: it terminates for virtual
-            goals, too, and costs as much.
+            transition that terminated with a lower reward failed, as by a fall: it also terminates for
+            virtual goals, with the same reward.
         exclude: entries to leave out, in the root and under ``next``. ``state`` is one of them because it
             holds the real goal. Add whatever else was computed from the desired goal.
         achieved_goal_key, desired_goal_key: goals, in the root and under ``next``.
@@ -167,7 +165,7 @@ class HindsightOptions:
 
         Raises:
             TypeError: there is no option of one of these names.
-            ValueError: an option cannot be, or ``goal_sources`` and one of ``k`` and ``strategy`` are given.
+            ValueError: an option is out of range, or ``goal_sources`` comes with ``k`` or ``strategy``.
 
         Example:
             >>> HindsightOptions(k=8).changed({"strategy": "final"}).strategy

@@ -67,7 +67,7 @@ class _Stored(NamedTuple):
     state: tuple[int, int]
     rows: TensorDictBase  # [n], a view
     after: Tensor  # [n, g], goals that the action achieved: the candidates
-    wanted: Tensor  # [n, g], desired goals; if they are candidates, in the type of ``after``
+    wanted: Tensor  # [n, g], desired goals; converted to the dtype of ``after`` if they serve as candidates
     episodes: EpisodeIndex
     ends: Callable[[], bool]  # whether episodes end at their goals; the reward function is called once
     recent: dict[tuple[str, int], Tensor]  # rows of the newest episodes, cached
@@ -528,7 +528,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _draw_by_likelihood(
         self, stored: _Stored, group: Tensor, first: Tensor, end: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """Draws like ``_draw``, but from all candidates of each group, ``first`` to ``end``."""
+        """Draws a goal for each group from all candidates ``first`` to ``end``, by weights and filter."""
         source, valid = torch.empty_like(first), torch.ones_like(first, dtype=torch.bool)
         if len(group) == 0:
             return source, valid
@@ -556,8 +556,8 @@ def _moved(entry: Tensor | None, device: torch.device) -> Tensor | None:
 def _oldest(storage: Storage) -> int:
     """Returns the slot of a storage's oldest rows.
 
-    The writer's cursor tells; TorchRL does not restore that of the storage. If several buffers share a
-    storage, it is the cursor of the one that has written most.
+    Reads the writer's cursor, since TorchRL does not restore the cursor of the storage. If several buffers
+    share a storage, the cursor is that of the buffer that has written most.
     """
     if not is_full(storage):
         return 0

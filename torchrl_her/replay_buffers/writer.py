@@ -52,13 +52,13 @@ OnWrite = Callable[[TensorDictBase, list[int], list[int]], Callable[[], None] | 
 class _Draft(NamedTuple):
     """Real and virtual transitions of some episodes before they are written."""
 
-    rows: TensorDictBase  # those that were collected, as the stage shows them
+    rows: TensorDictBase  # collected transitions, as the stage shows them
     runs: list[int]
     real: WrittenRows
     virtual: WrittenRows | None
     numbers: dict[str, list[int]]  # arguments of RunCounts.add
     weighted: bool  # whether weights are updated with the virtual goals
-    ids: int  # number of trajectory ids that they take
+    ids: int  # number of trajectory ids that the episodes take
 
     @property
     def counts(self) -> list[int]:
@@ -71,25 +71,25 @@ class _Draft(NamedTuple):
 class HERWriter(HindsightBase, RoundRobinWriter):
     """Writes each transition as it was, and up to k times more with a goal that was achieved later.
 
-    It takes a collector's batch: [N, T] with time last, or flat with trajectory ids. Episodes that are still
-    open at the end of a batch are held back until they end. A virtual transition has another desired goal
-    in the root and under ``next``; its reward, terminated and done are computed again for that goal (but an
-    episode that terminated without achieving its goal, as by a fall, does so for any goal), and everything
-    else stays as it was.
+    The writer takes a collector's batch: [N, T] with time last, or flat with trajectory ids. Episodes that
+    are still open at the end of a batch are held back until they end. A virtual transition has another
+    desired goal in the root and under ``next``. Its reward, terminated and done are computed for that goal,
+    and everything else stays as it was. An episode that terminated without achieving its goal, as by a fall,
+    terminates for any goal.
 
-    Goals come from the same episode and no other one, unless ``goal_sources`` asks for ``"actual"`` or
-    ``"achieved"`` ones: the writer remembers what was wanted and achieved in recent episodes, of all
-    environments of the run. They are part of its state, and forgotten when the buffer is emptied.
+    Goals come from the same episode, unless ``goal_sources`` has ``"actual"`` or ``"achieved"``. For these
+    the writer remembers goals that were desired and achieved in recent episodes, in all environments of a
+    run. They are part of its state, and forgotten when the buffer is emptied.
 
-    Rows of the next batch that go on with an open episode are found by the ids of environments
-    (:class:`~torchrl_her.EnvIds`), if there are any; otherwise by their place in a batch [N, T], or by
-    trajectory ids in a flat one. What that cannot tell apart is refused: environments that are reset before
-    their episodes end, and batches of several collectors that share places, need ids of environments. If you
-    reset environments yourself, call :meth:`end_episodes`.
+    Rows of the next batch continue an open episode if they have the same environment id
+    (:class:`~torchrl_her.EnvIds`). Without such ids, they continue it if they have the same place in a batch
+    [N, T], or the same trajectory id in a flat batch. Ids are needed, and their absence raises an error, if
+    environments are reset before their episodes end, or if batches of several collectors share places. If
+    you reset environments yourself, call :meth:`end_episodes`.
 
-    With ``per="episode"``, whole virtual episodes are stored: up to k copies of each episode, each with one
-    goal, drawn for its first transition, and each with an id of its own under ``trajectory_key``. A copy ends
-    where its goal terminates it, or is truncated at its end. That is what samplers of slices need.
+    With ``per="episode"``, whole virtual episodes are stored, as samplers of slices need them: up to k copies
+    of each episode. Each copy has one goal, drawn for its first transition, and its own id under
+    ``trajectory_key``. It ends where its goal terminates it, or is truncated at its end.
 
     One writer may serve R independent runs: ``HERWriter(..., runs=R, generators=...)``. It takes batches
     [R * N, T], R equal blocks in the order of the runs, and the storage is R equal blocks of rows, each of
@@ -107,20 +107,20 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         options: how transitions are relabeled; None for the defaults.
 
     Keyword Args:
-        weights: prefers some goals to others, all goals of a batch as it did before that batch; None for all
-            alike. For several runs a list, one of each run (``goal_weights``).
+        weights: prefers some goals to others; None for equal weights. Weights are updated only after the
+            goals of a batch are drawn. For several runs a list, one for each run (``goal_weights``).
         runs: R.
         generators: R sources of random numbers; None for the buffer's, with one run only.
         stages: for episodes that carry the stage of a curriculum in which they were played, one rule for each
             stage; they take the place of ``reward_fn``. A rule may have all episodes written for its stage,
             whatever stage they were played in. None if episodes have no stages.
-        refill: where the filter leaves transitions without goals, the others get more goals of their episode,
-            so that there are about as many in all: up to this many times as many; 1: no more. It goes by the
-            share of transitions that got goals so far, of each run.
-        on_write: called with all that is written, real and virtual transitions, as ``(rows, runs, counts)``:
-            rows run after run, which runs these are, and how many rows each has. It comes before they are
-            stored, and may come several times for one batch; if it raises an error, nothing of the batch is
-            stored. It may return a function that undoes it, for rows that could not be stored. See
+        refill: largest number of goals of a transition, as a multiple of k. If the filter leaves some
+            transitions without goals, the others get more, so that a run has about k virtual transitions for
+            each real one. The number follows the share of transitions that got goals so far. 1 adds none.
+        on_write: called as ``on_write(rows, runs, counts)`` before rows are stored: real and virtual
+            transitions run after run, the indices of these runs, and their numbers of rows. It may be called
+            several times for one batch. If it raises an error, nothing of the batch is stored. It may return
+            a function that undoes the call, for rows that could not be stored. See
             :class:`~torchrl_her.modules.RunningNorm`.
         **changes: options by name, as in the example; all are listed in
             :class:`~torchrl_her.HindsightOptions`.
@@ -132,7 +132,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         held_back: number of transitions of open episodes that wait for their end.
 
     Raises:
-        ValueError: an option cannot be, or (when extending) the writer cannot work beside another part.
+        ValueError: an option is out of its range, or (when extending) the writer does not fit another part.
         TypeError: ``exclude`` is one key, not a list.
         KeyError: a batch lacks an entry (when extending).
         RuntimeError: the buffer was copied to another process.
@@ -349,7 +349,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._all_over = True
 
     def state_dict(self) -> dict[str, Any]:
-        """The writer's whole state, as tensors and plain data."""
+        """Returns the writer's whole state, as tensors and plain data."""
         state = super().state_dict()
         state["cursors"] = [self._cursor] if self.runs == 1 else list(self._rings.cursors)
         state["sizes"] = self.sizes

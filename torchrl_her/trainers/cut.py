@@ -14,8 +14,8 @@ _TRAJECTORY = ("collector", "traj_ids")
 def cut_episodes(batch: TensorDictBase) -> TensorDictBase:
     """Truncates all episodes that are open at the end of a batch.
 
-    Whoever resets a collector before its episodes are over needs this: a replay buffer that waits for whole
-    episodes would never see the end of those that were open.
+    Call it if you reset a collector before its episodes have ended: a replay buffer that waits for whole
+    episodes would otherwise never see their end.
 
     Args:
         batch: [N, T] with time last; or flat [n], with ``("collector", "traj_ids")``, without which it is one

@@ -36,7 +36,7 @@ class FusedLearner:
     All gradient steps of an update are one call of a program in C++, which does everything: losses,
     gradients, clipping, Adam and target updates. The program is compiled at first use, which takes some
     seconds, and kept for later (see :func:`~torchrl_her.native.load_steps`). Several runs are shared out
-    among as many threads as torch may use (``torch.set_num_threads``).
+    among the threads that torch may use (``torch.set_num_threads``).
 
     Args:
         loss: as :func:`~torchrl_her.make_ddpg_loss`, :func:`~torchrl_her.objectives.make_td3_loss`,
@@ -160,7 +160,7 @@ class FusedLearner:
         return call
 
     def _run(self, call: FusedCall, first: int, steps: int) -> Tensor:
-        """Makes some of the steps, and returns their losses, [3, steps, R]."""
+        """Makes the gradient steps from number ``first`` on, and returns their losses, [3, steps, R]."""
         losses = torch.zeros(3, steps, self.runs, dtype=self._kinds.dtype)
         counts = self._weights.counts
         noise, adam = call.draw_noise(steps), self._adam(steps, counts)  # memory that the job points to
@@ -176,7 +176,7 @@ class FusedLearner:
         (group,) = self.optimizer.param_groups
         rate, (beta1, beta2), kind = float(group["lr"]), group["betas"], self._kinds.adam
 
-        @cache  # most runs have made as many steps as the others
+        @cache  # most runs have made the same number of steps
         def numbers(count: float) -> list[Any]:
             return [
                 kind(

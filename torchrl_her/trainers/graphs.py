@@ -32,10 +32,10 @@ class GraphLearner(LossLearner):
     by steps without a graph.
 
     Args:
-        loss: as for :class:`~torchrl_her.LossLearner`, on a GPU.
-        optimizer: as for :class:`~torchrl_her.LossLearner`; it is made ``capturable``.
+        loss: TorchRL loss on a GPU, see :class:`~torchrl_her.LossLearner`.
+        optimizer: optimizer of the loss's parameters; it is made ``capturable``.
         target: update that moves the targets in the same way in each step, such as ``SoftUpdate``.
-        max_grad_norm: as for :class:`~torchrl_her.LossLearner`.
+        max_grad_norm: norm to which gradients are clipped, see :class:`~torchrl_her.LossLearner`.
         runs: R.
 
     Keyword Args:
@@ -183,8 +183,8 @@ class _Recorded:
                 first = first.__context__
             reason = next(iter(str(first).splitlines()), type(first).__name__)
             raise RuntimeError(
-                f"gradient steps cannot be recorded as a CUDA graph: {reason}; use LossLearner, in recipes "
-                "compile=never"
+                f"gradient steps cannot be recorded as a CUDA graph: {reason}; use LossLearner "
+                "(in recipes, compile=never)"
             ) from error
         return graph
 

@@ -105,8 +105,8 @@ class Trainer:
 
     Keyword Args:
         runs: R.
-        epoch_frames: environment steps of each run in an epoch. Epochs end with whole batches: the first n
-            have n times as many steps together, rounded up.
+        epoch_frames: environment steps of each run in an epoch. Epochs end with whole batches, so the first n
+            epochs together have n times this number, rounded up.
         frames_per_update: environment steps of each run for each of its gradient steps; 0.5, for example, for
             two gradient steps for each environment step. They are made after each collected batch.
         warmup_frames: environment steps of each run before its first gradient step. The gradient steps that
@@ -161,7 +161,7 @@ class Trainer:
 
     @property
     def in_epoch(self) -> bool:
-        """Whether an epoch has begun and not ended."""
+        """Whether an epoch is under way."""
         return self._measured is not None
 
     def epoch(self, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
@@ -303,7 +303,7 @@ class Trainer:
 
 
 def _without(value: Tensor, idle: list[int]) -> Tensor:
-    """Returns measurements [S, R] with a mark in place of those of idle runs."""
+    """Returns measurements [S, R] in which those of idle runs are replaced by a mark."""
     return value.index_fill(1, torch.tensor(idle, dtype=torch.int64, device=value.device), _IDLE)
 
 

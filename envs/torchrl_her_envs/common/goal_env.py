@@ -41,11 +41,11 @@ class GoalEnv(EnvBase):
 
     @abstractmethod
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """The reward of goals: [..., g] to [..., 1]."""
+        """Returns the reward of goals: [..., g] to [..., 1]."""
 
     @abstractmethod
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Whether an episode ends there: goals [..., g] to [..., 1] of bool."""
+        """Returns whether goals [..., g] end an episode, [..., 1] of bool."""
 
     @abstractmethod
     def set_seeds(self, seeds: Sequence[int]) -> None:
@@ -88,9 +88,9 @@ class GoalEnv(EnvBase):
 
     @property
     def continues_after_termination(self) -> bool:
-        """Whether it can be stepped further after it terminated an episode.
+        """Whether the environment can be stepped further after it terminated an episode.
 
-        Stages of a curriculum have goals of their own, so their episodes then go on as well.
+        Episodes of a curriculum's stages then continue, too, since stages have goals of their own.
         """
         return False
 
@@ -100,7 +100,7 @@ class GoalEnv(EnvBase):
         return False
 
     def stages(self) -> list[dict[str, Any]]:
-        """The stages of the task's curriculum, in the order of training; the last one is the full task.
+        """Returns the stages of the task's curriculum, in the order of training; the last is the full task.
 
         Returns:
             For each stage its ``name``; ``observation``, ``achieved_goal`` and ``desired_goal``, which are
@@ -133,7 +133,7 @@ class GoalEnv(EnvBase):
         return {"observation": list(range(observed)), "desired_goal": list(range(observed, observed + goal))}
 
     def action_limits(self) -> tuple[Tensor, Tensor]:
-        """The least and the greatest action, [entries] each, of the type that the task itself takes.
+        """Returns the least and the greatest action, [entries] each, of the type that the task itself takes.
 
         They are equal at fixed entries, to which ``action_spec`` gives a width.
 
@@ -146,7 +146,7 @@ class GoalEnv(EnvBase):
         return space.low, space.high
 
     def goal_box(self) -> Box | None:
-        """The least and greatest coordinates that achieved goals can have; None if the task does not say.
+        """Returns the least and greatest coordinates of achieved goals; None if the task does not state them.
 
         Example:
             >>> from torchrl_her_envs import make_env
@@ -156,7 +156,7 @@ class GoalEnv(EnvBase):
         return None
 
     def picture_box(self) -> Box | None:
-        """The coordinates of the edges of a picture, left and bottom, right and top; None without a scale.
+        """Returns coordinates of a picture's corners, (left, bottom) and (right, top); None without a scale.
 
         Goals can be drawn on a picture only if this is known. It is larger than :meth:`goal_box` where
         pictures have a margin.
@@ -179,7 +179,7 @@ class GoalEnv(EnvBase):
         return {}
 
     def trail_points(self) -> Tensor | None:
-        """The present points [N, ...] of what leaves a trail in films; None if nothing does."""
+        """Returns the present points [N, ...] of bodies that leave a trail in videos; None without trails."""
         return None
 
     def render(
@@ -194,7 +194,7 @@ class GoalEnv(EnvBase):
 
         Args:
             worlds: an index, several, or None for all environments of the batch.
-            size: of the longer side of each picture in pixels; the environment's own choice if None.
+            size: longer side of each picture in pixels; the environment's own choice if None.
             trail: earlier values of :meth:`trail_points`, oldest first.
             caption: a line of text in each picture.
 
@@ -210,15 +210,15 @@ class GoalEnv(EnvBase):
         return pictures[0] if isinstance(worlds, int) else torch.stack(pictures)
 
     def _draw_worlds(self, worlds: Sequence[int], size: int | None) -> list[Tensor]:
-        """Pictures [height, width, 3] of some environments, without a caption; for :meth:`render`."""
+        """Returns pictures [height, width, 3] of some environments, without a caption; for :meth:`render`."""
         raise ValueError(f"{self.task_name} gives no pictures")
 
 
 def goal_env(env: EnvBase) -> GoalEnv:
-    """The environment with goals below any transforms.
+    """Returns the environment with goals below any transforms.
 
     Raises:
-        TypeError: there is none.
+        TypeError: no environment with goals is found.
 
     Example:
         >>> from torchrl.envs import StepCounter, TransformedEnv
@@ -231,10 +231,10 @@ def goal_env(env: EnvBase) -> GoalEnv:
 
 
 def first_below(env: object, kind: type[E], what: str) -> E:
-    """The environment, or the first one below its transforms, that is of a class.
+    """Returns the environment, or the first one below its transforms, that is of a class.
 
     Raises:
-        TypeError: there is none; the message says that ``what`` was expected.
+        TypeError: no such environment is found; the message says that ``what`` was expected.
     """
     inner: object = env
     while not isinstance(inner, kind):
@@ -245,7 +245,7 @@ def first_below(env: object, kind: type[E], what: str) -> E:
 
 
 def choose_indices(count: int, worlds: int | Sequence[int] | None) -> list[int]:
-    """The indices of environments that are meant by what the user gave, checked.
+    """Returns the indices of environments that a user's argument means, checked.
 
     Args:
         count: number of environments in the batch.
@@ -267,7 +267,7 @@ def choose_indices(count: int, worlds: int | Sequence[int] | None) -> list[int]:
 
 
 def bounded_actions(low: Tensor, high: Tensor, count: int) -> Bounded:
-    """The spec of actions [count, entries] of float32 from the bounds of one environment, in any shape.
+    """Makes the spec of actions [count, entries] of float32 from the bounds of one environment, in any shape.
 
     An entry that is fixed, with ``low`` = ``high``, gets the width of a hair: scaling actions divides by it.
 
@@ -294,7 +294,7 @@ def info_rows(transitions: TensorDictBase, names: Iterable[str], shape: torch.Si
 
 
 def needs_info(env: GoalEnv) -> str:
-    """The message about an environment whose rewards read more than the goals, where only goals are given."""
+    """Writes the message for rewards that read more than goals, where only goals are given."""
     return (
         f"compute_reward of {env.task_name} reads {env.info_keys} of transitions: pass them, as in "
         "EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)"
@@ -302,7 +302,7 @@ def needs_info(env: GoalEnv) -> str:
 
 
 def reward_range(env: GoalEnv) -> tuple[float, float]:
-    """The rewards of a missed and of an achieved goal; -1 and 0 unless the environment has others.
+    """Returns the rewards of a missed and of an achieved goal; -1 and 0 unless the environment has others.
 
     Example:
         >>> from torchrl_her_envs import make_env
@@ -313,7 +313,7 @@ def reward_range(env: GoalEnv) -> tuple[float, float]:
 
 
 def reward_bounds(env: GoalEnv) -> tuple[float, float]:
-    """The least and the greatest reward there can be, for targets to be clamped; infinite if it is dense.
+    """Returns the least and the greatest possible reward, to clamp targets; infinite if rewards are dense.
 
     Example:
         >>> from torchrl_her_envs import make_env

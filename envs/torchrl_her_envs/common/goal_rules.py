@@ -14,7 +14,7 @@ Ends = Literal["own", "success", "reward", "never", "watch"]
 _LOGGER = logging.getLogger("torchrl_her_envs")
 _MOST_VALUES = 2  # different rewards of goals that are not achieved, in a sparse reward
 _SHOWN = 3  # rewards in a message
-_DIGITS = 5  # in which rewards must differ to be different
+_DIGITS = 5  # decimal places to which rewards are compared
 _said: set[str] = set()
 
 

@@ -21,9 +21,9 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 class LiveEpisodes:
     """Plays a greedy episode in each of several environments, step by step.
 
-    The picture of an environment whose episode is over stays as it was, with a green border if it achieved
-    its goal in some step and a red one if not. The environment itself begins a new episode, which is not
-    shown, as long as others are.
+    When an episode ends, its picture stays, with a green border if the goal was achieved in some step and a
+    red border if not. The environment begins a new episode, which is not shown until all shown episodes have
+    ended.
 
     Args:
         env: an environment with goals that gives pictures (``can_render``), transformed or not.

@@ -69,13 +69,13 @@ def make_own_env(
             have ``set_seeds``, or else R times. If not, it is called ``num_envs`` times, and must give
             environments without a batch size, which are stepped one after the other.
         num_envs: number of environments.
-        seed: of all environments; R seeds for R equal blocks of them.
+        seed: seed of all environments; R seeds for R equal blocks of them.
         max_steps: length of an episode; the environment's attribute ``max_steps`` if None.
-        termination: what ends an episode at its goal, see :class:`OwnGoalEnv`.
+        termination: rule that ends an episode at its goal, see :class:`OwnGoalEnv`.
         achieved_reward: the reward from which on a goal counts as achieved, for dense rewards.
         info_keys: entries of a step that rewards read besides goals, see :class:`OwnGoalEnv`.
-        observation_key, achieved_goal_key, desired_goal_key: what it calls these entries; lists of several
-            entries follow each other in their order, and its functions get dictionaries of them.
+        observation_key, achieved_goal_key, desired_goal_key: the environment's names of these entries. The
+            entries in a list are joined in their order; the environment's functions get dictionaries of them.
         options: for the function.
 
     Returns:
@@ -159,7 +159,7 @@ def _check_made(path: str, env: object, batch_size: list[int]) -> None:
 
 
 def _load(path: str) -> Callable[..., Any]:
-    """The function or class of a path, whose module is imported."""
+    """Imports the module of a path, and returns its function or class."""
     module, _, name = path.partition(":")
     try:
         make = getattr(importlib.import_module(module), name, None)
@@ -192,7 +192,7 @@ def _check_options(path: str, taken: Any, options: dict[str, Any]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class GoalRules:
-    """How an environment rewards goals and ends episodes.
+    """Rules by which an environment rewards goals and ends episodes.
 
     Args:
         ends: what ends an episode at its goal, and what the environment was seen to do there.
@@ -227,12 +227,12 @@ class OwnGoalEnv(GoalEnv):
 
     Args:
         envs: N environments without a batch size, or some with a batch size, N together.
-        name: of the task.
-        seed: of all environments; R seeds for R equal blocks of them.
+        name: name of the task.
+        seed: seed of all environments; R seeds for R equal blocks of them.
         max_steps: length of an episode; the environment's attribute if None.
-        termination: what ends an episode at its goal.
+        termination: rule that ends an episode at its goal.
         achieved_reward: the reward from which on a goal counts as achieved; that of equal goals if None.
-        rules: what another such environment was found to do; some steps are tried if None.
+        rules: rules that were found for another such environment; some steps are tried if None.
         info_keys: entries of a step that rewards read besides goals.
         names: its entry, or entries, for observation, achieved and desired goal, where they differ.
 
@@ -309,13 +309,13 @@ class OwnGoalEnv(GoalEnv):
     def compute_reward(
         self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
     ) -> Tensor:
-        """The reward of having achieved one goal when another was desired: [..., 1] of float32."""
+        """Returns the reward of having achieved one goal when another was desired: [..., 1] of float32."""
         return self._ask("compute_reward", achieved_goal, desired_goal, info).float()
 
     def compute_terminated(
         self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
     ) -> Tensor:
-        """Whether an episode ends there: [..., 1] of bool."""
+        """Returns whether an episode ends at these goals, [..., 1] of bool."""
         if self.ends == "own":
             return self._ask("compute_terminated", achieved_goal, desired_goal, info).bool()
         return self._meets(achieved_goal, desired_goal, info) & (self.ends in ("success", "reward"))
@@ -416,7 +416,7 @@ class OwnGoalEnv(GoalEnv):
         return [names] if isinstance(names, str) else names
 
     def _named(self, key: str, goals: Tensor) -> Any:
-        """Goals [..., g] as its functions take them: several entries as a dictionary."""
+        """Converts goals [..., g] to the environment's own form: several entries to a dictionary."""
         if isinstance(self._names[key], str):
             return goals
         spec, names = self._envs[0].full_observation_spec, self._entries(key)
@@ -424,7 +424,7 @@ class OwnGoalEnv(GoalEnv):
         return dict(zip(names, parts, strict=True))
 
     def _flag(self, each: list[TensorDictBase], key: str) -> Tensor:
-        """A flag [N, 1]; false where there is none."""
+        """Returns the flag of a key, [N, 1]; False if the environments do not have it."""
         if each[0].get(key, None) is None:
             return torch.zeros(*self.batch_size, 1, dtype=torch.bool)
         return self._stack(each, key).bool().view(-1, 1)

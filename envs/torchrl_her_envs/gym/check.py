@@ -238,7 +238,7 @@ def coarse_goals(id: str, achieved: np.ndarray) -> str:
 
 
 def find_limit(env: gymnasium.Env) -> int:
-    """Returns the length of the longest random episode that an environment truncates; 100 without one."""
+    """Returns the length of the longest random episode that is truncated; 100 if no episode is truncated."""
     env.action_space.seed(0)
     longest = length = 0
     env.reset(seed=0)
@@ -258,7 +258,8 @@ def find_achieved_reward(
 ) -> float | None:
     """Finds the least reward at which an environment's own ``_is_success`` counts a goal as achieved.
 
-    Fetch and highway-env have this method. It is asked on the way from each desired goal to the achieved one.
+    Fetch and highway-env have this method. It is called with goals on the way from each desired goal to the
+    achieved one.
 
     Args:
         env: with a dense reward.
@@ -267,7 +268,7 @@ def find_achieved_reward(
         achieved, desired: [m, g] goals, most of which are not achieved.
 
     Returns:
-        None if there is no such method, or what it says does not follow from the reward.
+        The reward; None if there is no such method, or if its results do not follow from the reward.
     """
     if not env.has_wrapper_attr("_is_success"):
         return None

@@ -87,12 +87,12 @@ def make_gym_env(
         id: as ``gymnasium.make`` takes it, ``module:Env-v0`` included. The environments of
             gymnasium-robotics need no import.
         num_envs: number of environments.
-        seed: of all environments; R seeds for R equal blocks of them, each as if alone.
+        seed: seed of all environments; R seeds for R equal blocks of them, each as if alone.
         max_steps: length of an episode. If None, the registered one, or that with which the environment
             truncates episodes of random actions, or 100.
         parallel: a process for each environment, which pays where a step takes milliseconds and there are
             several cores.
-        termination: what ends an episode at its goal, see :class:`GymGoalEnv`.
+        termination: rule that ends an episode at its goal, see :class:`GymGoalEnv`.
         achieved_reward: the reward from which on a goal counts as achieved, for dense rewards; if None, that
             from which on the environment's method ``_is_success`` says so.
         info_keys: keys of ``info`` that ``compute_reward`` reads, see :class:`GymGoalEnv`.
@@ -188,9 +188,9 @@ class GymGoalEnv(GoalEnv, GymWrapper):
 
     Args:
         envs: gymnasium's vector of them, which must not reset by itself (``AutoresetMode.DISABLED``).
-        reference_env: one more of the same, whose functions give the rewards of goals.
-        seed: of all environments; R seeds for R equal blocks of them, each as if alone.
-        termination: what ends an episode at its goal.
+        reference_env: another environment of the same kind, whose functions give the rewards of goals.
+        seed: seed of all environments; R seeds for R equal blocks of them, each as if alone.
+        termination: rule that ends an episode at its goal.
         achieved_reward: the reward from which on a goal counts as achieved; that of equal goals if None.
         info_keys: keys of ``info`` that its functions read: numbers, or arrays of numbers, in every step.
 
@@ -294,7 +294,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     def _function(
         self, name: str, goals: tuple[np.ndarray, np.ndarray], info: dict[str, np.ndarray]
     ) -> GoalFunction:
-        """A function of the environment, for goals [B, g] that it gets in their original form."""
+        """Returns a function of the environment, for goals [B, g] that it gets in their original form."""
         method, layout = self._reference_env.get_wrapper_attr(name), self._layouts["achieved_goal"]
 
         def function(achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
@@ -308,11 +308,11 @@ class GymGoalEnv(GoalEnv, GymWrapper):
 
     @property
     def can_render(self) -> bool:
-        """Whether it was made with ``render_mode="rgb_array"``."""
+        """Whether the environment was made with ``render_mode="rgb_array"``."""
         return self._reference_env.render_mode == PICTURES
 
     def stages(self) -> list[dict[str, Any]]:
-        """The stages of the Fetch tasks; an error for other environments, which have none of their own."""
+        """Returns the stages of the Fetch tasks; raises a ValueError for other environments."""
         return fetch_stages(spec_of(self._reference_env).id) or super().stages()
 
     def state_names(self) -> dict[str, list[int]]:
@@ -331,7 +331,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     def compute_reward(
         self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
     ) -> Tensor:
-        """The reward of having achieved one goal when another was desired, by the environment's own rule.
+        """Returns the reward of an achieved goal when another was desired, by the environment's own rule.
 
         Args:
             achieved_goal: [..., g].
@@ -349,7 +349,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     def compute_terminated(
         self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
     ) -> Tensor:
-        """Whether an episode ends there: [..., 1] of bool."""
+        """Returns whether an episode ends at these goals, [..., 1] of bool."""
         if self.ends == "own":
             return self._ask(self._terminated_of, achieved_goal, desired_goal, info).bool()
         reward = self.compute_reward(achieved_goal, desired_goal, info)
@@ -395,7 +395,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         desired_goal: Tensor,
         info: TensorDictBase | None,
     ) -> Tensor:
-        """A function's answers [..., 1]."""
+        """Returns a function's answers [..., 1]."""
         if info is None and self.info_keys:
             raise ValueError(needs_info(self))
         pair = torch.broadcast_tensors(achieved_goal, desired_goal)
@@ -444,7 +444,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         return {**super().read_obs(shown), **info}
 
     def _output_transform(self, step_outputs_tuple: tuple[Any, ...]) -> Any:
-        """The outputs of a step, with the ends of episodes that goals give."""
+        """Returns the outputs of a step, with the ends of episodes that goals give."""
         shown, reward, terminated, truncated, info = step_outputs_tuple
         if SUCCESS in info:
             shown = {**shown, SUCCESS: info[SUCCESS]}
@@ -455,7 +455,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         return super()._output_transform((shown, reward, terminated, truncated, info))
 
     def _met(self, shown: dict[str, Any]) -> np.ndarray:
-        """Which environments achieve their goals, [N] of bool: by their own word, or by the goals' reward."""
+        """Returns which environments achieve their goals, [N] of bool, by ``is_success`` or the reward."""
         if self.goal_ends.asks_success:
             return np.asarray(shown.get(SUCCESS, np.zeros(self.batch_size))).astype(np.bool_)
         achieved, desired = (self._layouts[key].flatten(shown[key]) for key in KEYS[1:])

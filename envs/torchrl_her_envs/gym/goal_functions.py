@@ -120,7 +120,7 @@ class GoalFunction:
         return np.array([self._ask(achieved, desired, info, row) for row in rows], np.float64)
 
     def _ask(self, achieved: np.ndarray, desired: np.ndarray, info: Info, row: int) -> float:
-        """Calls the function for one pair of goals."""
+        """Calls the wrapped function for one pair of goals, and checks that the result is one number."""
         try:
             if self.form == "pair":
                 result = self._function(achieved[row], desired[row], self._one(info, row))

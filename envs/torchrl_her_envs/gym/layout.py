@@ -29,9 +29,9 @@ class Layout:
     """The order of a space's numbers in a row of ``width`` numbers.
 
     A vector stays as it is, and a matrix is written row by row. The entries of a dictionary follow each
-    other in the alphabetical order of their keys, those of a dictionary within it likewise at its place.
-    The order in which a space or an observation happens to list its keys makes no difference, so that an
-    achieved goal and a desired one always agree.
+    other in the alphabetical order of their keys, and so do those of a nested dictionary at its place. The
+    order of keys in a space or an observation makes no difference, so that achieved and desired goals always
+    agree.
 
     Args:
         space: an array, a whole number, or a dictionary of these and further dictionaries.

@@ -34,7 +34,7 @@ _HELD_FROM_THE_START = {"held": 1.0, "away": 0.0, "mixed": 0.5}
 class Shown(NamedTuple):
     """Observed entries: ``state`` is the observation [N, ...] with the goal [N, 2] behind it.
 
-    Each is an array of its own, so whoever gets them may keep or change them.
+    Each is an array of its own, which the caller may keep or change.
     """
 
     state: np.ndarray

@@ -290,7 +290,7 @@ def base_env(env: EnvBase) -> ThrowingEnv:
     """Returns the throwing environment below any transforms.
 
     Raises:
-        TypeError: there is none.
+        TypeError: no throwing environment is found.
 
     Example:
         >>> from torchrl.envs import StepCounter, TransformedEnv

@@ -177,7 +177,7 @@ class _Limits:
 
 
 class _Space:
-    """Chipmunk space with the sides and the wall of one world, and as many balls as were needed at once.
+    """Chipmunk space with the sides and the wall of one world, and balls for all that move at once.
 
     Args:
         world: the constants of the world.
@@ -229,7 +229,7 @@ class _Space:
         """Adds or removes balls up to the given number, and parks them.
 
         A body keeps its old contacts, and the push that still moves it out of a surface, for one substep
-        more. Nobody can read or write these, so all balls spend a substep parked, each by itself and far
+        more. These cannot be read or written, so all balls spend a substep parked, each by itself and far
         from everything, before each step: then position and velocity are the whole state of a ball.
         """
         world = self._world

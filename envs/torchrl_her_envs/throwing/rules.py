@@ -130,7 +130,7 @@ class Numbers:
 
 
 class Arrays:
-    """Operations on all worlds in arrays."""
+    """Moves, velocities and choices for all worlds at once, as operations on arrays."""
 
     def __init__(self, effector: Effector, physics: BallPhysics, world: WorldConfig) -> None:
         self._effector, self._physics = effector, physics

@@ -221,7 +221,7 @@ def get_task(name: str) -> Task:
     """Returns the throwing or reaching task of a name.
 
     Raises:
-        ValueError: there is none; the message lists those that there are.
+        ValueError: no task has this name; the message lists all tasks.
 
     Example:
         >>> get_task("robot_v1").effector

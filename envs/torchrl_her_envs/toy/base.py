@@ -52,15 +52,15 @@ class ToyEnv(BatchedEnv):
     leaves the others as they are.
 
     Args:
-        goals: where desired goals come from.
+        goals: distribution of the desired goals.
         places: number of places along each coordinate.
         low: the first place as the agent sees it.
-        high: the last one.
+        high: the last place as the agent sees it.
         num_actions: number of actions.
         max_steps: number of steps after which an episode is truncated.
         num_envs: N, the number of environments.
-        seed: of all that is random; R seeds for R equal blocks of environments, each as if alone.
-        size: coordinates of a place; as many as a goal has, unless only some of them are achieved.
+        seed: seed of all random numbers; R seeds for R equal blocks of environments, each as if alone.
+        size: number of coordinates of a place; a goal has fewer if it is about some of them only.
 
     Attributes:
         threshold: half the distance of two neighboring places, as the agent sees them.
@@ -116,7 +116,7 @@ class ToyEnv(BatchedEnv):
         return self._goals
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Whether goals [..., g] are the same place: [..., 1] of bool.
+        """Returns whether achieved and desired goals [..., g] are equal, [..., 1] of bool.
 
         Raises:
             ValueError: goals of another width than g.
@@ -135,7 +135,7 @@ class ToyEnv(BatchedEnv):
         return True
 
     def _draw_worlds(self, worlds: Sequence[int], size: int | None) -> list[Tensor]:
-        """Pictures three fifths as high as they are wide."""
+        """Returns pictures three fifths as high as they are wide."""
         return [draw(WIDTH if size is None else size, partial(self._draw, world=world)) for world in worlds]
 
     # What each toy environment says
@@ -146,14 +146,14 @@ class ToyEnv(BatchedEnv):
 
     @abstractmethod
     def _start(self, which: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the given environments [M] start, and their goals: both [M, size], never the same place."""
+        """Draws start places and goals of the given environments [M]: both [M, size], always different."""
 
     @abstractmethod
     def _move(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The places [N, size] that actions [N] lead to, and which episodes [N] they end without success."""
+        """Returns the next places [N, size], and a mask [N] of episodes that end without success."""
 
     def _goal_of(self, place: Tensor) -> Tensor:
-        """The part [N, g] of places [N, size] that goals are about."""
+        """Returns the part [N, g] of places [N, size] that goals are about."""
         return place
 
     # One step, and the start of an episode
@@ -203,7 +203,7 @@ class ToyEnv(BatchedEnv):
 
 
 def check_whole(name: str, value: int, low: int, high: int | None) -> int:
-    """An option as an int; raises a ValueError where it is not a whole number from ``low`` to ``high``.
+    """Returns an option as an int; raises a ValueError if it is not a whole number from ``low`` to ``high``.
 
     Example:
         >>> check_whole("bits", 5, 1, 127)
@@ -218,7 +218,7 @@ def check_whole(name: str, value: int, low: int, high: int | None) -> int:
 
 
 def check_flag(name: str, value: bool) -> bool:
-    """An option that is True or False; raises a ValueError for anything else.
+    """Returns an option that is True or False; raises a ValueError for anything else.
 
     Example:
         >>> check_flag("reset_state", True)

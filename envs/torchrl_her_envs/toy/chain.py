@@ -16,8 +16,8 @@ from torchrl_her_envs.toy.pictures import Sheet, draw_chain
 class Chain(ToyEnv):
     """A walk along a chain of n steps, from its first place to its last.
 
-    Thesis, appendix C. The agent starts at the first place, its goal is always the last one, and
-    there are as many steps as it takes without a mistake (premise 4). Action 1 goes forward with
+    Thesis, appendix C. The agent starts at the first place, its goal is always the last one, and an
+    episode has n steps, which suffice without a mistake (premise 4). Action 1 goes forward with
     probability p (premise 1). Where it fails, and always with action 0, the agent goes back: by one
     place, or to the first place in the reset-state form. At the first place it stays.
 
@@ -26,9 +26,9 @@ class Chain(ToyEnv):
     learn place by place instead.
 
     The agent sees n links. At place k the first k are closed (1) and the others open (-1); the goal is
-    that all are closed. With ``stages`` above 1 the chain is made of so many equal parts, and only the
-    links of the last part count as the achieved goal, just as only the ball does in the throwing tasks:
-    until the agent comes to that part, hindsight teaches nothing.
+    that all are closed. With ``stages`` above 1 the chain consists of equal parts, and only the links of
+    the last part are the achieved goal, just as only the ball is in the throwing tasks. Until the agent
+    comes to that part, hindsight teaches nothing.
 
     Args:
         length: n, the number of steps from the start to the goal.

@@ -151,7 +151,7 @@ def _guide_of(
 def _networks(
     builder: LearnerBuilder, seeds: Sequence[int], options: CurriculumConfig, curriculum: Curriculum | None
 ) -> Networks:
-    """The actor and the critics; the weights of each run depend on its own seed alone."""
+    """Returns the actor and the critics; the weights of each run depend on its own seed alone."""
     with torch.random.fork_rng(devices=[]):
         alone = []
         for seed in seeds:

@@ -34,10 +34,10 @@ from torchrl_her_recipes.config.recipe import Recipe
 
 
 def build(recipe: Recipe) -> Components:
-    """Makes the components that a recipe asks for.
+    """Makes the components that a recipe describes.
 
     Args:
-        recipe: of the run.
+        recipe: recipe of the run.
 
     Raises:
         ValueError: something in the recipe cannot work or does not fit into memory, or it names a module that
@@ -128,5 +128,5 @@ def make_collector(
 
 
 def eval_seeds(seeds: Sequence[int], epoch: int) -> list[int]:
-    """The seeds of an evaluation: for each run and epoch its own, and never one of training."""
+    """Returns the seeds of an evaluation: for each run and epoch its own, and never one of training."""
     return [Stream.EVALUATION + (seed << 20) + epoch for seed in seeds]

@@ -57,19 +57,19 @@ def make_buffer(
     devices: Devices = ON_THE_CPU,
     capacity: int | None = None,
 ) -> TensorDictReplayBuffer:
-    """The replay buffer of all runs, with the hindsight writer and the sampler.
+    """Makes the replay buffer of all runs, with the hindsight writer and the sampler.
 
     Args:
-        recipe: of the runs.
-        env: of their task.
-        generators: sources of random numbers, one of each run, where the buffer is.
+        recipe: recipe of the runs.
+        env: environment of the task.
+        generators: sources of random numbers, one for each run, on the device of the buffer.
 
     Keyword Args:
-        space: of the goals; None where they are not counted.
-        state: the curriculum, if there is one.
+        space: space of the goals; None if goals are not counted.
+        state: the curriculum, or None.
         norm: counts what is written and normalizes what is sampled; None for raw transitions.
-        devices: where the buffer is, and the learner that samples from it.
-        capacity: in transitions of each run; the recipe's if None.
+        devices: devices of the buffer and of the learner that samples from it.
+        capacity: number of transitions of each run; the recipe's if None.
     """
     size, task, runs = recipe.replay.buffer_size, goal_env(env), len(generators)
     algorithm = recipe.hindsight.algorithm
@@ -115,10 +115,10 @@ def make_buffer(
 
 
 def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) -> list[StageRule] | None:
-    """How the episodes of each stage are relabeled, where they have stages of their own.
+    """Returns the rules for relabeling episodes of each stage; None unless episodes have stages of their own.
 
     Args:
-        every: whether they are written for all stages.
+        every: whether episodes are written for all stages.
     """
     if state is None or not state.progress.by_episode:
         return None
@@ -130,7 +130,7 @@ def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) 
 
 
 def _goals(options: HindsightConfig) -> dict[str, Any]:
-    """How many virtual goals are drawn from where, as options of the writer."""
+    """Returns the writer's options for numbers and sources of virtual goals."""
     if options.goal_sources is not None:
         return {"goal_sources": options.goal_sources}
     return {"k": options.k, "strategy": options.strategy}

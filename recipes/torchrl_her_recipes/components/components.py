@@ -40,9 +40,9 @@ class Components(Agent):
     own collector.
 
     Attributes:
-        recipe: what the components were made from.
+        recipe: recipe of the components.
         env: batched training environments: R equal blocks; where other processes collect, one of each run.
-        eval_env: batched environments for evaluation, likewise.
+        eval_env: batched environments for evaluation: R equal blocks.
         actor: the greedy policy. With ``normalize=true`` it is a
             :class:`~torchrl_her.modules.NormalizedPolicy`, and losses take its ``actor``.
         critic: values of (observation, goal, action); what the loss's critics were made from, None if there
@@ -50,7 +50,7 @@ class Components(Agent):
         exploration: turns greedy into exploring actions.
         policy: actor, then the guide if there is one, then exploration.
         collector: runs the policy in the environments.
-        buffer: of all runs, with the writer that relabels and the sampler.
+        buffer: replay buffer of all runs, with the writer that relabels and the sampler.
         loss: any TorchRL loss module.
         optimizer: over the loss module's parameters.
         target: moves the target networks.
@@ -58,16 +58,16 @@ class Components(Agent):
         goal_target: q* [cells] of the task's goals, to which the divergence of virtual goals is
             measured; None if they are not counted in cells.
         generators: sources of the random numbers of each run (exploration, relabeling, sampling).
-        rewards: of a missed goal and of an achieved one.
+        rewards: reward of a missed goal and of an achieved goal.
         bounds: the least and the greatest reward; infinite where there are none.
         norm: statistics of observations and goals by which actor and sampled transitions are normalized, or
             None.
-        average: follows the actor, and is what is evaluated, filmed and kept in its place; or None.
-        guide: begins episodes as the stage below has learned it, see ``guided_share``; or None.
+        average: moving average of the actor, which is evaluated, filmed and saved in its place; or None.
+        guide: policy of the stage below, which begins episodes, see ``guided_share``; or None.
         virtual_env: environments for evaluation at virtual goals, or None.
         behavior: proposes the goals of episodes, or None. It is one of the environment's transforms, and its
             state a part of the collector's.
-        demonstrations: episodes that somebody else played, in batches and as starts; or None.
+        demonstrations: recorded episodes, in batches and as starts of episodes; or None.
     """
 
     recipe: Recipe
@@ -97,13 +97,13 @@ class Components(Agent):
         return policy if place_of(policy) == place else deepcopy(policy).to(place)
 
     def learner(self) -> Learner:
-        """Gradient steps on the loss: compiled where that is possible, through the loss module elsewhere.
+        """Makes the learner: compiled gradient steps if that is possible, else steps through the loss module.
 
-        On the CPU they are in C++. On a GPU they are recorded as CUDA graphs, and ``compile=always`` applies
-        ``torch.compile`` to them first.
+        On the CPU, compiled steps are C++. On a GPU they are CUDA graphs, and ``compile=always`` applies
+        ``torch.compile`` before they are recorded.
 
         Raises:
-            ValueError: ``compile=always``, and they cannot be compiled.
+            ValueError: ``compile=always``, and the steps cannot be compiled.
         """
         choice, parts = self.recipe.learner.compile, (self.loss, self.optimizer, self.target)
         norm, runs = self.recipe.learner.max_grad_norm, self.recipe.run.num_runs
@@ -124,7 +124,7 @@ class Components(Agent):
                         f"gradient steps are several times slower than they could be: {error}", stacklevel=2
                     )
         if choice == "always":
-            raise ValueError(f"compile=always cannot be: {reason}; choose auto")
+            raise ValueError(f"compile=always is not supported here: {reason}; choose compile=auto")
         return LossLearner(*parts, max_grad_norm=norm, runs=runs)
 
     def _why_not_fused(self) -> str | None:
@@ -138,7 +138,7 @@ class Components(Agent):
             self.collector.shutdown()
 
     def trainer(self) -> Trainer:
-        """The training loop over these components."""
+        """Returns the training loop over these components."""
         recipe, replay, demonstrations = self.recipe, self.recipe.replay, self.demonstrations
         proposals = [] if self.behavior is None else self.behavior.weights
         weights = [*self.buffer.writer.goal_weights, *proposals]

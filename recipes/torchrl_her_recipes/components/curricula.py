@@ -42,7 +42,7 @@ class CurriculumState:
         return self.progress.curriculum
 
     def at_the_top(self, run: int) -> bool:
-        """Whether a run is in the last stage, which is the full task."""
+        """Returns whether a run is in the last stage, which is the full task."""
         return self.progress.stages[run] == len(self.curriculum) - 1
 
 
@@ -55,7 +55,7 @@ def make_curriculum(options: CurriculumConfig | None, env: EnvBase) -> Curriculu
 
 
 def read_curriculum(stages: object, env: GoalEnv) -> Curriculum:
-    """A curriculum from plain values, for an environment whose state they index.
+    """Returns a curriculum from plain values, for an environment whose state they index.
 
     The state is the observation with the desired goal behind it. Its entries may be given by the names that
     the environment has for them (``env.state_names()``). The last stage is the environment's own task; stages
@@ -190,7 +190,7 @@ def make_played_env(
 
 
 def is_guided(options: CurriculumConfig | None, progress: CurriculumProgress | None) -> bool:
-    """Whether some episodes are begun by what was learned in the stage below."""
+    """Returns whether the policy of the stage below begins some of the episodes."""
     if options is None or progress is None:
         return False
     return options.guided_share > 0 and len(progress.curriculum) > 1
@@ -204,11 +204,11 @@ def in_stages(
     behavior: BehaviorGoals | None = None,
     starts: DemonstrationStarts | None = None,
 ) -> EnvBase:
-    """An environment as its runs see it: in their stages, with the networks' input, and with proposed goals.
+    """Adds the transforms for stages, for the input of networks, and for proposed goals to an environment.
 
     Args:
-        env: of the full task.
-        progress: of the runs; None without a curriculum.
+        env: environment of the full task.
+        progress: stages of the runs; None without a curriculum.
 
     Keyword Args:
         begins: whether steps say if they are the first of an episode, as ``is_init``.

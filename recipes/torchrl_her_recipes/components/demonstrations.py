@@ -26,14 +26,14 @@ from torchrl_her_recipes.config.groups import DemonstrationsConfig, HindsightCon
 
 @dataclass
 class RunDemonstrations:
-    """The demonstrations of some runs side by side.
+    """The demonstrations of several runs side by side.
 
     Attributes:
-        recorded: those of the file that are used, as the full task.
-        env: of the task; its reward is that of runs without a curriculum.
-        state: the curriculum, if there is one.
-        buffer: their rows, relabeled like all rows; None if batches have none.
-        starts: starts episodes at their states; None if there are no such episodes.
+        recorded: demonstrations from the file that are used, with the goals of the full task.
+        env: environment of the task, whose reward runs without a curriculum have.
+        state: the curriculum, or None.
+        buffer: relabeled rows of the demonstrations; None if batches contain none.
+        starts: starts episodes at states of demonstrations; None if no episode does so.
     """
 
     recorded: Demonstrations
@@ -43,7 +43,7 @@ class RunDemonstrations:
     starts: DemonstrationStarts | None = None
 
     def shown(self, run: int) -> Demonstrations:
-        """The demonstrations in the stage that a run is in, with the task's rewards."""
+        """Returns the demonstrations as the stage of a run sees them, with the task's rewards."""
         rule = task_reward(self.env)
         if self.state is None:
             return with_reward(self.recorded, rule)
@@ -56,7 +56,7 @@ class RunDemonstrations:
             write_demonstrations(buffer, self.shown(run), run=run)
 
     def enter_stage(self, run: int) -> None:
-        """Shows a run its demonstrations in the stage that it has entered."""
+        """Replaces a run's demonstrations by those of the stage that it has entered."""
         assert self.state is not None
         if self.buffer is not None:
             enter_stage(self.buffer, self.state.progress.stage_of(run), run=run)
@@ -65,17 +65,17 @@ class RunDemonstrations:
             self.starts.show(self.shown(run), run=run)
 
     def mixed_with(self, buffer: TensorDictReplayBuffer, share: float, batch_size: int) -> Any:
-        """A buffer in whose batches a share of the rows are theirs."""
+        """Returns a buffer in whose batches a share of the rows are demonstrations."""
         if self.buffer is None:
             return buffer
         return MixedReplay(buffer, self.buffer, share=share, batch_size=batch_size)
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain data; that of the starts is a part of the collector's."""
+        """Returns tensors and plain data. The state of ``starts`` is a part of the collector's state."""
         return {"buffer": None if self.buffer is None else buffer_state_dict(self.buffer, copy=False)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` gave; the progress of the curriculum was put back before."""
+        """Restores the state that :meth:`state_dict` returned; restore the curriculum's progress before."""
         if self.buffer is not None:
             self.buffer.empty()
             load_buffer_state_dict(self.buffer, state["buffer"])

@@ -1,4 +1,4 @@
-"""Where networks learn and transitions are stored."""
+"""Devices on which networks learn and transitions are stored."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from torchrl_her_recipes.config.choices.learners import LearnerConfig
 from torchrl_her_recipes.config.groups import ReplayConfig
 
 CPU = torch.device("cpu")
-_WORTH_IT = 1e9  # multiplications of a gradient step of all runs, from which on a GPU is worth its calls
+_WORTH_IT = 1e9  # multiplications in a gradient step of all runs from which on a GPU pays off
 
 
 class Devices(NamedTuple):
-    """Where the parts of a run are. Environments are on the CPU.
+    """Devices of the parts of a run. Environments are on the CPU.
 
     Attributes:
-        learner: networks, losses, optimizer and the policy that plays.
-        replay: storage, priorities and relabeling.
+        learner: device of networks, losses, optimizer and the policy that plays.
+        replay: device of storage, priorities and relabeling.
     """
 
     learner: torch.device
@@ -31,7 +31,7 @@ ON_THE_CPU = Devices(CPU, CPU)
 
 
 def devices_of(learner: LearnerConfig, replay: ReplayConfig, runs: int) -> Devices:
-    """The devices that options ask for; "auto" is a GPU if the gradient steps of all runs are worth it."""
+    """Returns the devices of learner and buffer; "auto" is a GPU if gradient steps are large enough."""
     device = learner.device
     if device == "auto":
         work = 6 * learner.hidden_weights * replay.batch_size * runs
@@ -43,7 +43,7 @@ def devices_of(learner: LearnerConfig, replay: ReplayConfig, runs: int) -> Devic
 
 
 def place_of(module: nn.Module) -> torch.device:
-    """Where a module's parameters are; the CPU if it has none."""
+    """Returns the device of a module's parameters; the CPU if it has none."""
     return next((parameter.device for parameter in module.parameters()), CPU)
 
 
@@ -53,7 +53,7 @@ def make_generators(seeds: Sequence[int], device: torch.device) -> list[torch.Ge
 
 
 def _find(name: str, option: str, word: str) -> torch.device:
-    """The device of a name, which must be there and draw random numbers."""
+    """Returns the device of a name; raises an error if it is missing or cannot draw random numbers."""
     try:
         device = torch.device(name)
     except RuntimeError:

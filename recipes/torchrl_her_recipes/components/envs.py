@@ -97,9 +97,9 @@ class TaskEnvs:
 
 
 def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
-    """The least and the greatest actions of a task, [actions]; -1 and 1 if it has no finite ones.
+    """Returns the least and the greatest actions of a task, [actions]; -1 and 1 if its bounds are not finite.
 
-    Those of the task itself are returned, below a transform that scales them.
+    The bounds are the task's own, before a transform scales actions.
     """
     actions = goal_env(env).action_spec_unbatched
     if isinstance(actions, Bounded) and bool((actions.low.isfinite() & actions.high.isfinite()).all()):
@@ -109,7 +109,7 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
 
 
 def task_reward(env: EnvBase) -> EnvReward:
-    """The reward function of a task, below any transforms."""
+    """Returns the reward function of a task, below any transforms."""
     task = goal_env(env)
     return EnvReward(task.compute_reward, task.compute_terminated, info_keys=task.info_keys)
 

@@ -22,14 +22,14 @@ from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_optio
 
 _AT_ONCE = 8
 _STEPS = 3_000
-_SELDOM = 1 / 3  # of the episodes, in which what is achieved changes: 0.25 of Panda, 0.42 of hand_v2
-_FACTS: dict[str, EnvFacts] = {}  # of tasks that were looked at before
-_SECONDS = 20.0  # after which no further episodes begin
+_SELDOM = 1 / 3  # share of episodes in which the achieved goal changes: Panda has 0.25, hand_v2 0.42
+_FACTS: dict[str, EnvFacts] = {}  # cache, by task
+_SECONDS = 20.0  # no further episodes begin after this time
 _FUTURE = 16  # later goals of an episode that each transition is tried with
-_DIGITS = 1e-4  # relative, in which rewards must agree
-_TOUCH = 0.1  # quantile of distances at which something moves the achieved goal; later it may move by itself
-_NEAR = 0.5  # of the usual distance: how near positions come where the achieved goal moves
-_PAIRS = 32  # of goals, whose distance is looked at
+_DIGITS = 1e-4  # relative difference up to which two rewards count as equal
+_TOUCH = 0.1  # quantile of distances while the object moves: touch; farther away it may roll by itself
+_NEAR = 0.5  # a hand is at most this share of its usual distance from an object that moves
+_PAIRS = 32  # number of pairs of goals from which the distance of achieved goals is estimated
 _HALVINGS = 20
 
 Meets = Callable[[Outcome, Tensor], Tensor]
@@ -40,8 +40,8 @@ class Facts:
     """Facts about a task from random actions.
 
     Attributes:
-        steps, episodes: how many were played; episodes that were still open at the end do not count.
-        seconds: that one step takes.
+        steps, episodes: numbers of steps and of finished episodes that were played.
+        seconds: duration of one step.
         max_steps: length of an episode.
         actions: the least and the greatest value of each entry; None if actions are discrete.
         scales: the least and the greatest standard deviation of entries of the observation.
@@ -53,10 +53,10 @@ class Facts:
         constant: entries of the observation that never changed.
         goal_inside: entries of the observation that are the desired goal.
         own_stages: whether the task has a curriculum of its own.
-        stages: of a curriculum, as ``propose_stages`` gives them; empty if none is proposed, as where
-            rewards depend on more than goals.
-        ends: what ends an episode at its goal, and what the environment was seen to do there; None if the
-            environment itself says so for all goals.
+        stages: stages that ``propose_stages`` returns; empty if it proposes none, or if rewards depend on
+            more than goals.
+        ends: rule that ends an episode at its goal, and what the environment did at goals; None if the
+            environment has such a rule for all goals.
     """
 
     steps: int
@@ -78,11 +78,11 @@ class Facts:
 
 
 def resolved(recipe: Recipe) -> Recipe:
-    """The recipe with a value for each option that is ``auto``, from what its environment is.
+    """Returns the recipe with a value for each option that is ``auto``, chosen from facts about the task.
 
-    Where environments are stepped one by one, random actions are played in some: if ``algo`` is ``auto``, or
-    if it is open what ends an episode at its goal. What is found then is in the recipe, so that nobody who
-    has it looks again.
+    If environments are stepped one by one, random actions are played if ``algo`` is ``auto``, or if it is
+    unknown what ends an episode at its goal. The result is stored in the recipe, so that a resumed run and
+    other processes need not play them again.
     """
     if not auto_options(recipe) and not ends_open(recipe.task):
         return recipe
@@ -112,10 +112,10 @@ def _watched(envs: TaskEnvs) -> TaskEnvs:
 
 
 def _needed_stages(facts: Facts) -> list[dict[str, Any]] | None:
-    """Stages for a task whose achieved goal seldom changes by chance; None if it needs none, or has none.
+    """Returns stages for a task whose achieved goal seldom changes by chance; None without need or result.
 
-    They are the same for each seed. There are none where episodes end in failures, which say nothing about
-    the goals of a stage below the task.
+    Stages are the same for each seed. A task in which episodes end in failures gets none, since a failure
+    says nothing about the goals of a stage below the task.
     """
     return None if facts.fallen > 0 or facts.moved >= _SELDOM else facts.stages or None
 
@@ -124,11 +124,11 @@ def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SEC
     """Plays random actions on the task of a recipe.
 
     Args:
-        recipe: whose task it is; its seed is that of the environments and actions.
+        recipe: recipe with the task, and with the seed of environments and actions.
 
     Keyword Args:
-        steps: how many.
-        seconds: after which no further episodes begin; None for all steps, however long they take.
+        steps: number of steps.
+        seconds: time after which no further episodes begin; None for no limit.
 
     Raises:
         ValueError: the task cannot be made.
@@ -158,7 +158,7 @@ def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SEC
 
 
 def _episodes(rows: TensorDictBase) -> Iterator[TensorDictBase]:
-    """The episodes of an environment's rows [T]; the last one may not have ended."""
+    """Yields the episodes in an environment's rows [T]; the last episode may be unfinished."""
     begin = 0
     for end in (rows["next", "done"].flatten().nonzero().flatten() + 1).tolist():
         yield rows[begin:end]
@@ -175,7 +175,7 @@ def _facts(
     rule, judged_by = task_reward(task), judging(task)
 
     def meets(achieved: Outcome, desired: Tensor) -> Tensor:
-        """[...] of bool."""
+        """Returns whether goals are achieved, [...] of bool."""
         return ~missed(rule, achieved, desired, achieved_reward)
 
     moved, some_kept, achieved, fallen = [], [], [], []
@@ -192,7 +192,8 @@ def _facts(
         fallen.append(bool(last["terminated"].all() and not is_achieved(last, **judged_by).all()))
     reached = outcomes(rule, rows["next", "achieved_goal"], rows["next"])
     computed, reward = ask_reward(rule, reached, rows["next", "desired_goal"])[0], rows["next", "reward"]
-    went_on = ~rows["next", "terminated"] | (computed >= achieved_reward)  # what a failure costs is kept
+    # A failure may have a penalty that the reward function does not know.
+    went_on = ~rows["next", "terminated"] | (computed >= achieved_reward)
     differ = went_on & ((reward - computed).abs() > _DIGITS * (1 + computed.abs()))
     observations = rows["observation"].double()
     spread = observations.std(0)
@@ -226,7 +227,7 @@ def _has_stages(task: GoalEnv) -> bool:
 
 
 def _kept(before: Outcome, after: Tensor, meets: Meets) -> Tensor:
-    """Whether some later goal of an episode was not achieved before each transition, [T] of bool."""
+    """Returns whether each transition has a later goal that was not achieved before it, [T] of bool."""
     steps = len(after)
     later = torch.linspace(0, 1, min(_FUTURE, steps))
     chosen = (
@@ -237,7 +238,7 @@ def _kept(before: Outcome, after: Tensor, meets: Meets) -> Tensor:
 
 
 def _columns(observations: Tensor, goal: Tensor) -> list[int]:
-    """Neighboring entries of observations [n, w] that are always the goals [n, g]; none if there are none."""
+    """Finds g neighboring entries of observations [n, w] that always equal goals [n, g]; empty if none do."""
     width = goal.shape[-1]
     for first in range(observations.shape[-1] - width + 1):
         if torch.allclose(observations[:, first : first + width], goal, rtol=1e-5, atol=1e-6):
@@ -246,19 +247,20 @@ def _columns(observations: Tensor, goal: Tensor) -> list[int]:
 
 
 def propose_stages(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
-    """Two stages of a curriculum: bring near what comes near the achieved goal where it moves, then the task.
+    """Proposes a curriculum of two stages: first bring the hand to the object, then the task itself.
 
-    The achieved goal must be observed, and other entries of the observation, as many, must be nearer to it in
-    the steps in which it moves than in others: those of a hand, for instance, that pushes it. They are to
-    touch it; or, where they have come nearer than half of the distance at which the task's goals are
-    achieved, as fingers that go around it do, they are to be that near.
+    The object is what the achieved goal is about; the observation must contain it. The hand is g neighboring
+    entries of the observation that are nearer to the object in steps in which the object moves than in other
+    steps. The first stage is achieved where the hand touches the object. Fingers that go around the object
+    come nearer than half of the distance at which the task's goals are achieved; then half of that distance
+    is the threshold of the first stage.
 
     Args:
         rows: transitions [n] of random actions.
-        meets: which achieved goals [..., g] are the desired ones [..., g], [...] of bool.
+        meets: returns whether achieved goals [..., g] are the desired goals [..., g], as [...] of bool.
 
     Returns:
-        Stages as ``curriculum=FILE.yaml`` takes them, or none if there are no such entries.
+        Stages in the form of ``curriculum=FILE.yaml``; empty if no entries of the observation are a hand.
     """
     observations, goal = rows["observation"].double(), rows["achieved_goal"].double()
     width, wide = goal.shape[-1], observations.shape[-1]
@@ -294,7 +296,7 @@ def propose_stages(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
 
 
 def _radius(rows: TensorDictBase, meets: Meets) -> float | None:
-    """The distance within which a goal counts as achieved; None if it is not the same everywhere."""
+    """Returns the distance within which goals count as achieved; None if it differs between goals."""
     achieved, desired = rows["achieved_goal"], rows["desired_goal"]
     far = ~meets(achieved, desired)
     achieved, desired = achieved[far][:_PAIRS], desired[far][:_PAIRS]

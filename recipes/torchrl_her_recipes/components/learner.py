@@ -61,7 +61,7 @@ class AgentShape:
 
 
 def acting(actor: TensorDictModuleBase, norm: RunningNorm | None) -> TensorDictModuleBase:
-    """An actor as it plays, on what environments show."""
+    """Returns an actor as it plays, on what environments show."""
     return actor if norm is None else NormalizedPolicy(actor, norm)
 
 
@@ -96,7 +96,7 @@ class LearnerBuilder(ABC):
 
     @abstractmethod
     def networks(self, runs: int) -> Networks:
-        """The actor and the critics of some runs side by side."""
+        """Returns the actor and the critics of some runs side by side."""
 
     def norm(self) -> RunningNorm | None:
         """Statistics of inputs of each run, before anything was counted; None if nothing is normalized."""
@@ -111,14 +111,14 @@ class LearnerBuilder(ABC):
         )
 
     def player(self, runs: int) -> TensorDictModule:
-        """The actor alone; override this where critics need not be made for it."""
+        """Returns the actor alone; override this where critics need not be made for it."""
         return self.networks(runs)[0]
 
     def greedy(self, actor: TensorDictModule) -> nn.Module:
-        """The network of an exported policy: (observation, goal), as tensors, to the greedy action.
+        """Returns the network of an exported policy: (observation, goal), as tensors, to the greedy action.
 
         Args:
-            actor: of a single run, from :meth:`player`; its weights are shared.
+            actor: actor of a single run, from :meth:`player`; the result shares its weights.
 
         Raises:
             ValueError: the actor writes more than the action. Then a builder overrides this.
@@ -133,11 +133,11 @@ class LearnerBuilder(ABC):
 
     @abstractmethod
     def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
-        """TorchRL's loss.
+        """Makes TorchRL's loss.
 
         Args:
-            actor: from :meth:`networks`.
-            critics: likewise.
+            actor: actor from :meth:`networks`.
+            critics: critics from :meth:`networks`.
         """
 
     def exploration(self) -> Exploration:
@@ -148,11 +148,11 @@ class LearnerBuilder(ABC):
         )
 
     def epsilon(self) -> dict[str, float]:
-        """The schedule of epsilon."""
+        """Returns the schedule of epsilon."""
         options = self.options
         return {"start": options.epsilon_start, "decay": options.epsilon_decay, "end": options.epsilon_end}
 
     def action_noise(self) -> dict[str, float]:
-        """How exploring actions are drawn, where that is an option of the learner."""
+        """Noise and share of uniform actions, as far as the learner has these options."""
         names = {"noise": "action_noise", "uniform_share": "uniform_share"}
         return {to: getattr(self.options, name) for to, name in names.items() if hasattr(self.options, name)}

@@ -26,7 +26,7 @@ def check_buffer_size(
 
 
 def memory_of(device: torch.device) -> float:
-    """Bytes of memory of a device; infinity where nobody tells."""
+    """Returns the bytes of memory of a device; infinity if the number is unknown."""
     if device.type == "cuda" and torch.cuda.device_count():
         return float(torch.cuda.get_device_properties(device).total_memory)
     if device.type != "cpu" or not hasattr(os, "sysconf"):

@@ -1,4 +1,4 @@
-"""Random numbers of their own for the parts of a run, so that no two parts draw the same ones."""
+"""Seeds for the parts of a run, so that no two parts draw the same random numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchrl_her_recipes.components.devices import CPU, make_generators
 
 
 class Stream(IntEnum):
-    """How far the seeds of a part lie from those of the runs, which are below ``2 ** 31``."""
+    """Offset of a part's seeds from the seeds of the runs, which are below ``2 ** 31``."""
 
     EVALUATION = 1 << 32
     PROPOSED_GOALS = 1 << 33
@@ -21,5 +21,5 @@ class Stream(IntEnum):
 
 
 def generators_of(seeds: Sequence[int], stream: Stream) -> list[torch.Generator]:
-    """The sources of random numbers of a part, one for each run's seed."""
+    """Returns the generators of a part of a run, one for each run's seed."""
     return make_generators([stream + seed for seed in seeds], CPU)

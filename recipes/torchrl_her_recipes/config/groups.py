@@ -177,7 +177,7 @@ class HindsightConfig(Group):
     )
     refill: int = option(
         5,
-        "where the filter leaves transitions without goals, the others get up to this many times as many",
+        "if the filter leaves transitions without goals, others get up to this multiple of k",
         at_least=1,
     )
     redraw: bool = option(
@@ -325,7 +325,7 @@ class EvaluationConfig(Group):
     episodes: int = option(100, "greedy episodes of each evaluation", at_least=1)
     virtual_goals: bool = option(
         False,
-        "whether as many other episodes ask for virtual goals, and log virtual_success and virtual_q_bias",
+        "whether to play extra episodes with virtual goals, and log virtual_success and virtual_q_bias",
     )
 
 

@@ -63,7 +63,7 @@ def choices_of(group: str) -> dict[str, type[groups.Group]]:
 
 
 def option_names() -> dict[str, list[str]]:
-    """Returns the names of the options of each group, in groups with choices those of all choices."""
+    """Returns the names of the options of each group; a group with choices has the options of all choices."""
     names = {group: ["name"] if group in KINDS else [] for group in GROUPS}
     for group, known in names.items():
         kinds = choices_of(group).values()

@@ -1,4 +1,4 @@
-"""Rules about options that have no effect together with others, and are therefore refused by name."""
+"""Finds options that have no effect beside the other options of a recipe, so that they can be refused."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
 
 
 def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
-    """Yields conditions on other options: whether one holds, its text, and options without effect."""
+    """Yields rules: whether a condition holds, the condition in words, and options that it makes idle."""
     algorithm = groups.hindsight.algorithm
     learner, sources = groups.learner, groups.hindsight.sources
     takes, with_task = get_task_spec(groups.task.name).options, f"with task={groups.task.name}"

@@ -26,11 +26,11 @@ class PolicyInfo:
     """Inputs and outputs of an exported policy, and the run that made it.
 
     Attributes:
-        task: that it is for.
+        task: name of the task that the policy was trained on.
         widths: widths of ``observation`` and ``desired_goal``: each is [..., width].
-        dtype: type of both.
+        dtype: dtype of ``observation`` and ``desired_goal``.
         action_shape: shape of one action: [width], or [] for an integer.
-        action_dtype: ``"int64"`` for an integer, otherwise that of the inputs.
+        action_dtype: ``"int64"`` for an integer, otherwise the dtype of the inputs.
         task_dtype: type of the actions that the task itself takes, to which :meth:`Policy.predict` rounds.
         low, high: the least and the greatest actions that the task takes, one number for each entry.
         normalize_clip: normalized inputs are clipped to plus and minus this; None if the policy does not

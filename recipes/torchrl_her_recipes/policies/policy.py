@@ -81,8 +81,8 @@ class Policy(TensorDictModuleBase):
     def load(cls, source: str | Path, *, run: int | None = None, best: bool = False) -> Policy:
         """Loads the policy of a task, a run or a file.
 
-        Nothing is imported for a file, whatever module its task names. For a run, an environment of its task
-        is made.
+        Loading a file imports no module, even if its task names one. Loading a run makes an environment of
+        its task.
 
         Args:
             source: Name of a policy that comes with the package, or of its task, a ``.safetensors`` file that

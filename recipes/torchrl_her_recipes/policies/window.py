@@ -135,7 +135,7 @@ class Viewing:
             self._go_on(hold=self.rate)
 
     def frame(self) -> Tensor:
-        """The present picture [height, width, 3] of uint8, with lines of information below it."""
+        """Returns the present picture [height, width, 3] of uint8, with lines of information below it."""
         return underlined(self._viewer.frame(), [self.status(), _KEYS])
 
     def status(self) -> str:

@@ -30,7 +30,7 @@ class Picture:
     """A picture or film of the page.
 
     Attributes:
-        file: that is embedded.
+        file: file that is embedded.
         alt: alternative text.
     """
 

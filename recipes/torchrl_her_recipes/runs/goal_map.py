@@ -21,8 +21,8 @@ class GoalMap:
     """Histograms over a grid of goals: n x n cells of the screen, the first index goes right, the second up.
 
     Attributes:
-        counts: [R, n, n] virtual goals of each run written since its buffer was last emptied; [R, n] or
-            [R, n, n, n] for goals of as many coordinates.
+        counts: [R, n, n], virtual goals of each run written since its buffer was last emptied; [R, n] for
+            goals of one coordinate, [R, n, n, n] for goals of three.
         target: [n, n], q* at the final sigma.
     """
 
@@ -57,7 +57,7 @@ class GoalMap:
         """Makes a map from the arrays of a file, checked.
 
         Raises:
-            ValueError: there are none, or they are not those of a map; the message names the file.
+            ValueError: arrays are missing, or do not form a map; the message names the file.
         """
         if counts is None or target is None or counts.ndim < 2 or counts.shape[1:] != target.shape:
             got = [None if array is None else list(array.shape) for array in (counts, target)]

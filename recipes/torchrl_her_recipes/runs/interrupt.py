@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-_TOGETHER = 1.0  # seconds
+_TOGETHER = 1.0  # seconds within which signals count as one
 _OTHERS = ("SIGTERM", "SIGHUP")  # sent by `kill`, job schedulers and closed terminals; not on all systems
 
 
@@ -19,9 +19,9 @@ class Interrupted(Exception):
 
 @contextmanager
 def soft_interrupt() -> Iterator[Callable[[], None]]:
-    """Defers the first Ctrl-C to the next call of what this yields; a later one strikes at once.
+    """Defers the first Ctrl-C until the yielded function is called; a second Ctrl-C takes effect at once.
 
-    SIGTERM and SIGHUP are as good as Ctrl-C, unless they are ignored, as under ``nohup``. Signals that
+    SIGTERM and SIGHUP count as Ctrl-C, unless they are ignored, as under ``nohup``. Signals that
     come together, as from a process group and its parent, count as one.
 
     Example:

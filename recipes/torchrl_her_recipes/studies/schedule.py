@@ -1,4 +1,4 @@
-"""Runs the jobs of a plan, as many at once as workers allow, and shows their progress."""
+"""Runs the jobs of a plan side by side on the available workers, and shows their progress."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def run_study(
 ) -> StudyResult:
     """Runs the unfinished jobs of a study, several at once, and draws its figure.
 
-    Runs that were interrupted go on from their checkpoints.
+    Interrupted runs are resumed from their checkpoints.
 
     Args:
         study: study to run; or recipes of single runs, by the names of their folders.
@@ -111,7 +111,7 @@ def run_study(
 
 
 def unfinished_sweep(runs: Mapping[str, Recipe], folders: Path) -> Path | None:
-    """Finds the newest folder of exactly these single runs that is unfinished; None if there is none.
+    """Finds the newest folder of an unfinished sweep with exactly the given runs; None if there is none.
 
     Args:
         runs: recipes, by the names of their folders.

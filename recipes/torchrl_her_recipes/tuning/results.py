@@ -21,14 +21,14 @@ from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.config.searches.search import Search
 from torchrl_her_recipes.runs.plots import save_figure
 
-_FEWEST = 5  # complete trials, from which importances are estimated
-_SHOWN = 5  # trials in the table that is printed
+_FEWEST = 5  # least number of complete trials for estimates of importance
+_SHOWN = 5  # number of trials in the printed table
 # Attribute of the trial of the recipe as it is: its values, some of which may lie outside of the space.
 DEFAULT = "default"
 
 
 def folder_of(trial: FrozenTrial | Trial) -> str:
-    """Returns the name of a trial's folder, or that of the trial that it repeats."""
+    """Returns the name of a trial's folder, or of the trial that it repeats."""
     return str(trial.user_attrs.get("folder", f"trial_{trial.number:04}"))
 
 
@@ -36,9 +36,9 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
     """Writes ``trials.csv``, and the best trial as the preset ``best.yaml``.
 
     Args:
-        search: that the trials belong to.
-        study: study of Optuna.
-        trials: that count.
+        search: search that the trials belong to.
+        study: Optuna's study.
+        trials: all trials except interrupted ones.
         folder: folder of the search.
     """
     names = list(search.space.ranges)

@@ -69,7 +69,7 @@ class SearchResult:
 
     @property
     def failed(self) -> dict[int, str]:
-        """Reasons for which trials failed, by number."""
+        """Why trials failed, by the number of the trial."""
         failed = (trial for trial in self.trials if trial.state == TrialState.FAIL)
         return {trial.number: trial.user_attrs.get(_ERROR, "") for trial in failed}
 
@@ -86,7 +86,7 @@ def tune(
 ) -> SearchResult:
     """Searches for good options, or resumes the search of a folder.
 
-    Runs of trials that were cut short go on from their checkpoints.
+    Interrupted trials are resumed from their checkpoints.
 
     Args:
         search: recipe, space, sampler and pruner.
@@ -94,7 +94,7 @@ def tune(
 
     Keyword Args:
         trials: number of trials in the folder at the end; 50 if ``minutes`` is not given either.
-        minutes: after which no further trial begins.
+        minutes: time after which no further trial begins.
         workers: run the trials; by default a process for each core. They are closed at the end.
         say: called with a line for each trial that ends.
         progress: whether to show a progress bar.

@@ -71,7 +71,7 @@ def test_cloning_is_learned_without_compiled_steps(options: dict[str, Any], lear
 
 def test_compiled_steps_cannot_be_asked_for(file: str) -> None:
     components = build(small(**asked(file), compile="always"))
-    with pytest.raises(ValueError, match="compile=always cannot be: behavior cloning of demonstrations"):
+    with pytest.raises(ValueError, match="compile=always is .*: behavior cloning of demonstrations"):
         components.trainer()
 
 

@@ -23,8 +23,8 @@ class RecentGoals:
     """Memory of the goals that were desired and achieved in recent episodes of each of R runs.
 
     Attributes:
-        goals: for ``"actual"`` and ``"achieved"``, those of each run, [m, g] with the newest last; None for
-            a run that has none.
+        goals: goals of each run, [m, g] with the newest last, under ``"actual"`` and ``"achieved"``; None for
+            a run without goals.
 
     Example:
         >>> from tensordict import TensorDict
@@ -54,11 +54,11 @@ class RecentGoals:
         *,
         sizes: Mapping[str, int],
     ) -> RecentGoals:
-        """Returns the memory after some episodes.
+        """Returns the memory with the goals of some episodes added.
 
         Args:
             rows: [n], transitions.
-            episodes: positions among them; those of one run after those of the other.
+            episodes: positions of the episodes in ``rows``, run after run.
             run: [E] int64, the run of each episode; None if there is only one.
             keys: keys of the goals.
 
@@ -90,10 +90,10 @@ class RecentGoals:
         )
 
     def lines(self, name: str, runs: Sequence[int]) -> tuple[Tensor, Episodes]:
-        """Joins the goals of one kind of some runs, which all have goals.
+        """Joins the remembered goals of one kind of some runs, which all have goals.
 
         Returns:
-            ``(goals, lines)``: [p, g], and where those of each run lie in there, as those of an episode do.
+            ``(goals, lines)``: [p, g], and the positions of each run's goals among them, as of an episode.
         """
         parts = [goals for run in runs if (goals := self.goals[name][run]) is not None]
         goals = parts[0] if len(parts) == 1 else torch.cat([part.to(parts[-1]) for part in parts])
@@ -102,7 +102,7 @@ class RecentGoals:
         return goals, Episodes((lengths.cumsum(0) - lengths).unsqueeze(-1) + step, lengths)
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain data that :meth:`from_state` takes."""
+        """Returns tensors and plain data that :meth:`from_state` takes."""
         return {name: list(goals) for name, goals in self.goals.items()}
 
     @classmethod

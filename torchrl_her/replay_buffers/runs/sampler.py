@@ -209,19 +209,19 @@ class RunsPrioritizedSampler(PrioritizedSampler):
     ) -> None:
         """Sets the priorities of some rows.
 
-        Rows that were not written yet, or not since their run was emptied, are left out. So are priorities
-        that are not finite, or not once they are raised to the power: these rows keep theirs, and a warning
-        names their run the first time.
+        Skips rows that have not been written since their run was last emptied. Also skips priorities that are
+        not finite, before or after they are raised to the power: these rows keep their old priorities, and a
+        warning names their run the first time.
 
         Args:
-            index: [n] of rows; -1 stands for none.
+            index: [n], indices of rows; -1 is skipped.
             priority: [n], or one for all.
 
         Keyword Args:
-            storage: that of the rows; with a single run, all that it holds were written.
+            storage: storage of the rows; with a single run, all rows in it count as written.
 
         Raises:
-            RuntimeError: there are neither as many priorities as rows nor one.
+            RuntimeError: the number of priorities is neither one nor the number of rows.
         """
         index = torch.as_tensor(index, dtype=torch.int64, device=self.device).flatten()
         priority = torch.as_tensor(priority, dtype=torch.float32, device=self.device).detach().abs().flatten()
@@ -335,7 +335,7 @@ def generators_of(sampler: AnyRunsSampler) -> Generators:
 
 
 def rows_of(place: Tensor, filled: Sequence[bool], capacity: int) -> Tensor:
-    """Converts places [R, n] in the runs' blocks to rows [R * n]; empty runs get those of a filled one."""
+    """Converts places [R, n] in the runs' blocks to rows [R * n]; empty runs get the rows of a filled run."""
     row = place + torch.arange(0, len(filled) * capacity, capacity, device=place.device).unsqueeze(-1)
     if not all(filled):
         stand_in = list(filled).index(True)

@@ -132,8 +132,8 @@ class PackedStorage(LazyTensorStorage):
     def _allocate(self, fields: tuple[Field, ...], device: torch.device | None) -> None:
         width = -(-fields[-1].end // _ALIGNED)
         self._fields = fields
-        # Of zeros, so that also the bytes between rows are the same in every checkpoint. On the CPU they are
-        # NumPy's, which take no memory before rows come: those of torch are written at once.
+        # Zeros, so that the bytes between rows are the same in every checkpoint. On the CPU NumPy makes them,
+        # since its zeros take memory only when rows are written; torch.zeros takes all memory at once.
         if device is None or device.type == "cpu":
             self._packed = torch.from_numpy(np.zeros((self.max_size, width), np.int64))
         else:

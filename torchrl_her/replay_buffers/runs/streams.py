@@ -65,7 +65,7 @@ class RunDraws:
         self.generators, self.run = generators, run
 
     def of(self, some: Tensor) -> RunDraws:
-        """Returns the random numbers for some transitions, in order."""
+        """Returns the random numbers for the transitions at the positions ``some``, ascending."""
         return self if self.run is None else RunDraws(self.generators, self.run[some])
 
     def __call__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:

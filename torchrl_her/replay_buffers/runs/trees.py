@@ -18,21 +18,21 @@ _TOPS = 32  # nodes without a parent, at most
 class SumTrees:
     """Sum trees of R runs, drawn from and updated together in a few tensor operations.
 
-    Each run has up to ``capacity`` leaves of at least 0, the sums of each 16 of them, of each 16 sums, and so
-    on. A draw goes down from the top: at each node it takes the child in which its random number lies.
-    Leaves and sums are single precision and what is left of the random number is double, so that also one
-    of a million equal leaves is drawn as often as the others.
+    Each run has ``capacity`` leaves, which are at least 0. Each node above holds the sum of its 16 children.
+    A draw goes down from the top: at each node it takes the child in which its random number lies. Leaves
+    and sums have single precision, the rest of the random number has double precision: even each of a
+    million equal leaves is drawn equally often.
 
     Args:
-        capacity: leaves of each run.
+        capacity: number of leaves of each run.
 
     Keyword Args:
-        runs: R.
+        runs: R, the number of runs.
         native: whether draws and updates are made in C++ where that can be compiled, with the same result.
         device: device of the leaves.
 
     Raises:
-        MemoryError: there is not enough memory for so many leaves.
+        MemoryError: the memory does not suffice for the leaves.
 
     Example:
         >>> trees = SumTrees(4, runs=2)
@@ -69,15 +69,15 @@ class SumTrees:
         return self._levels[0][run, :count].clone()
 
     def set(self, run: Tensor, leaf: Tensor, value: Tensor, *, sorted: bool = False) -> None:
-        """Sets some leaves.
+        """Sets the values of some leaves, and updates the sums above them.
 
         Args:
-            run, leaf: [n] int64, which leaves. Of one that is named several times, the last value counts.
+            run, leaf: [n] int64, run and index of each leaf. For repeated leaves, the last value counts.
             value: [n], or one number for all.
 
         Keyword Args:
-            sorted: whether the leaves mostly follow each other, as those of new rows do; then the sums over
-                them are computed only once.
+            sorted: whether most leaves follow each other, as for new rows; then the sums above them are
+                computed only once.
         """
         node = run * self._levels[0].shape[1] + leaf
         value = value.to(self._levels[0].dtype).expand(node.shape)

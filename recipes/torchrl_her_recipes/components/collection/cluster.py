@@ -48,7 +48,7 @@ def join(address: str) -> bool:
 
 @contextmanager
 def _signals_kept() -> Iterator[None]:
-    """Ray handles SIGTERM in its own way, and does not save what there is."""
+    """Restores the handler of SIGTERM: Ray sets its own, which ends a run without saving it."""
     before = signal.getsignal(signal.SIGTERM)
     yield
     if threading.current_thread() is threading.main_thread():
@@ -56,17 +56,17 @@ def _signals_kept() -> Iterator[None]:
 
 
 def resource(name: str) -> float:
-    """How much of a resource, such as ``CPU``, the nodes have together just now."""
+    """Returns the present amount of a resource, such as ``CPU``, on all nodes together."""
     return float(ray.cluster_resources().get(name, 0))
 
 
 def gpus() -> list[float]:
-    """How many GPUs each node has."""
+    """Returns the number of GPUs of each node."""
     return [float(node["Resources"].get("GPU", 0)) for node in ray.nodes() if node["Alive"]]
 
 
 def one_line(error: Any) -> str:
-    """Type and message of an error, without its traceback, in one line."""
+    """Returns type and message of an error in one line, without its traceback."""
     if isinstance(error, RayTaskError):
         return f"{type(error.cause).__name__}: {error.cause}"
     return next(iter(str(error).splitlines()), type(error).__name__)

@@ -74,13 +74,13 @@ class SyncWorkers(MultiSyncCollector):
         self.map_fn("begin", [(beginning,) for beginning in beginnings])
 
     def ahead(self, weights: TensorDictBase) -> None:
-        """Lets them collect the next batch with these weights of the policy, unless they do already."""
+        """Starts collecting the next batch with these weights of the policy, unless that is under way."""
         if self._batch is None:
             self.update_policy_weights_(weights)  # while no process looks at them
             self._batch = self._thread.submit(self.next)
 
     def take(self, weights: TensorDictBase) -> TensorDictBase:
-        """The next batch [..., T], time last; the first dimension may be that of processes."""
+        """Returns the next batch [..., T], time last; the first dimension may be the processes."""
         self.ahead(weights)
         assert self._batch is not None
         batch = self._batch.result()
@@ -89,7 +89,7 @@ class SyncWorkers(MultiSyncCollector):
 
     def _shutdown_main(self, timeout: float | None = None) -> None:
         super()._shutdown_main(timeout)
-        self._thread.shutdown(wait=False)  # it may be the one that calls this
+        self._thread.shutdown(wait=False)  # no waiting: the thread itself may call this
 
 
 class AsyncWorkers(MultiAsyncCollector):
@@ -120,16 +120,16 @@ Workers: TypeAlias = "SyncWorkers | AsyncWorkers | NodeWorkers"
 
 
 class ProcessCollector(BaseCollector):
-    """Collects in processes of their own, each with its share of the environments of every run.
+    """Collects in several processes, each with its share of the environments of every run.
 
     The processes start when they are first needed and end with :meth:`shutdown`; after that, they start again
     when needed.
 
-    With ``sync=true`` all of them collect a batch [R * E, T] together, where row k always belongs to the same
-    environment. :meth:`collect_ahead` lets them collect the next one while the caller learns from the last
-    one; the policy that plays in such a batch is always one batch old, and the same seed gives the same
-    batches. With ``sync=false`` no process waits for another one: a batch [R * E / N, T] is that of the
-    process that was ready first, and rows carry ids of their environments.
+    With ``sync=true`` all processes collect a batch [R * E, T] together, where row k always belongs to the
+    same environment. After :meth:`collect_ahead` they collect the next batch while the caller learns from
+    the last one. The policy that plays in such a batch is always one batch old, and the same seed gives the
+    same batches. With ``sync=false`` no process waits for another: a batch [R * E / N, T] comes from the
+    first process that is ready, and rows carry ids of their environments.
 
     With ``ray=ADDRESS`` the processes are on the nodes of a Ray cluster, see
     :class:`~torchrl_her_recipes.components.collection.ray_workers.NodeWorkers`.
@@ -140,13 +140,13 @@ class ProcessCollector(BaseCollector):
     Args:
         options: Options of collecting.
         make_env: Makes the environments of a process; takes names of modules to import first, as ``modules``.
-        policy: whose weights, epsilon of exploration included, are sent to the processes.
+        policy: Policy whose weights and epsilon are sent to the processes.
         seeds: Seeds of the runs.
-        progress: the stages of the runs, which are sent with each reset; None without a curriculum.
-        storing_device: where batches come. The processes are on the CPU.
+        progress: Stages of the runs, which are sent with each reset; None without a curriculum.
+        storing_device: Device of the batches. The processes are on the CPU.
 
     Raises:
-        RuntimeError: a process failed, when asked for a batch.
+        RuntimeError: A process failed while collecting a batch.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class ProcessCollector(BaseCollector):
         self._workers: Workers | None = None
 
     def next(self) -> TensorDictBase:
-        """The next batch; new episodes begin first if the processes were not running."""
+        """Returns the next batch; new episodes begin first if the processes were not running."""
         if self._workers is None:
             self.reset()
         assert self._workers is not None
@@ -207,7 +207,7 @@ class ProcessCollector(BaseCollector):
         raise NotImplementedError("seeds of processes that collect are those of the recipe: set its seed")
 
     def state_dict(self) -> OrderedDict:
-        """The number of resets: the next one begins as it would have, whatever happened since the last."""
+        """Returns the number of resets, on which alone the random numbers after the next reset depend."""
         return OrderedDict(resets=self.resets)
 
     def load_state_dict(self, state_dict: OrderedDict) -> None:
@@ -313,7 +313,7 @@ def _get(get: Callable[..., Any], processes: Sequence[BaseProcess]) -> Any:
 
 
 def _in_blocks(batch: TensorDictBase, runs: int) -> TensorDictBase:
-    """A batch [R * E, T] with the environments of each run together.
+    """Returns a batch [R * E, T] with the environments of each run together.
 
     Args:
         batch: [N, R * E / N, T] of N processes, or [R * E, T] of one.
@@ -328,7 +328,7 @@ def _in_blocks(batch: TensorDictBase, runs: int) -> TensorDictBase:
 
 
 def _to_send(policy: TensorDictModuleBase) -> TensorDictModuleBase:
-    """A copy of a policy for other processes, which share the memory of its weights.
+    """Returns a copy of a policy for other processes, which share the memory of its weights.
 
     It has no generators of random numbers: each process makes its own, and two of them cannot be sent
     together.
@@ -344,7 +344,7 @@ def _end(workers: Workers) -> None:
     try:
         workers.shutdown()
     finally:
-        torch.set_num_threads(threads)  # TorchRL takes as many as processes have ended
+        torch.set_num_threads(threads)  # TorchRL changes the number of threads when it ends its processes
 
 
 def _end_if_there(workers: weakref.ref[Any]) -> None:

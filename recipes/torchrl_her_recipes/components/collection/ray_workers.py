@@ -25,25 +25,24 @@ _ON_A_CORE = {"num_cpus": 1, "num_gpus": 0, "scheduling_strategy": "SPREAD"}
 class NodeWorkers(RayCollector):
     """Processes on the nodes of a Ray cluster, each with a core, which are sent weights and send batches.
 
-    Nothing is asked of the nodes but this package. Where one dies, a process elsewhere takes the place of
-    each that was lost, as soon as there is a core for it; it begins new episodes. Lost are the batch that was
-    being collected there, and the rest of the episodes that were open: what was sent of them is kept by the
-    writer, which stores it when it is told that episodes have ended (at each epoch of a
-    :class:`~torchrl_her.Trainer`).
+    The nodes need this package only. If a node dies, a new process on another node replaces each process that
+    was lost, as soon as a core is free, and begins new episodes. The unfinished batch of a lost process is
+    dropped, and so is the rest of its open episodes. The writer keeps the part that was sent, and stores it
+    when the episodes are ended (at each epoch of a :class:`~torchrl_her.Trainer`).
 
     Args:
-        address: of the cluster, HOST:PORT, or ``auto`` for the one that this machine is a node of.
+        address: address of the cluster, HOST:PORT, or ``auto`` for the cluster of this machine.
         make_env: makes a process's environments.
-        policy: a copy for others, on the CPU.
+        policy: a copy of the policy, on the CPU.
 
     Keyword Args:
-        processes: N.
-        frames: in a batch of one process.
-        sync: whether a batch [N, ...] is that of all processes, or of the one that was ready first.
+        processes: N, the number of processes.
+        frames: number of frames in a batch of one process.
+        sync: whether a batch [N, ...] joins all processes; if not, it is from the first that is ready.
 
     Raises:
         ConnectionError: there is no such cluster.
-        ValueError: fewer than N of its cores are free.
+        ValueError: fewer than N cores of the cluster are free.
         RuntimeError: a process failed for another reason than its death, or died time after time.
     """
 
@@ -88,22 +87,22 @@ class NodeWorkers(RayCollector):
             raise RuntimeError(f"a process that collects cannot start: {one_line(error)}") from error
 
     def begin(self, beginnings: Sequence[Beginning]) -> None:
-        """Drops what they are collecting, and begins new episodes in all of them."""
+        """Drops the batches that processes are collecting, and begins new episodes in all processes."""
         self._orders.clear()
         self._beginnings, self._to_begin = list(beginnings), set(range(len(beginnings)))
 
     def ahead(self, weights: TensorDictBase) -> None:
-        """Lets those that are idle collect the next batch with these weights."""
+        """Starts collecting the next batch with these weights in all idle processes."""
         self._order(weights, range(self.num_collectors))
 
     def take(self, weights: TensorDictBase) -> TensorDictBase:
-        """The next batch: [N, ...] of all processes, or that of the first that is ready."""
+        """Returns the next batch: [N, ...] from all processes, or one from the first that is ready."""
         batches: dict[int, TensorDictBase] = {}
         while len(batches) < (self.num_collectors if self._sync else 1):
             self._order(weights, set(range(self.num_collectors)) - set(batches))
             ready, _ = ray.wait(
                 list(self._orders.values()), timeout=_SECONDS
-            )  # the one first told, of several
+            )  # of several, the one that was started first
             if not ready and resource("CPU") == 0:
                 raise RuntimeError("no node that could collect is left in the cluster")
             for process in [index for index, order in self._orders.items() if order in ready]:
@@ -115,7 +114,7 @@ class NodeWorkers(RayCollector):
         return next(iter(batches.values()))
 
     def _order(self, weights: TensorDictBase, processes: Iterable[int]) -> None:
-        """Tells those that have nothing to do to collect a batch."""
+        """Starts collecting a batch in each of the given processes that is idle."""
         idle = [process for process in processes if process not in self._orders]
         if not idle:
             return
@@ -127,7 +126,7 @@ class NodeWorkers(RayCollector):
             self._to_begin.discard(process)
 
     def _fetch(self, process: int) -> TensorDictBase | None:
-        """The batch that a process has collected; None if it has died, and another one takes its place."""
+        """Returns the batch that a process has collected; None if the process died and was replaced."""
         order = self._orders.pop(process)
         try:
             batch = ray.get(order)

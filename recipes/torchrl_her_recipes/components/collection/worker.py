@@ -33,7 +33,7 @@ from torchrl_her_recipes.config.imports import import_modules, permit_task
 
 
 def share_of_envs(options: CollectionConfig) -> int:
-    """How many environments of each run one process steps."""
+    """Returns the number of environments of each run in one process."""
     return options.num_envs // options.processes
 
 
@@ -75,8 +75,8 @@ class Beginning:
     """All that the episodes of a process depend on, from one reset to the next.
 
     Attributes:
-        env_seeds: of its environments, one for each run.
-        seeds: of each run's exploration.
+        env_seeds: seeds of the process's environments, one for each run.
+        seeds: seeds of each run's exploration.
         progress: state of the curriculum, or None.
     """
 
@@ -85,7 +85,7 @@ class Beginning:
     progress: dict[str, Any] | None = None
 
     def again(self, life: int) -> Beginning:
-        """How a process begins that takes the place of one that died, for the ``life``-th time."""
+        """Returns new seeds for a process that replaces a dead one, for the ``life``-th time."""
         return replace(
             self,
             env_seeds=[derive_seed(seed, life) for seed in self.env_seeds],
@@ -94,13 +94,13 @@ class Beginning:
 
 
 def drawing_modules(policy: nn.Module) -> list[Any]:
-    """The parts of a policy that draw random numbers, each from a generator for each run."""
+    """Returns the parts of a policy that draw random numbers, each from one generator for each run."""
     kinds = Exploration | GuidedExploration | StochasticActor
     return [module for module in policy.modules() if isinstance(module, kinds)]
 
 
 def derive_seed(*numbers: int) -> int:
-    """A seed that differs for different numbers, which are not negative."""
+    """Derives a seed from non-negative numbers; different numbers give different seeds."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
@@ -119,7 +119,7 @@ class WorkerCollector(Collector):
         if beginning.progress is not None:
             progress = _progress_of(self.env)
             progress.load_state_dict(beginning.progress)
-            if isinstance(progress, EpisodeStages):  # each process draws other ones
+            if isinstance(progress, EpisodeStages):  # each process draws stages of its own
                 seeds = [derive_seed(seed, Stream.STAGES) for seed in beginning.seeds]
                 progress.generators = make_generators(seeds, CPU)
         self.reset()
@@ -134,7 +134,7 @@ class NodeCollector(WorkerCollector):
     def __init__(self, *args: Any, **options: Any) -> None:
         torch.set_flush_denormal(True)  # as the learner does
         torch.set_num_threads(1)
-        self._error = ""  # that kept it from being made
+        self._error = ""  # error of the constructor, if any
         try:
             super().__init__(*args, **options)
         except Exception as error:
@@ -144,7 +144,7 @@ class NodeCollector(WorkerCollector):
         """Does nothing: weights come with each call of :meth:`collect`."""
 
     def collect(self, weights: TensorDictBase, beginning: Beginning | None = None) -> TensorDictBase | str:
-        """The next batch that a policy with these weights plays; of new episodes, if told how they begin."""
+        """Collects the next batch with these weights, in new episodes if ``beginning`` is given."""
         if self._error:
             return self._error
         try:
@@ -157,5 +157,5 @@ class NodeCollector(WorkerCollector):
 
 
 def _progress_of(env: TransformedEnv) -> CurriculumProgress:
-    """The progress that an environment's transforms look at."""
+    """Returns the progress that an environment's transforms look at."""
     return next(transform.progress for transform in env.transform if isinstance(transform, StateToObs))

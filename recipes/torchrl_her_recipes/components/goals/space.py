@@ -59,7 +59,7 @@ class KernelSpace:
 
 
 def goal_space(options: Group, envs: TaskEnvs, env: EnvBase, num_envs: int) -> GoalSpace | KernelSpace | None:
-    """The space of a task's goals: the range that the task states, or else a box around goals of it.
+    """Returns the space of a task's goals: the range that the task states, or else a box around goals of it.
 
     For kernel densities it is goals of the task. None if the options (of weights or of behavior goals) need
     none, or if goals are merely counted and the task states no range.
@@ -92,16 +92,16 @@ def goal_space(options: Group, envs: TaskEnvs, env: EnvBase, num_envs: int) -> G
 
 
 def goal_width(env: Any) -> int:
-    """How many numbers a goal of a task has."""
+    """Returns the number of entries of a task's goal."""
     return int(env.observation_spec["desired_goal"].shape[-1])
 
 
 def _without_grid(task: str, choice: str, width: int) -> bool:
-    """Whether q* and q are kernel densities."""
+    """Returns whether q* and q are kernel densities, not histograms over a grid."""
     if choice == "grid" and width > MOST_DIMENSIONS:
         raise ValueError(
-            f"estimator=grid cannot be on {task}: its goals have {width} numbers, and a grid is "
-            f"kept over {MOST_DIMENSIONS} at most; choose kernel"
+            f"estimator=grid needs goals of at most {MOST_DIMENSIONS} numbers, and those of {task} have "
+            f"{width}; choose estimator=kernel"
         )
     return choice == "kernel" or (choice == "auto" and width > MOST_DIMENSIONS)
 
@@ -119,7 +119,7 @@ def _kernel(task: str, env: Any, options: SequentialIBS, box: Box | None, goals:
 
 
 def _given(task: str, env: Any, options: Equal, low: Sequence[float], high: Sequence[float]) -> GoalSpace:
-    """The range of goals that an environment states."""
+    """Returns the range of goals that an environment states."""
     goals = env.goal_distribution
     grid = GoalGrid(low, high, [options.cells] * len(low))
     target: Callable[[float], Tensor]
@@ -132,7 +132,7 @@ def _given(task: str, env: Any, options: Equal, low: Sequence[float], high: Sequ
 
 
 def _sampled(env: Any, options: SequentialIBS, goals: Tensor) -> GoalSpace:
-    """A box around goals of the task, half as wide again on each side."""
+    """Returns a box around goals of the task, half as wide again on each side."""
     low, high = goals.amin(0), goals.amax(0)
     width = float((high - low).max()) or 1.0
     margin = torch.where(high > low, (high - low) / 2, width / 2)
@@ -152,5 +152,5 @@ def _desired_goals(envs: TaskEnvs, env: Any, num_envs: int) -> Tensor:
 
 
 def _share(options: Equal, env: Any) -> float:
-    """The final sigma as a share of the space."""
+    """Returns the final sigma as a share of the space."""
     return getattr(options, "sigma", None) or env.goal_sigma

@@ -1,4 +1,4 @@
-"""DDPG."""
+"""Builder of DDPG: networks, loss and exploration."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchrl_her_recipes.components.learner import LearnerBuilder, Networks
 
 
 class DDPGBuilder(LearnerBuilder):
-    """See :func:`~torchrl_her.make_ddpg_loss`."""
+    """Builds networks and loss of DDPG, see :func:`~torchrl_her.make_ddpg_loss`."""
 
     def networks(self, runs: int) -> Networks:
         actor = self.player(runs)
@@ -27,7 +27,7 @@ class DDPGBuilder(LearnerBuilder):
         return self.actor(runs).to(self.dtype)
 
     def actor(self, runs: int) -> TensorDictModule:
-        """The deterministic actor of some runs side by side."""
+        """Returns the deterministic actor of some runs side by side."""
         return make_actor(
             self.widths,
             self.action_spec.shape[-1],
@@ -38,11 +38,11 @@ class DDPGBuilder(LearnerBuilder):
 
     @property
     def outputs(self) -> int:
-        """How many numbers a critic gives."""
+        """Number of outputs of a critic."""
         return 1
 
     def critic(self, runs: int) -> TensorDictModule:
-        """Their critic, or one of them."""
+        """Returns one critic of some runs side by side."""
         return make_critic(
             self.widths,
             self.action_spec.shape[-1],

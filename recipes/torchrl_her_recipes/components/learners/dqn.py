@@ -1,4 +1,4 @@
-"""DQN."""
+"""Builder of DQN: networks, loss and exploration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SAC, and REDQ, which is SAC with other defaults."""
+"""Builder of SAC, and of REDQ, which is SAC with other defaults."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchrl_her_recipes.components.learners.ddpg import DDPGBuilder
 
 
 class SACBuilder(DDPGBuilder):
-    """See :func:`~torchrl_her.objectives.make_sac_loss`; the critics are those of DDPG."""
+    """Builds SAC, see :func:`~torchrl_her.objectives.make_sac_loss`, with the critics of DDPG."""
 
     def actor(self, runs: int) -> TensorDictModule:
         return make_stochastic_actor(

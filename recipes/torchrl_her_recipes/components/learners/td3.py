@@ -1,4 +1,4 @@
-"""TD3."""
+"""Builder of TD3: networks, loss and exploration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl_her_recipes.components.learners.ddpg import DDPGBuilder
 
 
 class TD3Builder(DDPGBuilder):
-    """See :func:`~torchrl_her.objectives.make_td3_loss`; the networks are those of DDPG."""
+    """Builds TD3, see :func:`~torchrl_her.objectives.make_td3_loss`, with the networks of DDPG."""
 
     def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
         return make_td3_loss(

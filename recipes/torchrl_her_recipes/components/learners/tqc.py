@@ -1,4 +1,4 @@
-"""TQC."""
+"""Builder of TQC: networks, loss and exploration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl_her_recipes.components.learners.sac import SACBuilder
 
 
 class TQCBuilder(SACBuilder):
-    """See :func:`~torchrl_her.objectives.make_tqc_loss`; the actor is that of SAC."""
+    """Builds TQC, see :func:`~torchrl_her.objectives.make_tqc_loss`, with the actor of SAC."""
 
     @property
     def outputs(self) -> int:

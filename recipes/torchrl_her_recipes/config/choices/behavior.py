@@ -31,15 +31,19 @@ class Real(Behavior):
 class Proposed(Behavior):
     """Base class: goals that were achieved before, in some of the episodes.
 
-    The maker takes the options and ``goals``, which makes :class:`~torchrl_her.behavior.BehaviorGoals` from
-    ``weights``, ``factors`` and the like, and returns its result. By keyword it also takes ``learner`` (its
-    options), ``runs`` (their number), ``rewards`` (of a missed and of an achieved goal), ``space`` (of the
-    task's goals, for options of IBS) and ``values``, which makes the
-    :class:`~torchrl_her.behavior.GoalValues` of the agent.
+    The maker takes the options and ``goals``, a function that makes
+    :class:`~torchrl_her.behavior.BehaviorGoals` from ``weights``, ``factors`` and the like. The maker returns
+    its result. Keyword arguments of the maker:
+
+    - ``learner``: options of the learner;
+    - ``runs``: number of runs;
+    - ``rewards``: rewards of a missed and of an achieved goal;
+    - ``space``: space of the task's goals, for options of IBS;
+    - ``values``: function that makes the :class:`~torchrl_her.behavior.GoalValues` of the agent.
     """
 
     real_share: float = option(
-        0.5, "share of the episodes that ask for the task's own goals nevertheless", at_least=0, at_most=1
+        0.5, "share of the episodes that keep the task's own goals", at_least=0, at_most=1
     )
     goal_memory: int = option(50_000, "newest achieved goals that are remembered", at_least=1)
 

@@ -14,7 +14,7 @@ Actions = Literal["continuous", "discrete"]
 _MAKERS = "torchrl_her_recipes.components.learners"
 _CRITICS = "how many critics there are; targets have the least of their values"
 _CLAMPED = "whether targets are clamped to the returns that rewards allow, where rewards have bounds"
-_TARGET_CRITICS = "so many critics, drawn at random, are asked for each step's targets; 0: all"
+_TARGET_CRITICS = "number of critics, drawn in each step, whose least value is the target; 0 uses all"
 
 
 def _norm(*more: str, text: str = "") -> Any:
@@ -235,7 +235,7 @@ class TQCConfig(EntropyConfig):
     critics: int = option(2, "how many critics there are; targets have all of their quantiles", at_least=1)
     quantiles: int = option(25, "quantiles of the return that each critic gives", at_least=1)
     dropped_quantiles: int = option(
-        2, "targets leave out so many of the greatest quantiles for each critic", at_least=0
+        2, "number of the greatest quantiles of each critic that targets leave out", at_least=0
     )
 
     def __post_init__(self) -> None:

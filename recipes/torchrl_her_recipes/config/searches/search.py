@@ -66,7 +66,7 @@ class Search:
                 )
 
     def to_plain(self) -> dict[str, Any]:
-        """Returns the search as plain values, in the form of its folder."""
+        """Returns the search as plain values, as they are written into the folder of the search."""
         return {
             "sampler": self.sampler,
             "pruner": self.pruner,

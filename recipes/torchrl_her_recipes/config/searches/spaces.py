@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _RANGE = ("low", "high")
 _KINDS = {"float": _RANGE, "log_float": _RANGE, "int": _RANGE, "log_int": _RANGE, "choice": ("values",)}
-_MOST = 100  # values of a choice
+_MOST = 100  # largest number of values of a choice
 _LARGEST = 1e15
 # Options that cannot vary: trials must have the same length and start to be compared.
 _SAME_FOR_ALL = ("task", "seed", "num_runs", "epochs", "epoch_frames", "checkpoint_interval", "keep_buffer")

@@ -20,17 +20,17 @@ _OF_A_ROW = ("run", "seed")  # columns that identify a row, and are no metrics
 class LogTo(Callback):
     """Logs a run to one of TorchRL's loggers.
 
-    It gets the options at the start, each row of the table of metrics after its evaluation, at the step
-    that is its number of frames, and the pictures and the video at the end. Metrics are named
-    ``success/run_0``, for each run. The caller closes it.
+    Logs the options at the start, and the pictures and the video at the end. After each evaluation, logs the
+    new row of the table of metrics, with its number of frames as the step. Metrics are named
+    ``success/run_0``, for each run. The caller closes the logger.
 
-    When a run resumes, the logger first gets all rows so far, as it may be a new one.
+    When a run resumes, all rows so far are logged first, since the logger may be a new one.
 
     Args:
-        logger: any of TorchRL's, or one of your own.
+        logger: a logger of TorchRL's, or one of your own.
 
     Keyword Args:
-        after: rows up to so many frames are left out, because the logger has them.
+        after: number of frames up to which rows are left out, because the logger has them.
 
     Example:
         >>> from tempfile import TemporaryDirectory
