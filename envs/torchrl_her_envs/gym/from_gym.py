@@ -38,7 +38,7 @@ from torchrl_her_envs.common.goal_rules import (
     warn_once,
 )
 from torchrl_her_envs.common.rendering.pictures import as_picture
-from torchrl_her_envs.common.seeding import as_seeds, block_keys
+from torchrl_her_envs.common.seeding import as_seeds, block_keys, uniform
 from torchrl_her_envs.gym.check import (
     EPISODES,
     KEYS,
@@ -358,14 +358,17 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     def set_seeds(self, seeds: Sequence[int]) -> None:
         """Seeds R equal blocks of environments, each as if it were alone; from their next reset on.
 
+        Each reset of an environment gets a seed of its own, which depends on the environment's seed and the
+        number of the episode alone.
+
         Args:
             seeds: R of them.
 
         Raises:
             ValueError: the environments cannot be shared out among R blocks, or a seed is out of range.
         """
-        # Some environments hand their seed to generators that take 32 bits.
-        self._next_seeds: list[int | None] = (block_keys(seeds, self.batch_size[0]) >> np.uint64(33)).tolist()
+        self._seed_keys = block_keys(seeds, self.batch_size[0])
+        self._episodes = np.zeros(self.batch_size[0], np.int64)
 
     def _draw_worlds(self, worlds: Sequence[int], size: int | None) -> list[Tensor]:
         if not self.can_render:
@@ -468,9 +471,10 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         which = np.ones(self.batch_size, np.bool_) if mask is None else mask.view(-1).numpy()
         options = {"options": {"reset_mask": which}} if not which.all() else {}
-        observations, info = self._env.reset(seed=self._next_seeds, **options)
-        self._next_seeds = [
-            None if reset else seed for reset, seed in zip(which, self._next_seeds, strict=True)
-        ]
+        # Each reset gets a seed, since some environments (panda-gym's) otherwise draw one from the system.
+        # It has 31 bits, since others pass it to generators that take 32.
+        seeds = (uniform(self._seed_keys, self._episodes, 1)[:, 0] * 2**31).astype(np.int64)
+        observations, info = self._env.reset(seed=seeds.tolist(), **options)
+        self._episodes += which
         shown = {**observations, INFO: self._infos.of_batch(info, len(which), reset=True)}
         return TensorDict(self.read_obs(shown), batch_size=self.batch_size, device=self.device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -213,6 +214,19 @@ def test_the_same_seed_gives_the_same_run_and_another_one_another() -> None:
     runs = [rollout(walk(3, seed=seed)) for seed in (5, 5, 6)]
     assert same(runs[0], runs[1])
     assert not same(runs[0], runs[2])
+
+
+def test_environments_that_draw_a_seed_at_each_reset_repeat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of panda-gym do if they get none."""
+
+    def reset(self: Walk, *, seed: int | None = None, options: Any = None) -> Any:
+        return usual(self, seed=secrets.randbits(31) if seed is None else seed, options=options)
+
+    usual = Walk.reset
+    monkeypatch.setattr(Walk, "reset", reset)
+    one, other = (torch.cat([env.reset()["desired_goal"] for _ in range(9)]) for env in (walk(), walk()))
+    assert torch.equal(one, other)
+    assert len(one.unique()) > 1
 
 
 def test_a_environment_does_the_same_in_every_batch() -> None:
