@@ -246,8 +246,8 @@ class Curriculum:
         width = len(stage.desired_goal or stage.constant_goal)
         if width != self.goal_width:
             raise ValueError(
-                f"stage {stage.name!r}: the goal has {width} entries, but all stages need "
-                f"as many as the last one, {last.name!r}: {self.goal_width}"
+                f"stage {stage.name!r}: the goal has {width} entries, but must have "
+                f"{self.goal_width}, like the goal of the last stage, {last.name!r}"
             )
         if len(stage.observation) > self.observation_width:
             raise ValueError(

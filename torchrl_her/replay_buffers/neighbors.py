@@ -233,6 +233,6 @@ def refuse_other_runs(name: str, storage: Storage, transitions: TensorDictBase, 
     for sampler in samplers_of(storage):
         if getattr(sampler, "runs", 1) != runs:
             raise ValueError(
-                f"{name}(runs={runs}) needs a RunsSampler or RunsPrioritizedSampler of as many "
+                f"{name}(runs={runs}) needs a RunsSampler or RunsPrioritizedSampler of {runs} "
                 f"runs, got a {type(sampler).__name__} of {getattr(sampler, 'runs', 1)}"
             )

@@ -105,7 +105,9 @@ class FusedWeights:
                     )
         counts = {tuple(state["step"].flatten().tolist()) for state in states}
         if len(counts) > 1:
-            raise ValueError(f"Adam must have made as many steps for each parameter, got {sorted(counts)}")
+            raise ValueError(
+                f"Adam must have made the same number of steps for each parameter, got {sorted(counts)}"
+            )
 
     @property
     def counts(self) -> list[float]:

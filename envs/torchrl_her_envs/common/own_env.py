@@ -125,7 +125,7 @@ def make_own_env(
     if isinstance(envs[0], GoalEnv):
         plain = len(info_keys) == 0 and all(key == name for key, name in names.items())
         if termination not in ("auto", "watch") or achieved_reward is not None or not plain:
-            raise ValueError(f"{path} says itself how it ends and rewards: leave out {', '.join(_OURS[1:])}")
+            raise ValueError(f"{path} has its own rewards and ends; leave out {', '.join(_OURS[1:])}")
         return envs[0]
     # A single one is tried, so that what is found out does not depend on how many are asked for.
     tried = OwnGoalEnv(

@@ -117,8 +117,8 @@ def load_demonstrations(
     if options.as_starts:
         if not callable(getattr(goal_env(env), "start_at", None)):
             raise ValueError(
-                f"demonstrations.starts_share={options.starts_share} cannot be on {task}, whose "
-                "environments cannot be started at given states: leave it out"
+                f"demonstrations.starts_share={options.starts_share} cannot be used with {task}, "
+                "whose environments cannot start at given states; leave it out"
             )
         runs = len(seeds)
         demonstrations.starts = DemonstrationStarts(

@@ -191,7 +191,7 @@ def resume(
             )
         if options and target.run.epochs < done:
             raise ValueError(
-                f"epochs must be at least {done}, as many as the run in {home.path} has done, "
+                f"epochs must be at least {done}, the number that the run in {home.path} has done, "
                 f"got {target.run.epochs}"
             )
         current = _Run(components or build(target), home)

@@ -55,7 +55,7 @@ class RayWorkers:
         self._joined, self._gpus = join(address), gpus_per_job
         if gpus_per_job and self._places_on_gpus() == 0:
             self._leave()
-            raise ValueError(f"no node of the cluster has as many GPUs as gpus_per_job={gpus_per_job:g}")
+            raise ValueError(f"no node of the cluster has gpus_per_job={gpus_per_job:g} GPUs")
         this_node = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
         board = ray.remote(num_cpus=0, scheduling_strategy=this_node)(Board)
         self._board = board.remote()

@@ -275,7 +275,7 @@ def test_epochs_extend_a_finished_run_and_an_interrupted_one(
         (["epoch=4"], "no option 'epoch'; did you mean epochs?"),
         (["epochs=4", "run.epochs=5"], "epochs=4 and run.epochs=5 set the same option"),
         (["epochs=4,5"], "epochs must be one value, got 4,5"),
-        (["epochs=1"], "epochs must be at least 2, as many as the run in run has done, got 1"),
+        (["epochs=1"], "epochs must be at least 2, the number that the run in run has done, got 1"),
         (["--show"], "--resume cannot be given together with -m or --show"),
     ],
 )

@@ -101,7 +101,7 @@ def test_each_job_gets_its_share_of_a_gpu(cluster: Cluster) -> None:
         workers = RayWorkers(cluster.address, gpus_per_job=0.25)
         assert workers.at_once == 4
         workers.close()
-        with pytest.raises(ValueError, match="no node of the cluster has as many GPUs as gpus_per_job=2"):
+        with pytest.raises(ValueError, match="no node of the cluster has gpus_per_job=2 GPUs"):
             RayWorkers(cluster.address, gpus_per_job=2)
         with pytest.raises(ValueError, match=r"gpus_per_job must be at most 1 or a whole number, got 1\.5"):
             RayWorkers(cluster.address, gpus_per_job=1.5)

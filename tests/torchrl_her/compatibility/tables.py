@@ -109,7 +109,7 @@ REFUSALS: dict[str, Refusal] = {
     ),
     "ensemble sizes": Refusal(
         "The shapes of the tensors to stack is incompatible",
-        "Members of an ensemble must give slices of as many steps.",
+        "Members of an ensemble must give slices of the same number of steps.",
         ours=False,
     ),
 }

@@ -430,7 +430,9 @@ def test_counts_of_steps_that_differ_are_refused() -> None:
     learner = make_learner(FusedLearner, make_loss("ddpg"))
     learner.update(make_rows("ddpg", (1, 8)))
     list(learner.optimizer.state.values())[-1]["step"] = torch.tensor(1000.0)
-    with pytest.raises(ValueError, match=r"as many steps for each parameter, got \[\(1.0,\), \(1000.0,\)\]"):
+    with pytest.raises(
+        ValueError, match=r"same number of steps for each parameter, got \[\(1.0,\), \(1000.0,\)\]"
+    ):
         learner.update(make_rows("ddpg", (1, 8)))
 
 

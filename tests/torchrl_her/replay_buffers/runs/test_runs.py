@@ -373,7 +373,7 @@ def test_what_cannot_be_is_refused() -> None:
         beside(LazyTensorStorage(31), sampler)
     with pytest.raises(ValueError, match="of 3 equal blocks, got a ListStorage of 30 rows"):
         beside(ListStorage(30), sampler)
-    with pytest.raises(ValueError, match="of as many runs, got a RandomSampler of 1"):
+    with pytest.raises(ValueError, match="of 3 runs, got a RandomSampler of 1"):
         beside(LazyTensorStorage(30), RandomSampler())
 
 
