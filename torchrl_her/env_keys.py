@@ -1,4 +1,4 @@
-"""Keys of an environment's entries, for the transforms that change goals, rewards and ends."""
+"""Keys of an environment's entries, for all that reads or changes goals, rewards and ends."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tensordict import NestedKey
 
 @dataclass(frozen=True, kw_only=True)
 class EnvKeys:
-    """Keys of the entries of an environment with goals that a transform reads or writes.
+    """Keys of the entries of an environment with goals; each part reads some of them.
 
     Args:
         observation, achieved_goal, desired_goal, reward, terminated, done: keys of these entries.

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 
+from torchrl_her.env_keys import EnvKeys
 from torchrl_her.objectives.critics import critic_values
 
 Prepare = Callable[[TensorDictBase], TensorDictBase]
@@ -32,7 +33,7 @@ class GoalValues:
             for example :class:`~torchrl_her.ZeroPad`.
         before_critic: called with them before the critics; for example
             :class:`~torchrl_her.modules.RunningNorm`.
-        observation_key, desired_goal_key: keys of what the networks see.
+        keys: keys of observation and desired goal, which the networks see.
 
     Raises:
         ValueError: the loss has no critics that are known.
@@ -55,12 +56,10 @@ class GoalValues:
         runs: int = 1,
         before_actor: Prepare | None = None,
         before_critic: Prepare | None = None,
-        observation_key: NestedKey = "observation",
-        desired_goal_key: NestedKey = "desired_goal",
+        keys: EnvKeys = EnvKeys(),
     ) -> None:
         self.loss, self.actor, self.runs = loss, actor, runs
-        self.before_actor, self.before_critic = before_actor, before_critic
-        self.observation_key, self.desired_goal_key = observation_key, desired_goal_key
+        self.before_actor, self.before_critic, self.keys = before_actor, before_critic, keys
 
     @torch.no_grad()
     def __call__(self, observation: Tensor, goals: Tensor, counts: Sequence[int]) -> Tensor:
@@ -81,7 +80,7 @@ class GoalValues:
         blocks = _blocks(counts, goals.device)
         entries = {
             key: entry.expand(-1, width, -1).index_select(0, blocks).flatten(0, 1).to(place)
-            for key, entry in ((self.observation_key, observation), (self.desired_goal_key, goals))
+            for key, entry in ((self.keys.observation, observation), (self.keys.desired_goal, goals))
         }
         rows: TensorDictBase = TensorDict(entries, [len(blocks) * width], device=place)
         rows = rows if self.before_actor is None else self.before_actor(rows)

@@ -46,8 +46,8 @@ class GuidedExploration(TensorDictModuleBase):
         runs: R; the weights of R runs are stacked, along the first dimension of each parameter.
         generators: generators, one for each run, or None for torch's own.
         stage_key: key of the stage [..., 1] that each episode is played in; None if runs have stages.
-        state_key, input_key, action_key, init_key: keys of the state vector, which is read, of what the
-            policy reads and writes, and of the flag at the beginning of an episode.
+        state_key, action_key, init_key: keys of the state vector, of the action, and of the flag at the
+            beginning of an episode.
 
     Attributes:
         stage: [R], the stage whose policy begins a run's episodes; -1 while there is none. Not used if
@@ -92,7 +92,6 @@ class GuidedExploration(TensorDictModuleBase):
         generators: Sequence[torch.Generator] | None = None,
         stage_key: NestedKey | None = None,
         state_key: NestedKey = "state",
-        input_key: NestedKey = "input",
         action_key: NestedKey = "action",
         init_key: NestedKey = "is_init",
     ) -> None:
@@ -102,7 +101,7 @@ class GuidedExploration(TensorDictModuleBase):
             raise ValueError(f"per must be episode or step, got {per!r}")
         super().__init__()
         self.in_keys, self.out_keys = [action_key, state_key, init_key], [action_key]
-        self.stage_key, self.input_key = stage_key, input_key
+        self.stage_key = stage_key
         if stage_key is None:
             self.module = deepcopy(policy).requires_grad_(False)
         else:
@@ -168,7 +167,7 @@ class GuidedExploration(TensorDictModuleBase):
         guided.copy_(torch.where(reached & (guided >= 0), after, guided))
         if top is not None and bool((reached & (guided >= 0)).any()):
             inputs, *_ = self._look(state, guided)  # some act as in the next stage from now on
-        rows = TensorDict({self.input_key: inputs}, tensordict.batch_size)
+        rows = TensorDict({self.guide.in_keys[0]: inputs}, tensordict.batch_size)
         policy_action = tensordict.get(action_key)
         acts = guided >= 0 if policy_action.ndim == guided.ndim else (guided >= 0).squeeze(-1)
         # Greedy: whether it is called depends on other runs, so it must not draw numbers for this one.

@@ -10,6 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 
 from torchrl_her.checks import check_finite
 from torchrl_her.curriculum.stages import CurriculumProgress, CurriculumStage
+from torchrl_her.env_keys import EnvKeys
 from torchrl_her.modules.normalization import RunningNorm
 
 
@@ -20,8 +21,7 @@ def count_inputs(
     runs: Sequence[int],
     counts: Sequence[int],
     *,
-    observation_key: NestedKey = "observation",
-    desired_goal_key: NestedKey = "desired_goal",
+    keys: EnvKeys = EnvKeys(),
     input_key: NestedKey = "input",
     stage_key: NestedKey = "stage",
 ) -> Callable[[], None]:
@@ -39,7 +39,7 @@ def count_inputs(
         counts: number of rows of each of these runs.
 
     Keyword Args:
-        observation_key, desired_goal_key: read.
+        keys: keys of observation and desired goal, which are read.
         input_key: key of the input, in ``norm``.
         stage_key: key of the stage that each row carries, if episodes have stages of their own.
 
@@ -49,7 +49,7 @@ def count_inputs(
     Raises:
         ValueError: an input is not finite; then nothing is counted.
     """
-    check_finite({f"{key!r}": rows.get(key) for key in (observation_key, desired_goal_key)})
+    check_finite({f"{key!r}": rows.get(key) for key in (keys.observation, keys.desired_goal)})
     undo, stages = norm.snapshot(), progress.curriculum.stages
     for run, run_rows in zip(runs, rows.split(list(counts)), strict=True):
         parts = [(progress.stage_of(run), run_rows)]
@@ -58,7 +58,7 @@ def count_inputs(
             parts = [(stage, run_rows[which == place]) for place, stage in enumerate(stages)]
         for stage, part in parts:
             width = len(stage.observation)
-            inputs = (part.get(observation_key)[..., :width], part.get(desired_goal_key))
+            inputs = (part.get(keys.observation)[..., :width], part.get(keys.desired_goal))
             if len(part) > 0:
                 norm.count(input_key, torch.cat(inputs, -1), run=run)
     return undo

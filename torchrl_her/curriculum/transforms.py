@@ -340,7 +340,8 @@ class StageOutcomes(Transform):
     Keyword Args:
         reward_fn, achieved_reward: tell which goals are achieved in the last stage, where achieving a goal
             need not terminate; see :func:`~torchrl_her.goals.is_achieved`.
-        stage_key, proposed_key, terminated_key, done_key: read; there need not be a ``proposed_key``.
+        keys: keys of the flags ``terminated`` and ``done``, which are read.
+        stage_key, proposed_key: read; there need not be a ``proposed_key``.
     """
 
     def __init__(
@@ -349,25 +350,23 @@ class StageOutcomes(Transform):
         *,
         reward_fn: RewardFunction | None = None,
         achieved_reward: float = 0.0,
+        keys: EnvKeys = EnvKeys(),
         stage_key: NestedKey = "stage",
         proposed_key: NestedKey = "proposed",
-        terminated_key: NestedKey = "terminated",
-        done_key: NestedKey = "done",
     ) -> None:
         super().__init__()
         self.progress, self.stage_key, self.proposed_key = progress, stage_key, proposed_key
-        self.reward_fn, self.achieved_reward = reward_fn, achieved_reward
-        self.terminated_key, self.done_key = terminated_key, done_key
+        self.reward_fn, self.achieved_reward, self.keys = reward_fn, achieved_reward, keys
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        done, proposed = next_tensordict.get(self.done_key), tensordict.get(self.proposed_key, None)
+        done, proposed = next_tensordict.get(self.keys.done), tensordict.get(self.proposed_key, None)
         ended = done if proposed is None else done & ~proposed
         if bool(ended.any()):
             stage, runs = tensordict.get(self.stage_key), self.progress.runs
             stages = len(self.progress.curriculum)
             met = is_achieved(next_tensordict, self.reward_fn, achieved_reward=self.achieved_reward)
             met = torch.where(
-                stage == stages - 1, met.view_as(stage), next_tensordict.get(self.terminated_key)
+                stage == stages - 1, met.view_as(stage), next_tensordict.get(self.keys.terminated)
             )
             achieved = ended & met
             place = stage.reshape(runs, -1) + stages * torch.arange(runs, device=stage.device).unsqueeze(1)
@@ -396,7 +395,7 @@ class ZeroPad(_StageTransform):
     Keyword Args:
         run: the run that all transitions belong to, in batches of any shape; None if the first
             dimension is R equal blocks, in the order of the runs.
-        observation_key, desired_goal_key: read.
+        keys: keys of observation and desired goal, which are read.
         input_key: written.
         stage_key: key of the stage [..., 1] that each row carries, if episodes have stages of their own
             (:class:`~torchrl_her.curriculum.EpisodeStages`).
@@ -432,12 +431,11 @@ class ZeroPad(_StageTransform):
         progress: CurriculumProgress,
         *,
         run: int | None = None,
-        observation_key: NestedKey = "observation",
-        desired_goal_key: NestedKey = "desired_goal",
+        keys: EnvKeys = EnvKeys(),
         input_key: NestedKey = "input",
         stage_key: NestedKey = "stage",
     ) -> None:
-        in_keys: list[NestedKey] = [observation_key, desired_goal_key]
+        in_keys: list[NestedKey] = [keys.observation, keys.desired_goal]
         if progress.by_episode:
             in_keys.append(stage_key)
         super().__init__(curriculum, progress, run, in_keys, [input_key], stage_key)

@@ -26,7 +26,6 @@ class StageView:
 
     Keyword Args:
         state_key: the state vector, which :class:`~torchrl_her.StateToObs` has read.
-        observation_key: key of the observation.
         options: has the keys of all other entries; None for the usual ones.
 
     Example:
@@ -57,14 +56,14 @@ class StageView:
         reward_fn: RewardFunction,
         *,
         state_key: NestedKey = "state",
-        observation_key: NestedKey = "observation",
         options: HindsightOptions | None = None,
     ) -> None:
         if not 0 <= stage < len(curriculum):
             raise ValueError(f"stage must be in [0, {len(curriculum) - 1}], got {stage}")
         self.curriculum, self.stage, self.reward_fn = curriculum, stage, reward_fn
-        self.state_key, self.observation_key = state_key, observation_key
-        self._keys = (options or HindsightOptions()).transition_keys()
+        options = options or HindsightOptions()
+        self.state_key, self.observation_key = state_key, options.keys.observation
+        self._keys = options.transition_keys()
 
     def __call__(self, rows: TensorDictBase) -> TensorDictBase:
         """Returns transitions [n] of any stages as this stage shows them; the given ones stay as they are.

@@ -11,6 +11,7 @@ from torchrl_her.modules.exploration import (
 from torchrl_her.modules.networks import (
     ActorNet,
     CriticNet,
+    GoalNet,
     NetworkShape,
     StackedLayerNorm,
     StackedLinear,
@@ -31,6 +32,7 @@ __all__ = [
     "DecayingEpsilon",
     "DecayingEpsilonGreedy",
     "Exploration",
+    "GoalNet",
     "Moments",
     "NetworkShape",
     "NormalizeBatch",

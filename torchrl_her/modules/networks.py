@@ -173,45 +173,50 @@ def hidden_layers(inputs: int, shape: NetworkShape, *, joined: int = 0, runs: in
     return layers
 
 
-class ActorNet(nn.Module):
-    """Network of the policy: maps (observation, goal) to an action in [-1, 1].
+class GoalNet(nn.Module):
+    """Network that maps (observation, goal) to numbers: base of all networks but critics.
 
     Args:
         inputs: width of all inputs together.
-        actions: width of the action.
+        actions: width of the action, or number of discrete actions.
         shape: its hidden layers.
-        runs: R, how many independent actors.
+        runs: R, how many independent networks.
 
     Raises:
         ValueError: the shape has batch normalization, which is for critics only.
+    """
+
+    def __init__(
+        self, inputs: int, actions: int, *, shape: NetworkShape = NetworkShape(), runs: int = 1
+    ) -> None:
+        super().__init__()
+        if shape.norm == "batch":
+            raise ValueError(f"norm must be none or layer in {type(self).__name__}, got 'batch'")
+        self.runs = runs
+        self.layers = nn.Sequential(
+            *hidden_layers(inputs, shape, runs=runs), *self._last_layers(shape.hidden, actions)
+        )
+
+    def _last_layers(self, hidden: int, actions: int) -> Sequence[nn.Module]:
+        """Makes the layers behind the hidden ones."""
+        return [StackedLinear(hidden, actions, runs=self.runs)]
+
+    def forward(self, *inputs: Tensor) -> Any:
+        """Maps inputs [..., width] to numbers [..., outputs]."""
+        x = torch.cat(inputs, -1)
+        return self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
+
+
+class ActorNet(GoalNet):
+    """:class:`~torchrl_her.modules.GoalNet` of a policy: maps (observation, goal) to an action in [-1, 1].
 
     Example:
         >>> ActorNet(11, 3)(torch.zeros(2, 9), torch.zeros(2, 2)).shape
         torch.Size([2, 3])
     """
 
-    def __init__(
-        self,
-        inputs: int,
-        actions: int,
-        *,
-        shape: NetworkShape = NetworkShape(),
-        runs: int = 1,
-    ) -> None:
-        super().__init__()
-        if shape.norm == "batch":
-            raise ValueError("norm must be none or layer in an actor, got 'batch'")
-        self.runs = runs
-        self.layers = nn.Sequential(
-            *hidden_layers(inputs, shape, runs=runs),
-            StackedLinear(shape.hidden, actions, runs=runs, bound=_LAST_LAYER),
-            nn.Tanh(),
-        )
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Maps inputs [..., width] to actions [..., actions]."""
-        x = torch.cat(inputs, -1)
-        return self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
+    def _last_layers(self, hidden: int, actions: int) -> Sequence[nn.Module]:
+        return [StackedLinear(hidden, actions, runs=self.runs, bound=_LAST_LAYER), nn.Tanh()]
 
 
 class CriticNet(nn.Module):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Transform
 
+from torchrl_her.env_keys import EnvKeys
 from torchrl_her.modules.normalization import RunningNorm, entry_to_normalize
 
 
@@ -31,7 +32,7 @@ class NormalizeBatch(Transform):
             does. In a buffer with a plain writer and a :class:`~torchrl_her.HERSampleUnit`, the k of that
             unit: then all that is written counts here, and each achieved goal under ``next`` as k desired
             goals.
-        achieved_goal_key, desired_goal_key: goals, for ``counted_k``.
+        keys: keys of the goals, for ``counted_k``.
 
     Raises:
         ValueError: ``counted_k`` is negative or not finite, or the desired goal is not normalized; or, when
@@ -60,16 +61,14 @@ class NormalizeBatch(Transform):
         norm: RunningNorm,
         *,
         counted_k: float | None = None,
-        achieved_goal_key: NestedKey = "achieved_goal",
-        desired_goal_key: NestedKey = "desired_goal",
+        keys: EnvKeys = EnvKeys(),
     ) -> None:
         if counted_k is not None and not 0 <= counted_k < math.inf:
             raise ValueError(f"counted_k must be None or a finite number of at least 0, got {counted_k}")
-        if counted_k is not None and unravel_key(desired_goal_key) not in norm.widths:
-            raise ValueError(f"counted_k needs {desired_goal_key!r} to be normalized, got {norm}")
+        if counted_k is not None and unravel_key(keys.desired_goal) not in norm.widths:
+            raise ValueError(f"counted_k needs {keys.desired_goal!r} to be normalized, got {norm}")
         super().__init__(in_keys=norm.keys, out_keys=norm.keys)
-        self.norm, self.counted_k = norm, counted_k
-        self.achieved_goal_key, self.desired_goal_key = achieved_goal_key, desired_goal_key
+        self.norm, self.counted_k, self.keys = norm, counted_k, keys
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Normalizes sampled transitions."""
@@ -79,16 +78,16 @@ class NormalizeBatch(Transform):
         """Counts transitions that are written, and leaves them unchanged."""
         if self.counted_k is not None and not self.norm.frozen:
             # Checked first, so that rows which cannot be counted leave the statistics as they were.
-            key = unravel_key(("next", self.achieved_goal_key))
+            key = unravel_key(("next", self.keys.achieved_goal))
             achieved = entry_to_normalize(tensordict, key, who="counted_k")
-            width = self.norm.widths[unravel_key(self.desired_goal_key)]
+            width = self.norm.widths[unravel_key(self.keys.desired_goal)]
             if achieved.shape[-1] > width:
                 raise ValueError(f"{key!r} must have a width of at most {width}, got {achieved.shape[-1]}")
             if not bool(achieved.isfinite().all()):
                 raise ValueError(f"{key!r} must be finite to be counted, got NaN or infinity in it")
             self.norm.update(tensordict)
             for run, goals in enumerate(achieved.flatten(0, -2).chunk(self.norm.runs)):
-                self.norm.count(self.desired_goal_key, goals, run=run, weight=self.counted_k)
+                self.norm.count(self.keys.desired_goal, goals, run=run, weight=self.counted_k)
         return tensordict
 
 

@@ -4,47 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
 
-from torchrl_her.modules.networks import NetworkShape, StackedLinear, by_run, hidden_layers
+from torchrl_her.modules.networks import GoalNet, NetworkShape
 
 
-class QNet(nn.Module):
-    """Network that maps (observation, goal) to the values of all actions.
-
-    Args:
-        inputs: width of all inputs together.
-        actions: number of actions.
-        shape: its hidden layers.
-        runs: R, how many independent networks.
+class QNet(GoalNet):
+    """:class:`~torchrl_her.modules.GoalNet` that maps (observation, goal) to the values of all actions.
 
     Example:
+        >>> import torch
         >>> QNet(6, 4)(torch.zeros(2, 3), torch.zeros(2, 3)).shape
         torch.Size([2, 4])
     """
-
-    def __init__(
-        self,
-        inputs: int,
-        actions: int,
-        *,
-        shape: NetworkShape = NetworkShape(),
-        runs: int = 1,
-    ) -> None:
-        super().__init__()
-        self.runs = runs
-        layers = hidden_layers(inputs, shape, runs=runs)
-        self.layers = nn.Sequential(*layers, StackedLinear(shape.hidden, actions, runs=runs))
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Maps inputs [..., width] to values [..., actions]."""
-        x = torch.cat(inputs, -1)
-        return self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
 
 
 class BestAction(nn.Module):
@@ -54,6 +30,7 @@ class BestAction(nn.Module):
         net: gives the values; it may be shared.
 
     Example:
+        >>> import torch
         >>> best = BestAction(QNet(6, 4))
         >>> best(torch.zeros(2, 3), torch.zeros(2, 3)).dtype
         torch.int64
@@ -71,6 +48,7 @@ class BestAction(nn.Module):
         """Returns by how much the value of an action [...] is below the greatest one, [...].
 
         Example:
+            >>> import torch
             >>> best, seen = BestAction(QNet(6, 4)), (torch.zeros(2, 3), torch.zeros(2, 3))
             >>> best.regret(best(*seen), *seen).tolist()
             [0.0, 0.0]
@@ -115,6 +93,7 @@ def make_q_actor(
         given.
 
     Example:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> actor, critic = make_q_actor((3, 3), 4)
         >>> seen = TensorDict({"observation": torch.zeros(2, 3), "desired_goal": torch.ones(2, 3)}, [2])

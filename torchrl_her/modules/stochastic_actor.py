@@ -13,20 +13,14 @@ from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from torchrl_her.modules.networks import NetworkShape, StackedLinear, by_run, hidden_layers
+from torchrl_her.modules.networks import GoalNet, NetworkShape
 from torchrl_her.modules.noise import RunNoise
 
 _LEAST_SCALE, _GREATEST_SCALE = -10.0, 2.0  # bounds of the scale's logarithm: Haarnoja et al., 2018
 
 
-class StochasticActorNet(nn.Module):
-    """Network that maps (observation, goal) to the location and the scale of a normal distribution.
-
-    Args:
-        inputs: width of all inputs together.
-        actions: width of the action.
-        shape: its hidden layers.
-        runs: R, how many independent actors.
+class StochasticActorNet(GoalNet):
+    """:class:`~torchrl_her.modules.GoalNet` that gives location and scale of a normal distribution.
 
     Example:
         >>> location, scale = StochasticActorNet(11, 3)(torch.zeros(2, 9), torch.zeros(2, 2))
@@ -34,24 +28,12 @@ class StochasticActorNet(nn.Module):
         (torch.Size([2, 3]), True)
     """
 
-    def __init__(
-        self,
-        inputs: int,
-        actions: int,
-        *,
-        shape: NetworkShape = NetworkShape(),
-        runs: int = 1,
-    ) -> None:
-        super().__init__()
-        self.runs = runs
-        layers = hidden_layers(inputs, shape, runs=runs)
-        self.layers = nn.Sequential(*layers, StackedLinear(shape.hidden, 2 * actions, runs=runs))
+    def _last_layers(self, hidden: int, actions: int) -> Sequence[nn.Module]:
+        return super()._last_layers(hidden, 2 * actions)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Maps inputs [..., width] to location and scale, [..., actions] each."""
-        x = torch.cat(inputs, -1)
-        out = self.layers(by_run(x, self.runs)).view(*x.shape[:-1], -1)
-        location, scale = out.chunk(2, -1)
+        location, scale = super().forward(*inputs).chunk(2, -1)
         return location, scale.clamp(_LEAST_SCALE, _GREATEST_SCALE).exp()
 
 

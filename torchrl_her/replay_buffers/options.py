@@ -13,6 +13,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torchrl_her.checks import check_whole
+from torchrl_her.env_keys import EnvKeys
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.sources import GoalSources, check_goal_sources, sources_name
 from torchrl_her.goals.strategies import RECENT, Strategy, get_strategy
@@ -66,8 +67,7 @@ class HindsightOptions:
             virtual goals, with the same reward.
         exclude: entries to leave out, in the root and under ``next``. ``state`` is one of them because it
             holds the real goal. Add whatever else was computed from the desired goal.
-        achieved_goal_key, desired_goal_key: goals, in the root and under ``next``.
-        reward_key, terminated_key, truncated_key, done_key: under ``next``.
+        keys: keys of the goals, in the root and under ``next``, and of reward and flags under ``next``.
         trajectory_key: ids that tell trajectories apart; the entry may be missing.
         env_ids_key: ids that tell environments apart, as :class:`~torchrl_her.EnvIds` gives them; the entry
             may be missing, and is not stored by the writer.
@@ -104,12 +104,7 @@ class HindsightOptions:
     redraw: bool = True
     achieved_reward: float = 0.0
     exclude: Sequence[NestedKey] = ("state",)
-    achieved_goal_key: NestedKey = "achieved_goal"
-    desired_goal_key: NestedKey = "desired_goal"
-    reward_key: NestedKey = "reward"
-    terminated_key: NestedKey = "terminated"
-    truncated_key: NestedKey = "truncated"
-    done_key: NestedKey = "done"
+    keys: EnvKeys = EnvKeys()
     trajectory_key: NestedKey = ("collector", "traj_ids")
     env_ids_key: NestedKey = "env_ids"
     real_goal_key: NestedKey = "real_desired_goal"
@@ -186,15 +181,21 @@ class HindsightOptions:
         return replace(self, **changes)
 
     def transition_keys(self) -> TransitionKeys:
-        """Full keys of the entries that relabeling reads and writes."""
+        """Returns the full keys of the entries that relabeling reads and writes.
+
+        Raises:
+            ValueError: ``keys.truncated`` is None.
+        """
+        if self.keys.truncated is None:
+            raise ValueError("relabeling needs a key for truncated, got keys.truncated=None")
         return TransitionKeys(
-            achieved=unravel_key(self.achieved_goal_key),
-            next_achieved=under_next(self.achieved_goal_key),
-            goals=(unravel_key(self.desired_goal_key), under_next(self.desired_goal_key)),
-            reward=under_next(self.reward_key),
-            terminated=under_next(self.terminated_key),
-            truncated=under_next(self.truncated_key),
-            done=under_next(self.done_key),
+            achieved=unravel_key(self.keys.achieved_goal),
+            next_achieved=under_next(self.keys.achieved_goal),
+            goals=(unravel_key(self.keys.desired_goal), under_next(self.keys.desired_goal)),
+            reward=under_next(self.keys.reward),
+            terminated=under_next(self.keys.terminated),
+            truncated=under_next(self.keys.truncated),
+            done=under_next(self.keys.done),
             trajectory=unravel_key(self.trajectory_key),
             env_ids=unravel_key(self.env_ids_key),
             real_goal=unravel_key(self.real_goal_key),

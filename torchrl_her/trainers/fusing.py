@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import torch
@@ -38,7 +39,7 @@ class FusedLoss:
         actor_net: its type.
         critic: the attribute of the critic or critics, None if there is none.
         losses: the names of what is measured.
-        fixed: the options that the loss must be set to.
+        fixed: attributes of the loss and the values that they must have, besides those of all losses.
     """
 
     algorithm: Algorithm
@@ -49,6 +50,20 @@ class FusedLoss:
     fixed: dict[str, Any]
 
 
+_FIXED: dict[str, Any] = {  # attributes of each loss and the values that they must have
+    **{
+        f"{part}tensor_keys.{key}": key
+        for part in ("", "value_estimator.")
+        for key in ("reward", "terminated", "done")
+    },
+    "tensor_keys.priority_weight": "priority_weight",
+    "value_estimator.average_rewards": False,
+    "value_estimator.shifted": False,
+    "value_estimator.skip_existing": None,
+    "value_estimator.group_key": None,
+}
+# SAC and TQC compute their targets without gradients, even with TorchRL's default of differentiable targets.
+_HARD = {"value_estimator.differentiable": False, "loss_function": "l2"}
 _SOFT = {
     "delay_actor": False,
     "delay_qvalue": True,
@@ -66,7 +81,7 @@ FUSED: dict[type[LossModule], FusedLoss] = {
         ActorNet,
         "value_network",
         ("loss_actor", "loss_value"),
-        {"delay_actor": True, "delay_value": True, "loss_function": "l2"},
+        {**_HARD, "delay_actor": True, "delay_value": True},
     ),
     PenalizedTD3Loss: FusedLoss(
         Algorithm.TD3,
@@ -74,7 +89,7 @@ FUSED: dict[type[LossModule], FusedLoss] = {
         ActorNet,
         "qvalue_network",
         ("loss_actor", "loss_qvalue"),
-        {"delay_actor": True, "delay_qvalue": True, "loss_function": "l2"},
+        {**_HARD, "delay_actor": True, "delay_qvalue": True},
     ),
     PenalizedSACLoss: FusedLoss(
         Algorithm.SAC,
@@ -98,7 +113,7 @@ FUSED: dict[type[LossModule], FusedLoss] = {
         QNet,
         None,
         ("loss",),
-        {"delay_value": True, "double_dqn": True, "action_space": "categorical", "loss_function": "l2"},
+        {**_HARD, "delay_value": True, "double_dqn": True, "action_space": "categorical"},
     ),
 }
 
@@ -172,17 +187,24 @@ def _ids(parameters: Iterator[nn.Parameter] | list[nn.Parameter]) -> set[int]:
 
 def _obstacles(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
     """Yields a description of each option that fused steps do not support."""
-    for name, value in fused.fixed.items():
-        if getattr(loss, name) != value:
-            yield f"{name}={getattr(loss, name)!r}"
+    estimator: Any = loss.value_estimator
+    kinds = (TD0Estimator, ClampedTD0) if fused.algorithm in STOCHASTIC else (ClampedTD0,)
+    if type(estimator) not in kinds:
+        yield f"targets of a {type(estimator).__name__}"
+        return
+    for name, value in (_FIXED | fused.fixed).items():
+        if (found := attrgetter(name)(loss)) != value:
+            yield f"{name}={found!r}"
     if loss.reduction not in ("mean", "none"):
         yield f"reduction={loss.reduction!r}"
     yield from _strange_networks(loss, fused)
     yield from _strange_keys(loss, fused)
-    yield from _strange_targets(loss, fused)
+    if estimator.gamma.numel() != 1:
+        yield f"a discount of shape {list(estimator.gamma.shape)}"
     # TorchRL puts one hook on each loss, which warns if nothing updates its targets.
-    if _has_hooks(loss, expected=1) or any(_has_hooks(module) for module in _modules(loss, fused)):
-        yield "hooks on the loss or its networks"
+    modules = [estimator, *_modules(loss, fused)]
+    if _has_hooks(loss, expected=1) or any(_has_hooks(module) for module in modules):
+        yield "hooks on the loss, its networks or its targets"
     parameters = list(loss.parameters())
     if not all(p.requires_grad for p in parameters):
         yield "frozen parameters"
@@ -246,44 +268,19 @@ def _is_plain_module(actor: nn.Module, fused: FusedLoss) -> bool:
 
 
 def _strange_keys(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
-    keys: Any = loss.tensor_keys
-    if fused.critic is not None:
-        actor, critic = getattr(loss, fused.actor), getattr(loss, fused.critic)
-        if list(critic.in_keys) != [*actor.in_keys, action_key(loss)]:
-            yield f"a critic that reads {critic.in_keys}, not what the actor reads and writes, in that order"
-        if critic.out_keys != [keys.state_action_value]:
-            yield f"a critic that writes {critic.out_keys}, not {keys.state_action_value!r}"
-    for name in ("reward", "terminated", "done", "priority_weight"):
-        if getattr(keys, name) != name:
-            yield f"{name} under the key {getattr(keys, name)!r}"
-
-
-def _strange_targets(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
-    estimator: Any = loss.value_estimator
-    kinds = (TD0Estimator, ClampedTD0) if fused.algorithm in STOCHASTIC else (ClampedTD0,)
-    if type(estimator) not in kinds:
-        yield f"targets of a {type(estimator).__name__}"
+    if fused.critic is None:
         return
-    if fused.algorithm is Algorithm.DDPG and (
-        estimator.value_network is not loss.actor_critic
-        or estimator.tensor_keys.value != loss.tensor_keys.state_action_value
+    actor, critic = getattr(loss, fused.actor), getattr(loss, fused.critic)
+    estimator, value_key = loss.value_estimator, loss.tensor_keys.state_action_value
+    if list(critic.in_keys) != [*actor.in_keys, action_key(loss)]:
+        yield f"a critic that reads {critic.in_keys}, not what the actor reads and writes, in that order"
+    if critic.out_keys != [value_key]:
+        yield f"a critic that writes {critic.out_keys}, not {value_key!r}"
+    is_ddpg = fused.algorithm is Algorithm.DDPG
+    if estimator.value_network is not (loss.actor_critic if is_ddpg else None) or (
+        is_ddpg and estimator.tensor_keys.value != value_key
     ):
         yield "targets from other networks than the loss's"
-    if fused.algorithm in (Algorithm.TD3, *STOCHASTIC) and estimator.value_network is not None:
-        yield "targets from a network of the value estimator's own"
-    for name in ("reward", "terminated", "done"):
-        if getattr(estimator.tensor_keys, name) != name:
-            yield f"{name} of the targets under the key {getattr(estimator.tensor_keys, name)!r}"
-    plain = TD0Estimator(gamma=0.0, value_network=None)
-    # TorchRL's default for SAC, whose loss computes the targets without gradients all the same.
-    free = ("differentiable",) if fused.algorithm in STOCHASTIC else ()
-    for name in ("average_rewards", "shifted", "differentiable", "skip_existing", "group_key"):
-        if name not in free and getattr(estimator, name) != getattr(plain, name):
-            yield f"targets with {name}={getattr(estimator, name)!r}"
-    if estimator.gamma.numel() != 1:
-        yield f"a discount of shape {list(estimator.gamma.shape)}"
-    if estimator._forward_hooks or estimator._forward_pre_hooks:
-        yield "hooks on the value estimator"
 
 
 def _has_hooks(module: nn.Module, expected: int = 0) -> bool:

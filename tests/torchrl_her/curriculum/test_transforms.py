@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -632,27 +632,12 @@ def test_clones_follow_the_same_progress() -> None:
 
 def test_nested_keys() -> None:
     progress = at(make_three(), 0, 2)
-    names = (
-        "observation",
-        "achieved_goal",
-        "desired_goal",
-        "reward",
-        "terminated",
-        "truncated",
-        "done",
-    )
-    own = {name: ("agent", name) for name in names}
+    keys = EnvKeys(**{field.name: ("agent", field.name) for field in fields(EnvKeys)})
     env = TransformedEnv(
         TinyEnv((2,), group="agent"),
         Compose(
-            StateToObs(progress.curriculum, progress, state_key=("agent", "state"), keys=EnvKeys(**own)),
-            ZeroPad(
-                progress.curriculum,
-                progress,
-                observation_key=own["observation"],
-                desired_goal_key=own["desired_goal"],
-                input_key=("net", "input"),
-            ),
+            StateToObs(progress.curriculum, progress, state_key=("agent", "state"), keys=keys),
+            ZeroPad(progress.curriculum, progress, keys=keys, input_key=("net", "input")),
         ),
     )
     check_env_specs(env)

@@ -16,9 +16,12 @@ from torchrl_her import make_actor, make_critic
 from torchrl_her.modules import (
     ActorNet,
     CriticNet,
+    GoalNet,
     NetworkShape,
+    QNet,
     StackedLayerNorm,
     StackedLinear,
+    StochasticActorNet,
     stack_runs,
     take_run,
 )
@@ -217,9 +220,10 @@ def test_a_critic_may_have_several_outputs() -> None:
         make_critic((4, 2), 3, outputs=0)
 
 
-def test_an_actor_has_no_batch_normalization() -> None:
-    with pytest.raises(ValueError, match="norm must be none or layer in an actor, got 'batch'"):
-        make_actor((4, 2), 3, shape=NetworkShape(norm="batch"))
+@pytest.mark.parametrize("kind", [ActorNet, QNet, StochasticActorNet])
+def test_critics_alone_have_batch_normalization(kind: type[GoalNet]) -> None:
+    with pytest.raises(ValueError, match=f"norm must be none or layer in {kind.__name__}, got 'batch'"):
+        kind(6, 3, shape=NetworkShape(norm="batch"))
 
 
 def test_layer_normalization_is_that_of_torch() -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_her import HindsightOptions
+from torchrl_her import EnvKeys, HindsightOptions
 from torchrl_her.replay_buffers.keys import entry_of, in_root_and_next, under_next
 
 
@@ -28,7 +28,8 @@ def test_one_key_is_no_list_of_keys() -> None:
 
 
 def test_what_relabeling_changes_by_hand() -> None:
-    keys = HindsightOptions(desired_goal_key=("agent", "wanted"), reward_key="cost").transition_keys()
+    names = EnvKeys(desired_goal=("agent", "wanted"), reward="cost")
+    keys = HindsightOptions(keys=names).transition_keys()
     goals, reward = torch.tensor([[1.0], [2.0]]), torch.tensor([[0.0], [-1.0]])
     terminated, truncated = torch.tensor([[True], [False]]), torch.tensor([False, True])
     changes = keys.changes(goals, reward, terminated, truncated)

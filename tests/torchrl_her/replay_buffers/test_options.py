@@ -13,7 +13,15 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_her import GoalReward, GoalWeights, HERSampleUnit, HERWriter, HindsightOptions, register_strategy
+from torchrl_her import (
+    EnvKeys,
+    GoalReward,
+    GoalWeights,
+    HERSampleUnit,
+    HERWriter,
+    HindsightOptions,
+    register_strategy,
+)
 from torchrl_her.goals import STRATEGIES
 
 from ..her_data import make_batch, tag
@@ -32,12 +40,7 @@ OTHERS = {
     "redraw": False,
     "achieved_reward": -0.5,
     "exclude": ("state", "action"),
-    "achieved_goal_key": ("goals", "got"),
-    "desired_goal_key": ("goals", "wanted"),
-    "reward_key": "cost",
-    "terminated_key": "reached",
-    "truncated_key": "cut",
-    "done_key": "over",
+    "keys": EnvKeys(achieved_goal=("goals", "got"), reward="cost"),
     "trajectory_key": "path",
     "env_ids_key": "who",
     "real_goal_key": ("goals", "real"),
@@ -83,6 +86,12 @@ def test_writer_and_unit_take_the_same_options(make: Callable[..., Any]) -> None
 
 
 @both
+def test_relabeling_needs_the_flag_of_the_time_limit(make: Callable[..., Any]) -> None:
+    with pytest.raises(ValueError, match="needs a key for truncated, got keys.truncated=None"):
+        make(REWARD, keys=EnvKeys(truncated=None))
+
+
+@both
 def test_an_object_and_keywords_relabel_alike(make: Callable[..., Any]) -> None:
     options = {"k": 3, "strategy": "episode", "filter_achieved": True, "exclude": ["state", "action"]}
     first, second = relabeled(make, **options), relabeled(make, HindsightOptions(**options))
@@ -102,7 +111,7 @@ def test_options_are_read_and_set_as_attributes(make: Callable[..., Any]) -> Non
         with pytest.raises(ValueError, match=message):
             setattr(part, name, value)
     assert (part.k, part.strategy) == (7, "final")
-    part.options = replace(part.options, reward_key="cost", exclude=("seen",), real_goal_key="real")
+    part.options = replace(part.options, keys=EnvKeys(reward="cost"), exclude=("seen",), real_goal_key="real")
     assert part._keys.reward == ("next", "cost")
     assert part._exclude == ["seen", ("next", "seen"), "real", ("next", "real")]
 
@@ -136,7 +145,7 @@ def test_sources_take_the_place_of_k_and_strategy(make: Callable[..., Any]) -> N
     part = make(REWARD, HindsightOptions(k=8, strategy="episode"), goal_sources=mixed)
     assert (part.k, part.goal_sources, part.options.sources) == (6, mixed, mixed)
     assert part.options.remembered == {"actual": 1_000, "achieved": 2_000}
-    assert replace(part.options, reward_key="cost").sources == mixed
+    assert replace(part.options, keys=EnvKeys(reward="cost")).sources == mixed
     part.goal_sources = {"actual": 1}
     assert (part.k, part.options.remembered) == (1, {"actual": 1_000})
     mixed["future"] = 9  # the options have their own

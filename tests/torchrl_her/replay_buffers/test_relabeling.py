@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_her import EnvReward, GoalReward, GoalWeights, HERSampleUnit, HERWriter
+from torchrl_her import EnvKeys, EnvReward, GoalReward, GoalWeights, HERSampleUnit, HERWriter
 
 from ..her_data import WANTED, PreferFar, along, costly, make_batch, pairs, tags
 
@@ -294,8 +294,8 @@ def test_keys_of_ones_own(relabel: Relabel) -> None:
     for rows in (batch, batch["next"]):
         rows.rename_key_("desired_goal", ("goals", "wanted")).rename_key_("achieved_goal", ("goals", "got"))
     batch["next"].rename_key_("reward", "cost")
-    goals = {"achieved_goal_key": ("goals", "got"), "desired_goal_key": ("goals", "wanted")}
-    rows = relabel(batch, virtual_key=None, reward_key="cost", **goals)
+    keys = EnvKeys(achieved_goal=("goals", "got"), desired_goal=("goals", "wanted"), reward="cost")
+    rows = relabel(batch, virtual_key=None, keys=keys)
     assert "virtual" not in rows.keys()
     is_virtual = rows["goals", "wanted"][:, 0] != WANTED
     assert is_virtual.float().mean().item() == pytest.approx(0.8, abs=1e-6 if relabel is written else 0.02)

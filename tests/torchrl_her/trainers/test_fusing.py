@@ -13,8 +13,8 @@ from torchrl.objectives import DDPGLoss, LossModule, SoftUpdate, ValueEstimators
 
 from tests.torchrl_her.trainers.fused_cases import ALGORITHMS, make_loss
 from torchrl_her import FusedLearner, make_actor, make_critic, make_target_updater
-from torchrl_her.modules import make_stochastic_actor
-from torchrl_her.objectives import PenalizedDDPGLoss, Targets, make_sac_loss, make_tqc_loss
+from torchrl_her.modules import NetworkShape, make_stochastic_actor
+from torchrl_her.objectives import PenalizedDDPGLoss, PenalizedTD3Loss, Targets, make_sac_loss, make_tqc_loss
 from torchrl_her.trainers import is_plain_adam, why_not_fused
 
 
@@ -70,6 +70,10 @@ def add_a_hook_to_the_loss(loss: LossModule) -> None:
     loss.register_forward_hook(lambda *_: None)
 
 
+def add_a_hook_to_the_targets(loss: LossModule) -> None:
+    loss.value_estimator.register_forward_hook(lambda *_: None)
+
+
 def add_a_hook_to_a_parameter(loss: LossModule) -> None:
     next(loss.parameters()).register_hook(lambda gradient: 0.0 * gradient)
 
@@ -97,10 +101,14 @@ def freeze(loss: LossModule) -> None:
 @pytest.mark.parametrize(
     ("algorithm", "change", "reason"),
     [
-        ("ddpg", lambda loss: loss.set_keys(reward="cost"), "reward under the key 'cost'"),
-        ("ddpg", lambda loss: loss.set_keys(priority_weight="importance"), "priority_weight under the key"),
+        ("ddpg", lambda loss: loss.set_keys(reward="cost"), "tensor_keys.reward='cost'"),
+        (
+            "ddpg",
+            lambda loss: loss.set_keys(priority_weight="importance"),
+            "tensor_keys.priority_weight='importance'",
+        ),
         ("ddpg", lambda loss: setattr(loss.tensor_keys, "state_action_value", "q"), "a critic that writes"),
-        ("ddpg", set_keys_of_targets, "reward of the targets under the key 'cost'"),
+        ("ddpg", set_keys_of_targets, "value_estimator.tensor_keys.reward='cost'"),
         ("ddpg", set_order, "a critic that reads"),
         ("ddpg", lambda loss: setattr(loss, "loss_function", "smooth_l1"), "loss_function='smooth_l1'"),
         ("ddpg", lambda loss: setattr(loss, "reduction", "sum"), "reduction='sum'"),
@@ -108,8 +116,9 @@ def freeze(loss: LossModule) -> None:
         ("ddpg", set_targets_of_another, "targets from other networks"),
         ("ddpg", lambda loss: setattr(loss.value_estimator, "average_rewards", True), "average_rewards=True"),
         ("ddpg", lambda loss: setattr(loss.value_estimator, "skip_existing", True), "skip_existing=True"),
-        ("ddpg", add_a_hook, "hooks on the loss or its networks"),
-        ("ddpg", add_a_hook_to_the_loss, "hooks on the loss or its networks"),
+        ("ddpg", add_a_hook, "hooks on the loss, its networks or its targets"),
+        ("ddpg", add_a_hook_to_the_loss, "hooks on the loss, its networks or its targets"),
+        ("ddpg", add_a_hook_to_the_targets, "hooks on the loss, its networks or its targets"),
         ("ddpg", add_a_hook_to_a_parameter, "hooks on parameters"),
         ("ddpg", use_another_activation, "other layers than those of a plain ActorNet"),
         ("ddpg", freeze, "frozen parameters"),
@@ -119,11 +128,11 @@ def freeze(loss: LossModule) -> None:
         ("sac", lambda loss: setattr(loss, "skip_done_states", True), "skip_done_states=True"),
         ("tqc", lambda loss: setattr(loss, "fixed_alpha", True), "fixed_alpha=True"),
         ("tqc", lambda loss: setattr(loss, "loss_function", "l2"), "loss_function='l2'"),
-        ("tqc", set_a_value_network, "targets from a network of the value estimator's own"),
+        ("tqc", set_a_value_network, "targets from other networks than the loss's"),
         ("dqn", lambda loss: setattr(loss, "double_dqn", False), "double_dqn=False"),
         ("dqn", mask_actions, "a QValueActor as value_network"),
-        ("td3", set_a_value_network, "targets from a network of the value estimator's own"),
-        ("sac", set_a_value_network, "targets from a network of the value estimator's own"),
+        ("td3", set_a_value_network, "targets from other networks than the loss's"),
+        ("sac", set_a_value_network, "targets from other networks than the loss's"),
         ("ddpg", add_a_parameter, "parameters beside those of the layers in actor_network"),
         ("dqn", lambda loss: setattr(loss, "loss_function", "l1"), "loss_function='l1'"),
     ],
@@ -155,9 +164,12 @@ def test_batch_normalization_must_learn_and_its_targets_must_follow() -> None:
     loss.value_network.eval()
     target = make_target_updater(loss, tau=0.1, hard_interval=0)
     assert "a plain CriticNet in training mode" in str(why_not_fused(loss, target))
-    values = make_loss("dqn", norm="batch")
+    actor, critic = make_actor((4, 2), 3), make_critic((4, 2), 3, shape=NetworkShape(norm="batch"))
+    spec = Bounded(-1.0, 1.0, (3,))
+    values = PenalizedTD3Loss(actor, critic, action_spec=spec, delay_actor=True, loss_function="l2")
+    values.make_value_estimator(Targets(reward_range=None).estimator())
     target = make_target_updater(values, tau=0.1, hard_interval=0)
-    assert why_not_fused(values, target) == "batch normalization in value_network of a DQNLoss"
+    assert why_not_fused(values, target) == "batch normalization in qvalue_network of a PenalizedTD3Loss"
 
 
 def test_other_networks_targets_and_losses_are_refused() -> None:
