@@ -90,8 +90,9 @@ class GoalValues:
         values = critic_values(self.loss, rows)
         if values is None:
             raise ValueError(f"{type(self.loss).__name__} has no critics whose values are known")
-        inside = _inside(counts, goals.device)
-        return values.to(goals.device).unflatten(0, (len(blocks), width))[inside]
+        lengths = torch.tensor(counts, device=goals.device).unsqueeze(1)
+        is_row = (torch.arange(max(counts), device=goals.device) < lengths).flatten()  # not padding
+        return values.to(goals.device).unflatten(0, (len(blocks), width))[is_row]
 
 
 def _blocks(counts: Sequence[int], device: torch.device) -> Tensor:
@@ -106,9 +107,3 @@ def _blocks(counts: Sequence[int], device: torch.device) -> Tensor:
         index += [*range(begin, begin + count), *[0] * (longest - count)]
         begin += count
     return torch.tensor(index, device=device)
-
-
-def _inside(counts: Sequence[int], device: torch.device) -> Tensor:
-    """Returns which of the padded positions are rows, [R * n] of bool."""
-    step = torch.arange(max(counts), device=device)
-    return (step < torch.tensor(list(counts), device=device).unsqueeze(1)).flatten()

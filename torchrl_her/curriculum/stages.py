@@ -67,7 +67,11 @@ class CurriculumStage:
             raise ValueError(
                 f"stage {self.name!r}: threshold must be positive and finite, got {self.threshold}"
             )
-        self._check_constant_goal()
+        object.__setattr__(self, "constant_goal", tuple(map(float, self.constant_goal)))
+        if not all(map(math.isfinite, self.constant_goal)):
+            raise ValueError(f"stage {self.name!r}: constant_goal must be finite, got {self.constant_goal}")
+        if self.constant_goal and self.desired_goal:
+            raise ValueError(f"stage {self.name!r}: give desired_goal or constant_goal, got both")
         for key in _LISTS:
             value = getattr(self, key)
             entries = [value] if isinstance(value, str) else list(value)
@@ -86,13 +90,6 @@ class CurriculumStage:
             return None
         missed, achieved = self.rewards
         return GoalReward(self.threshold, missed_reward=missed, achieved_reward=achieved)
-
-    def _check_constant_goal(self) -> None:
-        object.__setattr__(self, "constant_goal", tuple(map(float, self.constant_goal)))
-        if not all(map(math.isfinite, self.constant_goal)):
-            raise ValueError(f"stage {self.name!r}: constant_goal must be finite, got {self.constant_goal}")
-        if self.constant_goal and self.desired_goal:
-            raise ValueError(f"stage {self.name!r}: give desired_goal or constant_goal, got both")
 
     def _check_indices(self) -> None:
         """Checks the indices of a stage whose names are resolved, except against the width of the state."""

@@ -86,7 +86,7 @@ def get_strategy(strategy: Strategy) -> StrategyFunction:
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     if strategy in RECENT:
         hint = f"; goals of other episodes are asked for by goal_sources={{{strategy!r}: 4}}"
-    raise ValueError(f"unknown goal strategy {strategy!r}; the strategies are {_known()}{hint}")
+    raise ValueError(f"unknown goal strategy {strategy!r}; the strategies are {', '.join(STRATEGIES)}{hint}")
 
 
 def strategy_name(strategy: Strategy) -> str:
@@ -139,7 +139,3 @@ def candidate_range(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[
                 f"candidates first={low}, end={high}, but 0 <= first < end <= {length} must hold"
             )
     return first, end
-
-
-def _known() -> str:
-    return ", ".join(STRATEGIES)

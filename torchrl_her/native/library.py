@@ -141,7 +141,9 @@ def _load_shipped(source: str, real: str) -> ctypes.CDLL:
 def _load_compiled(compiler: Sequence[str], source: str, headers: Sequence[str], real: str) -> ctypes.CDLL:
     folder = Path(__file__).parent
     text = "".join((folder / name).read_text(encoding="utf-8") for name in (source, *headers))
-    made_of = (text, real, *compiler, _version(compiler), str(_FLAGS), str(_EXTRAS), _processor())
+    # The processor is part of it: machines that need other instructions may share a cache.
+    processor = (platform.machine(), platform.processor(), _processor_flags())
+    made_of = (text, real, *compiler, _version(compiler), str(_FLAGS), str(_EXTRAS), *processor)
     name = hashlib.sha256("\n".join(made_of).encode()).hexdigest()[:20]
     library = _cache() / f"{Path(source).stem}-{real}-{name}.so"
     with contextlib.suppress(OSError):  # it is not there yet, or damaged
@@ -195,11 +197,6 @@ def find_ziglang() -> list[str]:
 
 def _version(compiler: Sequence[str]) -> str:
     return subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False).stdout
-
-
-def _processor() -> str:
-    """Describes the processor: a cache may be shared by machines that need other instructions."""
-    return "\n".join((platform.machine(), platform.processor(), _processor_flags()))
 
 
 def _processor_flags() -> str:

@@ -207,7 +207,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._own_rewards: dict[int, RewardFunction] = {}
         self._counts, self._rings = RunCounts(runs), Rings(runs)
         self._held = Batch.none(runs)  # transitions of open episodes
-        self._recent = self._no_goals(runs)
+        self._recent = [RecentGoals.none(runs) for _ in self.stages or [None]]  # for each stage
         self._episodes = 0  # copies of episodes ever written, if whole ones are
         self._process = os.getpid()
         # Whether the rows held back come from a loaded state, or are over, and nothing was written since.
@@ -463,17 +463,13 @@ class HERWriter(HindsightBase, RoundRobinWriter):
             )
             recent[stage] = recent_goals
             for piece in split_runs(part, run_of, settings, each=entries[0], together=entries[1]):
-                rule = self._rule(stage, piece.runs[0])
+                rule = self.stages[stage] if self.stages else StageRule(self.reward_of(piece.runs[0]))
                 chunk = Chunk(stage_rows, run, piece, rule.reward_fn, self.options, self._keys)
                 drafts.append(self._draft(chunk, recent_goals, weighted=rule.weighted, first_id=first_id))
                 first_id += drafts[-1].ids
         self._commit(drafts, places)
         self._episodes = first_id
         return places.rows(self._rings.cursors, self.capacity)[held:], left, recent
-
-    def _no_goals(self, runs: int) -> list[RecentGoals]:
-        """Returns an empty memory of goals for each stage."""
-        return [RecentGoals.none(runs) for _ in range(max(1, len(self.stages)))]
 
     def _by_stage(
         self, rows: TensorDictBase, episodes: Episodes, run: Tensor | None
@@ -482,10 +478,6 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         if not self.stages:
             return [(0, rows, episodes, run)]
         return split_stages(rows, episodes, run, self._keys.stage, self.stages)
-
-    def _rule(self, stage: int, run: int) -> StageRule:
-        """Returns the rule for relabeling episodes of a stage, or of a run without stages."""
-        return self.stages[stage] if self.stages else StageRule(self.reward_of(run))
 
     def _settings(self) -> list[Hashable]:
         """Returns settings of each run that must be equal in runs that are written at once."""

@@ -144,7 +144,10 @@ class LossLearner:
         self.optimizer.zero_grad(set_to_none=True)
         torch.stack(list(losses.values())).sum().backward()
         for parameters, dim in self._networks:
-            self._clip(parameters, dim)
+            if self.runs == 1:
+                nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+            else:
+                clip_by_run(parameters, self.max_grad_norm, runs=self.runs, dim=dim)
         self.optimizer.step()
         if self.target is not None:
             self.target.step()
@@ -158,12 +161,6 @@ class LossLearner:
                 f'(reduction="none"), got a shape of {list(value.shape)}'
             )
         return value.reshape(self.runs, -1).mean(1)
-
-    def _clip(self, parameters: list[nn.Parameter], dim: int) -> None:
-        if self.runs == 1:
-            nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
-        else:
-            clip_by_run(parameters, self.max_grad_norm, runs=self.runs, dim=dim)
 
     def _find_networks(self) -> list[tuple[list[nn.Parameter], int]]:
         """Returns the parameters of each network (child of the loss), and the runs' dimension in them."""

@@ -37,7 +37,10 @@ def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
     elif isinstance(sampler, PrioritizedSampler) and not isinstance(sampler, RunsPrioritizedSampler):
         state = _priorities(sampler, size)
     else:
-        state = {key: _copy(value) for key, value in sampler.state_dict().items()}
+        state = {
+            key: value.clone() if isinstance(value, torch.Tensor) else value
+            for key, value in sampler.state_dict().items()
+        }
     return {"kind": type(sampler).__name__, "own": state, "remaining": vars(sampler).get(_REMAINING)}
 
 
@@ -59,10 +62,6 @@ def load_sampler_state_dict(sampler: Sampler, state: dict[str, Any]) -> None:
         sampler.load_state_dict(state["own"])
     if state["remaining"] is not None:
         setattr(sampler, _REMAINING, state["remaining"])
-
-
-def _copy(value: Any) -> Any:
-    return value.clone() if isinstance(value, torch.Tensor) else value
 
 
 def _priorities(sampler: PrioritizedSampler, size: int) -> dict[str, Any]:

@@ -250,14 +250,15 @@ class Trainer:
         return measured
 
     def _learn_from(self, idle: list[int], steps: int) -> dict[str, Tensor]:
-        """Makes gradient steps for all runs but the idle ones; returns measurements, [steps, R] each."""
+        """Makes gradient steps; returns measurements, [steps, R] each, with a mark in place of idle runs'."""
         drawn = self.buffer.sample(self.runs * self.batch_size * steps)
         rows = drawn.view(self.runs, -1)
         measured = self.learner.update(rows, steps, idle=idle)
         if self.average is not None:
             self.average.follow(steps, idle=idle)
         self._set_priorities(drawn, rows, idle)
-        return {key: _without(value, idle) for key, value in measured.items()}
+        at = torch.tensor(idle, dtype=torch.int64)
+        return {key: value.index_fill(1, at.to(value.device), _IDLE) for key, value in measured.items()}
 
     def _set_priorities(self, drawn: TensorDictBase, rows: TensorDictBase, idle: list[int]) -> None:
         """Passes the new priorities of sampled transitions to the sampler."""
@@ -300,11 +301,6 @@ class Trainer:
     @property
     def _schedulers(self) -> list[ParameterScheduler]:
         return [schedule for schedule in self.schedules if isinstance(schedule, ParameterScheduler)]
-
-
-def _without(value: Tensor, idle: list[int]) -> Tensor:
-    """Returns measurements [S, R] in which those of idle runs are replaced by a mark."""
-    return value.index_fill(1, torch.tensor(idle, dtype=torch.int64, device=value.device), _IDLE)
 
 
 def _joined(measured: list[dict[str, Tensor]]) -> dict[str, Tensor]:
