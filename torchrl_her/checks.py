@@ -1,10 +1,11 @@
-"""Checks of arguments: options that must be whole numbers, and tensors that must be finite."""
+"""Checks: options that must be whole numbers, tensors that must be finite, entries that must be there."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from numbers import Integral
 
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 
@@ -57,3 +58,22 @@ def check_finite(tensors: Mapping[str, Tensor]) -> None:
         wrong = tensor[~tensor.isfinite()]
         if len(wrong) > 0:
             raise ValueError(f"{name} must be finite, got {wrong[0].item()} in it")
+
+
+def entry_of(rows: TensorDictBase, key: NestedKey, *, by: str = "relabeling") -> Tensor:
+    """Returns an entry; raises if it is missing.
+
+    Args:
+        rows: rows of any shape.
+        key: key of the entry.
+
+    Keyword Args:
+        by: name of the part that needs the entry, for the message.
+
+    Raises:
+        KeyError: the entry is missing; the message lists the entries that are there.
+    """
+    entry = rows.get(key, None)
+    if entry is None:
+        raise KeyError(f"{by} needs the entry {key!r}, got {list(rows.keys(True, True))}")
+    return entry

@@ -13,7 +13,7 @@ from torchrl.envs import Transform
 
 from torchrl_her.behavior.factors import GoalCandidates, GoalFactor
 from torchrl_her.behavior.memory import AchievedGoals
-from torchrl_her.checks import check_whole
+from torchrl_her.checks import check_whole, entry_of
 from torchrl_her.env_keys import EnvKeys
 from torchrl_her.goals.factors import draw
 from torchrl_her.goals.instructive import InstructiveWeights
@@ -376,10 +376,7 @@ class BehaviorGoals(Transform):
         return which.view(self.runs, -1).sum(1).tolist()
 
     def _get(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        entry = tensordict.get(key, None)
-        if entry is None:
-            raise KeyError(f"BehaviorGoals needs the entry {key!r}, got {list(tensordict.keys())}")
-        return entry
+        return entry_of(tensordict, key, by="BehaviorGoals")
 
 
 def _rows(entry: Tensor) -> Tensor:

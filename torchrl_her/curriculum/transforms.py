@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+from torchrl_her.checks import entry_of
 from torchrl_her.curriculum.orders import EpisodeStages
 from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress
 from torchrl_her.env_keys import EnvKeys
@@ -108,9 +109,7 @@ class _StageTransform(Transform):
 
     def _get(self, tensordict: TensorDictBase, key: NestedKey, width: int) -> Tensor:
         """Returns an entry; raises if it is missing or has another width."""
-        entry = tensordict.get(key, None)
-        if entry is None:
-            raise KeyError(f"{type(self).__name__} needs the entry {key!r}, got {list(tensordict.keys())}")
+        entry = entry_of(tensordict, key, by=type(self).__name__)
         if entry.shape[-1] != width:
             raise ValueError(f"the curriculum needs {key!r} of width {width}, got {entry.shape[-1]}")
         return entry

@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from tensordict import NestedKey, TensorDictBase
 
+from torchrl_her.checks import entry_of
 from torchrl_her.curriculum.stages import Curriculum
 from torchrl_her.goals.rewards import RewardFunction, ask_reward
-from torchrl_her.replay_buffers.keys import entry_of, under_next
+from torchrl_her.replay_buffers.keys import under_next
 from torchrl_her.replay_buffers.options import HindsightOptions
 
 

@@ -15,7 +15,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
-from torchrl_her.checks import check_whole
+from torchrl_her.checks import check_whole, entry_of
 from torchrl_her.modules.networks import by_run
 
 _RELATIVE_STD = 1e-4  # relative to the mean: smaller deviations are hardly above float32's rounding
@@ -211,7 +211,7 @@ class RunningNorm(nn.Module):
             self._check_blocks(rows.shape)
             runs = range(self.runs)
         shares = [rows.numel() // len(runs)] * len(runs) if counts is None else list(counts)
-        entries = {key: entry_to_normalize(rows, key) for key in self.widths}
+        entries = {key: entry_of(rows, key, by="normalization") for key in self.widths}
         for key, values in entries.items():
             self._check(key, values)
         new = [
@@ -301,7 +301,7 @@ class RunningNorm(nn.Module):
         """
         out = tensordict.copy()
         for key in self.widths:
-            out.set(key, self.normalize(key, entry_to_normalize(out, key)))
+            out.set(key, self.normalize(key, entry_of(out, key, by="normalization")))
             after = unravel_key(("next", key))
             value = out.get(after, None)
             if value is not None:
@@ -343,20 +343,3 @@ def _add(running: Moments, new: Moments) -> None:
     """Merges moments into others, in place: other processes may share their memory."""
     for each, value in zip(running, merge(running, new), strict=True):
         each.copy_(value)
-
-
-def entry_to_normalize(rows: TensorDictBase, key: NestedKey, *, who: str = "normalization") -> Tensor:
-    """Returns an entry that is to be normalized; raises if it is missing.
-
-    Raises:
-        KeyError: it is missing.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> entry_to_normalize(TensorDict({"observation": torch.ones(1, 2)}, [1]), "observation")
-        tensor([[1., 1.]])
-    """
-    entry = rows.get(key, None)
-    if entry is None:
-        raise KeyError(f"{who} needs the entry {key!r}, got {list(rows.keys(True, True))}")
-    return entry

@@ -8,8 +8,9 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Transform
 
+from torchrl_her.checks import entry_of
 from torchrl_her.env_keys import EnvKeys
-from torchrl_her.modules.normalization import RunningNorm, entry_to_normalize
+from torchrl_her.modules.normalization import RunningNorm
 
 
 class NormalizeBatch(Transform):
@@ -79,7 +80,7 @@ class NormalizeBatch(Transform):
         if self.counted_k is not None and not self.norm.frozen:
             # Checked first, so that rows which cannot be counted leave the statistics as they were.
             key = unravel_key(("next", self.keys.achieved_goal))
-            achieved = entry_to_normalize(tensordict, key, who="counted_k")
+            achieved = entry_of(tensordict, key, by="counted_k")
             width = self.norm.widths[unravel_key(self.keys.desired_goal)]
             if achieved.shape[-1] > width:
                 raise ValueError(f"{key!r} must have a width of at most {width}, got {achieved.shape[-1]}")
@@ -139,5 +140,6 @@ class NormalizedPolicy(TensorDictModuleBase):
         """
         normalized = tensordict.copy()
         for key in self._normalized:
-            normalized.set(key, self.norm.normalize(key, entry_to_normalize(tensordict, key)))
+            entry = entry_of(tensordict, key, by="normalization")
+            normalized.set(key, self.norm.normalize(key, entry))
         return tensordict.update(self.actor(normalized).select(*self.out_keys, strict=False))

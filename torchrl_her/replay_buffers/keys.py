@@ -9,7 +9,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-from torchrl_her.checks import check_finite
+from torchrl_her.checks import check_finite, entry_of
 from torchrl_her.goals.rewards import Outcome, RewardFunction, ask_reward, outcomes
 
 LEAST_COST = 1e-4  # relative: smaller differences are errors of rounding
@@ -203,15 +203,3 @@ def stored_as(value: Tensor, entry: Tensor, key: NestedKey) -> Tensor:
                 f"{key!r} is of {entry.dtype}, which cannot hold {lost[0].item()}: collect {value.dtype}"
             )
     return out.view(-1, *entry.shape[1:])
-
-
-def entry_of(transitions: TensorDictBase, key: NestedKey) -> Tensor:
-    """Returns an entry; raises if it is missing.
-
-    Raises:
-        KeyError: it is missing; the message lists the entries that are there.
-    """
-    entry = transitions.get(key, None)
-    if entry is None:
-        raise KeyError(f"relabeling needs the entry {key!r}, got {list(transitions.keys(True, True))}")
-    return entry

@@ -28,13 +28,14 @@ from torchrl.data import ReplayBuffer, SampleUnit, Storage
 from torchrl.data.replay_buffers.samplers import SliceSampler
 from torchrl.data.replay_buffers.storages import StorageEnsemble
 
+from torchrl_her.checks import entry_of
 from torchrl_her.goals.choose import LIKELIHOODS, TRIES, Candidates, Index, choose_goals
 from torchrl_her.goals.factors import combine, draw, draw_alike
 from torchrl_her.goals.rewards import RewardFunction, ask_reward, ends_at_goals, missed
 from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
-from torchrl_her.replay_buffers.keys import device_of, entry_of, failures, stored_as
+from torchrl_her.replay_buffers.keys import device_of, failures, stored_as
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_return, windows
 from torchrl_her.replay_buffers.neighbors import (
     MASK,

@@ -15,13 +15,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
-from torchrl_her.checks import check_whole
+from torchrl_her.checks import check_whole, entry_of
 from torchrl_her.files.reading import read_tensors
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, weights_by_run
 from torchrl_her.replay_buffers.draw import draw_for_runs
 from torchrl_her.replay_buffers.episodes import Episodes, find_episodes, time_order
-from torchrl_her.replay_buffers.keys import device_of, entry_of, in_root_and_next
+from torchrl_her.replay_buffers.keys import device_of, in_root_and_next
 from torchrl_her.replay_buffers.lanes import broken, ends_of_held
 from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer, refuse_stages
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
@@ -207,7 +207,7 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._own_rewards: dict[int, RewardFunction] = {}
         self._counts, self._rings = RunCounts(runs), Rings(runs)
         self._held = Batch.none(runs)  # transitions of open episodes
-        self._recent = [RecentGoals.none(runs) for _ in self.stages or [None]]  # for each stage
+        self._recent = [RecentGoals.none(runs) for _ in range(max(1, len(self.stages)))]  # by stage
         self._episodes = 0  # copies of episodes ever written, if whole ones are
         self._process = os.getpid()
         # Whether the rows held back come from a loaded state, or are over, and nothing was written since.

@@ -47,7 +47,8 @@ class RunsAdam(torch.optim.Adam):
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
     ) -> None:
-        self._dims = dim_of_runs(loss)
+        dims = run_dims(loss)
+        self._dims = {id(parameter): dims.get(name, 0) for name, parameter in loss.named_parameters()}
         self.runs = runs
         super().__init__(loss.parameters(), lr=lr, betas=betas, eps=eps)
 
@@ -84,9 +85,3 @@ class RunsAdam(torch.optim.Adam):
                 size = (group["lr"] / (1 - beta1**count)).to(parameter.dtype)
                 spread = (1 - beta2**count).sqrt().to(parameter.dtype)
                 parameter.sub_(size * m / (v.sqrt() / spread + group["eps"]))
-
-
-def dim_of_runs(loss: nn.Module) -> dict[int, int]:
-    """Returns the dimension of the runs in each parameter of a stacked loss, by the parameter's ``id``."""
-    dims = run_dims(loss)
-    return {id(parameter): dims.get(name, 0) for name, parameter in loss.named_parameters()}

@@ -50,13 +50,10 @@ class FusedLoss:
     fixed: dict[str, Any]
 
 
+_KEYS = ("reward", "terminated", "done")
 _FIXED: dict[str, Any] = {  # attributes of each loss and the values that they must have
-    **{
-        f"{part}tensor_keys.{key}": key
-        for part in ("", "value_estimator.")
-        for key in ("reward", "terminated", "done")
-    },
-    "tensor_keys.priority_weight": "priority_weight",
+    **{f"tensor_keys.{key}": key for key in (*_KEYS, "priority_weight")},
+    **{f"value_estimator.tensor_keys.{key}": key for key in _KEYS},
     "value_estimator.average_rewards": False,
     "value_estimator.shifted": False,
     "value_estimator.skip_existing": None,
@@ -164,7 +161,7 @@ def is_plain_adam(optimizer: torch.optim.Optimizer, loss: LossModule | None = No
         return False
     if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
         return False
-    return loss is None or _ids(group["params"]) == _ids(loss.parameters())
+    return loss is None or set(map(id, group["params"])) == set(map(id, loss.parameters()))
 
 
 def network_of(module: nn.Module) -> nn.Module:
@@ -181,15 +178,11 @@ def action_key(loss: LossModule) -> Any:
     return loss.tensor_keys.action
 
 
-def _ids(parameters: Iterator[nn.Parameter] | list[nn.Parameter]) -> set[int]:
-    return {id(parameter) for parameter in parameters}
-
-
 def _obstacles(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
     """Yields a description of each option that fused steps do not support."""
     estimator: Any = loss.value_estimator
-    kinds = (TD0Estimator, ClampedTD0) if fused.algorithm in STOCHASTIC else (ClampedTD0,)
-    if type(estimator) not in kinds:
+    is_plain = type(estimator) is TD0Estimator and fused.algorithm in STOCHASTIC
+    if type(estimator) is not ClampedTD0 and not is_plain:
         yield f"targets of a {type(estimator).__name__}"
         return
     for name, value in (_FIXED | fused.fixed).items():

@@ -7,7 +7,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_her import EnvKeys, HindsightOptions
-from torchrl_her.replay_buffers.keys import entry_of, in_root_and_next, under_next
+from torchrl_her.checks import entry_of
+from torchrl_her.replay_buffers.keys import in_root_and_next, under_next
 
 
 def test_keys_under_next() -> None:

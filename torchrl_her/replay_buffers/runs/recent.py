@@ -10,10 +10,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_her.checks import entry_of
 from torchrl_her.goals.strategies import RECENT
 from torchrl_her.goals.weights import spread_evenly
 from torchrl_her.replay_buffers.episodes import Episodes
-from torchrl_her.replay_buffers.keys import TransitionKeys, entry_of, stored_as
+from torchrl_her.replay_buffers.keys import TransitionKeys, stored_as
 
 Goals = tuple[Tensor | None, ...]
 

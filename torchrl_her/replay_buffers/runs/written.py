@@ -8,9 +8,10 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from torchrl_her.checks import entry_of
 from torchrl_her.goals.rewards import ask_reward
 from torchrl_her.replay_buffers.episodes import Episodes
-from torchrl_her.replay_buffers.keys import entry_of, stored_as
+from torchrl_her.replay_buffers.keys import stored_as
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, n_step_return, windows
 from torchrl_her.replay_buffers.runs.chunk import Chunk
 
