@@ -13,18 +13,18 @@ from functools import cache
 from typing import Any, Literal, get_args
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 from torchrl.objectives.utils import TargetNetUpdater
 
-from torchrl_her.native.job import STOCHASTIC, Layer, Norm, structures
+from torchrl_her.native.job import Layer, Norm, structures
 from torchrl_her.native.steps import load_steps
 from torchrl_her.trainers.fused_call import FusedCall
 from torchrl_her.trainers.fused_layers import layers_of
 from torchrl_her.trainers.fused_weights import FusedWeights
-from torchrl_her.trainers.fusing import FUSED, action_key, is_plain_adam, network_of, why_not_fused
+from torchrl_her.trainers.fusing import FUSED, is_plain_adam, network_of, why_not_fused
 from torchrl_her.trainers.learner import check_idle, check_rows, idle_runs
 
 MatmulDtype = Literal["float32", "bfloat16"]
@@ -95,8 +95,6 @@ class FusedLearner:
         self._matmul_dtype = matmul_dtype
         self._steps, self._kinds = load_steps(dtype), structures(dtype)
         self._weights = FusedWeights(loss, optimizer, self._kinds)
-        self._keys: list[NestedKey] = list(getattr(loss, self._fused.actor).in_keys)
-        self._action_key = action_key(loss)
         self._actor, self._critic = self._layers(self._fused.actor), self._layers(self._fused.critic)
         self.runs: int = network_of(getattr(loss, self._fused.actor)).runs  # type: ignore[assignment]
 
@@ -138,19 +136,7 @@ class FusedLearner:
 
     def _call(self, rows: TensorDictBase, steps: int) -> FusedCall:
         """Prepares the arguments of an update, except for its steps."""
-        outputs = self._actor[-1].outputs
-        call = FusedCall(
-            self.loss,
-            self._fused.algorithm,
-            self._kinds,
-            rows,
-            steps,
-            self.runs,
-            inputs=self._actor[0].inputs,
-            actions=outputs // 2 if self._fused.algorithm in STOCHASTIC else outputs,
-            keys=self._keys,
-            action_key=self._action_key,
-        )
+        call = FusedCall(self.loss, self._fused, self._kinds, rows, steps, self.runs, self._actor)
         job, weights = call.job, self._weights
         job.actor, job.actor_layers, job.actor_tensors = self._actor, len(self._actor), weights.actor_tensors
         job.critic, job.critic_layers = self._critic, len(self._critic)

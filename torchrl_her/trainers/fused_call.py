@@ -12,9 +12,10 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_her.native.job import STOCHASTIC, Algorithm, Structures
+from torchrl_her.native.job import STOCHASTIC, Algorithm, Layer, Structures
 from torchrl_her.replay_buffers.keys import under_next
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY
+from torchrl_her.trainers.fusing import FusedLoss, action_key
 
 # OpenMP's threads are not there in a process that was forked; starting them anew hangs.
 _FORKED: list[bool] = []
@@ -29,17 +30,12 @@ class FusedCall:
 
     Args:
         loss: whose numbers are read anew for each update, since they may be scheduled.
-        algorithm: the steps.
+        fused: names of its networks, and the steps.
         kinds: the structures for the type of the weights.
         rows: [R, S * B] transitions of R runs.
         steps: S.
         runs: R.
-
-    Keyword Args:
-        inputs: width of all that the networks see together.
-        actions: width of the action, or how many discrete ones there are.
-        keys: the entries that the networks see.
-        action_key: key of the action.
+        actor: layers of the actor.
 
     Raises:
         ValueError: an entry has another width, a discrete action is none of those that there are, or the loss
@@ -49,35 +45,28 @@ class FusedCall:
     def __init__(
         self,
         loss: LossModule,
-        algorithm: Algorithm,
+        fused: FusedLoss,
         kinds: Structures,
         rows: TensorDictBase,
         steps: int,
         runs: int,
-        *,
-        inputs: int,
-        actions: int,
-        keys: Sequence[NestedKey],
-        action_key: NestedKey,
+        actor: Sequence[Layer],
     ) -> None:
-        self._loss, self._algorithm, self._kinds, self._runs, self._actions = (
-            loss,
-            algorithm,
-            kinds,
-            runs,
-            actions,
-        )
-        self._dtype = kinds.dtype
+        self._loss, self._algorithm, self._kinds, self._runs = loss, fused.algorithm, kinds, runs
+        self._dtype, outputs = kinds.dtype, actor[-1].outputs
+        # Width of the action, or number of discrete actions.
+        self._actions: int = outputs // 2 if fused.algorithm in STOCHASTIC else outputs
         count = rows.numel() // runs
         self.job = kinds.job()
         self._kept: list[Tensor] = []
         self.priorities = torch.zeros(runs, count, dtype=self._dtype)
         job = self.job
-        job.algorithm, job.runs, job.rows, job.batch = algorithm, runs, count, count // steps
-        job.threads, job.actions = 1 if _FORKED else max(1, min(runs, torch.get_num_threads())), actions
+        job.algorithm, job.runs, job.rows, job.batch = fused.algorithm, runs, count, count // steps
+        job.threads = 1 if _FORKED else max(1, min(runs, torch.get_num_threads()))
+        job.actions = self._actions
         job.priorities = self._keep(self.priorities)
         self._read_settings()
-        self._read_rows(rows, inputs, keys, action_key)
+        self._read_rows(rows, getattr(loss, fused.actor).in_keys, actor[0].inputs)
 
     def set_idle(self, idle: Sequence[int]) -> None:
         """Sets which runs do not learn."""
@@ -134,20 +123,18 @@ class FusedCall:
             for bound in (low, high)
         )
 
-    def _read_rows(
-        self, rows: TensorDictBase, inputs: int, keys: Sequence[NestedKey], action_key: NestedKey
-    ) -> None:
-        job = self.job
+    def _read_rows(self, rows: TensorDictBase, keys: Sequence[NestedKey], inputs: int) -> None:
+        job, key = self.job, action_key(self._loss)
         job.entries = len(keys)
         job.seen, job.next_seen = (
             self._joined(rows, seen_keys, inputs) for seen_keys in (keys, [under_next(key) for key in keys])
         )
-        action = rows.get(action_key)
+        action = rows.get(key)
         if self._algorithm is Algorithm.DQN:
             whole = not (action.is_floating_point() or action.dtype == torch.bool)
             if action.numel() != self.priorities.numel() or not whole:
                 raise ValueError(
-                    f"{action_key!r} must be the number of an action in each row, got {action.dtype} "
+                    f"{key!r} must be the number of an action in each row, got {action.dtype} "
                     f"of shape {list(action.shape)}"
                 )
             choice = action.reshape(-1).to(torch.int64).contiguous()
@@ -157,7 +144,7 @@ class FusedCall:
                 )
             job.choice = self._keep(choice)
         else:
-            job.action = self._entry(action, self._actions, action_key)
+            job.action = self._entry(action, self._actions, key)
         job.reward = self._entry(rows.get(("next", "reward")), 1, ("next", "reward"))
         terminated = rows.get(("next", "terminated"), None)
         if terminated is None:  # as TorchRL's targets are
