@@ -78,6 +78,7 @@ def boards() -> dict[str, list[Curves]]:
     return {
         "FetchPush": [
             ours("default agent", "default agent"),
+            ours("default agent on FetchPush, seeds 105 to 109", "the same, seeds 105 to 109"),
             ours("default agent, one stage after the other", "the same, one stage after the other"),
             theirs("RHER", "FetchPush", "Relay-HER"),
             theirs("DDPG+HER", "FetchPush", "DDPG and HER, by Relay-HER's authors"),
@@ -91,6 +92,8 @@ def boards() -> dict[str, list[Curves]]:
             theirs("RHER", "FetchPickAndPlace", "Relay-HER"),
             theirs("DDPG+HER", "FetchPickAndPlace", "DDPG and HER, by Relay-HER's authors"),
         ],
+        "PandaPush": [ours("default agent on PandaPush", "default agent")],
+        "PandaPickAndPlace": [ours("default agent on PandaPickAndPlace", "default agent")],
     }
 
 
@@ -150,6 +153,7 @@ if __name__ == "__main__":
         {
             task: {curves.method.replace("`", ""): curves.rows for curves in board}
             for task, board in boards().items()
+            if len(board) > 1  # a curve beside others
         },
         FIGURE,
     )
