@@ -157,7 +157,7 @@ def test_indices_must_be_whole_numbers() -> None:
         ),
         (
             [make_stage("a"), make_stage("b", achieved_goal=[0, 1], desired_goal=[2, 3])],
-            r"stage 'a': the goal has 1 entries, but .* as the last one, 'b': 2",
+            r"stage 'a': the goal has 1 entries, but must have 2, like the goal of the last stage, 'b'",
         ),
         ([make_stage("a", observation="arm")], r"stage 'a': .* unknown name 'arm'; known are 'hand', 'hole'"),
         # What a stage of names hides until the names are resolved
