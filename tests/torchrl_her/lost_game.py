@@ -2,15 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
-from torchrl.objectives import LossModule
+from torchrl.objectives import LossModule, SoftUpdate
+
+from torchrl_her import make_critic
+from torchrl_her.modules import make_stochastic_actor
+from torchrl_her.objectives import Targets
 
 SPEC = Bounded(-2.0, 2.0, (3,))
+
+
+def stochastic_loss(
+    make: Callable[..., LossModule],
+    *,
+    runs: int = 1,
+    critics: int = 2,
+    outputs: int = 1,
+    generators: list[torch.Generator] | None = None,
+    gamma: float = 0.5,
+    reward_range: tuple[float, float] | None = None,
+    **options: Any,
+) -> LossModule:
+    """The loss of a stochastic actor by ``make_sac_loss`` or ``make_tqc_loss``, with its target networks."""
+    actor = make_stochastic_actor((4, 2), SPEC, runs=runs, generators=generators)
+    every = [make_critic((4, 2), 3, runs=runs, outputs=outputs) for _ in range(critics)]
+    loss = make(actor, every, targets=Targets(gamma=gamma, reward_range=reward_range), **options)
+    SoftUpdate(loss, tau=0.1)
+    return loss
 
 
 def rows(n: int, *, action: torch.Tensor, runs: int = 1) -> TensorDict:

@@ -45,9 +45,8 @@ def build(recipe: Recipe) -> Components:
     """
     recipe = resolved(recipe)
     envs, seeds, collection = TaskEnvs.of(recipe), recipe.seeds, recipe.collection
-    processes = (
-        collection.processes
-    )  # where there are any, the environments here only show what theirs are like
+    processes = collection.processes
+    # Where processes collect, this environment only shows what theirs are like.
     task = envs.make(1 if processes else collection.num_envs, seeds)
     progress = make_progress(recipe.order, envs.curriculum, task, seeds)
     check_order(recipe.order, progress, recipe.weights, processes, recipe.demonstrations.episodes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import pytest
@@ -10,26 +11,12 @@ from torchrl.objectives import LossModule, SACLoss, SoftUpdate
 
 from torchrl_her import LossLearner, make_critic
 from torchrl_her.modules import make_stochastic_actor
-from torchrl_her.objectives import ActorTerms, Targets, make_sac_loss
+from torchrl_her.objectives import ActorTerms, make_sac_loss
 from torchrl_her.trainers import RunsAdam
 
-from ..lost_game import SPEC, check_penalty, check_same_loss, rows, say, without_entropy
+from ..lost_game import SPEC, check_penalty, check_same_loss, rows, say, stochastic_loss, without_entropy
 
-
-def make_loss(
-    *,
-    runs: int = 1,
-    critics: int = 2,
-    generators: list[torch.Generator] | None = None,
-    gamma: float = 0.5,
-    reward_range: tuple[float, float] | None = None,
-    **options: Any,
-) -> LossModule:
-    actor = make_stochastic_actor((4, 2), SPEC, runs=runs, generators=generators)
-    every = [make_critic((4, 2), 3, runs=runs) for _ in range(critics)]
-    loss = make_sac_loss(actor, every, targets=Targets(gamma=gamma, reward_range=reward_range), **options)
-    SoftUpdate(loss, tau=0.1)
-    return loss
+make_loss = partial(stochastic_loss, make_sac_loss)
 
 
 def test_two_critics_learn_the_value_of_a_lost_game() -> None:

@@ -12,27 +12,14 @@ from torchrl.objectives import LossModule, SoftUpdate, TQCLoss
 
 from torchrl_her import LossLearner, make_critic
 from torchrl_her.modules import make_stochastic_actor
-from torchrl_her.objectives import ActorTerms, Targets, critic_value, make_tqc_loss
+from torchrl_her.objectives import ActorTerms, critic_value, make_tqc_loss
 from torchrl_her.objectives.tqc import PenalizedTQCLoss
 
-from ..lost_game import SPEC, check_penalty, check_same_loss, rows, say, without_entropy
+from ..lost_game import SPEC, check_penalty, check_same_loss, rows, say, stochastic_loss, without_entropy
 
 
-def make_loss(
-    *,
-    quantiles: int = 3,
-    runs: int = 1,
-    critics: int = 2,
-    generators: list[torch.Generator] | None = None,
-    gamma: float = 0.5,
-    reward_range: tuple[float, float] | None = None,
-    **options: Any,
-) -> LossModule:
-    actor = make_stochastic_actor((4, 2), SPEC, runs=runs, generators=generators)
-    every = [make_critic((4, 2), 3, runs=runs, outputs=quantiles) for _ in range(critics)]
-    loss = make_tqc_loss(actor, every, targets=Targets(gamma=gamma, reward_range=reward_range), **options)
-    SoftUpdate(loss, tau=0.1)
-    return loss
+def make_loss(*, quantiles: int = 3, **options: Any) -> LossModule:
+    return stochastic_loss(make_tqc_loss, outputs=quantiles, **options)
 
 
 def test_targets_leave_out_the_greatest_quantiles_of_all_critics_together() -> None:
