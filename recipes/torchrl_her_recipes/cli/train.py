@@ -20,7 +20,6 @@ from torchrl_her_recipes.cli.train_options import (
     with_folder,
 )
 from torchrl_her_recipes.config.imports import imported_modules, needs_permission
-from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import check_extending
 from torchrl_her_recipes.config.resolve import auto_options
 
@@ -78,11 +77,10 @@ def _train(request: RunRequest) -> recipes.RunResult:
     if chosen := auto_options(request.recipe):
         values = (f"{name}={getattr(getattr(components.recipe, group), name)}" for group, name in chosen)
         click.echo(f"chosen for this environment (auto): {' '.join(values)}")
-    if request.recipe.hindsight.algo == AUTO and components.recipe.hindsight.algo == "cher":
-        inside = components.recipe.curriculum.stages[0]["achieved_goal"]
+    if (stages := components.recipe.curriculum.stages) and request.recipe.curriculum.stages is None:
         click.echo(
-            f"random actions seldom change the achieved goal: entries {inside} of the observation are first "
-            "brought near it (algo=filtered_her does without)"
+            f"curriculum found: entries {stages[0]['achieved_goal']} of the observation are first brought to "
+            "the achieved goal, which random actions seldom change (algo=filtered_her does without)"
         )
     if request.recipe.learner.device == "auto":
         click.echo(f"learner.device=auto: {next(components.loss.parameters()).device}")

@@ -80,23 +80,27 @@ class Facts:
 def resolved(recipe: Recipe) -> Recipe:
     """Returns the recipe with a value for each option that is ``auto``, chosen from facts about the task.
 
-    If environments are stepped one by one, random actions are played if ``algo`` is ``auto``, or if it is
-    unknown what ends an episode at its goal. The result is stored in the recipe, so that a resumed run and
-    other processes need not play them again.
+    If environments are stepped one by one, random actions are played if stages may have to be found, or if
+    it is unknown what ends an episode at its goal. Stages are looked for if ``algo`` is ``auto``, or if it
+    learns stages and neither the recipe nor the task has any. The result is stored in the recipe, so that a
+    resumed run and other processes need not play them again.
     """
-    if not auto_options(recipe) and not ends_open(recipe.task):
+    auto = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
+    needs_stages = auto or (recipe.hindsight.algorithm.curriculum and recipe.curriculum.stages is None)
+    if not (auto_options(recipe) or ends_open(recipe.task) or needs_stages):
         return recipe
-    needs_stages = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
-    known = f"{recipe.task} {needs_stages}"
+    known = f"{recipe.task} {needs_stages} {auto}"
     if (facts := _FACTS.get(known)) is None:
         with closing(_watched(TaskEnvs.of(recipe)).make(1, [0])) as env:
             task = goal_env(env)
             facts = EnvFacts(max_steps=task.max_steps, batched=task.batched)
             ends: GoalEnds | None = getattr(task, "goal_ends", None)
+            needs_stages = needs_stages and (auto or not _has_stages(task))
         open_ends = ends is not None and ends.env_ends is None and ends_open(recipe.task)
         if (needs_stages or open_ends) and not facts.batched:
             look = look_at(recipe.replace(seed=0), seconds=None)
-            facts, ends = replace(facts, stages=_needed_stages(look) if needs_stages else None), look.ends
+            stages = _needed_stages(look, auto) if needs_stages else None
+            facts, ends = replace(facts, stages=stages), look.ends
         if ends is not None and ends_open(recipe.task):
             facts = replace(facts, ends=ends.found() or "never")
             say_once(ends.line())
@@ -111,13 +115,13 @@ def _watched(envs: TaskEnvs) -> TaskEnvs:
     return replace(envs, task=replace(envs.task, options=options, failure="environment"))
 
 
-def _needed_stages(facts: Facts) -> list[dict[str, Any]] | None:
-    """Returns stages for a task whose achieved goal seldom changes by chance; None without need or result.
+def _needed_stages(facts: Facts, auto: bool) -> list[dict[str, Any]] | None:
+    """Returns stages for a task, the same for each seed; None if there are none, or no need for them.
 
-    Stages are the same for each seed. A task in which episodes end in failures gets none, since a failure
-    says nothing about the goals of a stage below the task.
+    A task in which episodes end in failures gets none, since a failure says nothing about the goals of a
+    stage below the task. If ``algo`` is ``auto``, the achieved goal must seldom change by chance, besides.
     """
-    return None if facts.fallen > 0 or facts.moved >= _SELDOM else facts.stages or None
+    return None if facts.fallen > 0 or (auto and facts.moved >= _SELDOM) else facts.stages or None
 
 
 def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SECONDS) -> Facts:

@@ -102,6 +102,8 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
         >>> recipe.learner.gamma, recipe.collection.num_envs, recipe.collection.epoch_frames
         (0.96, 8, 5000)
     """
+    if facts.stages and recipe.hindsight.algo != AUTO:
+        recipe = recipe.replace(stages=facts.stages)
     if facts.ends is not None and ends_open(recipe.task):
         recipe = recipe.replace(**{f"task.options.{TERMINATION}": facts.ends})
     for group, name in auto_options(recipe):

@@ -125,6 +125,16 @@ def test_a_block_that_lies_still_gets_a_curriculum() -> None:
     components.close()
 
 
+def test_an_algorithm_with_stages_finds_them_and_nothing_else_changes() -> None:
+    recipe = make_recipe(task=f"{HERE}:Push", algo="unfiltered_cher", guided_share=0.25)
+    found = resolved(recipe)
+    assert found.curriculum.stages == resolved(make_recipe(task=f"{HERE}:Push")).curriculum.stages
+    assert (found.hindsight.algo, found.curriculum.guided_share) == ("unfiltered_cher", 0.25)
+    assert found.order == recipe.order
+    given = found.replace(algo="cher", stages=[{"name": "task"}])
+    assert resolved(given).curriculum.stages == [{"name": "task"}]
+
+
 def test_a_cost_of_actions_is_no_obstacle_to_a_curriculum() -> None:
     recipe = resolved(make_recipe(task=f"{HERE}:Push", **{"task.options": {"cost": 0.5}}))
     assert recipe.hindsight.algo == "cher"
