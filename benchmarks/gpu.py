@@ -49,7 +49,7 @@ SETTINGS = (
     Setting("1 run, 3 x 64", 1, NARROW),
     Setting("15 runs, 3 x 64", 15, NARROW),
     Setting("100 runs, 3 x 64", 100, NARROW),
-    Setting("1 run, 3 x 256, layer norm (the Fetch presets)", 1, WIDE),
+    Setting("1 run, 3 x 256, layer norm (the default agent)", 1, WIDE),
     Setting("5 runs, 3 x 256, layer norm", 5, WIDE),
 )
 WAYS = {"launched one by one": "never", "CUDA graphs": "auto", "torch.compile, CUDA graphs": "always"}

@@ -1,8 +1,8 @@
 """Wall-clock and frames to a success rate, beside Stable-Baselines3 and SBX with HER: one curve a seed.
 
     python benchmarks/time_to_learn.py --out time_to_learn.md
-    python benchmarks/time_to_learn.py --preset fetch_push --only SBX-SAC --aim 2 --repeats 5 \\
-        --epochs 12 --epoch-frames 10000 --curves push_sac
+    python benchmarks/time_to_learn.py --preset benchmarks/presets/fetch_push.yaml --only SBX-SAC \\
+        --aim 2 --repeats 5 --epochs 12 --epoch-frames 10000 --curves push_sac
 
 All train in as many worlds of the same task with the same networks, batches, discount and number of
 gradient steps; all are asked every epoch for the success of greedy episodes in the same environment, which

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,10 +49,7 @@ STUDIES = {  # where they are described: in the package, or in a file beside thi
     "proposals": "proposals",
     "demonstrations": str(HERE / "studies" / "demonstrations.yaml"),
     "demonstrations_preset": str(HERE / "studies" / "demonstrations_preset.yaml"),
-    "fetch": "fetch",
-    "lift_ablation": str(HERE / "studies" / "lift_ablation.yaml"),
-    "fetch_ibs": "fetch_ibs",
-    "hand_reach": str(HERE / "studies" / "hand_reach.yaml"),
+    "fetch_ablation": str(HERE / "studies" / "fetch_ablation.yaml"),
     "defaults": "defaults",
     "window": "window",
     "initialisation": "initialisation",
@@ -153,13 +149,6 @@ def print_from_change(cells: Sequence[Combination], every: Sequence[int], within
         print(f"| `{cell.algorithm}` | {' | '.join([spread(changes, ',.0f'), *shown])} |")
 
 
-def beginning_of_fetch(other: Combination) -> Combination:
-    """As many steps of the study ``fetch`` as another combination has: the same without weights of goals."""
-    (cell,) = [cell for cell in read_results(RESULTS / "fetch").cells if cell.task == other.task]
-    rows = [row for row in cell.rows if row["frames"] <= other.frames]
-    return replace(cell, algorithm="uniform", rows=rows)
-
-
 def draw_study(cells: Sequence[Combination], metrics: Sequence[str], path: Path) -> None:
     """Metrics of a study over environment steps."""
     panels: dict[str, dict[str, Rows]] = {}
@@ -245,10 +234,6 @@ def main() -> None:
                 print_speed(cells, 0.8)
             if name == "window":
                 print_from_change(cells, (25_600, 51_200, 76_800, 102_400, 126_720), within=6_400)
-            if name == "fetch":
-                cells = [cell for cell in every if not cell.missing]
-            if name == "fetch_ibs":
-                cells = [beginning_of_fetch(cells[0]), *cells]
             if name == "divergence":
                 draw_the_ends(cells, "kl", "KL(q, q*)", options.images / f"{name}.png")
             elif name in TOYS:

@@ -25,7 +25,6 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_her_recipes import Components, build, make_recipe
 from torchrl_her_recipes.components.collection.cluster import join, resource
-from torchrl_her_recipes.config.shipped import load_preset
 
 BATCHES = 30  # of a piece
 PIECES = ("two nodes", "one has died", "another one has come")
@@ -96,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     join(cluster.address)
     wait_for_cores(2)
     recipe = make_recipe(
-        load_preset("fetch_push"), algo="filtered_her", processes=2, sync=False, ray=cluster.address
+        task="gym:FetchPush-v4", algo="filtered_her", processes=2, sync=False, ray=cluster.address
     )
     components = build(recipe)
     try:

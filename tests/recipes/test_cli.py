@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -20,7 +18,6 @@ from .small import overrides
 from .studies.forked_worker import fork_workers
 
 PRESETS = sorted((CONF / "preset").glob("*.yaml"))
-ROBOTICS = find_spec("gymnasium_robotics") is not None
 
 
 @pytest.fixture(autouse=True)
@@ -81,16 +78,8 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert max(len(line) for line in out.splitlines()) < 110
 
 
-def _preset(path: Path) -> Any:
-    """A case of the test below; presets that are another one with another task are left for longer tests."""
-    marks = [pytest.mark.full] if path.stem in ("fetch_pick_and_place", "fetch_slide") else []
-    return pytest.param(path, id=path.stem, marks=marks)
-
-
-@pytest.mark.parametrize("preset", [_preset(path) for path in PRESETS])
+@pytest.mark.parametrize("preset", PRESETS, ids=lambda path: path.stem)
 def test_every_preset_runs(preset: Path) -> None:
-    if preset.stem.startswith("fetch") and not ROBOTICS:
-        pytest.skip("needs the extra robotics")
     shrunk = [
         option
         for option in overrides(folder="out", epochs=1, epoch_frames=480, episodes=2)

@@ -69,13 +69,13 @@ def test_a_file_of_ones_own(tmp_path: Path) -> None:
 
 def test_a_preset_begins_with_another_one(tmp_path: Path) -> None:
     file = tmp_path / "own.yaml"
-    file.write_text("preset: fetch\ntau: 0.01\nrun: {epochs: 3}\n")
-    values, fetch = load_preset(str(file)), load_preset("fetch")
-    assert values["learner"] == fetch["learner"] | {"tau": 0.01}
-    assert values["run"] == fetch["run"] | {"epochs": 3}
-    assert values["hindsight"] == fetch["hindsight"]
-    file.write_text("preset: fecth\n")
-    with pytest.raises(ValueError, match=r"own\.yaml cannot be read: there is no preset 'fecth'; did you"):
+    file.write_text("preset: demo\ntau: 0.01\nrun: {epochs: 3}\n")
+    values, demo = load_preset(str(file)), load_preset("demo")
+    assert values["learner"] == demo["learner"] | {"tau": 0.01}
+    assert values["run"] == demo["run"] | {"epochs": 3}
+    assert values["hindsight"] == demo["hindsight"]
+    file.write_text("preset: deno\n")
+    with pytest.raises(ValueError, match=r"own\.yaml cannot be read: there is no preset 'deno'; did you"):
         load_preset(str(file))
 
 
