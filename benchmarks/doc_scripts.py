@@ -22,9 +22,10 @@ from typing import Any
 import torch
 from matplotlib.figure import Figure
 
-from torchrl_her_recipes.reports.results import Combination, at_the_end
+from torchrl_her_recipes.reports.results import Combination
 from torchrl_her_recipes.reports.tidy import write_files
 from torchrl_her_recipes.runs.plots import colors, count_frames, draw_curve
+from torchrl_her_recipes.runs.scores import at_the_end
 
 ROOT = Path(__file__).parents[1]
 PAGE, EXAMPLE = ROOT / "docs" / "own_script.md", ROOT / "docs" / "examples" / "recurrent.py"

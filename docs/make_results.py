@@ -20,9 +20,10 @@ from matplotlib.figure import Figure
 
 from torchrl_her_envs import make_env
 from torchrl_her_recipes.config.study import load_study
-from torchrl_her_recipes.reports.results import LAST, Combination, at_the_end
+from torchrl_her_recipes.reports.results import Combination
 from torchrl_her_recipes.reports.tidy import is_results, read_results, write_results
 from torchrl_her_recipes.runs.plots import draw_goals, plot_comparison
+from torchrl_her_recipes.runs.scores import LAST, at_the_end
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results"

@@ -29,8 +29,9 @@ from torchrl_her_recipes.reports.compare import (
     values_of,
 )
 from torchrl_her_recipes.reports.formatting import show, show_gap, show_interval
-from torchrl_her_recipes.reports.results import Combination, at_the_end
+from torchrl_her_recipes.reports.results import Combination
 from torchrl_her_recipes.reports.tidy import Results, read_results
+from torchrl_her_recipes.runs.scores import at_the_end
 
 HERE = Path(__file__).parent
 PAGE, CLAIMS, RESULTS = HERE / "thesis.md", HERE / "thesis_claims.yaml", HERE.parent / "results"

@@ -7,7 +7,7 @@ for few runs on several tasks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,7 @@ _SIZE = 0.95
 _CUT = 0.25  # fraction of the runs that is cut off at either end
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """A number with its 95 % confidence interval, whose ends are NaN if there are too few samples."""
 
     value: float

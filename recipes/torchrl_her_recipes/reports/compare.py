@@ -14,7 +14,8 @@ import numpy as np
 
 from torchrl_her_recipes.config.study import Order
 from torchrl_her_recipes.reports.bootstrap import Interval, bootstrap
-from torchrl_her_recipes.reports.results import LAST, Combination, at_the_end
+from torchrl_her_recipes.reports.results import Combination
+from torchrl_her_recipes.runs.scores import LAST, at_the_end
 
 ALL_TASKS = "all tasks"
 _COUNTED = ("kl", "rows_")  # metrics accumulated over a run, of which only the last evaluation counts
@@ -40,11 +41,6 @@ class Final:
     most: float
     published: float | None
 
-    @property
-    def interval(self) -> Interval:
-        """The interquartile mean as an interval."""
-        return Interval(self.iqm, self.low, self.high)
-
 
 @dataclass(frozen=True)
 class Difference:
@@ -61,6 +57,12 @@ class Difference:
     low: float
     high: float
     apart: bool
+
+    def minus_other(self, first: str) -> Interval:
+        """Returns the mean of ``first``, one of the two algorithms, minus that of the other."""
+        if first == self.first:
+            return Interval(self.difference, self.low, self.high)
+        return Interval(-self.difference, -self.high, -self.low)
 
 
 class Verdict(StrEnum):
@@ -121,22 +123,13 @@ def compare(
     finals, numbers = [], published.get("numbers", {}).get(measure, {})
     for key, group, mean, finished in zip(keys, groups, means, final, strict=True):
         pooled = [value for index in group for value in samples[index]]
-        low, middle, high = (float(value) for value in np.percentile(pooled, [33, 50, 67]))
+        low, middle, high = np.percentile(pooled, [33, 50, 67]).tolist()
         frames = max(measured[index].frames for index in group)
-        spread = (mean.value, mean.low, mean.high, middle, low, high, min(pooled), max(pooled))
-        task, algorithm = key
-        number = numbers.get(task, {}).get(algorithm)
+        spread = (*mean, middle, low, high, min(pooled), max(pooled))
+        number = numbers.get(key[0], {}).get(key[1])
         finals.append(Final(measure, *key, finished, len(pooled), frames, *spread, number))
     differences = [
-        Difference(
-            measure,
-            *keys[first],
-            keys[second][1],
-            gap.value,
-            gap.low,
-            gap.high,
-            not means[first].overlaps(means[second]),
-        )
+        Difference(measure, *keys[first], keys[second][1], *gap, not means[first].overlaps(means[second]))
         for (first, second), gap in zip(pairs, gaps, strict=True)
     ]
     return finals, differences
@@ -175,33 +168,24 @@ def judge(
 def _judge(
     cells: Sequence[Combination], order: Order, task: str, differences: Sequence[Difference]
 ) -> Judged:
+    pair = {order.more, order.less}
     for gap in differences:
-        if (gap.measure, gap.task) == (order.measure, task) and {gap.first, gap.second} == {
-            order.more,
-            order.less,
-        }:
-            # in the order of writing: a < b is about a minus b
-            written = order.text.split()[0]
-            ends = (gap.difference, gap.low, gap.high)
-            if gap.first != written:
-                ends = (-gap.difference, -gap.high, -gap.low)
-            verdict = _verdict(Interval(*ends), rising=written == order.more, apart=gap.apart)
-            why = "too few runs" if math.isnan(gap.low) else ""
-            return Judged(order.measure, task, order.text, verdict, *ends, why)
+        if (gap.measure, gap.task) == (order.measure, task) and {gap.first, gap.second} == pair:
+            verdict = _verdict(gap.minus_other(order.more), apart=gap.apart)
+            why = "too few runs" if verdict is Verdict.OPEN else ""
+            written = gap.minus_other(order.text.split()[0])  # a < b is about a minus b
+            return Judged(order.measure, task, order.text, verdict, *written, why)
     unknown = (math.nan, math.nan, math.nan)
     return Judged(order.measure, task, order.text, Verdict.OPEN, *unknown, _why(cells, order, task))
 
 
-def _verdict(gap: Interval, *, rising: bool, apart: bool) -> Verdict:
-    """Returns the verdict on an order, from the interval of a difference."""
-    if math.isnan(gap.low):
+def _verdict(rise: Interval, *, apart: bool) -> Verdict:
+    """Returns the verdict on an order, from the algorithm with more of a metric minus that with less."""
+    if math.isnan(rise.low):
         return Verdict.OPEN
-    above, below = gap.low > 0, gap.high < 0
-    if not (above or below):
-        return Verdict.UNDECIDED
-    if above != rising:
-        return Verdict.REVERSED
-    return Verdict.APART if apart else Verdict.HOLDS
+    if rise.low > 0:
+        return Verdict.APART if apart else Verdict.HOLDS
+    return Verdict.REVERSED if rise.high < 0 else Verdict.UNDECIDED
 
 
 def _why(cells: Sequence[Combination], order: Order, task: str) -> str:

@@ -20,9 +20,10 @@ from torchrl_her_recipes.reports.bootstrap import REPETITIONS
 from torchrl_her_recipes.reports.compare import ALL_TASKS, Difference, Final, Judged, Verdict, compare, judge
 from torchrl_her_recipes.reports.formatting import MEASURES, SIGNS, show, show_gap, show_interval, show_range
 from torchrl_her_recipes.reports.pictures import draw_pictures
-from torchrl_her_recipes.reports.results import LAST, Combination
+from torchrl_her_recipes.reports.results import Combination
 from torchrl_her_recipes.reports.tidy import Results, read_study
 from torchrl_her_recipes.runs.plots import band
+from torchrl_her_recipes.runs.scores import LAST, last_success
 from torchrl_her_recipes.studies.plan import duration
 
 _AT_THE_END = ("success", "reached", "distance", "kl", "q_bias")  # shown with intervals
@@ -109,8 +110,7 @@ def _duration(seconds: float) -> str:
 
 def _success_now(cell: Combination) -> str:
     """Formats the median success of the runs in the last evaluation of a combination."""
-    last = [row["success"] for row in cell.rows if row["epoch"] == cell.epoch]
-    return show(statistics.median(last), "success")
+    return show(statistics.median(last_success(cell.rows)), "success")
 
 
 def _averaged(cells: Sequence[Combination]) -> str:

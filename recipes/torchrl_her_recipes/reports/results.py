@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,6 @@ from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.study import Study, curve_label
 from torchrl_her_recipes.runs.goal_map import GoalMap
 from torchrl_her_recipes.studies.seed_batches import Batches
-
-LAST = 3  # number of last evaluations whose mean is a run's result
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,30 +88,50 @@ def read_combinations(study: Study, folder: Path) -> list[Combination]:
     """Reads all combinations of a study, with their results in a folder."""
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; `torchrl-her study {study.name}` makes its runs")
-    cells = [
-        _read(label, recipe, options, Batches(folder / label))
-        for options, (label, recipe) in zip(study.combinations(), study.cells(), strict=True)
-    ]
+    cells = []
+    for options, (label, planned) in zip(study.combinations(), study.cells(), strict=True):
+        batches = Batches(folder / label)
+        differences = _differences(batches.recipe or planned, planned)
+        differs = [f"{name}={value} (the study: {usual})" for name, value, usual in differences]
+        algorithm = curve_label(label, planned)
+        cells.append(_combination(label, algorithm, planned, batches, differs=differs, options=options))
     if all(cell.missing for cell in cells):
         labels = ", ".join(cell.label for cell in cells)
         raise ValueError(f"{folder} has no run of the study {study.name}; its runs are {labels}")
     return cells
 
 
-def _read(label: str, planned: Recipe, options: Mapping[str, Any], batches: Batches) -> Combination:
-    used = batches.recipe or planned
-    differs = [f"{name}={value} (the study: {usual})" for name, value, usual in _differences(used, planned)]
-    return _combination(
-        label, planned, used, batches, options=options, algorithm=curve_label(label, planned), differs=differs
-    )
-
-
 def read_single(label: str, batches: Batches) -> Combination:
     """Reads a single run as a combination, described by its options that differ from the defaults."""
     recipes = [home.recipe() for home in batches.homes]
-    used = recipes[0].replace(num_runs=sum(recipe.run.num_runs for recipe in recipes))
-    differs = [f"{name}={value}" for name, value, _ in _differences(used, Recipe())]
-    return _combination(label, used, used, batches, options={}, algorithm=label, differs=differs)
+    planned = recipes[0].replace(num_runs=sum(recipe.run.num_runs for recipe in recipes))
+    differs = [f"{name}={value}" for name, value, _ in _differences(planned, Recipe())]
+    return _combination(label, label, planned, batches, differs=differs, options={})
+
+
+def _combination(
+    label: str,
+    algorithm: str,
+    planned: Recipe,
+    batches: Batches,
+    *,
+    differs: list[str],
+    options: Mapping[str, Any],
+) -> Combination:
+    rows = batches.rows()
+    return Combination(
+        label=label,
+        task=planned.task.name,
+        algorithm=algorithm,
+        options=dict(_flat(options)),
+        rows=rows,
+        done=batches.is_done,
+        epochs=(batches.recipe or planned).run.epochs,
+        planned=planned.run.num_runs,
+        seconds=batches.seconds if rows else 0.0,
+        differs=", ".join(differs),
+        goals=batches.goal_map(),
+    )
 
 
 def _differences(used: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
@@ -125,32 +142,6 @@ def _differences(used: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
     return [(name, left[name], right.get(name)) for name in differ]
 
 
-def _combination(
-    label: str,
-    planned: Recipe,
-    used: Recipe,
-    batches: Batches,
-    *,
-    options: Mapping[str, Any],
-    algorithm: str,
-    differs: Sequence[str],
-) -> Combination:
-    rows = batches.rows()
-    return Combination(
-        label=label,
-        task=planned.task.name,
-        algorithm=algorithm,
-        options=dict(_flat(options)),
-        rows=rows,
-        done=batches.is_done,
-        epochs=used.run.epochs,
-        planned=planned.run.num_runs,
-        seconds=batches.seconds if rows else 0.0,
-        differs=", ".join(differs),
-        goals=batches.goal_map(),
-    )
-
-
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Flattens nested mappings to one with names such as ``group.option``."""
     for name, value in values.items():
@@ -158,20 +149,3 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield from _flat(value, f"{prefix}{name}.")
         else:
             yield prefix + str(name), value
-
-
-def at_the_end(rows: Sequence[dict[str, float]], name: str, *, evaluations: int = LAST) -> list[float]:
-    """Returns a metric of each run: the mean of its last evaluations.
-
-    Returns:
-        One number for each run, in the order of the runs.
-
-    Example:
-        >>> rows = [{"run": 0, "success": success} for success in (0.0, 0.5, 0.75, 1.0)]
-        >>> at_the_end(rows, "success")
-        [0.75]
-    """
-    runs: dict[float, list[float]] = {}
-    for row in rows:
-        runs.setdefault(row["run"], []).append(row[name])
-    return [statistics.fmean(values[-evaluations:]) for _, values in sorted(runs.items())]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import gzip
+import json
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +26,9 @@ from torchrl_her_recipes.config.plain_files import (
 from torchrl_her_recipes.config.study import Study
 from torchrl_her_recipes.reports.pictures import Picture
 from torchrl_her_recipes.reports.results import Combination, read_combinations
+from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap, read_arrays
+from torchrl_her_recipes.studies.seed_batches import Batches
 
 _ABOUT, _RUNS, _GOALS = "about.yaml", "runs.csv", "goals.npz"
 _DAMAGE = (AttributeError, EOFError, LookupError, OSError, TypeError, ValueError, csv.Error, zlib.error)
@@ -69,14 +72,8 @@ def read_study(study: Study, folder: Path) -> Results:
         folder: with a folder of each combination, or with the files of :func:`write_results`.
     """
     if not is_results(folder):
-        cells = read_combinations(study, folder)
-        return Results(
-            name=study.name,
-            summary=study.summary,
-            cells=cells,
-            expect=study.expect,
-            published=study.published,
-        )
+        facts = {name: getattr(study, name) for name in ("name", "summary", "expect", "published")}
+        return Results(cells=read_combinations(study, folder), **facts)
     results = read_results(folder)
     if results.name != study.name:
         raise ValueError(f"{folder} holds results of the study {results.name}, not of {study.name}")
@@ -111,17 +108,15 @@ def write_results(
         OSError: the files cannot be written.
     """
     cells = read_combinations(study, folder)
+    described = {name: getattr(study, name) for name in ("cases", "for_task", "expect", "published")}
     about = {
         "study": study.name,
         "summary": study.summary,
         "command": command or f"torchrl-her study {study.name}",
-        **_origin([folder / cell.label for cell in cells]),
-        "recipe": dict(study.recipe),
-        "vary": {name: list(values) for name, values in study.vary.items()},
-        **({"cases": dict(study.cases)} if study.cases else {}),
-        **({"for_task": dict(study.for_task)} if study.for_task else {}),
-        **({"expect": dict(study.expect)} if study.expect else {}),
-        **({"published": dict(study.published)} if study.published else {}),
+        **_origin([home for cell in cells for home in Batches(folder / cell.label).homes]),
+        "recipe": study.recipe,
+        "vary": study.vary,
+        **{name: values for name, values in described.items() if values},
     }
     return write_files(about, cells, out)
 
@@ -131,10 +126,10 @@ def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Pat
     out.mkdir(parents=True, exist_ok=True)
     _write_table(cells, out)
     _write_goals(cells, out / _GOALS)
-    states = {cell.label: {name: _plain(getattr(cell, name)) for name in _KEPT} for cell in cells}
-    text = yaml.safe_dump(
-        {**_plain(about), "combinations": states}, sort_keys=False, allow_unicode=True, width=110
-    )
+    states = {cell.label: {name: getattr(cell, name) for name in _KEPT} for cell in cells}
+    # Through JSON: YAML takes neither numpy's numbers nor subclasses of dict.
+    plain = json.loads(json.dumps({**about, "combinations": states}, default=np.generic.item))
+    text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=110)
     # Written last: a folder with this file counts as results.
     (out / _ABOUT).write_text(text, encoding="utf-8")
     return out
@@ -249,26 +244,15 @@ def _read_goals(path: Path) -> dict[str, GoalMap]:
     }
 
 
-def _origin(folders: Sequence[Path]) -> dict[str, Any]:
+def _origin(homes: Sequence[RunFolder]) -> dict[str, Any]:
     """Returns the day of the last evaluation, and the versions of packages in all runs."""
-    homes = [home for folder in folders for home in (folder, *sorted(folder.glob("seeds_*")))]
     versions: dict[str, set[str]] = {}
-    for path in (home / "run.json" for home in homes):
-        if path.is_file():
-            with naming(path):
-                for name, version in read_json(path).get("versions", {}).items():
-                    versions.setdefault(name, set()).add(str(version))
-    times = [path.stat().st_mtime for home in homes if (path := home / "metrics.csv").is_file()]
+    for path in (home.about for home in homes if home.about.is_file()):
+        with naming(path):
+            for name, version in read_json(path).get("versions", {}).items():
+                versions.setdefault(name, set()).add(str(version))
+    times = [home.metrics.stat().st_mtime for home in homes if home.metrics.is_file()]
     return {
         "date": datetime.fromtimestamp(max(times), UTC).date().isoformat(),
         "versions": {name: " or ".join(sorted(found)) for name, found in versions.items()},
     }
-
-
-def _plain(value: Any) -> Any:
-    """Converts values to types that YAML can store."""
-    if isinstance(value, Mapping):
-        return {str(name): _plain(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return value.item() if isinstance(value, np.generic) else value

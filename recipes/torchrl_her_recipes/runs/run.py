@@ -58,7 +58,7 @@ class RunResult:
     @property
     def successes(self) -> list[float]:
         """Success rate of each run in the last evaluation; empty if there was none."""
-        return last_success(self.rows) if self.rows else []
+        return last_success(self.rows)
 
     @property
     def reached(self) -> float:

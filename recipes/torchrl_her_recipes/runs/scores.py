@@ -9,21 +9,39 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-LAST = 5  # evaluations
+LAST = 3  # number of last evaluations whose mean is a run's result
+_SCORED = 5  # the same number for searches
 
 
-def last_success(rows: list[dict[str, float]]) -> list[float]:
+def at_the_end(rows: Sequence[dict[str, float]], name: str, *, evaluations: int = LAST) -> list[float]:
+    """Returns a metric of each run: the mean of its last evaluations.
+
+    Returns:
+        One number for each run, in the order of the runs.
+
+    Example:
+        >>> rows = [{"run": 0, "success": success} for success in (0.0, 0.5, 0.75, 1.0)]
+        >>> at_the_end(rows, "success")
+        [0.75]
+    """
+    runs: dict[float, list[float]] = {}
+    for row in rows:
+        runs.setdefault(row["run"], []).append(row[name])
+    return [statistics.fmean(values[-evaluations:]) for _, values in sorted(runs.items())]
+
+
+def last_success(rows: Sequence[dict[str, float]]) -> list[float]:
     """Returns the success of each run in the last evaluation."""
-    return [row["success"] for row in rows if row["epoch"] == rows[-1]["epoch"]]
+    return at_the_end(rows, "success", evaluations=1)
 
 
-def median_run(rows: list[dict[str, float]]) -> int:
+def median_run(rows: Sequence[dict[str, float]]) -> int:
     """Returns the index of the run with the median success in the last evaluation."""
     values = last_success(rows)
     return sorted(range(len(values)), key=values.__getitem__)[len(values) // 2]
 
 
-def score(rows: Sequence[dict[str, float]], *, last: int = LAST) -> float:
+def score(rows: Sequence[dict[str, float]], *, last: int = _SCORED) -> float:
     """Computes the score for searches: the median of the runs' mean success in the last evaluations.
 
     Args:
@@ -44,12 +62,7 @@ def score(rows: Sequence[dict[str, float]], *, last: int = LAST) -> float:
     """
     if last < 1:
         raise ValueError(f"last must be at least 1, got {last}")
-    counted = sorted({row["epoch"] for row in rows})[-last:]
-    successes: dict[float, list[float]] = {}
-    for row in rows:
-        if row["epoch"] in counted:
-            successes.setdefault(row["run"], []).append(row["success"])
-    return statistics.median(map(statistics.fmean, successes.values())) if successes else 0.0
+    return statistics.median(at_the_end(rows, "success", evaluations=last) or [0.0])
 
 
 class BestPolicy:

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from torchrl_her_recipes import Recipe, make_recipe
-from torchrl_her_recipes.reports.results import _differences, at_the_end, read_combinations
+from torchrl_her_recipes.reports.results import _differences, read_combinations
+from torchrl_her_recipes.runs.scores import at_the_end
 
 from .small_study import STUDY, write_run
 
