@@ -21,11 +21,11 @@ def check(options: tuple[str, ...], steps: int) -> int:
     Options are those of `torchrl-her train`. Nothing is trained. In half a minute, prints what hindsight can
     learn from, and suggests options.
     """
-    (request,) = requests(options, multirun=False)
-    facts = recipes.look_at(request.recipe, steps=steps)
-    file = Path(f"{file_name(request.recipe.task.name)}_stages.yaml")
+    (recipe,) = requests(options, multirun=False).values()
+    facts = recipes.look_at(recipe, steps=steps)
+    file = Path(f"{file_name(recipe.task.name)}_stages.yaml")
     click.echo("\n".join(_table(facts)))
-    lines = recipes.advice(facts, request.recipe, str(file))
+    lines = recipes.advice(facts, recipe, str(file))
     if any(str(file) in line for line in lines):
         if not file.exists():
             file.write_text(yaml.safe_dump(facts.stages, sort_keys=False, default_flow_style=None))

@@ -12,7 +12,6 @@ import torchrl_her_recipes as recipes  # its names are loaded when they are used
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, say_result, success_line
 from torchrl_her_recipes.cli.train_options import (
     OptionsCommand,
-    RunRequest,
     complete,
     folder_option,
     requests,
@@ -20,7 +19,7 @@ from torchrl_her_recipes.cli.train_options import (
     with_folder,
 )
 from torchrl_her_recipes.config.imports import imported_modules, needs_permission
-from torchrl_her_recipes.config.recipe import check_extending
+from torchrl_her_recipes.config.recipe import Recipe, check_extending
 from torchrl_her_recipes.config.resolve import auto_options
 
 
@@ -61,36 +60,37 @@ def train(
         click.echo(f"run: {resume}")
         _say_finished(recipes.RunFolder(resume), changes)
         return _say_end(recipes.resume(resume, options=changes))
-    run_requests = list(requests(options, multirun=multirun))  # all are checked before the first one starts
+    runs = requests(options, multirun=multirun)  # all are checked before the first one starts
     if show:
-        documents = [yaml.safe_dump(request.recipe.to_dict(), sort_keys=False) for request in run_requests]
+        documents = [yaml.safe_dump(recipe.to_dict(), sort_keys=False) for recipe in runs.values()]
         click.echo("---\n".join(documents), nl=False)
         return 0
     if multirun:
-        return _sweep(run_requests, jobs, anew=not any(option.startswith("folder=") for option in options))
-    return _say_end(_train(run_requests[0]))
+        return _sweep(runs, jobs, anew=not any(option.startswith("folder=") for option in options))
+    ((home, recipe),) = runs.items()
+    return _say_end(_train(recipe, home))
 
 
-def _train(request: RunRequest) -> recipes.RunResult:
-    components = recipes.build(request.recipe)
-    click.echo(f"run: {request.folder}")
-    if chosen := auto_options(request.recipe):
+def _train(recipe: Recipe, folder: Path) -> recipes.RunResult:
+    components = recipes.build(recipe)
+    click.echo(f"run: {folder}")
+    if chosen := auto_options(recipe):
         values = (f"{name}={getattr(getattr(components.recipe, group), name)}" for group, name in chosen)
         click.echo(f"chosen for this environment (auto): {' '.join(values)}")
-    if (stages := components.recipe.curriculum.stages) and request.recipe.curriculum.stages is None:
+    if (stages := components.recipe.curriculum.stages) and recipe.curriculum.stages is None:
         click.echo(
             f"curriculum found: entries {stages[0]['achieved_goal']} of the observation are first brought to "
             "the achieved goal, which random actions seldom change (algo=filtered_her does without)"
         )
-    if request.recipe.learner.device == "auto":
+    if recipe.learner.device == "auto":
         click.echo(f"learner.device=auto: {next(components.loss.parameters()).device}")
-    return recipes.run(components, request.folder)
+    return recipes.run(components, folder)
 
 
-def _sweep(run_requests: list[RunRequest], jobs: int | None, *, anew: bool) -> int:
+def _sweep(requested: dict[Path, Recipe], jobs: int | None, *, anew: bool) -> int:
     """Trains several runs on all cores; if one fails, the others are still trained."""
-    runs = {request.folder.name: request.recipe for request in run_requests}
-    folder = run_requests[0].folder.parent
+    runs = {home.name: recipe for home, recipe in requested.items()}
+    folder = next(iter(requested)).parent
     if anew:  # the same command resumes an unfinished sweep
         folder = recipes.unfinished_sweep(runs, folder.parent) or folder
     plan, workers = recipes.plan_study(runs, folder), recipes.make_workers(jobs=jobs)

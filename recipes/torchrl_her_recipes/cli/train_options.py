@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -36,33 +36,24 @@ def with_folder(options: tuple[str, ...], folder: str | None) -> tuple[str, ...]
     return options if folder is None else (*options, f"folder={folder}")
 
 
-@dataclass(frozen=True)
-class RunRequest:
-    """A requested run, and its folder."""
-
-    recipe: Recipe
-    folder: Path
-
-
-def requests(options: tuple[str, ...], *, multirun: bool) -> Iterator[RunRequest]:
-    """Returns the runs that arguments describe."""
+def requests(options: tuple[str, ...], *, multirun: bool) -> dict[Path, Recipe]:
+    """Returns the runs that arguments describe, by their folders."""
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     if not multirun:
         values = single(options)
         folder = values.pop("folder", None)
         recipe = _recipe(values)
-        yield RunRequest(recipe, Path(folder or f"runs/{now}_{label(recipe)}"))
-        return
-    values_given = dict(_pairs(options))
-    root = Path(values_given.pop("folder", "") or f"runs/sweep_{now}")
-    before: list[Recipe] = []
-    for number, values in enumerate(sweep(list(values_given.items()))):
+        return {Path(folder or f"runs/{now}_{label(recipe)}"): recipe}
+    given = dict(_pairs(options))
+    root = Path(given.pop("folder", "") or f"runs/sweep_{now}")
+    runs: dict[Path, Recipe] = {}
+    for number, values in enumerate(sweep(list(given.items()))):
         recipe = _recipe(values)
-        if recipe in before:
+        if recipe in runs.values():
             written = " ".join(f"{name}={value}" for name, value in values.items())
             raise ValueError(f"the sweep has the same run twice: {written}; give each value once")
-        before.append(recipe)
-        yield RunRequest(recipe, root / f"{label(recipe)}_{number}")
+        runs[root / f"{label(recipe)}_{number}"] = recipe
+    return runs
 
 
 def single(options: tuple[str, ...]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 
 from torchrl_her_recipes.config.options import AUTO, REGISTERED, what_there_is
@@ -14,74 +14,59 @@ RECENT = ("actual", "achieved")  # sources of goals besides strategies: those of
 _STRATEGY_REGISTRY = "torchrl_her.goals.strategies"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Algorithm:
     """An algorithm: a combination of hindsight, weights, curriculum and so on, on top of any learner.
 
     Args:
         name: the name that recipes take.
+        summary: one-line description for users.
+
+    Keyword Args:
         virtual: whether virtual rows are written at all.
         filter: whether virtual goals that were already achieved are left out.
-        curriculum: whether runs learn the stages of a curriculum (CHER).
         weights: the weights of virtual goals; None if recipes choose them.
-        summary: one-line description for users.
+        curriculum: whether runs learn the stages of a curriculum (CHER).
     """
 
     name: str
+    summary: str = ""
+    _: KW_ONLY
     virtual: bool = True
     filter: bool = False
     weights: str | None = None
     curriculum: bool = False
-    summary: str = ""
 
 
 _filtered = partial(Algorithm, filter=True)
 _cher = partial(Algorithm, curriculum=True, filter=True)
 _unfiltered_cher = partial(Algorithm, curriculum=True)
 
+_IBS = "prefers instructive goals"
+_RARE = "prefers goals with few others around them"
+_RND = "prefers goals new to a network (RND)"
+
 ALGORITHMS: dict[str, Algorithm] = {
     algorithm.name: algorithm
     for algorithm in (
-        Algorithm(name="no_hindsight", virtual=False, weights="none", summary="the learner alone"),
-        Algorithm(name="her", summary="hindsight experience replay"),
-        _filtered(name="filtered_her", summary="HER without virtual goals that were achieved already"),
+        Algorithm("no_hindsight", "the learner alone", virtual=False, weights="none"),
+        Algorithm("her", "hindsight experience replay"),
+        _filtered("filtered_her", "HER without virtual goals that were achieved already"),
+        Algorithm("her_ibs", f"HER that {_IBS}: weights q* - q", weights="ibs"),
+        _filtered("filtered_her_ibs", f"Filtered-HER that {_IBS}", weights="ibs"),
         Algorithm(
-            name="her_ibs", weights="ibs", summary="HER that prefers instructive goals: weights q* - q"
-        ),
-        _filtered(
-            name="filtered_her_ibs", weights="ibs", summary="Filtered-HER that prefers instructive goals"
-        ),
-        Algorithm(
-            name="her_ibs_sequential",
+            "her_ibs_sequential",
+            "HER with weights q* alone; prioritized replay does the rest",
             weights="ibs_sequential",
-            summary="HER with weights q* alone; prioritized replay does the rest",
         ),
-        _filtered(
-            name="filtered_her_rare",
-            weights="rare",
-            summary="Filtered-HER that prefers goals with few others around them",
-        ),
-        _filtered(
-            name="filtered_her_rnd",
-            weights="rnd",
-            summary="Filtered-HER that prefers goals new to a network (RND)",
-        ),
-        _cher(name="cher", summary="Filtered-HER with a curriculum: CHER"),
-        _cher(
-            name="cher_ibs",
-            weights="ibs",
-            summary="CHER that prefers instructive goals in the stages that say so",
-        ),
-        _cher(
-            name="cher_rare", weights="rare", summary="CHER that prefers goals with few others around them"
-        ),
-        _cher(name="cher_rnd", weights="rnd", summary="CHER that prefers goals new to a network (RND)"),
-        _unfiltered_cher(name="unfiltered_cher", summary="CHER without the filter"),
-        _unfiltered_cher(
-            name="unfiltered_cher_ibs",
-            weights="ibs",
-            summary="CHER that prefers instructive goals, without the filter",
-        ),
+        _filtered("filtered_her_rare", f"Filtered-HER that {_RARE}", weights="rare"),
+        _filtered("filtered_her_rnd", f"Filtered-HER that {_RND}", weights="rnd"),
+        _cher("cher", "Filtered-HER with a curriculum: CHER"),
+        _cher("cher_ibs", f"CHER that {_IBS} in the stages that say so", weights="ibs"),
+        _cher("cher_rare", f"CHER that {_RARE}", weights="rare"),
+        _cher("cher_rnd", f"CHER that {_RND}", weights="rnd"),
+        _unfiltered_cher("unfiltered_cher", "CHER without the filter"),
+        _unfiltered_cher("unfiltered_cher_ibs", f"CHER that {_IBS}, without the filter", weights="ibs"),
     )
 }
 

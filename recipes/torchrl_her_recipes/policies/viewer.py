@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -23,23 +22,6 @@ _GAP = 8  # pixels between policies
 _HOLD = 25  # times that the last frame of a film is repeated
 
 
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """Options for showing policies.
-
-    Args:
-        goals: Number of goals, side by side.
-        seed: Seed of goals and starts.
-        size: Pixels of one environment.
-        named: Whether names and successes stand below the pictures.
-    """
-
-    goals: int = 6
-    seed: int = 0
-    size: int = 240
-    named: bool = False
-
-
 class Seen(NamedTuple):
     """Number of goals that a policy achieved, of those that it had."""
 
@@ -50,23 +32,40 @@ class Seen(NamedTuple):
 class Viewer:
     """Shows policies on the same starts and goals, side by side. As a context, it closes their environments.
 
+    Args:
+        policies: The policies, all of the same task.
+
+    Keyword Args:
+        goals: Number of goals, side by side.
+        seed: Seed of goals and starts.
+        size: Pixels of one environment.
+        named: Whether names and successes stand below the pictures.
+
     Raises:
         ValueError: The policies are of different tasks, or an environment gives no pictures.
     """
 
-    def __init__(self, policies: Sequence[Policy], view: View) -> None:
+    def __init__(
+        self,
+        policies: Sequence[Policy],
+        *,
+        goals: int = 6,
+        seed: int = 0,
+        size: int = 240,
+        named: bool = False,
+    ) -> None:
         _check_comparable(policies)
-        self.view = view
-        self._labels = _labels_of(policies) if view.named else None
+        self.goals, self.seed = goals, seed
+        self._labels = _labels_of(policies) if named else None
         self._opened = ExitStack()
         self._episodes: list[LiveEpisodes] = []
         with ExitStack() as opened:
             for policy in policies:
-                env = policy.envs(view.goals, seed=view.seed, pictures=True)
+                env = policy.envs(goals, seed=seed, pictures=True)
                 opened.callback(env.close, raise_if_closed=False)
                 if not goal_env(env).can_render:
                     raise ValueError(f"{policy.source} cannot be filmed: its environment gives no pictures")
-                self._episodes.append(LiveEpisodes(env, policy, size=view.size))
+                self._episodes.append(LiveEpisodes(env, policy, size=size))
             self._opened = opened.pop_all()
         self._before = [Seen(0, 0)] * len(self._episodes)  # counts of earlier episodes
         self._round = -1
@@ -95,7 +94,7 @@ class Viewer:
     @property
     def first_goal(self) -> int:
         """Number of the first goal that is shown, counted from 1."""
-        return self._round * self.view.goals + 1
+        return self._round * self.goals + 1
 
     @property
     def desired_goal(self) -> Tensor:
@@ -117,7 +116,7 @@ class Viewer:
             self._before = self.seen
         self._round += 1
         for episodes in self._episodes:
-            episodes.start(seed=self.view.seed + self._round)
+            episodes.start(seed=self.seed + self._round)
 
     def step(self) -> None:
         """Takes a step with each policy that has open episodes."""

@@ -4,30 +4,20 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
 from torch import Tensor
 
 from torchrl_her_envs.common.rendering.key_window import Command, KeyWindow
 from torchrl_her_envs.common.rendering.pictures import underlined
 from torchrl_her_recipes.policies.policy import Policy
-from torchrl_her_recipes.policies.viewer import Seen, View, Viewer
+from torchrl_her_recipes.policies.viewer import Seen, Viewer
 from torchrl_her_recipes.runs.film import FPS
 
 _RATES = (1, 2, 4, 8, FPS, 25, 50, 100, 200)  # steps a second
 _LOOKS = 30  # times a second that keys are looked for, at least
 _MOST_NUMBERS = 3  # coordinates of a goal up to which they are shown
 _KEYS = "space: pause    n: one step    r: next goals    + -: speed    q: quit"
-
-
-class Window(Protocol):
-    """Window that shows pictures."""
-
-    def show(self, picture: np.ndarray) -> None: ...
-    def commands(self) -> list[Command]: ...
-    def wait(self, rate: float) -> None: ...
-    def close(self) -> None: ...
 
 
 def play(
@@ -49,7 +39,7 @@ def play(
             None.
         best: Whether to take the best policy of the first source, if that is a folder.
         view: ``goals``, ``seed``, ``size`` and ``named`` of
-            ``torchrl_her_recipes.policies.viewer.View``.
+            ``torchrl_her_recipes.policies.viewer.Viewer``.
 
     Returns:
         Goals that each policy achieved, and all that it had.
@@ -69,7 +59,7 @@ def play(
 
     def viewer() -> Viewer:
         policies = [Policy.load(first, run=run, best=best), *map(Policy.load, others)]
-        return Viewer(policies, View(**{"named": out is None or bool(others), **view}))
+        return Viewer(policies, **{"named": out is None or bool(others), **view})
 
     if out is not None:
         with viewer() as frames:
@@ -79,7 +69,7 @@ def play(
         return frames.seen
 
 
-def show(viewing: Viewing, window: Window) -> None:
+def show(viewing: Viewing, window: KeyWindow) -> None:
     """Shows episodes in a window until it is closed."""
     due = 0.0  # steps; each look at the keys adds its share of one
     while not viewing.over:
@@ -140,7 +130,7 @@ class Viewing:
 
     def status(self) -> str:
         """Describes goals, step and speed in a line."""
-        viewer, goals, first = self._viewer, self._viewer.view.goals, self._viewer.first_goal
+        viewer, goals, first = self._viewer, self._viewer.goals, self._viewer.first_goal
         which = f"goal {first}{self._where()}" if goals == 1 else f"goals {first} to {first + goals - 1}"
         speed = "paused" if self.paused else f"{self.rate} steps a second"
         return f"{which}, step {viewer.step_count} of {viewer.max_steps}, {speed}"

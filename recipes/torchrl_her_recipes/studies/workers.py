@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
+from importlib.util import find_spec
 
+from torchrl_her_recipes.config.values import load_name
 from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
+
+_ON_RAY = "torchrl_her_recipes.studies.workers_ray:RayWorkers"
 
 
 def make_workers(*, jobs: int | None = None, ray: str | None = None, gpus_per_job: float = 0.0) -> Workers:
@@ -22,8 +25,7 @@ def make_workers(*, jobs: int | None = None, ray: str | None = None, gpus_per_jo
     """
     if ray is None:
         return LocalWorkers(jobs)
-    try:
-        module = import_module("torchrl_her_recipes.studies.workers_ray")  # needs an extra
-    except ModuleNotFoundError as error:
-        raise ImportError("--ray needs Ray: pip install '.[cluster]'") from error
-    return module.RayWorkers(ray, gpus_per_job=gpus_per_job)
+    if find_spec("ray") is None:
+        raise ImportError("--ray needs Ray: pip install '.[cluster]'")
+    workers: Workers = load_name(_ON_RAY)(ray, gpus_per_job=gpus_per_job)
+    return workers

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -185,12 +186,12 @@ def make_sampler(name: str, seed: int) -> optuna.samplers.BaseSampler:
     """
     if name == "cmaes" and find_spec("cmaes") is None:
         raise ImportError("--sampler cmaes needs cmaes: pip install '.[tune]'")
-    makers: dict[str, Callable[[], optuna.samplers.BaseSampler]] = {
-        "tpe": lambda: optuna.samplers.TPESampler(seed=seed),
-        "random": lambda: optuna.samplers.RandomSampler(seed=seed),
-        "cmaes": lambda: optuna.samplers.CmaEsSampler(seed=seed, warn_independent_sampling=False),
+    makers: dict[str, Callable[..., optuna.samplers.BaseSampler]] = {
+        "tpe": optuna.samplers.TPESampler,
+        "random": optuna.samplers.RandomSampler,
+        "cmaes": partial(optuna.samplers.CmaEsSampler, warn_independent_sampling=False),
     }
-    return makers[name]()
+    return makers[name](seed=seed)
 
 
 def _make_pruner(name: str, epochs: int) -> optuna.pruners.BasePruner:

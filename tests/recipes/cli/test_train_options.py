@@ -47,21 +47,18 @@ def test_show_prints_documents_that_are_recipes(capsys: pytest.CaptureFixture[st
 
 
 def test_requests_and_their_folders() -> None:
-    (one,) = requests(("task=gym:FetchReach-v4", "algo=her"), multirun=False)
-    assert one.recipe == make_recipe(task="gym:FetchReach-v4", algo="her")
-    assert one.folder.name.endswith("_gym_FetchReach-v4_her_s0")
-    several = list(requests(("seed=3,4", "folder=a,b"), multirun=True))
-    assert [str(each.folder) for each in several] == [
-        "a,b/hand_v0_s3_0",
-        "a,b/hand_v0_s4_1",
-    ]
+    ((folder, recipe),) = requests(("task=gym:FetchReach-v4", "algo=her"), multirun=False).items()
+    assert recipe == make_recipe(task="gym:FetchReach-v4", algo="her")
+    assert folder.name.endswith("_gym_FetchReach-v4_her_s0")
+    several = requests(("seed=3,4", "folder=a,b"), multirun=True)
+    assert list(map(str, several)) == ["a,b/hand_v0_s3_0", "a,b/hand_v0_s4_1"]
 
 
 def test_options_of_a_task_are_given_as_the_guide_says() -> None:
     guide = (Path(__file__).parents[3] / "docs" / "gymnasium.md").read_text()
     (written,) = set(re.findall(r"`(task.options.continuing_task=\w+)`", guide))
-    (one,) = requests(("task=gym:PointMaze_UMaze-v3", written), multirun=False)
-    assert one.recipe.task.options == {"continuing_task": False}
+    (recipe,) = requests(("task=gym:PointMaze_UMaze-v3", written), multirun=False).values()
+    assert recipe.task.options == {"continuing_task": False}
     assert "task_options" not in guide
 
 
@@ -69,25 +66,23 @@ def test_goal_sources_are_given_as_a_mapping_or_one_by_one() -> None:
     mixed = make_recipe(goal_sources={"future": 2, "actual": 2})
     single = "hindsight.goal_sources."
     for written in (["goal_sources={future: 2, actual: 2}"], [f"{single}future=2", f"{single}actual=2"]):
-        (one,) = requests(tuple(written), multirun=False)
-        assert one.recipe == mixed
-    several = list(requests(("goal_sources={future: 4},{actual: 1}",), multirun=True))
-    assert [each.recipe.hindsight.sources for each in several] == [{"future": 4}, {"actual": 1}]
+        (recipe,) = requests(tuple(written), multirun=False).values()
+        assert recipe == mixed
+    several = requests(("goal_sources={future: 4},{actual: 1}",), multirun=True)
+    assert [recipe.hindsight.sources for recipe in several.values()] == [{"future": 4}, {"actual": 1}]
     with pytest.raises(ValueError, match="goal_sources needs a space behind each colon"):
-        list(requests(("goal_sources={future:2,actual:2}",), multirun=False))
+        requests(("goal_sources={future:2,actual:2}",), multirun=False)
 
 
 def test_folders_have_names_that_every_file_system_takes() -> None:
     tasks = ("task=gym:my.module:Mine/Walk-v0",)
-    (one,) = requests(tasks, multirun=False)
     several = requests((*tasks, "seed=0,1"), multirun=True)
-    for folder in (one.folder, *(each.folder for each in several)):
+    for folder in (*requests(tasks, multirun=False), *several):
         assert re.fullmatch(r"[\w./-]+", str(folder))
 
 
 def test_the_folder_is_given_in_either_way() -> None:
     for options in (with_folder(("seed=3",), "there"), with_folder(("seed=3", "folder=there"), None)):
-        (wanted,) = requests(options, multirun=False)
-        assert wanted.folder == Path("there")
+        assert list(requests(options, multirun=False)) == [Path("there")]
     with pytest.raises(ValueError, match="folder"):
-        list(requests(with_folder(("folder=here",), "there"), multirun=False))
+        requests(with_folder(("folder=here",), "there"), multirun=False)

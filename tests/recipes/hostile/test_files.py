@@ -94,7 +94,7 @@ KINDS = {
     "goals": Kind("run/goal_map.npz", GoalMap.load, BYTES, ("plot", "DIR", "--out", "NEW")),
     "preset": Kind(
         "mine.yaml",
-        lambda path: list(requests((f"preset={path}",), multirun=False)),
+        lambda path: requests((f"preset={path}",), multirun=False),
         TEXT,
         ("train", "preset=FILE", "--show"),
     ),

@@ -13,10 +13,10 @@ import torch
 from PIL import Image
 from tensordict import TensorDictBase
 
-from torchrl_her_envs.common.rendering.key_window import Command
+from torchrl_her_envs.common.rendering.key_window import Command, KeyWindow
 from torchrl_her_recipes import Policy, load_policy, play
 from torchrl_her_recipes.cli import main
-from torchrl_her_recipes.policies.viewer import View, Viewer
+from torchrl_her_recipes.policies.viewer import Viewer
 from torchrl_her_recipes.policies.window import Viewing, show
 
 
@@ -40,9 +40,7 @@ def acting(forward: Callable[[TensorDictBase], TensorDictBase], name: str) -> Po
 @pytest.fixture
 def viewer() -> Viewer:
     """A policy that achieves all goals beside one that achieves none."""
-    return Viewer(
-        [acting(to_the_ball, "good"), acting(still, "bad")], View(goals=2, seed=5, size=32, named=True)
-    )
+    return Viewer([acting(to_the_ball, "good"), acting(still, "bad")], goals=2, seed=5, size=32, named=True)
 
 
 @pytest.fixture
@@ -96,13 +94,13 @@ def test_goals_are_the_same_for_all_and_the_counts_are_of_all_that_was_seen(
 
 
 def test_a_single_goal_of_few_coordinates_is_written_out() -> None:
-    viewer = Viewer([acting(still, "mine")], View(goals=1, seed=5, size=32))
+    viewer = Viewer([acting(still, "mine")], goals=1, seed=5, size=32)
     viewing = Viewing(viewer)
     x, y = viewer.desired_goal[0].tolist()
     assert viewing.status() == f"goal 1 at ({x:.2f}, {y:.2f}), step 0 of 50, 12 steps a second"
 
 
-class Script:
+class Script(KeyWindow):
     """A window in which somebody presses keys at given looks."""
 
     def __init__(self, keys: dict[int, list[Command]]) -> None:

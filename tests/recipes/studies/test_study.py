@@ -196,7 +196,7 @@ def test_one_process_at_a_time_is_at_work_in_a_folder(tmp_path: Path) -> None:
 def test_without_ray_its_name_and_the_remedy_are_given(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "torchrl_her_recipes.studies.workers_ray", None)
+    monkeypatch.setitem(sys.modules, "ray", None)
     assert main(["study", study_names()[0], "--plan", "--ray", "auto"]) == 2
     said = capsys.readouterr().err
     assert said == "torchrl-her: --ray needs Ray: pip install '.[cluster]'\n"

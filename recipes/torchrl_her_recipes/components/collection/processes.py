@@ -13,7 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
-from importlib import import_module
+from importlib.util import find_spec
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -40,10 +40,12 @@ from torchrl_her_recipes.components.collection.worker import (
 from torchrl_her_recipes.components.devices import CPU
 from torchrl_her_recipes.config.groups import CollectionConfig
 from torchrl_her_recipes.config.imports import imported_modules
+from torchrl_her_recipes.config.values import load_name
 
 if TYPE_CHECKING:
     from torchrl_her_recipes.components.collection.ray_workers import NodeWorkers
 
+_ON_RAY = "torchrl_her_recipes.components.collection.ray_workers:NodeWorkers"
 _SECONDS = 1.0  # between two looks at whether processes still run
 _FAILED = "a process failed: worker {} (exit code {})"
 _TRACEBACK = "Worker traceback:"  # what TorchRL's message has below that is in ``__cause__``
@@ -219,7 +221,10 @@ class ProcessCollector(BaseCollector):
         make = partial(self.make_env, modules=imported_modules())
         frames = len(self.seeds) * share_of_envs(config) * config.steps_per_batch
         if config.ray is not None:
-            return _start_on_cluster(config, make, _to_send(self.policy), frames)
+            if find_spec("ray") is None:
+                raise ImportError(f"ray={config.ray} needs Ray: pip install '.[cluster]'")
+            start = partial(load_name(_ON_RAY), config.ray, make, _to_send(self.policy), frames=frames)
+            return start(processes=config.processes, sync=config.sync)
         _check_main_script(f"processes={config.processes}")
         kind = SyncWorkers if config.sync else AsyncWorkers
         with _interrupts_later():  # processes that were interrupted while they start would say so at length
@@ -282,19 +287,6 @@ def _check_main_script(asked: str) -> None:
             f"{asked} starts processes that import {path}: put what trains there under "
             "`if __name__ == '__main__':`"
         )
-
-
-def _start_on_cluster(
-    config: CollectionConfig, make: Callable[[], EnvBase], policy: TensorDictModuleBase, frames: int
-) -> Workers:
-    """Starts the processes on the nodes of a Ray cluster."""
-    try:
-        module = import_module("torchrl_her_recipes.components.collection.ray_workers")  # needs an extra
-    except ModuleNotFoundError as error:
-        raise ImportError(f"ray={config.ray} needs Ray: pip install '.[cluster]'") from error
-    return module.NodeWorkers(
-        config.ray, make, policy, processes=config.processes, frames=frames, sync=config.sync
-    )
 
 
 def _get(get: Callable[..., Any], processes: Sequence[BaseProcess]) -> Any:
