@@ -137,18 +137,10 @@ class BehaviorGoals(Transform):
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.generators: Generators = check_generators(runs, generators) or [None]
         self.reward_fn, self.weights, self.factors = reward_fn, run_weights, list(factors)
-        self.remember = remember
-        self.update_on, self.greedy, self.real_share, self.candidates = (
-            update_on,
-            greedy,
-            real_share,
-            candidates,
-        )
-        self.runs, self.achieved_reward, self.continues_after_termination = (
-            runs,
-            achieved_reward,
-            continues_after_termination,
-        )
+        self.remember, self.update_on, self.greedy = remember, update_on, greedy
+        self.real_share, self.candidates = real_share, candidates
+        self.runs, self.achieved_reward = runs, achieved_reward
+        self.continues_after_termination = continues_after_termination
         self.memory = AchievedGoals(memory, runs=runs)
         self.keys, self.stage_key, self.stage = keys, stage_key, stage
         self.ended = torch.zeros(runs, dtype=torch.int64)

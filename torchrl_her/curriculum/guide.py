@@ -177,8 +177,7 @@ class GuidedExploration(TensorDictModuleBase):
 
     def _begin(self, begun: Tensor, top: Tensor | None) -> Tensor:
         """Draws which of the episodes that begin are guided; episodes under way stay as they are."""
-        known = self.guided is not None and self.guided.dtype == torch.int64  # older states have flags here
-        if self.guided is None or not known or self.guided.shape != begun.shape:
+        if self.guided is None or self.guided.shape != begun.shape:
             self.guided = torch.full(begun.shape, -1, device=begun.device)
         self.guided = self.guided.to(begun.device)  # the tensor may have been loaded from a checkpoint
         runs = len(self.generators)

@@ -59,7 +59,7 @@ class _StageTransform(Transform):
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.curriculum, self.progress, self.run = curriculum, progress, run
         self.stage_key = unravel_key(stage_key)
-        self._tables: tuple[Any, Any] = (None, None)  # what the tables were made for, and the tables
+        self._table: tuple[Any, Any] = (None, None)  # what the table of columns was made for, and the table
         self._shown_in: tuple[int, ...] | None = None  # the stages that the last states were shown in
 
     def _stages(self) -> tuple[int, ...]:
@@ -74,6 +74,20 @@ class _StageTransform(Transform):
         if not self.progress.by_episode:
             return None
         return self._get(tensordict, self.stage_key, 1).squeeze(-1)
+
+    def _columns(self, columns: Tensor, rows: Tensor | None, device: torch.device) -> Tensor:
+        """Returns the columns [B, n] of the stages of B blocks, or of rows that carry their stages.
+
+        Args:
+            columns: [stages, n], those of each stage.
+            rows: stages [...] of the rows; None if stages are those of runs.
+            device: device of the result.
+        """
+        stages = self._stages() if rows is None else tuple(range(len(self.curriculum)))
+        made_for = stages, device
+        if self._table[0] != made_for:
+            self._table = made_for, columns[list(stages)].to(device)
+        return self._table[1] if rows is None else self._table[1][rows.flatten()]
 
     def _check_blocks(self, shape: torch.Size) -> None:
         """Raises if a batch of ``shape`` [..., width] is not one equal block for each run."""
@@ -313,18 +327,10 @@ class StateToObs(_StageTransform):
     def _observe(self, tensordict: TensorDictBase) -> None:
         """Sets the observations and goals of each row's stage."""
         state = self._get(tensordict, self.in_keys[0], self.curriculum.state_width)
-        index = self._lookup(state, self._rows_stages(tensordict))
+        index = self._columns(self.curriculum.state_index, self._rows_stages(tensordict), state.device)
         entries = take_columns(self.curriculum.extend(state), index).split(self._widths, -1)
         for key, entry in zip(self.out_keys, entries, strict=True):
             tensordict.set(key, entry)
-
-    def _lookup(self, state: Tensor, rows: Tensor | None) -> Tensor:
-        """Returns the columns [B, n] of the state for the stages of blocks or rows."""
-        stages = self._stages() if rows is None else tuple(range(len(self.curriculum)))
-        made_for = stages, state.device
-        if self._tables[0] != made_for:
-            self._tables = made_for, self.curriculum.state_index[list(stages)].to(state.device)
-        return self._tables[1] if rows is None else self._tables[1][rows.flatten()]
 
 
 class StageOutcomes(Transform):
@@ -438,7 +444,6 @@ class ZeroPad(_StageTransform):
         if progress.by_episode:
             in_keys.append(stage_key)
         super().__init__(curriculum, progress, run, in_keys, [input_key], stage_key)
-        self._sizes = [len(stage.observation) for stage in curriculum.stages]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._set_input(next_tensordict, self._rows_stages(next_tensordict))
@@ -471,18 +476,8 @@ class ZeroPad(_StageTransform):
         return observation_spec
 
     def _pad(self, observation: Tensor, goal: Tensor, stage: Tensor | None) -> Tensor:
-        if stage is not None:
-            index = self.curriculum.input_index.to(observation.device)[stage]
-            zero = observation.new_zeros(*observation.shape[:-1], 1)
-            return torch.cat((observation, goal, zero), -1).gather(-1, index)
-        self._check_blocks(observation.shape)
-        stages = self._stages()
-        if len(stages) == 1:
-            size = self._sizes[stages[0]]
-            unused = observation.new_zeros(*observation.shape[:-1], observation.shape[-1] - size)
-            return torch.cat((observation[..., :size], goal, unused), -1)
-        made_for = (stages, observation.device)
-        if self._tables[0] != made_for:
-            self._tables = made_for, self.curriculum.input_index[list(stages)].to(observation.device)
+        if stage is None:
+            self._check_blocks(observation.shape)
         zero = observation.new_zeros(*observation.shape[:-1], 1)
-        return take_columns(torch.cat((observation, goal, zero), -1), self._tables[1])
+        index = self._columns(self.curriculum.input_index, stage, observation.device)
+        return take_columns(torch.cat((observation, goal, zero), -1), index)

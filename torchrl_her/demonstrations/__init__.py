@@ -5,7 +5,7 @@ from torchrl_her.demonstrations.play import demonstrate
 from torchrl_her.demonstrations.replay import MixedReplay, demonstration_rows, write_demonstrations
 from torchrl_her.demonstrations.shown import in_stage, with_reward
 from torchrl_her.demonstrations.starts import DemonstrationStarts
-from torchrl_her.demonstrations.walk import WalkBack, step_back
+from torchrl_her.demonstrations.walk import WalkBack
 
 __all__ = [
     "DemonstrationStarts",
@@ -15,7 +15,6 @@ __all__ = [
     "demonstrate",
     "demonstration_rows",
     "in_stage",
-    "step_back",
     "with_reward",
     "write_demonstrations",
 ]

@@ -8,39 +8,6 @@ from typing import Any
 from torchrl_her.checks import check_whole
 
 
-def step_back(
-    back: int, outcomes: Sequence[bool], *, stride: int, threshold: float, samples: int, longest: int
-) -> tuple[int, list[bool]]:
-    """Moves the starts a step back if the episodes that began there were successful.
-
-    Args:
-        back: the greatest number of steps before the end at which episodes start.
-        outcomes: whether each episode since the last step back achieved its goal, oldest first.
-
-    Keyword Args:
-        stride: length of a step back.
-        threshold: share of successes at which there is one.
-        samples: number of episodes of which it is the share: the latest ones.
-        longest: ``back`` is at most this.
-
-    Returns:
-        ``(back, outcomes)``, the second one empty after a step back.
-
-    Example:
-        >>> options = {"stride": 3, "threshold": 0.5, "samples": 4, "longest": 9}
-        >>> step_back(2, [False, True, True], **options)
-        (2, [False, True, True])
-        >>> step_back(2, [False, False, False, True, True], **options)
-        (5, [])
-        >>> step_back(8, [True] * 4, **options)
-        (9, [])
-    """
-    latest = list(outcomes)[-samples:]
-    if len(latest) < samples or sum(latest) < threshold * samples:
-        return back, latest
-    return min(longest, back + stride), []
-
-
 class WalkBack:
     """Starts of episodes that walk back from the ends of demonstrations, for each of R runs by itself.
 
@@ -53,7 +20,9 @@ class WalkBack:
     Keyword Args:
         width: number of steps among which starts are drawn: from ``back - width + 1`` to ``back`` steps
             before the end.
-        stride, threshold, samples: options of a step back, see :func:`step_back`.
+        stride: length of a step back.
+        threshold: share of successes at which there is one.
+        samples: number of episodes of which it is the share: the latest ones since the last step back.
 
     Attributes:
         back: R, the greatest number of steps before the end at which episodes start.
@@ -94,14 +63,10 @@ class WalkBack:
     def record(self, run: int, outcomes: Sequence[bool]) -> None:
         """Records whether episodes of a run that started at demonstrations achieved their goal."""
         for outcome in outcomes:  # one by one: any of them may complete a step back
-            self.back[run], self._outcomes[run] = step_back(
-                self.back[run],
-                [*self._outcomes[run], outcome],
-                stride=self.stride,
-                threshold=self.threshold,
-                samples=self.samples,
-                longest=self._longest[run],
-            )
+            latest = [*self._outcomes[run], outcome][-self.samples :]
+            if len(latest) == self.samples and sum(latest) >= self.threshold * self.samples:
+                self.back[run], latest = min(self._longest[run], self.back[run] + self.stride), []
+            self._outcomes[run] = latest
 
     def restart(self, run: int, longest: int) -> None:
         """Restarts a run's walk, for other demonstrations."""

@@ -88,7 +88,7 @@ class GoalHistogram(GoalWeights):
         if state["counts"].shape != self.counts.shape:
             raise ValueError(f"the grid has {self.grid.num_cells} cells, the state {len(state['counts'])}")
         self.counts = state["counts"].to(self.counts.device, copy=True)
-        self._newest = state.get("newest", self._newest).to(self.counts.device, copy=True)
+        self._newest = state["newest"].to(self.counts.device, copy=True)
 
 
 class Instructiveness(InstructiveWeights, GoalHistogram):

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
-from typing import Any, Generic, Literal, TypeVar, get_args, overload
+from typing import Any, Literal, get_args
 
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
@@ -20,7 +20,6 @@ from torchrl_her.goals.strategies import RECENT, Strategy, get_strategy
 from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.replay_buffers.keys import LEAST_COST, TransitionKeys, in_root_and_next, under_next
 
-T = TypeVar("T")
 Per = Literal["transition", "episode"]
 _SUSPICIOUS = 10  # that many episodes of one step hardly come by chance
 
@@ -209,22 +208,16 @@ def _twice(sources: GoalSources, **repeated: Any) -> str:
     return f"{assignments} and goal_sources={{{sources_name(sources)}}} say the same: give one of them"
 
 
-class _Option(Generic[T]):
-    """Option that is read and set as an attribute of its writer or sample unit."""
+def _option(name: str) -> Any:
+    """Returns a property that reads and sets an option of a writer or sample unit."""
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
+    def read(part: HindsightBase) -> Any:
+        return getattr(part.options, name)
 
-    @overload
-    def __get__(self, instance: None, owner: type) -> _Option[T]: ...
-    @overload
-    def __get__(self, instance: Any, owner: type) -> T: ...
+    def change(part: HindsightBase, value: Any) -> None:
+        part.options = part.options.changed({name: value})
 
-    def __get__(self, instance: Any, owner: type) -> _Option[T] | T:
-        return self if instance is None else getattr(instance.options, self.name)
-
-    def __set__(self, instance: Any, value: T) -> None:
-        instance.options = instance.options.changed({self.name: value})
+    return property(read, change)
 
 
 class HindsightBase:
@@ -248,11 +241,11 @@ class HindsightBase:
         TypeError: an unknown option.
     """
 
-    k = _Option[int]()
-    strategy = _Option[Strategy]()
-    goal_sources = _Option[GoalSources | None]()
-    filter_achieved = _Option[bool]()
-    achieved_reward = _Option[float]()
+    k: int = _option("k")
+    strategy: Strategy = _option("strategy")
+    goal_sources: GoalSources | None = _option("goal_sources")
+    filter_achieved: bool = _option("filter_achieved")
+    achieved_reward: float = _option("achieved_reward")
 
     def __init__(
         self,

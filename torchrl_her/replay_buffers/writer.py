@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import replace
 from multiprocessing.context import get_spawning_popen
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
 from torchrl_her.checks import check_whole, entry_of
-from torchrl_her.files.reading import read_tensors
+from torchrl_her.files.state import StateFile
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, weights_by_run
 from torchrl_her.replay_buffers.draw import draw_for_runs
@@ -44,7 +43,6 @@ from torchrl_her.replay_buffers.stage_rules import StageRule, check_stages, spli
 
 # Transitions written at once: larger pieces touch fresh memory each time, smaller ones need more calls.
 _ROWS = 1 << 17
-_STATE_FILE = "her_writer.pt"
 
 OnWrite = Callable[[TensorDictBase, list[int], list[int]], Callable[[], None] | None]
 
@@ -68,7 +66,7 @@ class _Draft(NamedTuple):
         return [sum(both) for both in zip(self.real.counts, self.virtual.counts, strict=True)]
 
 
-class HERWriter(HindsightBase, RoundRobinWriter):
+class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     """Writes each transition as it was, and up to k times more with a goal that was achieved later.
 
     The writer takes a collector's batch: [N, T] with time last, or flat with trajectory ids. Episodes that
@@ -381,14 +379,6 @@ class HERWriter(HindsightBase, RoundRobinWriter):
         self._counts.load_state_dict(state_dict)
         for weights, saved in zip(self.goal_weights, state_dict["weights"], strict=False):
             weights.load_state_dict(saved)
-
-    def dumps(self, path: str | Path) -> None:
-        super().dumps(path)
-        torch.save(self.state_dict(), Path(path) / _STATE_FILE)
-
-    def loads(self, path: str | Path) -> None:
-        super().loads(path)
-        self.load_state_dict(read_tensors(Path(path) / _STATE_FILE))
 
     def _empty(self, empty_write_count: bool = True) -> None:
         super()._empty(empty_write_count)

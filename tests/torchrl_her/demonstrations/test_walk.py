@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from torchrl_her.demonstrations import WalkBack, step_back
+from torchrl_her.demonstrations import WalkBack
 
-RULE: dict[str, Any] = {"stride": 3, "threshold": 0.5, "samples": 4, "longest": 20}
+RULE: dict[str, Any] = {"stride": 3, "threshold": 0.5, "samples": 4}
 
 
 @pytest.mark.parametrize(
@@ -18,15 +18,17 @@ RULE: dict[str, Any] = {"stride": 3, "threshold": 0.5, "samples": 4, "longest": 
         (2, "111", (2, "111")),  # too few
         (2, "0011", (5, "")),  # half of four
         (2, "1000", (2, "1000")),
-        (2, "110001", (2, "0001")),  # only the latest four count
+        (2, "100001", (2, "0001")),  # only the latest four count
         (2, "100011", (5, "")),
         (18, "1111", (20, "")),  # the longest demonstration
         (20, "1111", (20, "")),
     ],
 )
 def test_a_step_back(back: int, outcomes: str, expected: tuple[int, str]) -> None:
-    after, left = step_back(back, [own == "1" for own in outcomes], **RULE)
-    assert (after, "".join("01"[own] for own in left)) == expected
+    walk = WalkBack([20], width=back, **RULE)
+    walk.record(0, [outcome == "1" for outcome in outcomes])
+    (left,) = walk.state_dict()["outcomes"]
+    assert (walk.back[0], "".join("01"[outcome] for outcome in left)) == expected
 
 
 def test_the_window_walks_back_as_far_as_the_longest_demonstration() -> None:

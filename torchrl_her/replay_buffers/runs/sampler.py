@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,15 +12,13 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from torchrl_her.files.reading import read_tensors
+from torchrl_her.files.state import StateFile
 from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
 from torchrl_her.replay_buffers.runs.trees import SumTrees
 from torchrl_her.torchrl_private import generator_of
 
-_STATE_FILE = "runs_sampler.pt"
 
-
-class RunsSampler(Sampler):
+class RunsSampler(StateFile, Sampler):
     """Draws the same number of transitions of each of R runs; those of a run are equally likely.
 
     The storage is R equal blocks of rows, as :class:`~torchrl_her.HERWriter` fills them. A batch is R equal
@@ -86,14 +83,8 @@ class RunsSampler(Sampler):
     def _empty(self) -> None:
         self._sizes.zero_()
 
-    def dumps(self, path: str | Path) -> None:
-        _dump(self, path)
 
-    def loads(self, path: str | Path) -> None:
-        _load(self, path)
-
-
-class RunsPrioritizedSampler(PrioritizedSampler):
+class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
     """Draws transitions of each of R runs in proportion to their priorities.
 
     It is TorchRL's ``PrioritizedSampler`` for R runs: with ``p = (|priority| + eps) ** alpha``, a row is
@@ -302,12 +293,6 @@ class RunsPrioritizedSampler(PrioritizedSampler):
             leaf = torch.arange(len(value), device=self.device)
             self._trees.set(torch.full_like(leaf, run), leaf, value.to(self.device), sorted=True)
 
-    def dumps(self, path: str | Path) -> None:
-        _dump(self, path)
-
-    def loads(self, path: str | Path) -> None:
-        _load(self, path)
-
     def __repr__(self) -> str:
         return f"{type(self).__name__}(runs={self.runs}, alpha={self._alpha}, beta={self._beta})"
 
@@ -369,12 +354,3 @@ def _all_finite(priority: Tensor, value: Tensor) -> bool:
 def _check_runs(sizes: Tensor, runs: int) -> None:
     if len(sizes) != runs:
         raise ValueError(f"the state is that of {len(sizes)} runs, not of {runs}")
-
-
-def _dump(sampler: AnyRunsSampler, path: str | Path) -> None:
-    Path(path).mkdir(exist_ok=True)
-    torch.save(sampler.state_dict(), Path(path) / _STATE_FILE)
-
-
-def _load(sampler: AnyRunsSampler, path: str | Path) -> None:
-    sampler.load_state_dict(read_tensors(Path(path) / _STATE_FILE))
