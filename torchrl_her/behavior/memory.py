@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_her.checks import check_whole
-from torchrl_her.replay_buffers.runs.streams import Generators, uniform
+from torchrl_her.randomness import Generators, uniform
 
 
 class AchievedGoals:

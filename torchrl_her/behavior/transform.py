@@ -20,7 +20,7 @@ from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights, weights_by_run
 from torchrl_her.modules.noise import generator_states, set_generator_states
-from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
+from torchrl_her.randomness import Generators, check_generators, uniform
 
 UpdateOn = Literal["achieved", "proposed"]
 

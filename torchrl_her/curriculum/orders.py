@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress
 from torchrl_her.modules.noise import generator_states, set_generator_states
-from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
+from torchrl_her.randomness import Generators, check_generators, uniform
 
 
 class EpisodeStages(CurriculumProgress):

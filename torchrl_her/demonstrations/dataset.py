@@ -255,10 +255,6 @@ class Demonstrations:
 
 
 def check_free(path: str | Path, *, force: bool = False) -> None:
-    """Raises a FileExistsError if a file would be overwritten.
-
-    Raises:
-        ValueError: it exists, and ``force`` is False.
-    """
+    """Raises a ValueError if a file exists, unless ``force`` says that it may be overwritten."""
     if Path(path).exists() and not force:
         raise ValueError(f"{path} exists already: choose another name, or --force (force=True) to replace it")

@@ -7,13 +7,14 @@ many transitions share. What the strategy allows is a part of it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrl_her.goals.factors import between, combine, draw, draw_alike, draw_weighted
 from torchrl_her.goals.weights import checked_weights
+from torchrl_her.randomness import RunDraws
 
 # Likelihoods of goals [transitions, W] that are held in memory at once.
 LIKELIHOODS = 1 << 17
@@ -22,16 +23,6 @@ TRIES = 8
 
 Index = Tensor | slice
 Keep = Callable[[Index, Tensor], Tensor]
-
-
-class Draws(Protocol):
-    """Uniform numbers in [0, 1) for transitions [n]."""
-
-    def __call__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-        """Returns random numbers of a shape [n, k]."""
-
-    def of(self, some: Tensor) -> Self:
-        """Returns the random numbers for the transitions at the positions ``some``."""
 
 
 class Candidates(NamedTuple):
@@ -61,7 +52,7 @@ def choose_goals(
     *,
     weights: Callable[[Tensor], Tensor] | None,
     keep: Keep | None,
-    draws: Draws,
+    draws: RunDraws,
     tries: int = 0,
     redraw: bool = True,
 ) -> tuple[Tensor, Tensor]:
@@ -91,7 +82,6 @@ def choose_goals(
         ValueError: weights are negative or not finite.
 
     Example:
-        >>> from torchrl_her.replay_buffers.runs.streams import RunDraws
         >>> goals = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
         >>> line = torch.tensor([[0, 1, 2, 3]])  # for two transitions; the second may take the last two
         >>> first, end = torch.tensor([0, 2]), torch.tensor([4, 4])
@@ -146,7 +136,7 @@ def choose_goals(
     return table.take(begin.unsqueeze(-1) + index), valid
 
 
-def _propose(candidates: Candidates, k: int, weight: Tensor | None, draws: Draws) -> Tensor:
+def _propose(candidates: Candidates, k: int, weight: Tensor | None, draws: RunDraws) -> Tensor:
     """Draws k positions in the lines of n transitions, [n, k], without the filter."""
     _, _, line, first, end = candidates
     if weight is None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from difflib import get_close_matches
 from numbers import Integral
 
-from torchrl_her.goals.strategies import RECENT, STRATEGIES, Strategy, get_strategy, strategy_name
+from torchrl_her.goals.strategies import RECENT, STRATEGIES, Strategy, strategy_name
 
 GoalSources = Mapping[Strategy, int]
 
@@ -59,14 +59,8 @@ def sources_name(sources: GoalSources) -> str:
 
 
 def _check_source(source: Strategy) -> None:
-    if source in RECENT:
-        return
-    try:
-        get_strategy(source)
-    except ValueError:
-        known = [*STRATEGIES, *RECENT]
+    known = [*STRATEGIES, *RECENT]
+    if not callable(source) and source not in known:
         nearest = get_close_matches(str(source), known, n=1)
         hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-        raise ValueError(
-            f"unknown goal source {source!r}; the sources are {', '.join(known)}{hint}"
-        ) from None
+        raise ValueError(f"unknown goal source {source!r}; the sources are {', '.join(known)}{hint}")

@@ -103,8 +103,6 @@ class RunningNorm(nn.Module):
             unit of the values. None for one ten-thousandth of an entry's mean, in whatever unit it is.
 
     Attributes:
-        widths: as given.
-        runs: R.
         n, mean, var: [R, W] of float64, the moments of all numbers of all entries, in their order.
         frozen: whether :meth:`update` and :meth:`count` do nothing. It is no part of ``state_dict``.
 

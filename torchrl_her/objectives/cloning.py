@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_her.objectives.critics import critic_value
+from torchrl_her.objectives.critics import action_key, critic_value
 
 DEMONSTRATION = "demonstration"  # the flag of rows that are demonstrations
 
@@ -98,8 +98,7 @@ def with_cloning(value: Tensor, loss: Any, cloning: Cloning, transitions: Tensor
     at = flagged.reshape(-1, batch).any(0).nonzero().squeeze(-1)  # other rows have weight 0
     if len(at) == 0:
         return value
-    # DDPG's loss has no name for the action, but its actor has.
-    key = getattr(loss.tensor_keys, "action", loss.actor_network.out_keys[0])
+    key = action_key(loss)
     rows = transitions.select(*loss.actor_network.in_keys, key)[..., at]
     shown = rows.get(key)
     with (

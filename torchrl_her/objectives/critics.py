@@ -84,6 +84,11 @@ def critic_values(loss: LossModule, transitions: TensorDictBase) -> Tensor | Non
     return torch.cat([value.mean(-1, keepdim=True) for value in values], -1)
 
 
+def action_key(loss: LossModule) -> Any:
+    """Returns the key of the actions of a loss; DDPG's does not name it, but its actor does."""
+    return loss.actor_network.out_keys[0] if isinstance(loss, DDPGLoss) else loss.tensor_keys.action
+
+
 def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
     """Returns the least value of all critics, or of some that are drawn at random for each run.
 

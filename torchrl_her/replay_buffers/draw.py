@@ -14,11 +14,11 @@ from torchrl_her.goals.choose import TRIES, Candidates, Index, choose_goals
 from torchrl_her.goals.rewards import Outcome, ends_at_goals, missed
 from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
+from torchrl_her.randomness import Generators, RunDraws
 from torchrl_her.replay_buffers.episodes import Episodes
 from torchrl_her.replay_buffers.options import Per
 from torchrl_her.replay_buffers.runs.chunk import Chunk
 from torchrl_her.replay_buffers.runs.recent import RecentGoals
-from torchrl_her.replay_buffers.runs.streams import Generators, RunDraws
 
 Keep = Callable[[Any, Tensor], Tensor]
 

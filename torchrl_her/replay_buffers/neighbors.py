@@ -67,21 +67,13 @@ def refuse_beside_writer(
 
 
 def refuse_shared(name: str, storage: Storage) -> None:
-    """Raises an error if several processes write into a storage.
-
-    Raises:
-        RuntimeError: a buffer of this storage is shared.
-    """
+    """Raises a RuntimeError if a buffer of a storage is shared between processes."""
     if any(getattr(buffer, "shared", False) for buffer in buffers_of(storage)):
         raise RuntimeError(f"{name} cannot work in a buffer that is shared between processes: {SHARED}")
 
 
 def refuse_unordered(name: str, storage: Storage) -> None:
-    """Raises an error unless a storage holds real transitions in the order of time.
-
-    Raises:
-        ValueError: a buffer of this storage writes them in another order, or relabels them.
-    """
+    """Raises a ValueError if a buffer does not write real transitions in the order of time to a storage."""
     for buffer in buffers_of(storage):
         writer = getattr(buffer, "writer", None)
         if isinstance(writer, HindsightBase) and writer.k > 0:
@@ -97,11 +89,7 @@ def refuse_unordered(name: str, storage: Storage) -> None:
 
 
 def refuse_padded(name: str, transitions: TensorDictBase) -> None:
-    """Raises an error if trajectories were split and padded.
-
-    Raises:
-        ValueError: they were.
-    """
+    """Raises a ValueError if trajectories were split and padded."""
     if MASK in transitions.keys(True):
         raise ValueError(
             f"{name} needs batches that are not split and padded: make the collector with split_trajs=False"
@@ -109,11 +97,7 @@ def refuse_padded(name: str, transitions: TensorDictBase) -> None:
 
 
 def refuse_stages(name: str, transitions: TensorDictBase, options: HindsightOptions) -> None:
-    """Raises an error if transitions carry a stage although one reward relabels those of all stages.
-
-    Raises:
-        ValueError: they do.
-    """
+    """Raises a ValueError if transitions carry a stage although one reward relabels those of all stages."""
     if options.k > 0 and options.stage_key in transitions.keys(True):
         raise ValueError(
             f"{name} got transitions that carry their stage ({options.stage_key!r}), and has one reward for "
@@ -122,11 +106,7 @@ def refuse_stages(name: str, transitions: TensorDictBase, options: HindsightOpti
 
 
 def refuse_priorities(name: str, storage: Storage, transitions: TensorDictBase) -> None:
-    """Raises an error if a batch of several dimensions brings its own priorities, which TorchRL cannot set.
-
-    Raises:
-        ValueError: it does.
-    """
+    """Raises a ValueError if a batch [N, T] brings its own priorities, which TorchRL cannot set."""
     for buffer in buffers_of(storage):
         key = getattr(buffer, "priority_key", None)
         if transitions.ndim > 1 and key is not None and transitions.get(key, None) is not None:
@@ -145,11 +125,10 @@ def has_slices(storage: Storage) -> bool:
 
 
 def refuse_slices(name: str, storage: Storage) -> None:
-    """Raises an error if TorchRL samples wrong sequences from a storage of this kind.
+    """Raises a ValueError if TorchRL samples wrong sequences from a storage of this kind.
 
-    Raises:
-        ValueError: a sampler writes its marks into a storage of lists, or what it takes for sequences in a
-            full storage of several dimensions are none.
+    A sampler of slices writes its marks into a storage of lists. In a full storage of several dimensions,
+    what a prioritized one takes for sequences are none.
     """
     if isinstance(storage, ListStorage) and has_slices(storage):
         raise ValueError(
@@ -165,11 +144,7 @@ def refuse_slices(name: str, storage: Storage) -> None:
 
 
 def refuse_consuming(name: str, storage: Storage) -> None:
-    """Raises an error if transitions are removed when they are sampled.
-
-    Raises:
-        ValueError: a buffer of this storage consumes its transitions.
-    """
+    """Raises a ValueError if transitions are removed when they are sampled."""
     if any(isinstance(sampler, ConsumingSampler) for sampler in samplers_of(storage)):
         raise ValueError(
             f"{name} cannot work in a buffer that consumes its transitions (consume_after_n_samples, "
@@ -179,11 +154,7 @@ def refuse_consuming(name: str, storage: Storage) -> None:
 
 
 def refuse_n_steps(name: str, transitions: TensorDictBase) -> None:
-    """Raises an error if transitions span several steps already.
-
-    Raises:
-        ValueError: they do.
-    """
+    """Raises a ValueError if transitions span several steps already."""
     if transitions.get(STEPS_KEY, None) is not None:
         raise ValueError(
             f"{name} got transitions that span several steps (entry {STEPS_KEY!r}, as MultiStep and "
@@ -193,10 +164,9 @@ def refuse_n_steps(name: str, transitions: TensorDictBase) -> None:
 
 
 def refuse_copies_in_slices(name: str, storage: Storage, options: HindsightOptions) -> None:
-    """Raises an error if sequences are sampled from a storage to which single transitions are written.
+    """Raises a ValueError if sequences are sampled from a storage of single transitions.
 
-    Raises:
-        ValueError: they would be copies of one transition, or overlap.
+    These would be copies of one transition, or overlap.
     """
     if not has_slices(storage):
         return
@@ -213,11 +183,7 @@ def refuse_copies_in_slices(name: str, storage: Storage, options: HindsightOptio
 
 
 def refuse_other_runs(name: str, storage: Storage, transitions: TensorDictBase, *, runs: int) -> None:
-    """Raises an error if a batch, the storage or a sampler is not made for the writer's runs.
-
-    Raises:
-        ValueError: one of them does not fit.
-    """
+    """Raises a ValueError if a batch, the storage or a sampler is not made for the writer's runs."""
     if runs == 1:
         return
     if transitions.ndim != 2 or len(transitions) % runs:

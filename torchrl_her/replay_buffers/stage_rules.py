@@ -38,12 +38,15 @@ def split_stages(
         episodes: positions among them.
         run: [E] int64, the run of each episode; None if there is only one.
         key: key of the stage [n, 1].
-        stages: rules of the stages.
+        stages: rules of the stages; empty if episodes have none.
 
     Raises:
         KeyError: rows do not carry their stage.
         ValueError: there is no such stage.
     """
+    if not stages:
+        yield 0, rows, episodes, run
+        return
     if len(episodes.lengths) == 0:
         return
     stage = rows.get(key, None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from multiprocessing.context import get_spawning_popen
 from typing import Any, NamedTuple
@@ -18,8 +18,9 @@ from torchrl_her.checks import check_whole, entry_of
 from torchrl_her.files.state import StateFile
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, weights_by_run
+from torchrl_her.randomness import check_generators
 from torchrl_her.replay_buffers.draw import draw_for_runs
-from torchrl_her.replay_buffers.episodes import Episodes, find_episodes, time_order
+from torchrl_her.replay_buffers.episodes import find_episodes, time_order
 from torchrl_her.replay_buffers.keys import device_of, in_root_and_next
 from torchrl_her.replay_buffers.lanes import broken, ends_of_held
 from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer, refuse_stages
@@ -37,7 +38,6 @@ from torchrl_her.replay_buffers.runs.recent import RecentGoals
 from torchrl_her.replay_buffers.runs.rings import Places, Rings
 from torchrl_her.replay_buffers.runs.rows import join_rows
 from torchrl_her.replay_buffers.runs.storage import PackedStorage, write_slices
-from torchrl_her.replay_buffers.runs.streams import check_generators
 from torchrl_her.replay_buffers.runs.written import WrittenRows, real_rows, virtual_rows
 from torchrl_her.replay_buffers.stage_rules import StageRule, check_stages, split_stages
 
@@ -122,12 +122,6 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
             :class:`~torchrl_her.modules.RunningNorm`.
         **changes: options by name, as in the example; all are listed in
             :class:`~torchrl_her.HindsightOptions`.
-
-    Attributes:
-        runs: R.
-        counts: transitions written since the buffer was last emptied; of all runs.
-        totals: transitions ever written; of all runs.
-        held_back: number of transitions of open episodes that wait for their end.
 
     Raises:
         ValueError: an option is out of its range, or (when extending) the writer does not fit another part.
@@ -218,12 +212,12 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
 
     @property
     def counts(self) -> WriterCounts:
-        """Counts of the transitions written since the buffer was last emptied."""
+        """Counts of the transitions of all runs written since the buffer was last emptied."""
         return WriterCounts.sum(self._counts.counts)
 
     @property
     def totals(self) -> WriterCounts:
-        """Counts of all transitions ever written."""
+        """Counts of all transitions of all runs that were ever written."""
         return WriterCounts.sum(self._counts.totals)
 
     def counts_of(self, run: int) -> WriterCounts:
@@ -447,7 +441,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         entries = max(1, min(_ROWS, self.capacity) // most), _ROWS // most
         episode_runs = None if run is None else run[episodes.rows[:, :1]].flatten()
         recent, settings, drafts, first_id = list(self._recent), self._settings(), [], self._episodes
-        for stage, stage_rows, part, run_of in self._by_stage(rows, episodes, episode_runs):
+        parts = split_stages(rows, episodes, episode_runs, self._keys.stage, self.stages)
+        for stage, stage_rows, part, run_of in parts:
             recent_goals = recent[stage].after(
                 stage_rows, part, run_of, self._keys, sizes=self.options.remembered
             )
@@ -460,14 +455,6 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         self._commit(drafts, places)
         self._episodes = first_id
         return places.rows(self._rings.cursors, self.capacity)[held:], left, recent
-
-    def _by_stage(
-        self, rows: TensorDictBase, episodes: Episodes, run: Tensor | None
-    ) -> Iterable[tuple[int, TensorDictBase, Episodes, Tensor | None]]:
-        """Yields transitions and episodes of each stage; all of them if episodes have no stages."""
-        if not self.stages:
-            return [(0, rows, episodes, run)]
-        return split_stages(rows, episodes, run, self._keys.stage, self.stages)
 
     def _settings(self) -> list[Hashable]:
         """Returns settings of each run that must be equal in runs that are written at once."""
@@ -537,8 +524,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
 
     def _weights_of_runs(self) -> WeightsOfRuns:
         """Returns the weights of all runs as one object; there must be weights."""
-        weights = self.goal_weights
-        return weights[0].of_runs(weights) if isinstance(weights[0], GoalWeights) else WeightsOfRuns(weights)
+        return self.goal_weights[0].of_runs(self.goal_weights)
 
     def _store(self, rows: TensorDictBase, runs: list[int], counts: list[int]) -> None:
         """Writes rows slice by slice, which is far faster than the plain writer's index for each row.

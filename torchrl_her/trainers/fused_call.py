@@ -13,9 +13,10 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_her.native.job import STOCHASTIC, Algorithm, Layer, Structures
+from torchrl_her.objectives.critics import action_key
 from torchrl_her.replay_buffers.keys import under_next
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY
-from torchrl_her.trainers.fusing import FusedLoss, action_key
+from torchrl_her.trainers.fusing import FusedLoss
 
 # OpenMP's threads are not there in a process that was forked; starting them anew hangs.
 _FORKED: list[bool] = []

@@ -19,6 +19,7 @@ from torchrl_her.modules.networks import ActorNet, CriticNet, StackedBatchNorm
 from torchrl_her.modules.q_actor import QNet
 from torchrl_her.modules.stochastic_actor import StochasticActorNet
 from torchrl_her.native.job import STOCHASTIC, Algorithm, Norm
+from torchrl_her.objectives.critics import action_key
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss
 from torchrl_her.objectives.sac import PenalizedSACLoss
 from torchrl_her.objectives.targets import BuffersSoftUpdate, ClampedTD0, RunsHardUpdate
@@ -35,19 +36,19 @@ class FusedLoss:
 
     Attributes:
         algorithm: the steps.
-        actor: the attribute of the actor, or of the values of discrete actions.
-        actor_net: its type.
-        critic: the attribute of the critic or critics, None if there is none.
+        actor_net: type of the actor's network.
         losses: the names of what is measured.
         fixed: attributes of the loss and the values that they must have, besides those of all losses.
+        actor: the attribute of the actor, or of the values of discrete actions.
+        critic: the attribute of the critic or critics, None if there is none.
     """
 
     algorithm: Algorithm
-    actor: str
     actor_net: type[nn.Module]
-    critic: str | None
     losses: tuple[str, ...]
     fixed: dict[str, Any]
+    actor: str = "actor_network"
+    critic: str | None = "qvalue_network"
 
 
 _KEYS = ("reward", "terminated", "done")
@@ -70,47 +71,35 @@ _SOFT = {
     "max_log_alpha": None,
     "_version": 2,
 }
+_SOFT_LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
 
 FUSED: dict[type[LossModule], FusedLoss] = {
     PenalizedDDPGLoss: FusedLoss(
         Algorithm.DDPG,
-        "actor_network",
         ActorNet,
-        "value_network",
         ("loss_actor", "loss_value"),
         {**_HARD, "delay_actor": True, "delay_value": True},
+        critic="value_network",
     ),
     PenalizedTD3Loss: FusedLoss(
         Algorithm.TD3,
-        "actor_network",
         ActorNet,
-        "qvalue_network",
         ("loss_actor", "loss_qvalue"),
         {**_HARD, "delay_actor": True, "delay_qvalue": True},
     ),
     PenalizedSACLoss: FusedLoss(
-        Algorithm.SAC,
-        "actor_network",
-        StochasticActorNet,
-        "qvalue_network",
-        ("loss_actor", "loss_qvalue", "loss_alpha"),
-        {**_SOFT, "loss_function": "l2"},
+        Algorithm.SAC, StochasticActorNet, _SOFT_LOSSES, {**_SOFT, "loss_function": "l2"}
     ),
     PenalizedTQCLoss: FusedLoss(
-        Algorithm.TQC,
-        "actor_network",
-        StochasticActorNet,
-        "qvalue_network",
-        ("loss_actor", "loss_qvalue", "loss_alpha"),
-        {**_SOFT, "loss_function": "smooth_l1"},
+        Algorithm.TQC, StochasticActorNet, _SOFT_LOSSES, {**_SOFT, "loss_function": "smooth_l1"}
     ),
     DQNLoss: FusedLoss(
         Algorithm.DQN,
-        "value_network",
         QNet,
-        None,
         ("loss",),
         {**_HARD, "delay_value": True, "double_dqn": True, "action_space": "categorical"},
+        actor="value_network",
+        critic=None,
     ),
 }
 
@@ -169,13 +158,6 @@ def network_of(module: nn.Module) -> nn.Module:
     if isinstance(module, TensorDictSequential):
         module = module[0]
     return module.module  # type: ignore[return-value]
-
-
-def action_key(loss: LossModule) -> Any:
-    """Returns the key of the actions; DDPG's loss does not name it, but its actor does."""
-    if isinstance(loss, PenalizedDDPGLoss):
-        return loss.actor_network.out_keys[0]
-    return loss.tensor_keys.action
 
 
 def _obstacles(loss: LossModule, fused: FusedLoss) -> Iterator[str]:

@@ -217,22 +217,18 @@ class Trainer:
             _check_batch(batch)
             if ("collector", "traj_ids") not in batch.keys(True):
                 raise ValueError("the collector must mark trajectories: episodes are cut where epochs begin")
-            is_last = self.frames + batch.numel() // self.runs >= end
+            collected = batch.numel() // self.runs  # frames of one run
+            is_last = self.frames + collected >= end
             if not is_last and isinstance(self.collector, CollectsAhead):
                 self.collector.collect_ahead()
-            collected = self._write(cut_episodes(batch) if cut and is_last else batch)
+            if len(batch) % self.runs:
+                raise ValueError(f"{len(batch)} environments cannot be shared out among {self.runs} runs")
+            self.buffer.extend(cut_episodes(batch) if cut and is_last else batch)
             self.frames += collected
             self._credit += collected / self.frames_per_update
             measured += self._learn()
             if on_batch is not None:
                 on_batch(self)
-
-    def _write(self, batch: TensorDictBase) -> int:
-        """Writes a batch into the buffer; returns the number of frames of one run."""
-        if len(batch) % self.runs:
-            raise ValueError(f"{len(batch)} environments cannot be shared out among {self.runs} runs")
-        self.buffer.extend(batch)
-        return batch.numel() // self.runs
 
     def _learn(self) -> list[dict[str, Tensor]]:
         """Makes all gradient steps that the collected frames allow."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_her.goals import choose
 from torchrl_her.goals.choose import Candidates, Index, choose_goals
-from torchrl_her.replay_buffers.runs.streams import RunDraws
+from torchrl_her.randomness import RunDraws
 
 # Two lines of four goals, the second one padded: goals 0 to 3, and 4 to 6.
 GOALS = torch.arange(7.0).unsqueeze(-1)

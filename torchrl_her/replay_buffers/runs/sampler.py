@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from torchrl_her.files.state import StateFile
-from torchrl_her.replay_buffers.runs.streams import Generators, check_generators, uniform
+from torchrl_her.randomness import Generators, check_generators, uniform
 from torchrl_her.replay_buffers.runs.trees import SumTrees
 from torchrl_her.torchrl_private import generator_of
 
