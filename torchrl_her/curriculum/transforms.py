@@ -478,6 +478,10 @@ class ZeroPad(_StageTransform):
     def _pad(self, observation: Tensor, goal: Tensor, stage: Tensor | None) -> Tensor:
         if stage is None:
             self._check_blocks(observation.shape)
+            if len(stages := self._stages()) == 1:  # without an index, which takes several times as long
+                size = len(self.curriculum.stages[stages[0]].observation)
+                unused = observation.new_zeros(*observation.shape[:-1], observation.shape[-1] - size)
+                return torch.cat((observation[..., :size], goal, unused), -1)
         zero = observation.new_zeros(*observation.shape[:-1], 1)
         index = self._columns(self.curriculum.input_index, stage, observation.device)
         return take_columns(torch.cat((observation, goal, zero), -1), index)
