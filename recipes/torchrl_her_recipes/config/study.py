@@ -221,9 +221,6 @@ def load_study(
         ValueError: there is no such study, or a number below 1.
     """
     path = find_file("study", name)
-    for option, value in (("seeds", seeds), ("frames", frames)):
-        if value is not None and value < 1:
-            raise ValueError(f"{option} must be at least 1, got {value}")
     values = read_mapping(path)
     preset = values.pop("preset", None)
     known = [field.name for field in fields(Study) if field.name != "name"]

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.choices.behavior import Proposed
-from torchrl_her_recipes.config.options import AUTO, idle_options
+from torchrl_her_recipes.config.options import idle_options
 
 
 def without_effect(groups: Any) -> dict[tuple[str, str], str]:
@@ -38,8 +38,8 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     yield "termination" not in takes, with_task, ["task.failure"]
     yield "dtype" not in takes, with_task, ["run.dtype"]
 
-    given = algorithm.virtual and groups.hindsight.goal_sources not in (None, AUTO)
-    yield given, "with goal_sources", ["hindsight.k", "hindsight.strategy"]
+    mixed = algorithm.virtual and groups.hindsight.goal_sources is not None
+    yield mixed, "with goal_sources", ["hindsight.k", "hindsight.strategy"]
     with_algo = f"with algo={algorithm.name}"
     of_filter = ["hindsight.redraw", "hindsight.refill"]
     yield not algorithm.filter, with_algo, of_filter

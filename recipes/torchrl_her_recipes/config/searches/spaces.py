@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.choices.learners import BY_ACTIONS
-from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.plain_files import read_yaml, shown
 from torchrl_her_recipes.config.recipe import Recipe, compose, drop_alternatives
 from torchrl_her_recipes.config.shipped import find_file, shipped_names
@@ -81,12 +80,6 @@ class Space:
             raise ValueError(f"all options of the space {self.name} are given: there is nothing to search")
         return replace(self, ranges=left)
 
-    def with_effect(self, recipe: Recipe) -> Space:
-        """Returns the space without options that have no effect on a recipe."""
-        idle = _idle(recipe)
-        left = {name: values for name, values in self.ranges.items() if locate(name) not in idle}
-        return replace(self, ranges=left)
-
     def check(self, recipe: Recipe) -> None:
         """Checks that a recipe accepts the ends of all ranges, and all values of choices.
 
@@ -114,7 +107,7 @@ class Space:
 
     def values_of(self, recipe: Recipe) -> dict[str, Any]:
         """Returns a recipe's values of the options that have an effect, inside the ranges or not."""
-        idle = _idle(recipe)
+        idle = without_effect(recipe)
         places = {name: locate(name, recipe.to_dict()) for name in self.ranges}
         return {
             name: getattr(getattr(recipe, group), option)
@@ -180,14 +173,6 @@ def _includes(values: Mapping[str, Any], value: Any) -> bool:
     return isinstance(value, int | float) and values["low"] <= value <= values["high"]
 
 
-def _idle(recipe: Recipe) -> set[tuple[str, str]]:
-    """Returns the options that have no effect on a recipe, as (group, name)."""
-    idle = set(without_effect(recipe))
-    if recipe.hindsight.goal_sources == AUTO:  # sources that a run takes in place of k and strategy
-        idle |= {("hindsight", "k"), ("hindsight", "strategy")}
-    return idle
-
-
 def space_names() -> list[str]:
     """Returns the names of all spaces that come with the package, one for each learner."""
     return shipped_names("space")
@@ -228,4 +213,6 @@ def space_for(recipe: Recipe) -> Space:
     if learner not in space_names():
         known = ", ".join(space_names())
         raise ValueError(f"learner={learner} has no space of its own ({known} have): give one, --space FILE")
-    return load_space(learner).with_effect(recipe)
+    space, idle = load_space(learner), without_effect(recipe)
+    left = {name: values for name, values in space.ranges.items() if locate(name) not in idle}
+    return replace(space, ranges=left)
