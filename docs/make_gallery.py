@@ -1,7 +1,7 @@
 """Makes ``images/gallery/NAME.gif``: each policy that comes with the package, in its task.
 
-Run it as ``python docs/make_gallery.py``; it needs the extra ``robotics``. The goals are the first
-ones of one seed; none is chosen by hand.
+Run it as ``python docs/make_gallery.py``; it needs the extra ``robotics`` and panda-gym. The goals are the
+first ones of one seed; none is chosen by hand.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.shipped import find_policy
+from torchrl_her_recipes.config.shipped import find_policy, policy_files
 from torchrl_her_recipes.policies.info import KEYS, PolicyInfo, describe_env, present_versions
 from torchrl_her_recipes.policies.model_card import card_path, check_free, write_model_card
 from torchrl_her_recipes.policies.network import load_network
@@ -36,6 +36,7 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.policy_file import read_policy, write_policy
 from torchrl_her_recipes.runs.scores import median_run
 
+_AT_ONCE = 100  # environments that measure a policy: some, as those of PyBullet, take 15 MB each
 _MEASURED = 1 << 41  # seeds that no training uses: for episodes that measure a policy,
 _COMPARED = 1 << 42  # and for those on whose states an ONNX file is compared with it
 
@@ -119,6 +120,8 @@ class Policy(TensorDictModuleBase):
             )
         with naming(path, "is not an exported policy"):
             info, recipe = PolicyInfo.from_dict(described["info"]), Recipe.from_dict(described["recipe"])
+            if path in policy_files().values():  # this package's own files may name modules
+                permit_task(info.task)
             return cls(info, recipe, weights, str(source))
 
     @classmethod
@@ -220,12 +223,15 @@ class Policy(TensorDictModuleBase):
 
     def measure(self, episodes: int = 1_000, *, seed: int = _MEASURED) -> tuple[float, float]:
         """Returns the shares of episodes whose goal is achieved at the last step, and at some step."""
-        with closing(self.envs(episodes, seed=seed)) as env:
-            rollout = evaluate(env, self, max_steps=goal_env(env).max_steps)
-            at_last, at_some = (
-                metric(rollout, **judging(env)).double().mean() for metric in (success, reached)
-            )
-        return float(at_last), float(at_some)
+        results: list[list[bool]] = []
+        with closing(self.envs(min(episodes, _AT_ONCE), seed=seed)) as env:
+            max_steps, judged_by = goal_env(env).max_steps, judging(env)
+            while len(results) < episodes:
+                rollout = evaluate(env, self, max_steps=max_steps)
+                judged = (metric(rollout, **judged_by) for metric in (success, reached))
+                results += torch.stack(tuple(judged), 1).tolist()
+        at_last, at_some = torch.tensor(results[:episodes]).double().mean(0).tolist()
+        return at_last, at_some
 
     def save(self, path: str | Path, *, card: bool = True) -> None:
         """Writes the policy as a file: for :meth:`load` if its suffix is ``.safetensors``, for onnxruntime if
