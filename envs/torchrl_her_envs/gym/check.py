@@ -35,6 +35,7 @@ _LIMIT_STEPS = 1_000  # that are played to see where an environment truncates an
 _LIMIT = 100  # length at which other episodes are truncated
 _HALVINGS = 30
 _COARSE = 0.05  # steps of float32, relative to the standard deviation of a goal
+_NOISE = 1e-5  # standard deviation of an entry of goals, relative to the largest, below which it is noise
 
 
 def spec_of(env: gymnasium.Env) -> EnvSpec:
@@ -227,7 +228,7 @@ def coarse_goals(id: str, achieved: np.ndarray) -> str:
     """Returns a warning if achieved goals [n, g] are so far from 0 that float32 rounds their changes."""
     size, spread = np.abs(achieved).max(0), achieved.std(0, dtype=np.float64)
     steps = np.spacing(size.astype(np.float32))
-    coarse = (spread > 0) & (steps > _COARSE * spread)
+    coarse = (spread > _NOISE * spread.max()) & (steps > _COARSE * spread)
     if not coarse.any():
         return ""
     at = int(coarse.argmax())

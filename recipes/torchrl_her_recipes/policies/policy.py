@@ -22,7 +22,7 @@ from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.agents import find_learner, shape_of
 from torchrl_her_recipes.components.curricula import make_curriculum
-from torchrl_her_recipes.components.envs import TaskEnvs, judging
+from torchrl_her_recipes.components.envs import TaskEnvs, evaluation_envs, judging
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
@@ -36,7 +36,6 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.policy_file import read_policy, write_policy
 from torchrl_her_recipes.runs.scores import median_run
 
-_AT_ONCE = 100  # environments that measure a policy: some, as those of PyBullet, take 15 MB each
 _MEASURED = 1 << 41  # seeds that no training uses: for episodes that measure a policy,
 _COMPARED = 1 << 42  # and for those on whose states an ONNX file is compared with it
 
@@ -224,7 +223,7 @@ class Policy(TensorDictModuleBase):
     def measure(self, episodes: int = 1_000, *, seed: int = _MEASURED) -> tuple[float, float]:
         """Returns the shares of episodes whose goal is achieved at the last step, and at some step."""
         results: list[list[bool]] = []
-        with closing(self.envs(min(episodes, _AT_ONCE), seed=seed)) as env:
+        with closing(self.envs(evaluation_envs(self.info.task, episodes), seed=seed)) as env:
             max_steps, judged_by = goal_env(env).max_steps, judging(env)
             while len(results) < episodes:
                 rollout = evaluate(env, self, max_steps=max_steps)

@@ -126,5 +126,7 @@ def test_goals_that_float32_rounds_are_said() -> None:
     near = np.random.default_rng(0).uniform(-4.0, 4.0, (100, 2))
     assert coarse_goals("Boat-v0", near) == ""
     assert coarse_goals("Boat-v0", near * 0 + 5_334_760.5) == ""  # they never change
+    noise = near * np.array([1.0, 1e-8]) + np.array([0.0, 0.42])  # the height of a puck that slides
+    assert coarse_goals("Boat-v0", noise) == ""
     said = coarse_goals("Boat-v0", near + np.array([0.0, 5_334_760.5]))
     assert said.startswith("Boat-v0: achieved_goal 1 is about 5,334,764, where float32 has steps of 0.5, and")
