@@ -54,15 +54,15 @@ class GoalFactor:
 
     Example:
         >>> class NotTooFar(GoalFactor):
-        ...     def __call__(self, offers):
-        ...         return (offers.goals - offers.target.unsqueeze(1)).norm(dim=-1) < 1.0
+        ...     def __call__(self, candidates):
+        ...         return (candidates.goals - candidates.target.unsqueeze(1)).norm(dim=-1) < 1.0
     """
 
     samples: int = 0
 
-    def __call__(self, offers: GoalCandidates) -> Tensor:
+    def __call__(self, candidates: GoalCandidates) -> Tensor:
         """Returns a factor for each candidate of m episodes: [m, c] of at least 0, or of bool."""
-        return offers.goals.new_ones(offers.goals.shape[:-1])
+        return candidates.goals.new_ones(candidates.goals.shape[:-1])
 
     def record(self, ended: Tensor, achieved: Tensor) -> None:
         """Records how many episodes with proposed goals have ended, and in how many the goal was achieved.
@@ -132,8 +132,8 @@ class InverseDensity(GoalFactor):
     Example:
         >>> known = torch.tensor([[0.0], [0.1], [0.2], [5.0]])
         >>> goals = torch.tensor([[[0.1], [5.0]]])
-        >>> offers = GoalCandidates(goals, goals, torch.zeros(1, 1), torch.zeros(1, 1), [1], [known])
-        >>> InverseDensity()(offers).argmax().item()
+        >>> candidates = GoalCandidates(goals, goals, torch.zeros(1, 1), torch.zeros(1, 1), [1], [known])
+        >>> InverseDensity()(candidates).argmax().item()
         1
     """
 
@@ -144,8 +144,8 @@ class InverseDensity(GoalFactor):
         check_whole(samples=samples, k=k)
         self.samples, self.sigma, self.k = samples, sigma, k
 
-    def __call__(self, offers: GoalCandidates) -> Tensor:
-        parts = zip(offers.goals.split(list(offers.counts)), offers.known, strict=True)
+    def __call__(self, candidates: GoalCandidates) -> Tensor:
+        parts = zip(candidates.goals.split(list(candidates.counts)), candidates.known, strict=True)
         logs = torch.cat([self._log_density(goals, known) for goals, known in parts if len(goals)])
         return (logs.amin(1, keepdim=True) - logs).exp()  # 1 for the rarest
 
@@ -186,8 +186,8 @@ class ValueCutoff(GoalFactor):
     Example:
         >>> values = lambda observation, goals, counts: -goals.abs()  # the nearer to 0 the better
         >>> goals = torch.tensor([[[1.0], [2.0], [9.0]], [[5.0], [4.0], [6.0]]])
-        >>> offers = GoalCandidates(goals, goals, torch.zeros(2, 1), torch.zeros(2, 1), [2])
-        >>> ValueCutoff(values, cutoff=-3.0)(offers).tolist()
+        >>> candidates = GoalCandidates(goals, goals, torch.zeros(2, 1), torch.zeros(2, 1), [2])
+        >>> ValueCutoff(values, cutoff=-3.0)(candidates).tolist()
         [[True, True, False], [False, True, False]]
     """
 
@@ -212,9 +212,11 @@ class ValueCutoff(GoalFactor):
         self.successes = Successes(runs, memory=memory)
         self.cutoff = torch.full((runs,), cutoff, dtype=torch.float64)
 
-    def __call__(self, offers: GoalCandidates) -> Tensor:
-        value = self.values(offers.start, offers.goals, offers.counts).mean(-1).nan_to_num(-math.inf)
-        cutoff = self.cutoff.to(value)[offers.run].unsqueeze(1)
+    def __call__(self, candidates: GoalCandidates) -> Tensor:
+        value = (
+            self.values(candidates.start, candidates.goals, candidates.counts).mean(-1).nan_to_num(-math.inf)
+        )
+        cutoff = self.cutoff.to(value)[candidates.run].unsqueeze(1)
         believed = value >= cutoff
         return believed | (~believed.any(1, keepdim=True) & (value == value.amax(1, keepdim=True)))
 
@@ -267,8 +269,8 @@ class DiscoverScore(GoalFactor):
     Example:
         >>> values = lambda observation, goals, counts: -(observation.view(1, -1, 1) - goals).abs()
         >>> goals = torch.tensor([[[1.0], [3.0], [6.0]]])  # from 0, the task wants 4
-        >>> offers = GoalCandidates(goals, goals, torch.zeros(1, 1), torch.full((1, 1), 4.0), [1])
-        >>> DiscoverScore(values, alpha=0.0)(offers).log().tolist()  # towards the goal alone
+        >>> candidates = GoalCandidates(goals, goals, torch.zeros(1, 1), torch.full((1, 1), 4.0), [1])
+        >>> DiscoverScore(values, alpha=0.0)(candidates).log().tolist()  # towards the goal alone
         [[-2.0, 0.0, -1.0]]
     """
 
@@ -294,10 +296,10 @@ class DiscoverScore(GoalFactor):
         self.successes = Successes(runs, memory=memory, start=target)
         self.alpha = torch.full((runs,), alpha, dtype=torch.float64)
 
-    def __call__(self, offers: GoalCandidates) -> Tensor:
-        near = self._bound(self.values(offers.start, offers.goals, offers.counts))
-        far = self._bound(self.values(offers.reached, offers.target.unsqueeze(1), offers.counts))
-        alpha = self.alpha.to(near)[offers.run].unsqueeze(1)
+    def __call__(self, candidates: GoalCandidates) -> Tensor:
+        near = self._bound(self.values(candidates.start, candidates.goals, candidates.counts))
+        far = self._bound(self.values(candidates.reached, candidates.target.unsqueeze(1), candidates.counts))
+        alpha = self.alpha.to(near)[candidates.run].unsqueeze(1)
         score = ((alpha * near + (1 - alpha) * far) / self.temperature).nan_to_num(-math.inf)
         return (score - score.amax(1, keepdim=True)).exp().nan_to_num(0.0)
 

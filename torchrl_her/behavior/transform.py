@@ -300,7 +300,7 @@ class BehaviorGoals(Transform):
             return torch.zeros_like(begins), None
         counts = self._counts(chosen, len(begins))
         index = self.memory.draw(counts, self.candidates, self.generators)
-        offers = GoalCandidates(
+        candidates = GoalCandidates(
             goals=self.memory.goals(index),
             reached=self.memory.observations(index),
             start=_rows(self._get(tensordict, self.in_keys[0]))[chosen],
@@ -308,7 +308,7 @@ class BehaviorGoals(Transform):
             counts=counts,
             known=self._sample(counts),
         )
-        likelihood = self._likelihood(offers)
+        likelihood = self._likelihood(candidates)
         if self.greedy:
             place, valid = likelihood.argmax(1, keepdim=True), likelihood.amax(1) > 0
         else:
@@ -319,7 +319,7 @@ class BehaviorGoals(Transform):
                     counts, shape[-1], self.generators, dtype=dtype, device=device
                 ),
             )
-        goals = offers.goals.take_along_dim(place.unsqueeze(-1), 1).squeeze(1)
+        goals = candidates.goals.take_along_dim(place.unsqueeze(-1), 1).squeeze(1)
         if not bool(valid.all()):  # the others keep the task's own goal
             chosen, goals = chosen.index_put((chosen.clone(),), valid), goals[valid]
             counts = self._counts(chosen, len(begins))
@@ -336,14 +336,14 @@ class BehaviorGoals(Transform):
         goals = self.memory.goals(self.memory.draw(draws, number, self.generators))
         return [part.flatten(0, 1) for part in goals.split(draws)]
 
-    def _likelihood(self, offers: GoalCandidates) -> Tensor:
+    def _likelihood(self, candidates: GoalCandidates) -> Tensor:
         """Returns the likelihood [m, c] that each goal is proposed."""
-        likelihood = offers.goals.new_ones(offers.goals.shape[:-1])
-        if self.weights and not self.weights[0].alike:
-            weights = self._weights_of_runs()(offers.goals, range(self.runs), offers.counts)
-            likelihood = checked_weights(weights, offers.goals)
+        likelihood = candidates.goals.new_ones(candidates.goals.shape[:-1])
+        if self.weights and not self.weights[0].is_uniform:
+            weights = self._weights_of_runs()(candidates.goals, range(self.runs), candidates.counts)
+            likelihood = checked_weights(weights, candidates.goals)
         for factor in self.factors:
-            likelihood = likelihood * factor(offers)
+            likelihood = likelihood * factor(candidates)
         return likelihood
 
     def _count(self, ended: Tensor, achieved: Tensor) -> None:

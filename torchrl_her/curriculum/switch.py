@@ -29,7 +29,7 @@ def set_stage_goals(writer: Writer, stage: CurriculumStage, *, run: int = 0) -> 
     writer.set_reward(stage.reward_fn, run=run)
     weights = writer.goal_weights[run] if writer.goal_weights else None
     if isinstance(weights, InstructiveWeights):
-        weights.alike = not stage.instructive
+        weights.is_uniform = not stage.instructive
 
 
 def enter_stage(

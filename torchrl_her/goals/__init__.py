@@ -1,7 +1,7 @@
 """Goals: their rewards, the strategies that choose virtual goals, and weights for how useful each goal is."""
 
 from torchrl_her.goals.density import log_kernel_density, log_neighbor_density
-from torchrl_her.goals.factors import candidates, combine, draw, draw_alike, draw_weighted
+from torchrl_her.goals.factors import candidates, combine, draw, draw_uniformly, draw_weighted
 from torchrl_her.goals.grid import GoalGrid, box_target, kl_divergence, sampled_target
 from torchrl_her.goals.ibs import GoalHistogram, Instructiveness
 from torchrl_her.goals.instructive import InstructiveWeights
@@ -51,7 +51,7 @@ __all__ = [
     "combine",
     "distance",
     "draw",
-    "draw_alike",
+    "draw_uniformly",
     "draw_weighted",
     "ends_at_goals",
     "get_strategy",

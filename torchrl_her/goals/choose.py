@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_her.goals.factors import between, combine, draw, draw_alike, draw_weighted
+from torchrl_her.goals.factors import between, combine, draw, draw_uniformly, draw_weighted
 from torchrl_her.goals.weights import checked_weights
 from torchrl_her.randomness import RunDraws
 
@@ -140,7 +140,7 @@ def _propose(candidates: Candidates, k: int, weight: Tensor | None, draws: RunDr
     """Draws k positions in the lines of n transitions, [n, k], without the filter."""
     _, _, line, first, end = candidates
     if weight is None:
-        return draw_alike(first, end, k, generator=draws)
+        return draw_uniformly(first, end, k, generator=draws)
     n, counts = len(line), line.bincount(minlength=len(weight))
     longest = int(counts.max())
     whole = n == len(counts) * longest

@@ -78,7 +78,7 @@ def _uniform(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device, s
     return source(shape, dtype, device)
 
 
-def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: Randomness = None) -> Tensor:
+def draw_uniformly(first: Tensor, end: Tensor, k: int, *, generator: Randomness = None) -> Tensor:
     """Draws k goals for each transition, with replacement, all of its candidates being equally likely.
 
     The result is that of :func:`~torchrl_her.goals.draw` from a table of candidates. No table is made, as it
@@ -94,7 +94,7 @@ def draw_alike(first: Tensor, end: Tensor, k: int, *, generator: Randomness = No
         [..., k] of int64, the transition that achieved the goal.
 
     Example:
-        >>> draw_alike(torch.tensor([5, 7]), torch.tensor([6, 8]), 3).tolist()
+        >>> draw_uniformly(torch.tensor([5, 7]), torch.tensor([6, 8]), 3).tolist()
         [[5, 5, 5], [7, 7, 7]]
     """
     u = _uniform((*first.shape, k), torch.get_default_dtype(), first.device, generator)

@@ -40,7 +40,7 @@ class GoalHistogram(GoalWeights):
         [0.75, 0.25]
     """
 
-    alike = True
+    is_uniform = True
 
     def __init__(self, grid: GoalGrid, *, recent: int | None = None) -> None:
         if recent is not None:

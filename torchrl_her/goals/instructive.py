@@ -13,7 +13,7 @@ class InstructiveWeights(GoalWeights):
 
     Sigma starts larger and shrinks at each :meth:`step` down to its final value. Emptying the buffer
     (``clear``) forgets q but not sigma; :meth:`restart` sets sigma back to its first value, as at the change
-    of a curriculum's stage. In stages that are not instructive ``alike`` is True, so that no weights are
+    of a curriculum's stage. In stages that are not instructive ``is_uniform`` is True, so that no weights are
     asked for.
 
     Keyword Args:
@@ -37,7 +37,7 @@ class InstructiveWeights(GoalWeights):
         0.324
     """
 
-    alike = False
+    is_uniform = False
     sigma: float
 
     def __init__(

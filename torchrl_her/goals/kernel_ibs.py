@@ -128,7 +128,7 @@ class KernelInstructiveness(InstructiveWeights):
         stay. Such keys are spread evenly over any stretch of numbers, so what stays is, too, and at each
         moment.
         """
-        if self.alike and goals.shape[-1] != self._real.shape[1]:
+        if self.is_uniform and goals.shape[-1] != self._real.shape[1]:
             return  # goals of a curriculum's stage, which are not weighed
         self._check(goals)
         goals = goals.detach().reshape(-1, goals.shape[-1])

@@ -17,7 +17,7 @@ class GoalWeights:
     The base class gives all goals the same weight and has no state.
 
     Attributes:
-        alike: True promises that all weights are equal, so that they need not be computed.
+        is_uniform: True promises that all weights are equal, so that they need not be computed.
 
     Example:
         >>> class PreferRight(GoalWeights):
@@ -27,7 +27,7 @@ class GoalWeights:
         tensor([0., 2.])
     """
 
-    alike: bool = False
+    is_uniform: bool = False
 
     def __call__(self, goals: Tensor) -> Tensor:
         """Returns weights [...] of at least 0 for goals [..., g]."""

@@ -71,11 +71,11 @@ def draw_goals(
     drawn = _Transitions.of(episodes, per)
     if k == 0 or len(drawn.row) == 0:
         return drawn.row[:0], drawn.row[:0]
-    alike = weights is None or (isinstance(weights, GoalWeights) and weights.alike)
+    is_uniform = weights is None or (isinstance(weights, GoalWeights) and weights.is_uniform)
     index, valid = choose_goals(
         drawn.candidates(after, episodes, strategy),
         k,
-        weights=None if alike else weights,
+        weights=None if is_uniform else weights,
         keep=drawn.filter(before, keep),
         draws=drawn.draws([generator], None),
     )

@@ -14,13 +14,13 @@ from torch import Tensor
 class EpisodeIndex:
     """Index of the episodes in a ring buffer: converts rows of the storage to places in episodes, and back.
 
-    A row is a stored transition, a lane is an environment, and a run is a stretch of rows of one lane that
-    belong to the same episode without a break. Each row has a *position*, in the order of lanes and then
-    time, and a *place*: in the order of places, all rows of an episode follow each other.
+    A row is a stored transition, a stream the rows of one environment, and a run a stretch of rows of one
+    stream that belong to the same episode without a break. Each row has a *position*, in the order of streams
+    and then time, and a *place*: in the order of places, all rows of an episode follow each other.
 
     Attributes:
         slots: T, the length of the ring, as far as it is filled.
-        lanes: N, rows in each slot; row ``slot * N + lane`` is that of a lane in a slot.
+        streams: N, rows in each slot; row ``slot * N + stream`` is that of a stream in a slot.
         oldest: slot of the oldest rows.
         begins: [R] int64, positions at which runs begin, ascending.
         places: [R] int64, the places of the rows at ``begins``.
@@ -30,7 +30,7 @@ class EpisodeIndex:
     """
 
     slots: int
-    lanes: int
+    streams: int
     oldest: int
     begins: Tensor
     places: Tensor
@@ -40,7 +40,7 @@ class EpisodeIndex:
 
     def place(self, row: Tensor) -> Tensor:
         """Returns the places [...] of rows [...] in the order of episodes."""
-        position = row % self.lanes * self.slots + (row // self.lanes - self.oldest) % self.slots
+        position = row % self.streams * self.slots + (row // self.streams - self.oldest) % self.slots
         run = torch.searchsorted(self.begins, position, right=True) - 1
         return self.places[run] + position - self.begins[run]
 
@@ -48,7 +48,7 @@ class EpisodeIndex:
         """Returns the rows [...] at places [...]; the inverse of :meth:`place`."""
         run = torch.searchsorted(self.ordered_places, place, right=True) - 1
         position = self.ordered_begins[run] + place - self.ordered_places[run]
-        return (position % self.slots + self.oldest) % self.slots * self.lanes + position // self.slots
+        return (position % self.slots + self.oldest) % self.slots * self.streams + position // self.slots
 
     def episode(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """Returns where the episodes of places [...] begin, and the places behind their newest rows."""
@@ -57,14 +57,14 @@ class EpisodeIndex:
 
     def newest(self, count: int) -> Tensor:
         """Returns up to ``count`` of the newest rows, oldest first."""
-        rows = self.slots * self.lanes
+        rows = self.slots * self.streams
         number = torch.arange(max(0, rows - count), rows, device=self.first.device)
-        return (number // self.lanes + self.oldest) % self.slots * self.lanes + number % self.lanes
+        return (number // self.streams + self.oldest) % self.slots * self.streams + number % self.streams
 
     def newest_episodes(self, count: int) -> Tensor:
         """Returns the first rows of up to ``count`` of the newest episodes, open ones too, oldest first."""
         last = self.row(self.first[1:] - 1)
-        time = (last // self.lanes - self.oldest) % self.slots
+        time = (last // self.streams - self.oldest) % self.slots
         return self.row(self.first[:-1][time.argsort(stable=True)[-count:]])
 
 
@@ -77,10 +77,10 @@ def index_episodes(
 ) -> EpisodeIndex:
     """Finds the episodes of a ring buffer.
 
-    An episode ends with a row that is done, before a row of its lane with another trajectory id, or with the
-    newest row. In flat storages, rows with the same id belong together wherever they lie, since a
+    An episode ends with a row that is done, before a row of its stream with another trajectory id, or with
+    the newest row. In flat storages, rows with the same id belong together wherever they lie, since a
     collector's batches, flattened, hold a stretch of each environment in turn. Without ids, flat rows are
-    one lane.
+    one stream.
 
     Args:
         done: [T, N] of bool, time first, N environments; or flat, [T].
@@ -112,10 +112,10 @@ def index_episodes(
     new[oldest] = True
     # Only these flags are put in the order of time: moving the ids would take eight times as long.
     begins = new.roll(-oldest, 0).t().reshape(-1).nonzero().squeeze(-1)
-    lanes, behind = rows // slots, begins.new_tensor([rows])
+    streams, behind = rows // slots, begins.new_tensor([rows])
     if trajectory is None or done.ndim > 1:  # without ids, every run of rows is an episode
         first = torch.cat((begins, behind))
-        return EpisodeIndex(slots, lanes, oldest, begins, begins, begins, begins, first)
+        return EpisodeIndex(slots, streams, oldest, begins, begins, begins, begins, first)
     lengths = begins.diff(append=behind)
     ordered_ids, order = trajectory[(begins + oldest) % slots].sort(stable=True)
     ordered_begins, ordered_lengths = begins[order], lengths[order]
@@ -128,7 +128,7 @@ def index_episodes(
     for after, before in seams:  # two runs are one episode only if these agree
         opens[1:] |= _differ(after[last[:-1]], before[(ordered_begins[1:] + oldest) % slots])
     first = torch.cat((ordered_places[opens], behind))
-    return EpisodeIndex(slots, lanes, oldest, begins, places, ordered_begins, ordered_places, first)
+    return EpisodeIndex(slots, streams, oldest, begins, places, ordered_begins, ordered_places, first)
 
 
 def _differ(one: Tensor, other: Tensor) -> Tensor:

@@ -31,25 +31,25 @@ class Episodes:
         return [Episodes(self.rows[i : i + size], self.lengths[i : i + size]) for i in starts]
 
 
-def time_order(lanes: Tensor) -> Tensor:
-    """Returns positions [n] that sort rows by lane, and keep each lane in the order in which its rows came.
+def time_order(streams: Tensor) -> Tensor:
+    """Returns positions [n] that sort rows by stream, and keep the order of the rows of each stream.
 
     Args:
-        lanes: [n] int64, the environment or trajectory that each row is of.
+        streams: [n] int64, the environment or trajectory that each row is of.
     """
-    if bool((lanes[1:] < lanes[:-1]).any()):
-        return lanes.argsort(stable=True)
+    if bool((streams[1:] < streams[:-1]).any()):
+        return streams.argsort(stable=True)
     return torch.arange(
-        len(lanes), device=lanes.device
+        len(streams), device=streams.device
     )  # a batch [N, T] comes in order, and sorting takes long
 
 
-def find_episodes(lanes: Tensor, end: Tensor, order: Tensor | None = None) -> tuple[Episodes, Tensor]:
+def find_episodes(streams: Tensor, end: Tensor, order: Tensor | None = None) -> tuple[Episodes, Tensor]:
     """Sorts rows into whole episodes and rows of episodes that are still open.
 
     Args:
-        lanes: [n] int64, the environment or trajectory that each row is of. Rows of one lane are in the order
-            of time, one episode after the other.
+        streams: [n] int64, the environment or trajectory that each row is of. Rows of one stream are in the
+            order of time, one episode after the other.
         end: [n] of bool, the last rows of episodes.
         order: [n], from ``time_order``, if it is known already.
 
@@ -57,18 +57,18 @@ def find_episodes(lanes: Tensor, end: Tensor, order: Tensor | None = None) -> tu
         ``(episodes, left)``: the whole episodes, and the positions [m] of all other rows, in order.
 
     Example:
-        >>> lanes = torch.tensor([0, 1, 0, 1, 0])  # two environments, three and two steps
+        >>> streams = torch.tensor([0, 1, 0, 1, 0])  # two environments, three and two steps
         >>> done = torch.tensor([False, False, True, False, False])
-        >>> episodes, left = find_episodes(lanes, done)
+        >>> episodes, left = find_episodes(streams, done)
         >>> episodes.rows.tolist(), left.tolist()
         ([[0, 2]], [1, 3, 4])
     """
-    order = time_order(lanes) if order is None else order
-    lane, end = lanes[order], end[order]
+    order = time_order(streams) if order is None else order
+    stream, end = streams[order], end[order]
     begins = torch.ones_like(end)
-    begins[1:] = end[:-1] | (lane[1:] != lane[:-1])
+    begins[1:] = end[:-1] | (stream[1:] != stream[:-1])
     first = begins.nonzero().squeeze(-1)
-    length = torch.diff(first, append=first.new_tensor([len(lanes)]))
+    length = torch.diff(first, append=first.new_tensor([len(streams)]))
     whole = end[first + length - 1]
     left = order[~whole.repeat_interleave(length)].sort().values
     return _pad(order, first[whole], length[whole]), left

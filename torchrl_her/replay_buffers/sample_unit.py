@@ -30,7 +30,7 @@ from torchrl.data.replay_buffers.storages import StorageEnsemble
 
 from torchrl_her.checks import entry_of
 from torchrl_her.goals.choose import LIKELIHOODS, TRIES, Candidates, Index, choose_goals
-from torchrl_her.goals.factors import combine, draw, draw_alike
+from torchrl_her.goals.factors import combine, draw, draw_uniformly
 from torchrl_her.goals.rewards import RewardFunction, ask_reward, ends_at_goals, missed
 from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
@@ -471,12 +471,12 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         begin, behind = episodes.episode(place)
         first, end = (bound + begin for bound in candidate_range(source, place - begin, behind - begin))
         valid = torch.ones_like(row, dtype=torch.bool)
-        if self.weights is not None and not self.weights.alike:
+        if self.weights is not None and not self.weights.is_uniform:
             lent, valid = self._draw_by_likelihood(stored, group, first, end, generator)
             if self.options.redraw:
                 return lent, valid
         else:
-            lent = episodes.row(draw_alike(first, end, 1, generator=generator).squeeze(-1))
+            lent = episodes.row(draw_uniformly(first, end, 1, generator=generator).squeeze(-1))
         if not self.filter_achieved:
             return lent, valid
         # Goals are proposed without the filter; only where it rejects one are all candidates checked.
@@ -507,7 +507,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         index, valid = choose_goals(
             Candidates(goals, table, line, line, torch.full_like(line, table.shape[1])),
             1,
-            weights=None if self.weights is None or self.weights.alike else self.weights,
+            weights=None if self.weights is None or self.weights.is_uniform else self.weights,
             keep=keep if self.filter_achieved else None,
             draws=RunDraws([generator]),
             tries=TRIES,
@@ -541,7 +541,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             candidate = stored.episodes.row(first[part].unsqueeze(-1) + steps.minimum(width - 1))
             goals = stored.after[candidate]
             weight = keep = None
-            if self.weights is not None and not self.weights.alike:
+            if self.weights is not None and not self.weights.is_uniform:
                 weight = checked_weights(self.weights(goals), goals)
             if self.filter_achieved and self.options.redraw:
                 keep = self._kept(stored, group[part], goals)

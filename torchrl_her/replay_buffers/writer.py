@@ -22,7 +22,6 @@ from torchrl_her.randomness import check_generators
 from torchrl_her.replay_buffers.draw import draw_for_runs
 from torchrl_her.replay_buffers.episodes import find_episodes, time_order
 from torchrl_her.replay_buffers.keys import device_of, in_root_and_next
-from torchrl_her.replay_buffers.lanes import broken, ends_of_held
 from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer, refuse_stages
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.runs.batches import Batch
@@ -40,6 +39,7 @@ from torchrl_her.replay_buffers.runs.rows import join_rows
 from torchrl_her.replay_buffers.runs.storage import PackedStorage, write_slices
 from torchrl_her.replay_buffers.runs.written import WrittenRows, real_rows, virtual_rows
 from torchrl_her.replay_buffers.stage_rules import StageRule, check_stages, split_stages
+from torchrl_her.replay_buffers.streams import broken, ends_of_held
 
 # Transitions written at once: larger pieces touch fresh memory each time, smaller ones need more calls.
 _ROWS = 1 << 17
@@ -423,20 +423,20 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
             ``(index, left, recent)``: where the n new rows are in the storage, the positions in the batch of
             rows of open episodes, and the goals to be remembered.
         """
-        rows, run, lanes = batch.rows, batch.run, batch.lanes()
-        order = time_order(lanes)
+        rows, run, streams = batch.rows, batch.run, batch.streams()
+        order = time_order(streams)
         ends = entry_of(rows, self._keys.done).reshape(-1)
         if self._all_over and held:
-            ends = ends | ends_of_held(lanes, order, held)
+            ends = ends | ends_of_held(streams, order, held)
         ends = ends | broken(
-            rows, lanes, order, ends, self._keys, kind=batch.kind, held=held, resumed=self._loaded
+            rows, streams, order, ends, self._keys, kind=batch.kind, held=held, resumed=self._loaded
         )
-        episodes, left = find_episodes(lanes, ends, order)
+        episodes, left = find_episodes(streams, ends, order)
         if len(left) == 0:
             self._look_at_time(episodes.lengths)
         if self.runs == 1:  # a single run writes at TorchRL's own cursor
             self._rings.cursors[0] = self._cursor
-        places = Places(run, len(batch), runs=self.runs, device=lanes.device)
+        places = Places(run, len(batch), runs=self.runs, device=streams.device)
         most = self.k * self.refill + 1  # copies of a transition
         entries = max(1, min(_ROWS, self.capacity) // most), _ROWS // most
         episode_runs = None if run is None else run[episodes.rows[:, :1]].flatten()
@@ -458,8 +458,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
 
     def _settings(self) -> list[Hashable]:
         """Returns settings of each run that must be equal in runs that are written at once."""
-        alike = [weights.alike for weights in self.goal_weights] or [True] * self.runs
-        return [(id(self.reward_of(run)), alike[run], self._times(run)) for run in range(self.runs)]
+        is_uniform = [weights.is_uniform for weights in self.goal_weights] or [True] * self.runs
+        return [(id(self.reward_of(run)), is_uniform[run], self._times(run)) for run in range(self.runs)]
 
     def _times(self, run: int) -> int:
         """Returns the factor for a run's number of goals, which makes up for transitions without goals."""
@@ -474,7 +474,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         weights = self.goal_weights if weighted else []
         drawn = draw_for_runs(
             chunk,
-            weights=self._weights_of_runs() if weights and not weights[runs[0]].alike else None,
+            weights=self._weights_of_runs() if weights and not weights[runs[0]].is_uniform else None,
             generators=[self._rng] if self.generators is None else [self.generators[run] for run in runs],
             recent=recent,
             times=self._times(runs[0]),

@@ -560,8 +560,8 @@ class OwnGoalEnv(GoalEnv):
         check_stateless(self._name, *rewards)
         equal = float(self.compute_reward(other, other, after[chosen]).min())
         if self._info:
-            alike = self.compute_reward(desired, desired, after).flatten().numpy()
-            equal = equal_with_info(self._name, alike, rewards[0], achieved_reward)
+            of_equal_goals = self.compute_reward(desired, desired, after).flatten().numpy()
+            equal = equal_with_info(self._name, of_equal_goals, rewards[0], achieved_reward)
         missed, met, dense = check_rewards(self._name, equal, rewards[0], achieved_reward)
         stepped = after["reward"].flatten()
         computed = self.compute_reward(achieved, desired, after).flatten()

@@ -246,8 +246,8 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         others = np.concatenate([self._reward_of.tried[EPISODES:], self._reward_of(*pairs, paired)])
         equal = float(self._reward_of.tried[:EPISODES].min())
         if info:
-            alike = self._reward_of(trial.desired, trial.desired, stepped)
-            equal = equal_with_info(id, alike, others, achieved_reward)
+            of_equal_goals = self._reward_of(trial.desired, trial.desired, stepped)
+            equal = equal_with_info(id, of_equal_goals, others, achieved_reward)
         elif achieved_reward is None and is_dense(equal, others):
             achieved_reward = find_achieved_reward(env, layout, self._reward_of, *pairs)
             if achieved_reward is not None:

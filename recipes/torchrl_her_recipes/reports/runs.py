@@ -82,14 +82,17 @@ def _by_recipe(paths: Sequence[Path]) -> list[list[Path]]:
     groups: list[tuple[Recipe, set[int], list[Path]]] = []
     for path in paths:
         recipes = [home.recipe() for home in Batches(path).homes]
-        alike, seeds = recipes[0].replace(seed=0, num_runs=1), {seed for r in recipes for seed in r.seeds}
+        without_seeds, seeds = (
+            recipes[0].replace(seed=0, num_runs=1),
+            {seed for r in recipes for seed in r.seeds},
+        )
         for recipe, others, group in groups:
-            if recipe == alike and not seeds & others:
+            if recipe == without_seeds and not seeds & others:
                 others |= seeds
                 group.append(path)
                 break
         else:
-            groups.append((alike, seeds, [path]))
+            groups.append((without_seeds, seeds, [path]))
     return [group for _, _, group in groups]
 
 

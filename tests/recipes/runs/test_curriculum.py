@@ -163,7 +163,7 @@ def test_a_change_of_stage_empties_and_restarts_one_run_alone() -> None:
     assert writer.counts_of(1).real == 0
     first, second = writer.goal_weights
     assert isinstance(second, Instructiveness)
-    assert (first.alike, second.alike) == (True, False)
+    assert (first.is_uniform, second.is_uniform) == (True, False)
     assert second.sigma == pytest.approx(3 * 0.4)
     assert first.sigma < second.sigma
     assert writer.reward_of(1) is writer.reward_fn  # the task's own

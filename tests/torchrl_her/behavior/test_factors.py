@@ -25,7 +25,7 @@ def nearness(observation: Tensor, goals: Tensor, counts: Sequence[int]) -> Tenso
     return torch.stack((near, near - 2.0), -1)
 
 
-def offers(
+def candidates(
     *lines: list[float], start: float = 0.0, target: float = 10.0, counts: Sequence[int] = ()
 ) -> GoalCandidates:
     goals = torch.tensor(lines).unsqueeze(-1)
@@ -34,27 +34,27 @@ def offers(
 
 
 def test_the_run_of_each_episode() -> None:
-    assert offers([1.0], [2.0], [3.0], counts=[1, 0, 2]).run.tolist() == [0, 2, 2]
+    assert candidates([1.0], [2.0], [3.0], counts=[1, 0, 2]).run.tolist() == [0, 2, 2]
 
 
 def test_all_alike() -> None:
-    assert GoalFactor()(offers([1.0, 2.0])).tolist() == [[1.0, 1.0]]
+    assert GoalFactor()(candidates([1.0, 2.0])).tolist() == [[1.0, 1.0]]
 
 
 def test_goals_below_the_cutoff_are_left_out() -> None:
     achievable = ValueCutoff(nearness, cutoff=-4.0)  # the critics' mean is 1 below the nearness
-    assert achievable(offers([1.0, 3.0, 3.5])).tolist() == [[True, True, False]]
+    assert achievable(candidates([1.0, 3.0, 3.5])).tolist() == [[True, True, False]]
 
 
 def test_of_goals_out_of_reach_the_nearest_is_left() -> None:
-    assert ValueCutoff(nearness, cutoff=-4.0)(offers([9.0, 5.0, 6.0])).tolist() == [[False, True, False]]
+    assert ValueCutoff(nearness, cutoff=-4.0)(candidates([9.0, 5.0, 6.0])).tolist() == [[False, True, False]]
 
 
 def test_each_run_has_a_cutoff() -> None:
     achievable = ValueCutoff(nearness, runs=2, cutoff=-4.0)
     achievable.cutoff = torch.tensor([-4.0, -6.0]).double()
     line = [3.0, 5.0]
-    assert achievable(offers(line, line, counts=[1, 1])).tolist() == [[True, False], [True, True]]
+    assert achievable(candidates(line, line, counts=[1, 1])).tolist() == [[True, False], [True, True]]
 
 
 def test_the_cutoff_follows_success() -> None:
@@ -71,14 +71,16 @@ def test_the_cutoff_follows_success() -> None:
 
 def test_the_score_of_directed_goals() -> None:
     # alpha 1/4: a quarter of what leads there, three quarters of what leads on. The critics' spread is 1.
-    score = DiscoverScore(nearness, alpha=0.25, beta=0.5)(offers([2.0, 6.0])).log()
+    score = DiscoverScore(nearness, alpha=0.25, beta=0.5)(candidates([2.0, 6.0])).log()
     near, far = [-3.0 + 0.5, -7.0 + 0.5], [-9.0 + 0.5, -5.0 + 0.5]
     first, second = (0.25 * one + 0.75 * other for one, other in zip(near, far, strict=True))
     assert score[0].tolist() == pytest.approx([first - second, 0.0])
 
 
 def test_a_lower_temperature_prefers_more() -> None:
-    cold, warm = (DiscoverScore(nearness, alpha=0.0, temperature=t)(offers([2.0, 6.0])) for t in (0.5, 2.0))
+    cold, warm = (
+        DiscoverScore(nearness, alpha=0.0, temperature=t)(candidates([2.0, 6.0])) for t in (0.5, 2.0)
+    )
     assert cold.log()[0].tolist() == pytest.approx([-8.0, 0.0])
     assert warm.log()[0].tolist() == pytest.approx([-2.0, 0.0])
 
@@ -131,8 +133,8 @@ def test_the_rarest_goal_weighs_most_in_each_run(width: int) -> None:
     crowd = torch.linspace(0.0, 1.0, 40).unsqueeze(-1).expand(-1, width)
     known = [torch.cat((crowd, crowd[:1] + 9.0)), torch.cat((crowd + 9.0, crowd[:1]))]
     goals = torch.stack((crowd[20], crowd[20] + 9.0)).expand(2, -1, -1)
-    offered = GoalCandidates(goals, goals, goals[:, 0], goals[:, 0], [1, 1], known)
-    weights = InverseDensity(k=3)(offered)
+    candidates_of_both = GoalCandidates(goals, goals, goals[:, 0], goals[:, 0], [1, 1], known)
+    weights = InverseDensity(k=3)(candidates_of_both)
     assert weights.argmax(1).tolist() == [1, 0]
     assert weights.amax(1).tolist() == [1.0, 1.0]
     assert weights.amin() < 0.5
@@ -153,6 +155,6 @@ def test_a_value_that_is_not_a_number_is_not_proposed() -> None:
     def broken(observation: Tensor, goals: Tensor, counts: Sequence[int]) -> Tensor:
         return torch.where(goals == 2.0, torch.nan, -goals)
 
-    given = offers([1.0, 2.0, 3.0])
+    given = candidates([1.0, 2.0, 3.0])
     assert ValueCutoff(broken, cutoff=-9.0)(given).tolist() == [[True, False, True]]
     assert DiscoverScore(broken, alpha=1.0)(given)[0].tolist() == pytest.approx([1.0, 0.0, 0.1353], abs=1e-4)

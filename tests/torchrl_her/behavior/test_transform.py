@@ -42,8 +42,10 @@ class Farther(GoalFactor):
     def __init__(self) -> None:
         self.ends: list[tuple[list[int], list[int]]] = []
 
-    def __call__(self, offers: GoalCandidates) -> Tensor:
-        return (offers.reached - offers.start.unsqueeze(1)).squeeze(-1)  # observations are ten times goals
+    def __call__(self, candidates: GoalCandidates) -> Tensor:
+        return (candidates.reached - candidates.start.unsqueeze(1)).squeeze(
+            -1
+        )  # observations are ten times goals
 
     def record(self, ended: Tensor, achieved: Tensor) -> None:
         self.ends.append((ended.tolist(), achieved.tolist()))

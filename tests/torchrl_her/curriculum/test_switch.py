@@ -58,7 +58,7 @@ def test_transitions_and_q_are_forgotten_and_sigma_and_epsilon_start_anew() -> N
     assert int(weights.counts.sum()) == 0
     assert weights.sigma == 1.5
     assert buffer.writer.reward_of(0).threshold == 0.2
-    assert (buffer.writer.k, weights.alike) == (2, False)
+    assert (buffer.writer.k, weights.is_uniform) == (2, False)
     assert exploration.epsilon.tolist() == [1.0]
 
 
@@ -73,9 +73,9 @@ def test_epsilon_of_one_run_starts_where_it_is_told() -> None:
 def test_a_stage_says_whether_goals_are_weighed() -> None:
     writer = make_buffer().writer
     set_stage_goals(writer, make_stage(0.3, instructive=False))
-    assert writer.weights.alike
+    assert writer.weights.is_uniform
     set_stage_goals(writer, make_stage(0.3))
-    assert not writer.weights.alike
+    assert not writer.weights.is_uniform
     assert writer.reward_of(0).threshold == 0.3
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from torchrl_her.goals import candidate_range, candidates, combine, draw, draw_alike, draw_weighted
+from torchrl_her.goals import candidate_range, candidates, combine, draw, draw_uniformly, draw_weighted
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_drawing_all_alike_is_drawing_from_the_candidates(strategy: str) -> None
     table = candidates(strategy, lengths, 4).float()  # type: ignore[arg-type]
     for episode, time in ((0, 0), (1, 0), (1, 1), (1, 3)):
         edges = candidate_range(strategy, torch.tensor(time), lengths[episode])  # type: ignore[arg-type]
-        index = draw_alike(*edges, n, generator=torch.Generator().manual_seed(0))
+        index = draw_uniformly(*edges, n, generator=torch.Generator().manual_seed(0))
         share = torch.bincount(index, minlength=4) / n
         expected = table[episode, time] / table[episode, time].sum()
         assert share.tolist() == pytest.approx(expected.tolist(), abs=0.02)  # six standard deviations
@@ -97,7 +97,7 @@ def test_drawing_all_alike_is_drawing_from_the_candidates(strategy: str) -> None
 def test_even_the_largest_random_number_stays_in_the_window(first: int, size: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch, "rand", lambda *shape, **_: torch.full(shape, 1.0 - 2.0**-24))
-        index = draw_alike(torch.tensor(first), torch.tensor(first + size), 1)
+        index = draw_uniformly(torch.tensor(first), torch.tensor(first + size), 1)
     assert first <= index.item() < first + size
 
 

@@ -30,7 +30,7 @@ def test_sigma_is_its_state() -> None:
 def test_both_kinds_of_ibs_have_it() -> None:
     for kind in (Instructiveness, KernelInstructiveness):
         assert issubclass(kind, InstructiveWeights)
-        assert not kind.alike
+        assert not kind.is_uniform
 
 
 @pytest.mark.parametrize(

@@ -302,11 +302,11 @@ def test_a_stage_of_a_curriculum_turns_it_off_and_starts_sigma_anew() -> None:
     weights.step()
     weights.update(PAIR)
     set_stage_goals(buffer.writer, make_stage(instructive=False))
-    assert weights.alike
+    assert weights.is_uniform
     weights.update(torch.zeros(4, 3))  # a stage's goals may have another width
     assert weights.written == 2
     enter_stage(buffer, make_stage(instructive=True))
-    assert not weights.alike
+    assert not weights.is_uniform
     assert (weights.written, weights.sigma) == (0, 1.5)
     with pytest.raises(ValueError, match="real goals have 1 numbers, got goals of 3"):
         weights.update(torch.zeros(4, 3))

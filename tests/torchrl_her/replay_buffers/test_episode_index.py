@@ -48,7 +48,7 @@ def test_an_id_may_be_used_again_when_its_episode_was_done() -> None:
 def test_lanes_are_kept_apart_though_they_use_the_same_ids() -> None:
     done = torch.tensor([[0, 0], [1, 0], [0, 0]]).bool()
     index = index_episodes(done, torch.tensor([[0, 0], [0, 0], [1, 0]]), oldest=1)
-    # Rows are slot * 2 + lane; slot 1 is the oldest. In lane 0 the row of slot 1 is done.
+    # Rows are slot * 2 + stream; slot 1 is the oldest. In stream 0 the row of slot 1 is done.
     bounds = zip(index.first.tolist(), index.first[1:].tolist(), strict=False)
     found = [index.row(torch.arange(*bound)).tolist() for bound in bounds]
     assert found == [[2], [4], [0], [3, 5, 1]]

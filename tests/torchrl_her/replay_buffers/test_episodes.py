@@ -11,9 +11,9 @@ from torchrl_her.replay_buffers.episodes import time_order
 
 
 def test_episodes_of_different_lengths_are_padded_with_their_last_row() -> None:
-    lanes = torch.zeros(5, dtype=torch.int64)
+    streams = torch.zeros(5, dtype=torch.int64)
     done = torch.tensor([False, False, True, False, True])
-    episodes, left = find_episodes(lanes, done)
+    episodes, left = find_episodes(streams, done)
     assert episodes.rows.tolist() == [[0, 1, 2], [3, 4, 4]]
     assert episodes.lengths.tolist() == [3, 2]
     assert episodes.inside.tolist() == [[True, True, True], [True, True, False]]
@@ -21,9 +21,9 @@ def test_episodes_of_different_lengths_are_padded_with_their_last_row() -> None:
 
 
 def test_interleaved_lanes_are_told_apart() -> None:
-    lanes = torch.tensor([0, 1, 2, 0, 1, 2, 0, 1, 2])
+    streams = torch.tensor([0, 1, 2, 0, 1, 2, 0, 1, 2])
     done = torch.tensor([False, False, True, False, True, False, True, False, False])
-    episodes, left = find_episodes(lanes, done)
+    episodes, left = find_episodes(streams, done)
     assert [rows[:n] for rows, n in zip(episodes.rows.tolist(), episodes.lengths.tolist(), strict=True)] == [
         [0, 3, 6],
         [1, 4],
@@ -46,27 +46,27 @@ def test_no_rows_at_all() -> None:
 
 
 def test_an_order_that_is_known_is_used() -> None:
-    lanes, end = torch.tensor([1, 0, 1, 0]), torch.tensor([False, True, False, True])
-    episodes, left = find_episodes(lanes, end, time_order(lanes))
+    streams, end = torch.tensor([1, 0, 1, 0]), torch.tensor([False, True, False, True])
+    episodes, left = find_episodes(streams, end, time_order(streams))
     assert episodes.rows.tolist() == [[1], [3]]
     assert left.tolist() == [0, 2]
 
 
 def test_split_keeps_order() -> None:
-    lanes = torch.arange(5)
-    episodes, _ = find_episodes(lanes, torch.ones(5, dtype=torch.bool))
+    streams = torch.arange(5)
+    episodes, _ = find_episodes(streams, torch.ones(5, dtype=torch.bool))
     assert [part.rows.flatten().tolist() for part in episodes.split(2)] == [[0, 1], [2, 3], [4]]
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=40))
 def test_every_row_is_in_one_episode_or_left(rows: list[tuple[int, bool]]) -> None:
-    lanes, done = torch.tensor([lane for lane, _ in rows]), torch.tensor([end for _, end in rows])
-    episodes, left = find_episodes(lanes, done)
+    streams, done = torch.tensor([stream for stream, _ in rows]), torch.tensor([end for _, end in rows])
+    episodes, left = find_episodes(streams, done)
     inside = episodes.rows[episodes.inside].tolist()
     assert sorted(inside + left.tolist()) == list(range(len(rows)))
     for row, length in zip(episodes.rows, episodes.lengths, strict=True):
         own = row[:length]
-        assert len(set(lanes[own].tolist())) == 1
+        assert len(set(streams[own].tolist())) == 1
         assert own.tolist() == sorted(own.tolist())
         assert done[own].tolist() == [False] * (int(length) - 1) + [True]

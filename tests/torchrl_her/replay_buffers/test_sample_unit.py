@@ -327,7 +327,7 @@ def test_many_rows_are_drawn_piece_by_piece(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_weights_that_promise_to_be_alike_are_not_asked() -> None:
     class Alike(PreferFar):
-        alike = True
+        is_uniform = True
 
         def __call__(self, goals: Tensor) -> Tensor:
             raise AssertionError("asked")

@@ -241,7 +241,7 @@ def test_single_steps_may_be_added() -> None:
 
 
 def with_env_ids(batch: TensorDict) -> TensorDict:
-    """As with the transform ``EnvIds``: of thousands, so that their order is not that of the lanes."""
+    """As with the transform ``EnvIds``: of thousands, so that their order is not that of the streams."""
     ids = 7_000 - batch["observation"][..., :1].div(1_000, rounding_mode="floor").long()
     return batch.set("env_ids", ids).set(("next", "env_ids"), ids)
 

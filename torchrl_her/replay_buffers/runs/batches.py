@@ -1,4 +1,4 @@
-"""Transitions of one or several runs with their runs and lanes: a batch, or the part that is held back."""
+"""Transitions of one or several runs with their runs and streams: a batch, or the part that is held back."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_her.replay_buffers.keys import TransitionKeys
-from torchrl_her.replay_buffers.lanes import BY_ENV, find_lanes, in_order
 from torchrl_her.replay_buffers.runs.rows import take_rows
+from torchrl_her.replay_buffers.streams import BY_ENV, find_streams, in_order
 
 _NO_ROWS = TensorDict(batch_size=[0])  # made once, as most batches hold nothing back; it is never written to
 
@@ -50,7 +50,7 @@ class Batch:
     @classmethod
     def of(cls, data: TensorDictBase, keys: TransitionKeys, *, runs: int) -> Batch:
         """Makes a batch from a collector's rows, which are R equal blocks in the order of the runs."""
-        kind, ids = find_lanes(data, keys)
+        kind, ids = find_streams(data, keys)
         run = None
         if runs > 1:
             run = torch.arange(runs, device=ids.device).repeat_interleave(len(ids) // runs)
@@ -79,10 +79,10 @@ class Batch:
             rows = rows.copy().clear_device_()
         return Batch(torch.cat((rows, self.rows)), self.kind, ids, run)
 
-    def lanes(self) -> Tensor:
+    def streams(self) -> Tensor:
         """Returns a number [n] for each environment or trajectory; numbers increase from run to run."""
-        lanes = in_order(self.ids) if self.kind == BY_ENV else self.ids
-        return lanes if self.run is None else lanes + self.run * (int(lanes.max()) + 1)
+        streams = in_order(self.ids) if self.kind == BY_ENV else self.ids
+        return streams if self.run is None else streams + self.run * (int(streams.max()) + 1)
 
     def take(self, index: Tensor) -> Batch:
         """Returns copies of some of the transitions, [m]."""
@@ -100,14 +100,14 @@ class Batch:
         return {
             "held_runs": torch.empty(0, dtype=torch.int64) if self.run is None else self.run.clone(),
             "held": self.rows.to_dict() if len(self) else None,
-            "held_lanes": self.ids.clone(),
+            "held_ids": self.ids.clone(),
             "held_kind": self.kind,
         }
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, runs: int) -> Batch:
         """Restores a batch of R runs from a :meth:`state_dict`."""
-        ids, run, held = state["held_lanes"].clone(), state["held_runs"].clone(), state["held"]
+        ids, run, held = state["held_ids"].clone(), state["held_runs"].clone(), state["held"]
         rows: TensorDictBase = _NO_ROWS
         if held is not None:
             rows = TensorDict.from_dict(held, batch_size=ids.shape).clone()

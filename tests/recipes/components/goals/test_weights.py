@@ -157,7 +157,7 @@ def test_a_fetch_task_trains_with_a_curriculum_and_ibs_by_kernels() -> None:
     components = build(recipe)
     weights = components.buffer.writer.weights
     assert isinstance(weights, KernelInstructiveness)
-    assert weights.alike  # the first stage reaches for the object
+    assert weights.is_uniform  # the first stage reaches for the object
     rows = run(components, progress=False).rows
     assert rows[-1]["rows_virtual"] == weights.written > 0
     assert math.isnan(rows[-1]["kl"])  # until the last stage

@@ -45,11 +45,11 @@ def test_environments_that_are_told_apart_by_something_else_are_refused() -> Non
 
 
 def test_lanes_of_a_run_follow_those_of_the_run_before() -> None:
-    """By places, environment 2 of run 1 is lane 2 + 1 * 4; ids 9, 9, 4, 4 are numbered as they come."""
+    """By places, environment 2 of run 1 is stream 2 + 1 * 4; ids 9, 9, 4, 4 are numbered as they come."""
     places = make([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    assert places.lanes().tolist() == [0, 0, 1, 1, 6, 6, 7, 7]
-    assert make([[0.0, 0.0], [0.0, 0.0]], ids=[9, 4]).lanes().tolist() == [0, 0, 3, 3]
-    assert make([[0.0, 0.0], [0.0, 0.0]], runs=1, ids=[9, 4]).lanes().tolist() == [0, 0, 1, 1]
+    assert places.streams().tolist() == [0, 0, 1, 1, 6, 6, 7, 7]
+    assert make([[0.0, 0.0], [0.0, 0.0]], ids=[9, 4]).streams().tolist() == [0, 0, 3, 3]
+    assert make([[0.0, 0.0], [0.0, 0.0]], runs=1, ids=[9, 4]).streams().tolist() == [0, 0, 1, 1]
 
 
 def test_a_run_is_left_out() -> None:
@@ -66,7 +66,7 @@ def test_a_run_is_left_out() -> None:
 def test_a_state_brings_them_back(runs: int, number: int) -> None:
     batch = make([[1.0, 2.0], [3.0, 4.0]], runs).take(torch.arange(number))
     state = batch.state_dict()
-    assert list(state) == ["held_runs", "held", "held_lanes", "held_kind"]
+    assert list(state) == ["held_runs", "held", "held_ids", "held_kind"]
     assert (state["held"] is None) == (number == 0)
     other = Batch.from_state(state, runs=runs)
     assert other.kind == "places in the batch"

@@ -301,7 +301,7 @@ def test_runs_relabel_with_rewards_and_weights_of_their_own() -> None:
     for run, (reward, alike) in enumerate(((NEAR, True), (wide, False), (NEAR, True))):
         for buffer, place in ((together, run), (alone[run], 0)):
             buffer.writer.set_reward(reward, run=place)
-            buffer.writer.goal_weights[place].alike = alike
+            buffer.writer.goal_weights[place].is_uniform = alike
     for batch in batches([[9, 12, 30], [8, 30]] * RUNS, 6):
         extend(together, alone, batch)
         check_alone(together, alone)

@@ -1,4 +1,4 @@
-"""Lanes: what is looked at again when the next batch comes."""
+"""Streams: what is looked at again when the next batch comes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import GoalReward, HERWriter
-from torchrl_her.replay_buffers import lanes
+from torchrl_her.replay_buffers import streams
 
 from ..her_data import make_batch
 
@@ -17,13 +17,13 @@ from ..her_data import make_batch
 @pytest.mark.parametrize("flat", [True, False], ids=["flat, with ids", "by place, without ids"])
 def test_rows_that_are_held_back_are_compared_once(flat: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     compared: list[int] = []
-    jumps = lanes._jumps
+    jumps = streams._jumps
 
     def count(rows: TensorDict, keys: object, last: Tensor, new: Tensor, where: Tensor) -> Tensor:
         compared.append(int(where.count_nonzero()))
         return jumps(rows, keys, last, new, where)
 
-    monkeypatch.setattr(lanes, "_jumps", count)
+    monkeypatch.setattr(streams, "_jumps", count)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), writer=HERWriter(GoalReward(0.5)))
     whole = make_batch([[20], [20]])
     for begin in range(0, 20, 5):

@@ -1,7 +1,7 @@
-"""Lanes: the environment or the trajectory that each transition of a batch belongs to.
+"""Streams: the environment or the trajectory that each transition of a batch belongs to.
 
-Batches come from one collector or from several, with or without ids. Transitions of one lane are in the order
-of time, one episode after the other, and a lane continues from batch to batch.
+Batches come from one collector or from several, with or without ids. Transitions of one stream are in the
+order of time, one episode after the other, and a stream continues from batch to batch.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ _REMEDY = (
 )
 
 
-def find_lanes(data: TensorDictBase, keys: TransitionKeys) -> tuple[str, Tensor]:
-    """Returns the lanes of a batch [N, T], time last, or of a flat batch [n].
+def find_streams(data: TensorDictBase, keys: TransitionKeys) -> tuple[str, Tensor]:
+    """Returns the streams of a batch [N, T], time last, or of a flat batch [n].
 
-    A lane is the environment or the trajectory that a transition belongs to. Environment ids are used if the
-    batch has them. Without them, each row of a batch [N, T] is an environment. A flat batch is split by
+    A stream is the environment or the trajectory that a transition belongs to. Environment ids are used if
+    the batch has them. Without them, each row of a batch [N, T] is an environment. A flat batch is split by
     trajectory ids; without these, it counts as one environment.
 
     Returns:
-        ``(kind, lanes)``: how lanes were found, and the lane of each transition, int64, flat.
+        ``(kind, streams)``: how streams were found, and the stream of each transition, int64, flat.
 
     Example:
         >>> from tensordict import TensorDict
         >>> from torchrl_her import HindsightOptions
-        >>> kind, lanes = find_lanes(TensorDict(batch_size=[2, 3]), HindsightOptions().transition_keys())
-        >>> kind, lanes.tolist()
+        >>> kind, streams = find_streams(TensorDict(batch_size=[2, 3]), HindsightOptions().transition_keys())
+        >>> kind, streams.tolist()
         ('places in the batch', [0, 0, 0, 1, 1, 1])
     """
     if (envs := data.get(keys.env_ids, None)) is not None:
@@ -46,23 +46,23 @@ def find_lanes(data: TensorDictBase, keys: TransitionKeys) -> tuple[str, Tensor]
     return BY_PLACE, places.repeat_interleave(steps)
 
 
-def in_order(lanes: Tensor) -> Tensor:
-    """Renumbers lanes [n] in the order in which they first appear, so that random ids do not affect results.
+def in_order(streams: Tensor) -> Tensor:
+    """Numbers streams [n] in the order in which they first appear, so that random ids do not affect results.
 
     Example:
         >>> in_order(torch.tensor([7, 7, 3, 7, 5])).tolist()
         [0, 0, 1, 0, 2]
     """
-    _, number = lanes.unique(return_inverse=True)
-    place = torch.arange(len(lanes), device=lanes.device)
-    first = place.new_full((int(number.max()) + 1 if len(lanes) else 0,), len(lanes))
+    _, number = streams.unique(return_inverse=True)
+    place = torch.arange(len(streams), device=streams.device)
+    first = place.new_full((int(number.max()) + 1 if len(streams) else 0,), len(streams))
     first = first.scatter_reduce(0, number, place, "amin")
     return first.argsort().argsort()[number]
 
 
 def broken(
     rows: TensorDictBase,
-    lanes: Tensor,
+    streams: Tensor,
     order: Tensor,
     done: Tensor,
     keys: TransitionKeys,
@@ -73,27 +73,27 @@ def broken(
 ) -> Tensor:
     """Returns where an episode is over although its last transition is not done, [n] of bool.
 
-    That is where another episode's transition follows in the same lane: an environment was reset from
+    That is where another episode's transition follows in the same stream: an environment was reset from
     outside, or another collector uses the same ids again.
 
     Args:
         rows: [n], the first of which were held back, as their episodes were open.
-        lanes: [n], of all rows.
+        streams: [n], of all rows.
         order: [n], of :func:`~torchrl_her.replay_buffers.episodes.time_order`.
         done: [n] of bool, where episodes are known to be over.
         keys: keys of the goals.
-        kind: property that distinguishes lanes.
+        kind: property that distinguishes streams.
         held: number of rows that were held back.
         resumed: whether they come from a checkpoint: their episodes may then end anywhere.
 
     Raises:
-        ValueError: lanes are places in the batch, and it cannot be known whether an episode is over, or
+        ValueError: streams are places in the batch, and it cannot be known whether an episode is over, or
             whether this batch comes from other environments than the one before.
     """
-    over = torch.zeros_like(lanes, dtype=torch.bool)
+    over = torch.zeros_like(streams, dtype=torch.bool)
     trajectory = rows.get(keys.trajectory, None)
     last, new = order[:-1], order[1:]
-    same = lanes[last] == lanes[new]
+    same = streams[last] == streams[new]
     if trajectory is None or kind == BY_TRAJECTORY:  # without ids, goals show where episodes end
         # Rows that were held back have been compared with each other before.
         over[last] = _jumps(rows, keys, last, new, same & (new >= held))
@@ -110,16 +110,16 @@ def broken(
     return over
 
 
-def ends_of_held(lanes: Tensor, order: Tensor, held: int) -> Tensor:
-    """Returns which transitions are the last of a lane among those that were held back: [n] of bool.
+def ends_of_held(streams: Tensor, order: Tensor, held: int) -> Tensor:
+    """Returns which transitions are the last of a stream among those that were held back: [n] of bool.
 
     Args:
-        lanes, order, held: arguments of :func:`broken`.
+        streams, order, held: arguments of :func:`broken`.
     """
     rows = order[order < held]
     last = torch.ones_like(rows, dtype=torch.bool)
-    last[:-1] = lanes[rows[1:]] != lanes[rows[:-1]]
-    return torch.zeros_like(lanes, dtype=torch.bool).index_fill_(0, rows[last], True)
+    last[:-1] = streams[rows[1:]] != streams[rows[:-1]]
+    return torch.zeros_like(streams, dtype=torch.bool).index_fill_(0, rows[last], True)
 
 
 def _jumps(rows: TensorDictBase, keys: TransitionKeys, last: Tensor, new: Tensor, where: Tensor) -> Tensor:
