@@ -136,7 +136,7 @@ def as_critics(
     """Returns one critic that two are made like, or a list of all, as TorchRL takes them, and their number.
 
     TorchRL registers the weights of a list of one critic as buffers, which are not trained. So a single one
-    is handed over by itself; TorchRL then draws weights anew, which :func:`keep_weights` puts back.
+    is handed over by itself; TorchRL then draws weights anew, which :func:`connect_critics` puts back.
 
     Raises:
         ValueError: the list is empty, or a critic has batch normalization, whose statistics a stack of
@@ -151,13 +151,14 @@ def as_critics(
     return every if len(every) > 1 else every[0], number
 
 
-def keep_weights(loss: LossModule, critic: TensorDictModule | Sequence[TensorDictModule]) -> None:
-    """Gives the only critic of a loss the weights that it came with, if it came in a list.
+def connect_critics(loss: LossModule, critic: TensorDictModule | Sequence[TensorDictModule]) -> None:
+    """Sets the key of a loss's values, and gives an only critic that came in a list its weights.
 
     Args:
         loss: made with what :func:`as_critics` gave.
         critic: critic or list of critics that the loss was made with.
     """
+    loss.set_keys(state_action_value=loss.qvalue_network.out_keys[0])
     if isinstance(critic, TensorDictModule) or len(critic) > 1:
         return
     weights = TensorDict.from_module(critic[0]).data.unsqueeze(0)

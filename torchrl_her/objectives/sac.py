@@ -16,7 +16,7 @@ from torchrl.objectives import SACLoss
 from torchrl_her.modules.networks import stacked_runs
 from torchrl_her.modules.noise import RunNoise
 from torchrl_her.objectives.actor_terms import ActorTerms
-from torchrl_her.objectives.critics import as_critics, checked_subset, keep_weights, least_of_some
+from torchrl_her.objectives.critics import as_critics, checked_subset, connect_critics, least_of_some
 from torchrl_her.objectives.targets import Targets
 
 
@@ -39,8 +39,8 @@ class PenalizedSACLoss(SACLoss):
         noise: source of its random numbers.
 
     Raises:
-        ValueError: ``target_critics`` is not from 0 to the number of critics, or ``terms`` have a saturation
-            penalty.
+        ValueError: ``target_critics`` is not from 0 to the number of critics, ``alpha_init`` is not positive,
+            or ``terms`` have a saturation penalty.
     """
 
     def __init__(
@@ -51,6 +51,8 @@ class PenalizedSACLoss(SACLoss):
         noise: RunNoise | None = None,
         **kwargs: Any,
     ) -> None:
+        if not kwargs.get("alpha_init", 1.0) > 0:
+            raise ValueError(f"temperature must be positive, got {kwargs['alpha_init']}")
         super().__init__(*args, **kwargs)
         if terms.saturation_penalty:
             raise ValueError("saturation_penalty is for deterministic actors; choose action_penalty")
@@ -162,25 +164,13 @@ def make_sac_loss(
         networks,
         num_qvalue_nets=number,
         loss_function="l2",
-        alpha_init=positive_temperature(temperature),
+        alpha_init=temperature,
         terms=terms,
         target_critics=target_critics,
         noise=RunNoise(getattr(actor, "generators", None)),
         reduction=reduction,
         scalar_output_mode="exclude" if reduction == "none" else None,
     )
-    keep_weights(loss, critic)
-    loss.set_keys(state_action_value=loss.qvalue_network.out_keys[0])
+    connect_critics(loss, critic)
     loss.make_value_estimator(targets.estimator(value_key=loss.tensor_keys.value))
     return loss
-
-
-def positive_temperature(temperature: float) -> float:
-    """Returns a temperature, which must be positive.
-
-    Raises:
-        ValueError: it is not positive.
-    """
-    if not temperature > 0:
-        raise ValueError(f"temperature must be positive, got {temperature}")
-    return temperature

@@ -15,7 +15,7 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_her.modules.noise import RunNoise
 from torchrl_her.objectives.actor_terms import ActorTerms
-from torchrl_her.objectives.critics import as_critics, checked_subset, keep_weights, least_of_some
+from torchrl_her.objectives.critics import as_critics, checked_subset, connect_critics, least_of_some
 from torchrl_her.objectives.targets import Targets
 
 
@@ -153,8 +153,6 @@ def make_td3_loss(
         noise=RunNoise(generators),
         reduction=reduction,
     )
-    keep_weights(loss, critic)
-    key = loss.qvalue_network.out_keys[0]
-    loss.set_keys(state_action_value=key)
-    loss.make_value_estimator(targets.estimator(value_key=key))
+    connect_critics(loss, critic)
+    loss.make_value_estimator(targets.estimator(value_key=loss.tensor_keys.state_action_value))
     return loss

@@ -14,8 +14,8 @@ from torchrl.objectives import TQCLoss
 
 from torchrl_her.modules.noise import RunNoise
 from torchrl_her.objectives.actor_terms import ActorTerms
-from torchrl_her.objectives.critics import as_critics, keep_weights
-from torchrl_her.objectives.sac import PenalizedSACLoss, positive_temperature
+from torchrl_her.objectives.critics import as_critics, connect_critics
+from torchrl_her.objectives.sac import PenalizedSACLoss
 from torchrl_her.objectives.targets import Targets
 
 
@@ -125,13 +125,12 @@ def make_tqc_loss(
         networks,
         num_qvalue_nets=number,
         top_quantiles_to_drop_per_net=dropped_quantiles,
-        alpha_init=positive_temperature(temperature),
+        alpha_init=temperature,
         terms=terms,
         noise=RunNoise(getattr(actor, "generators", None)),
         reduction=reduction,
         scalar_output_mode="exclude" if reduction == "none" else None,
     )
-    keep_weights(loss, critic)
-    loss.set_keys(state_action_value=first.out_keys[0])
+    connect_critics(loss, critic)
     loss.make_value_estimator(targets.estimator(value_key=loss.tensor_keys.value))
     return loss

@@ -44,40 +44,30 @@ class ArmSkill:
         return nearest_turn(joints, target, self._base, self._world.arm_length) / self._world.time_step
 
     def throw(self, joints: Tensor, goal: Tensor, *, within: float) -> Tensor:
-        return arm_throw(joints, goal, self.effector, self._world, within=within)
+        """Returns the next velocity of the joints to swing a ball at the goal, or to get ready to.
 
+        A throw is: turn each joint at a constant speed (one of a grid) for some steps, let go, fly. The
+        quickest is taken; where none works from here, the arm turns to where all goals can be thrown at. No
+        plan is kept: one step later the same throw is still there, a step shorter.
 
-def arm_throw(joints: Tensor, goal: Tensor, arm: Effector, world: WorldConfig, *, within: float) -> Tensor:
-    """Computes the next velocity of an arm's joints to swing a ball at the goal, or to get ready to.
+        Returns:
+            [B, 2] in radians a second; more than the arm's speed where it has to turn farther than one step.
 
-    A throw is: turn each joint at a constant speed (one of a grid) for some steps, let go, fly. The
-    quickest is taken; where none works from here, the arm turns to where all goals can be thrown at. No
-    plan is kept: one step later the same throw is still there, a step shorter.
-
-    Args:
-        joints: [B, 2], the angles in radians.
-        goal: [B, 2], in meters.
-        arm: tells where its end is, and its speed.
-        world: the constants of the world.
-        within: how far beside the goal, in meters, the ball may come.
-
-    Returns:
-        [B, 2] in radians a second; more than the arm's speed where it has to turn farther than one step.
-
-    Example:
-        >>> world, joints, goal = WorldConfig(), torch.tensor([[1.6, 0.0]]), torch.tensor([[5.0, 4.0]])
-        >>> arm_throw(joints, goal, Arm(world), world, within=0.2)  # over the top, clockwise
-        tensor([[-4., -3.]])
-    """
-    speeds, launch, velocity = _swings(joints, arm, world)
-    flight = _steps_to_column(goal[:, None, None, 0] - launch[..., 0], velocity[..., 0], world)
-    points = fly(launch.unsqueeze(-2), velocity.unsqueeze(-2), flight * world.substeps, world)
-    hits = (points - goal[:, None, None, None]).square().sum(-1) < within**2  # [B, speeds, steps, 2]
-    clear = is_free(launch, world, wall=False) & clears_ceiling(launch, velocity, world)
-    works = hits & is_free(points, world, wall=False) & clear.unsqueeze(-1)
-    swing, *_ = quickest(torch.arange(1.0, _LONGEST_SWING + 1).unsqueeze(-1) + flight, works)
-    ready = turn(joints, torch.tensor(_READY)) / world.time_step
-    return torch.where(works.flatten(1).any(1, keepdim=True), speeds[swing], ready)
+        Example:
+            >>> arm, goal = ArmSkill(WorldConfig()), torch.tensor([[5.0, 4.0]])
+            >>> arm.throw(torch.tensor([[1.6, 0.0]]), goal, within=0.2)  # over the top, clockwise
+            tensor([[-4., -3.]])
+        """
+        world = self._world
+        speeds, launch, velocity = _swings(joints, self.effector, world)
+        flight = _steps_to_column(goal[:, None, None, 0] - launch[..., 0], velocity[..., 0], world)
+        points = fly(launch.unsqueeze(-2), velocity.unsqueeze(-2), flight * world.substeps, world)
+        hits = (points - goal[:, None, None, None]).square().sum(-1) < within**2  # [B, speeds, steps, 2]
+        clear = is_free(launch, world, wall=False) & clears_ceiling(launch, velocity, world)
+        works = hits & is_free(points, world, wall=False) & clear.unsqueeze(-1)
+        swing, *_ = quickest(torch.arange(1.0, _LONGEST_SWING + 1).unsqueeze(-1) + flight, works)
+        ready = turn(joints, torch.tensor(_READY)) / world.time_step
+        return torch.where(works.flatten(1).any(1, keepdim=True), speeds[swing], ready)
 
 
 def _swings(joints: Tensor, arm: Effector, world: WorldConfig) -> tuple[Tensor, Tensor, Tensor]:

@@ -33,46 +33,33 @@ class HandSkill:
         return (target - joints) / self._world.time_step
 
     def throw(self, joints: Tensor, goal: Tensor, *, within: float) -> Tensor:
-        return hand_throw(joints, goal, self.effector, self._world, wall=self._wall, within=within)
+        """Returns the next velocity to carry a ball to where it can be thrown, or to throw it.
 
+        A throw is: move to a place (one of a grid, or just here), swing for one step with the velocity of
+        :func:`~.ballistics.throw_velocity`, let go, fly. The quickest is taken. No plan is
+        kept: one step later the same throw is still there, a step shorter.
 
-def hand_throw(
-    grip: Tensor, goal: Tensor, hand: Effector, world: WorldConfig, *, wall: bool, within: float
-) -> Tensor:
-    """Computes the next velocity of a hand to carry a ball to where it can be thrown, or to throw it.
+        Returns:
+            [B, 2] in meters a second; more than the hand's speed where the place is farther than one step.
+            Where no throw works it means nothing.
 
-    A throw is: move to a place (one of a grid, or just here), swing for one step with the velocity of
-    :func:`~.ballistics.throw_velocity`, let go, fly. The quickest is taken. No plan is
-    kept: one step later the same throw is still there, a step shorter.
-
-    Args:
-        grip: [B, 2], where hand and ball are, in meters.
-        goal: [B, 2], in meters.
-        hand: tells its reach and its speed.
-        world: the constants of the world.
-        wall: whether there is one.
-        within: how far beside the goal, in meters, the ball may come.
-
-    Returns:
-        [B, 2] in meters a second; more than the hand's speed where the place is farther than one step.
-        Where no throw works it means nothing.
-
-    Example:
-        >>> world, grip, goal = WorldConfig(), torch.tensor([[2.0, 3.0]]), torch.tensor([[4.0, 2.5]])
-        >>> hand_throw(grip, goal, Hand(world, wall=False), world, wall=False, within=0.2)  # at once, flatly
-        tensor([[ 7.1429, -0.8000]])
-    """
-    places = torch.cat((grip.unsqueeze(1), _grid(hand, world).expand(len(grip), -1, -1)), 1)
-    start, target = places[:, :, None, None], _aims(goal, world, within=within)[:, None, :, None]
-    steps = torch.arange(1.0, LONGEST_FLIGHT + 1)
-    velocity = throw_velocity(start, target, steps, world)  # [B, places, aims, steps, 2]
-    works = _can_throw(start, velocity, hand, world, wall=wall)
-    travel = _steps_to(places - grip.unsqueeze(1), hand.action_speed * world.time_step)
-    place, aim, flight = quickest(travel[:, :, None, None] + steps, works)
-    row = torch.arange(len(grip))
-    arrived = travel[row, place].unsqueeze(-1) == 0
-    go = (places[row, place] - grip) / world.time_step
-    return torch.where(arrived, velocity[row, place, aim, flight], go)
+        Example:
+            >>> hand, goal = HandSkill(WorldConfig(), wall=False), torch.tensor([[4.0, 2.5]])
+            >>> hand.throw(torch.tensor([[2.0, 3.0]]), goal, within=0.2)  # at once, flatly
+            tensor([[ 7.1429, -0.8000]])
+        """
+        hand, world = self.effector, self._world
+        places = torch.cat((joints.unsqueeze(1), _grid(hand, world).expand(len(joints), -1, -1)), 1)
+        start, target = places[:, :, None, None], _aims(goal, world, within=within)[:, None, :, None]
+        steps = torch.arange(1.0, LONGEST_FLIGHT + 1)
+        velocity = throw_velocity(start, target, steps, world)  # [B, places, aims, steps, 2]
+        works = _can_throw(start, velocity, hand, world, wall=self._wall)
+        travel = _steps_to(places - joints.unsqueeze(1), hand.action_speed * world.time_step)
+        place, aim, flight = quickest(travel[:, :, None, None] + steps, works)
+        row = torch.arange(len(joints))
+        arrived = travel[row, place].unsqueeze(-1) == 0
+        go = (places[row, place] - joints) / world.time_step
+        return torch.where(arrived, velocity[row, place, aim, flight], go)
 
 
 def _grid(hand: Effector, world: WorldConfig) -> Tensor:

@@ -8,21 +8,21 @@ import pytest
 import torch
 
 from torchrl_her_envs import Arm, WorldConfig
-from torchrl_her_envs.throwing.experts.arm import ArmSkill, arm_throw
+from torchrl_her_envs.throwing.experts.arm import ArmSkill
 
 WORLD = WorldConfig()
 
 
 def test_speeds_of_a_throw_are_within_the_arm_s() -> None:
     joints, goal = torch.tensor([[1.6, 0.0]]), torch.tensor([[5.0, 4.0]])
-    velocity = arm_throw(joints, goal, Arm(WORLD), WORLD, within=0.2)
+    velocity = ArmSkill(WORLD).throw(joints, goal, within=0.2)
     assert velocity.abs().max() <= WORLD.joint_speed
     assert velocity[0, 0] < 0  # clockwise, to the right
 
 
 def test_an_arm_that_cannot_throw_gets_ready() -> None:
     hanging, goal = torch.tensor([[-math.pi / 2, 0.0]]), torch.tensor([[5.0, 4.9]])
-    impossible = arm_throw(hanging, goal, Arm(WORLD), WORLD, within=1e-6)
+    impossible = ArmSkill(WORLD).throw(hanging, goal, within=1e-6)
     ready = hanging + impossible * WORLD.time_step
     torch.testing.assert_close(ready.cos(), torch.tensor([[math.cos(math.radians(120)), 1.0]]))
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_her_envs import Hand, WorldConfig
+from torchrl_her_envs import WorldConfig
 from torchrl_her_envs.throwing.experts.ballistics import fly
-from torchrl_her_envs.throwing.experts.hand import HandSkill, hand_throw
+from torchrl_her_envs.throwing.experts.hand import HandSkill
 
 WORLD = WorldConfig()
 
 
 def test_a_throw_that_can_be_made_from_here_is_made_at_once() -> None:
     grip, goal = torch.tensor([[2.0, 3.0]]), torch.tensor([[4.0, 2.5]])
-    velocity = hand_throw(grip, goal, Hand(WORLD, wall=False), WORLD, wall=False, within=0.2)
+    velocity = HandSkill(WORLD, wall=False).throw(grip, goal, within=0.2)
     assert velocity.abs().max() <= WORLD.hand_speed
     launch = grip + velocity * WORLD.time_step
     substeps = torch.arange(1.0, 31.0) * WORLD.substeps
@@ -23,9 +23,7 @@ def test_a_throw_that_can_be_made_from_here_is_made_at_once() -> None:
 
 def test_a_hand_behind_the_wall_first_goes_to_a_better_place() -> None:
     low, goal = torch.tensor([[2.7, 0.3]]), torch.tensor([[3.5, 1.0]])
-    over, free = (
-        hand_throw(low, goal, Hand(WORLD, wall=wall), WORLD, wall=wall, within=0.2) for wall in (True, False)
-    )
+    over, free = (HandSkill(WORLD, wall=wall).throw(low, goal, within=0.2) for wall in (True, False))
     assert over[0, 1] > 0  # upwards, over the top
     assert not torch.allclose(over, free)
 
