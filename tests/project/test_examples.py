@@ -156,7 +156,7 @@ MISTAKES: dict[str, tuple[type[Exception], Callable[[ModuleType, Curriculum], ob
             name="drive", observation=[0, 1, 2], achieved_goal=[0], desired_goal=[2], threshold=0.1
         ),
     ),
-    "the goal has 2 entries": (
+    "achieved_goal has 2 entries": (
         ValueError,
         lambda own, _: Curriculum(
             [replace(own.DRIVE, achieved_goal=[0, 1], desired_goal=[2, 3]), own.DELIVER], 4, names=own.NAMES

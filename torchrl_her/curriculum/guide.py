@@ -202,5 +202,5 @@ class GuidedExploration(TensorDictModuleBase):
 
     def _columns_of(self, stage: CurriculumStage) -> list[int]:
         inputs = [*stage.observation, *stage.desired_goal]
-        zeros = [self.curriculum.state_width] * (self.curriculum.input_width - len(inputs))
-        return [*inputs, *zeros, *stage.achieved_goal, *stage.desired_goal]
+        padded = self.curriculum.padded(inputs, self.curriculum.input_width)
+        return [*padded, *self.curriculum.goal_index(stage)]

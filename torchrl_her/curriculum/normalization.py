@@ -57,8 +57,10 @@ def count_inputs(
             which = run_rows.get(stage_key).squeeze(-1)
             parts = [(stage, run_rows[which == place]) for place, stage in enumerate(stages)]
         for stage, part in parts:
-            width = len(stage.observation)
-            inputs = (part.get(keys.observation)[..., :width], part.get(keys.desired_goal))
+            inputs = (
+                part.get(keys.observation)[..., : len(stage.observation)],
+                part.get(keys.desired_goal)[..., : len(stage.desired_goal)],
+            )
             if len(part) > 0:
                 norm.count(input_key, torch.cat(inputs, -1), run=run)
     return undo

@@ -117,10 +117,10 @@ class Curriculum:
     """Stages in the order in which they are trained, the last one being the full task.
 
     The network's input is, in each stage, [its n observation entries | its desired goal | zeros],
-    as wide as the last stage's. Order the state so that a stage's inputs, its observation and then its
-    desired goal, are the first inputs of the next stage. Inputs then keep their meaning, and what was
-    learned carries over: with the hand, reaching sees [hand | ball], throwing [hand | ball | speed | black
-    hole].
+    as wide as the last stage's. Goals that have fewer entries than the last stage's have zeros behind them.
+    Order the state so that a stage's inputs, its observation and then its desired goal, are the first inputs
+    of the next stage. Inputs then keep their meaning, and what was learned carries over: with the hand,
+    reaching sees [hand | ball], throwing [hand | ball | speed | black hole].
 
     Args:
         stages: stages in the order of training, one or more.
@@ -132,7 +132,7 @@ class Curriculum:
     Attributes:
         stages: the stages, with indices in place of names and of constant goals.
         appended: the zero and the constant goals that :meth:`extend` puts behind a state.
-        observation_width, goal_width: widths of these entries, the same in every stage.
+        observation_width, goal_width: widths of these entries with their zeros, those of the last stage.
         input_width: width of the network's input.
         first_inputs: number of inputs that the first stage uses; they are the leading ones.
         state_index: [stages, observation_width + 2 * goal_width], indices of observation, achieved and
@@ -141,9 +141,9 @@ class Curriculum:
             desired goal and a zero appended.
 
     Raises:
-        ValueError: there is no stage, a name is unknown, an index lies outside of the state, goals differ in
-            width, a stage is wider than the last one, one below the last has no threshold, or the last one
-            has a constant goal.
+        ValueError: there is no stage, a name is unknown, an index lies outside of the state, the observation
+            or the goal of a stage is wider than the last one's, a stage below the last has no threshold, or
+            the last one has a constant goal.
 
     Example:
         >>> parts = {"hand": [0, 1], "ball": [2], "hole": [3]}
@@ -190,7 +190,7 @@ class Curriculum:
             for stage, (start, end) in zip(resolved, pairwise(ends), strict=True)
         )
         self.input_width = self.observation_width + self.goal_width
-        self.first_inputs = len(self.stages[0].observation) + self.goal_width
+        self.first_inputs = len(self.stages[0].observation) + len(self.stages[0].desired_goal)
         self.state_index = torch.tensor([self._state_index(stage) for stage in self.stages])
         self.input_index = torch.tensor([self._input_index(stage) for stage in self.stages])
 
@@ -224,7 +224,7 @@ class Curriculum:
             stage: index of the stage, from 0.
 
         Returns:
-            [..., observation_width], zeros behind the stage's own entries, and [..., g] twice.
+            [..., observation_width] and [..., goal_width] twice, zeros behind the stage's own entries.
         """
         entries = self.extend(state).index_select(-1, self.state_index[stage].to(state.device))
         observation, achieved, desired = entries.split(
@@ -240,22 +240,24 @@ class Curriculum:
                     f"stage {stage.name!r}: {key} has index {highest}, "
                     f"but the state has {self.state_width} entries: at most {self.state_width - 1} is allowed"
                 )
-        width = len(stage.desired_goal or stage.constant_goal)
-        if width != self.goal_width:
-            raise ValueError(
-                f"stage {stage.name!r}: the goal has {width} entries, but must have "
-                f"{self.goal_width}, like the goal of the last stage, {last.name!r}"
-            )
-        if len(stage.observation) > self.observation_width:
-            raise ValueError(
-                f"stage {stage.name!r}: observation and goal have "
-                f"{len(stage.observation) + self.goal_width} entries, but no stage may be wider than the "
-                f"last one, {last.name!r}, with {self.observation_width + self.goal_width}"
-            )
+        for key, widest in (("observation", self.observation_width), ("achieved_goal", self.goal_width)):
+            if (width := len(getattr(stage, key))) > widest:
+                raise ValueError(
+                    f"stage {stage.name!r}: {key} has {width} entries, but may have no more than that of the "
+                    f"last stage, {last.name!r}, which has {widest}"
+                )
 
     def _state_index(self, stage: CurriculumStage) -> list[Any]:
-        zeros = [self.state_width] * (self.observation_width - len(stage.observation))
-        return [*stage.observation, *zeros, *stage.achieved_goal, *stage.desired_goal]
+        return [*self.padded(stage.observation, self.observation_width), *self.goal_index(stage)]
+
+    def goal_index(self, stage: CurriculumStage) -> list[Any]:
+        """Returns the indices of a stage's achieved and desired goal, each with zeros behind it."""
+        goals = (stage.achieved_goal, stage.desired_goal)
+        return [index for goal in goals for index in self.padded(goal, self.goal_width)]
+
+    def padded(self, indices: Indices, width: int) -> list[Any]:
+        """Returns indices into the extended state, and those of zeros behind them up to a width."""
+        return [*indices, *[self.state_width] * (width - len(indices))]
 
     def _input_index(self, stage: CurriculumStage) -> list[int]:
         n, goal = len(stage.observation), range(self.observation_width, self.input_width)

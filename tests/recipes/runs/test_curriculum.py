@@ -98,6 +98,26 @@ def test_the_guide_s_file_of_stages_is_trained_with(
     )
 
 
+def test_stages_with_goals_of_one_and_of_two_numbers_train_together() -> None:
+    """First the hand comes below or above the ball, then the ball into the hole; guided at each step."""
+    goals = {"achieved_goal": [0], "desired_goal": [5], "threshold": 0.1}
+    below = {"name": "below", "observation": "hand", **goals}
+    _, throw = make_env("hand_v1").stages()
+    order = {"order": "all_at_once", "every_stage": True, "task_share": 1.0}
+    guided = {"guided_share": 1.0, "guided_per": "step"}
+    components = build(small(task="hand_v1", algo="cher", curriculum=[below, throw], **order, **guided))
+    result = run(components, progress=False)
+    assert result.rows[-1]["rows_virtual"] > 0
+    rows = components.buffer[:]
+    first = rows[rows["stage"].squeeze(-1) == 0]
+    assert len(first) > 0
+    assert first["desired_goal"].any(0).tolist() == [True, False]
+    near = (first["next", "observation"][:, 0] - first["desired_goal"][:, 0]).abs() < 0.1
+    assert 0 < near.sum() < len(near)
+    assert torch.equal(first["next", "reward"].squeeze(-1), near.float() - 1.0)
+    components.close()
+
+
 def test_a_chain_is_climbed() -> None:
     options = {"length": 4, "stages": 2, "alternating": True}
     recipe = small(

@@ -39,6 +39,17 @@ def test_each_run_counts_the_inputs_that_its_stage_uses() -> None:
     assert padded[:2].tolist() == [[-1.0, -1.0, -1.0, 0.0, 0.0], [1.0, 1.0, 1.0, 0.0, 0.0]]
 
 
+def test_zeros_behind_a_narrower_goal_are_not_counted() -> None:
+    near = CurriculumStage(name="near", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=1.0)
+    far = CurriculumStage(
+        name="far", observation=[0, 1], achieved_goal=[0, 1], desired_goal=[2, 3], threshold=1.0
+    )
+    progress, norm = CurriculumProgress(Curriculum([near, far], 4)), RunningNorm({"input": 4})
+    rows = TensorDict({"observation": torch.ones(2, 2), "desired_goal": torch.ones(2, 2)}, [2])
+    count_inputs(norm, progress, rows, [0], [2])
+    assert norm.moments_of("input").n.tolist() == [2.0, 2.0, 0.0, 0.0]
+
+
 def test_a_new_stage_forgets_what_means_something_else() -> None:
     curriculum, norm = make_curriculum(), RunningNorm({"input": 5}, runs=2)
     for run in range(2):

@@ -140,6 +140,20 @@ def test_a_stage_may_have_a_constant_goal() -> None:
     assert curriculum.extend(states)[1, index[1]].tolist() == [6.0, 7.0, 6.0, 7.0, 8.0, 9.0]
 
 
+def test_goals_narrower_than_the_last_stage_s_have_zeros_behind_them() -> None:
+    one = make_stage("one", observation=[0], desired_goal=[1])
+    fixed = make_stage("fixed", observation=[0], desired_goal=[], constant_goal=[9.0])
+    both = make_stage("both", achieved_goal=[0, 1], desired_goal=[2, 3])
+    curriculum, state = Curriculum([one, fixed, both], 4), torch.tensor([5.0, 6.0, 7.0, 8.0])
+    assert (curriculum.goal_width, curriculum.input_width, curriculum.first_inputs) == (2, 4, 2)
+    shown = [[part.tolist() for part in curriculum.show(state, stage)] for stage in range(3)]
+    assert shown == [
+        [[5.0, 0.0], [5.0, 0.0], [6.0, 0.0]],
+        [[5.0, 0.0], [5.0, 0.0], [9.0, 0.0]],
+        [[5.0, 6.0], [5.0, 6.0], [7.0, 8.0]],
+    ]
+
+
 def test_indices_must_be_whole_numbers() -> None:
     with pytest.raises(TypeError, match="float"):
         make_stage(observation=[0.5])
@@ -153,11 +167,11 @@ def test_indices_must_be_whole_numbers() -> None:
         ([make_stage(desired_goal=[9])], r"stage 'one': desired_goal has index 9, .* at most 4 is allowed"),
         (
             [make_stage("a", observation=[0, 1, 4]), make_stage("b")],
-            r"stage 'a': observation and goal have 4 entries, but .* last one, 'b', with 3",
+            r"stage 'a': observation has 3 entries, but .* last stage, 'b', which has 2",
         ),
         (
-            [make_stage("a"), make_stage("b", achieved_goal=[0, 1], desired_goal=[2, 3])],
-            r"stage 'a': the goal has 1 entries, but must have 2, like the goal of the last stage, 'b'",
+            [make_stage("a", achieved_goal=[0, 1], desired_goal=[2, 3]), make_stage("b")],
+            r"stage 'a': achieved_goal has 2 entries, but .* last stage, 'b', which has 1",
         ),
         ([make_stage("a", observation="arm")], r"stage 'a': .* unknown name 'arm'; known are 'hand', 'hole'"),
         # What a stage of names hides until the names are resolved
