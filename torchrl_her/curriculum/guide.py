@@ -30,7 +30,8 @@ class GuidedExploration(TensorDictModuleBase):
 
     Where each episode has a stage of its own (``stage_key``), it is as in that paper: the policy itself
     acts, as it would in the first stage, until that stage's goal is achieved, then as in the next one, up to
-    the episode's own stage.
+    the episode's own stage. With ``per="step"`` it acts as in the stage after the last one whose goal is
+    achieved at the moment, so that all that has to hold for a stage belongs to the goal of the one below.
 
     Put it behind the policy and before noise, and an InitTracker of TorchRL's into the environment. The
     environments of R runs are R equal blocks of the batch, in the order of the runs. Under
@@ -160,13 +161,13 @@ class GuidedExploration(TensorDictModuleBase):
         guided = self._begin(torch.ones_like(begun) if self.per == "step" else begun, top)
         if not bool((guided >= 0).any()):
             return tensordict
-        inputs, achieved, desired = self._look(state, guided)
-        squares = self._squares.to(state)[guided.clamp(min=0)].view(achieved.shape[:-1])
-        reached = ((achieved - desired).square().sum(-1) < squares).view(guided.shape)
-        after = torch.full_like(guided, -1) if top is None else torch.where(guided + 1 < top, guided + 1, -1)
-        guided.copy_(torch.where(reached & (guided >= 0), after, guided))
-        if top is not None and bool((reached & (guided >= 0)).any()):
-            inputs, *_ = self._look(state, guided)  # some act as in the next stage from now on
+        acting, after = guided >= 0, guided + 1
+        if self.per == "step" and top is not None:  # what was lost again is done again
+            after = self._after_the_last_achieved(state, top)
+        else:
+            acting &= self._achieved(state, guided)
+        guided.copy_(torch.where(acting, -1 if top is None else torch.where(after < top, after, -1), guided))
+        inputs, *_ = self._look(state, guided)
         rows = TensorDict({self.guide.in_keys[0]: inputs}, tensordict.batch_size)
         policy_action = tensordict.get(action_key)
         acts = guided >= 0 if policy_action.ndim == guided.ndim else (guided >= 0).squeeze(-1)
@@ -192,6 +193,19 @@ class GuidedExploration(TensorDictModuleBase):
                 drawn = drawn if episode_stage is None else drawn & (episode_stage > 0)
                 guided.copy_(torch.where(new, torch.where(drawn, first, -1), guided))
         return self.guided
+
+    def _after_the_last_achieved(self, state: Tensor, top: Tensor) -> Tensor:
+        """Returns the stage after the last one below the top, [B, 1], whose goal is achieved in each row."""
+        after = torch.zeros_like(top)
+        for stage in range(len(self.curriculum) - 1):
+            after = torch.where(self._achieved(state, torch.full_like(top, stage)), stage + 1, after)
+        return after
+
+    def _achieved(self, state: Tensor, stage: Tensor) -> Tensor:
+        """Returns whether each row's goal in the stage [B, 1] of this row is achieved, [B, 1] of bool."""
+        _, achieved, desired = self._look(state, stage)
+        squares = self._squares.to(state)[stage.clamp(min=0)].view(achieved.shape[:-1])
+        return ((achieved - desired).square().sum(-1) < squares).view(stage.shape)
 
     def _look(self, state: Tensor, stage: Tensor) -> tuple[Tensor, ...]:
         """Returns the network's input, the achieved and the desired goal by the stage of each row."""

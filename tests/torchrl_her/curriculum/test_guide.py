@@ -182,6 +182,15 @@ def test_stage_after_stage_up_to_the_episodes_own() -> None:
     assert guide.guided.flatten().tolist() == [-1, -1]
 
 
+def test_by_the_step_the_last_achieved_goal_says_which_stage_acts() -> None:
+    guide = GuidedExploration(policy(1.0), THREE, share=1.0, per="step", stage_key="stage")
+    reach, move = 5.0 + 70.0, 5.0 + 70.0 + 900.0  # see [own place, block, 0] and [own place, block, place]
+    away, at_block, moved = [5.0, 7.0, 9.0], [7.0, 7.0, 9.0], [5.0, 9.0, 9.0]
+    states, stages = [away, at_block, moved, away, at_block], [2, 2, 2, 1, 1]
+    assert in_stages(guide, stages, states, begun=False) == [reach, move + 2.0, -1.0, reach, -1.0]
+    assert in_stages(guide, [2], [away], begun=False) == [reach]  # the block was lost again
+
+
 def test_a_share_of_the_episodes_above_is_begun() -> None:
     guide = GuidedExploration(
         policy(1.0),
