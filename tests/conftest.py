@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Callable, Iterator
 
@@ -10,6 +11,8 @@ import torch
 from torchrl.envs.utils import exploration_type
 
 from .emulated import emulated_device
+
+gc.disable()  # until all is collected, see below
 
 # Small tensors are fastest in one thread, and the workers of pytest-xdist share the cores. The second line is
 # for the processes that tests start.
@@ -32,6 +35,12 @@ def _seed() -> Iterator[None]:
     before = exploration_type()
     yield
     assert exploration_type() is before
+
+
+def pytest_collection_finish() -> None:
+    """Garbage is collected from now on, but not sought among modules and tests, which stay."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -48,11 +48,11 @@ _BASES = [
 
 def _texts(path: Path) -> Iterator[str]:
     """The strings of a module, without its docstrings; what an f-string fills in reads ``{}``."""
-    tree = ast.parse(path.read_text())
-    inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
-    docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
-        if id(node) in inner | docs:
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    inner = {id(part) for node in nodes if isinstance(node, ast.JoinedStr) for part in node.values}
+    skipped = inner | {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    for node in nodes:
+        if id(node) in skipped:
             continue
         if isinstance(node, ast.JoinedStr):
             yield "".join(part.value if isinstance(part, ast.Constant) else "{}" for part in node.values)

@@ -162,12 +162,13 @@ def test_studies_of_this_package_may_name_modules(monkeypatch: pytest.MonkeyPatc
     check_permitted(task)
 
 
-@pytest.mark.parametrize("name", [name for name in study_names() if load_study(name).published])
-def test_published_numbers_are_of_what_the_study_has(name: str) -> None:
-    study = load_study(name)
-    cells = {(recipe.task.name, curve_label(label, recipe)) for label, recipe in study.cells()}
-    for numbers in study.published.get("numbers", {}).values():
-        assert {(task, algorithm) for task, own in numbers.items() for algorithm in own} <= cells
+def test_published_numbers_are_of_what_the_study_has() -> None:
+    studies = [study for study in map(load_study, study_names()) if study.published]
+    assert studies
+    for study in studies:
+        cells = {(recipe.task.name, curve_label(label, recipe)) for label, recipe in study.cells()}
+        for numbers in study.published.get("numbers", {}).values():
+            assert {(task, name) for task, own in numbers.items() for name in own} <= cells, study.name
 
 
 def test_what_is_no_order_is_refused() -> None:

@@ -805,11 +805,6 @@ def test_where_the_stage_s_goal_is_achieved_as_well_its_episode_is_terminated() 
     assert after["reward"].flatten().tolist() == [0.0, 0.0]
 
 
-def test_where_the_environment_can_go_on_so_does_the_stage() -> None:
-    after = act(wrap(TinyEnv((2,)), 0), [30.0, 0.0])
-    assert after["done"].flatten().tolist() == [False, False]
-
-
 def test_an_end_needs_a_flag_to_be_noted_in() -> None:
     progress = at(make_three(), 0)
     with pytest.raises(ValueError, match="continues_after_termination=False needs a key for truncated"):

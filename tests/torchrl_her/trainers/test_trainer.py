@@ -169,14 +169,14 @@ def test_several_gradient_steps_for_each_frame(frames_per_update: float) -> None
 
 
 def test_progress_is_told_after_each_batch() -> None:
-    trainer, _ = make_trainer(epoch_frames=240)
+    trainer, _ = make_trainer(epoch_frames=240, frames_per_update=40.0)
     seen: list[int] = []
     trainer.epoch(lambda own: seen.append(own.frames))
     assert seen == [80, 160, 240]
 
 
 def test_the_next_batch_is_collected_during_learning_until_the_epoch_ends() -> None:
-    trainer, _ = make_trainer(epoch_frames=240)  # three batches
+    trainer, _ = make_trainer(epoch_frames=240, frames_per_update=40.0)  # three batches
     done: list[str] = []
     collector, update = trainer.collector, trainer.learner.update
 
@@ -209,7 +209,7 @@ def test_the_next_batch_is_collected_during_learning_until_the_epoch_ends() -> N
 def test_seeds_make_training_repeat_bit_for_bit() -> None:
     weights = []
     for seed in (0, 0, 1):
-        trainer, policy = make_trainer(seed, epoch_frames=240)
+        trainer, policy = make_trainer(seed, epoch_frames=240, frames_per_update=10.0)
         trainer.epoch()
         weights.append(torch.cat([p.detach().flatten() for p in policy.parameters()]))
     assert torch.equal(weights[0], weights[1])
@@ -364,11 +364,12 @@ def test_epochs_that_follow_a_run_lose_nothing_either() -> None:
 
 
 def test_an_epoch_after_a_run_collects_as_many_frames_as_any_other() -> None:
-    trainer, _ = make_trainer(epoch_frames=2 * N * STEPS)
+    options: dict[str, Any] = {"epoch_frames": 2 * N * STEPS, "frames_per_update": 40.0}
+    trainer, _ = make_trainer(**options)
     trainer.run(10 * N * STEPS)
     trainer.epoch()
     assert trainer.frames == 12 * N * STEPS
-    state, (other, _) = trainer.state_dict(), make_trainer(epoch_frames=2 * N * STEPS)
+    state, (other, _) = trainer.state_dict(), make_trainer(**options)
     other.load_state_dict(state)
     other.epoch()
     assert other.frames == 14 * N * STEPS
