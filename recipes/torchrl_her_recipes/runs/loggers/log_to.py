@@ -81,7 +81,7 @@ class LogTo(Callback):
 
 
 class LogByName(Callback):
-    """Callback of ``log=NAME``: opens or resumes a logger in the run's folder, and closes it.
+    """Callback of ``log=NAME``: opens or resumes a logger in the run's folder. The run closes it.
 
     A logger that fails does not end the run: it is opened again after the next epoch, and gets the rows that
     it has missed.
@@ -106,15 +106,8 @@ class LogByName(Callback):
             self._kept = run.trainer.frames
 
     def on_end(self, run: RunView) -> None:
-        """Logs the pictures, and closes the logger."""
-
-        def show() -> None:
-            teller = self._opened(run)
-            teller.on_end(run)
-            teller.logger.close()
-            self._teller = None
-
-        self._tried(show, run)
+        """Logs the pictures."""
+        self._tried(lambda: self._opened(run).on_end(run), run)
 
     def close(self) -> None:
         """Closes the logger if it is open, also after an error."""
