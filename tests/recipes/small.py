@@ -15,7 +15,7 @@ from torchrl_her_recipes.runs.interrupt import Interrupted
 
 SMALL: dict[str, Any] = {
     "epochs": 2,
-    "epoch_frames": 800,
+    "epoch_frames": 480,
     "num_envs": 8,
     "frames_per_update": 20,
     "hidden": 64,

@@ -82,7 +82,7 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
 def test_every_preset_runs(preset: Path) -> None:
     shrunk = [
         option
-        for option in overrides(folder="out", epochs=1, epoch_frames=480, episodes=2)
+        for option in overrides(folder="out", epochs=1, episodes=2)
         if not option.startswith("num_runs")
     ]
     assert cli.main(["train", f"preset={preset.stem}", *shrunk, "num_runs=1"]) == 0

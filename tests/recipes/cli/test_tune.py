@@ -22,7 +22,7 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def _small(**options: Any) -> list[str]:
-    shrunk = {"epochs": 1, "epoch_frames": 800, "num_runs": 2, "compile": "never", **options}
+    shrunk = {"epochs": 1, "num_runs": 2, "compile": "never", **options}
     return ["task=bit_flip", *overrides(**shrunk)]
 
 

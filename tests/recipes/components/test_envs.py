@@ -170,7 +170,6 @@ def test_an_environment_of_gymnasium_trains_by_its_id(algo: str, tmp_path: Path)
         task="gym:torchrl_her/HandReach-v0",
         algo=algo,
         epochs=1,
-        epoch_frames=480,
         num_envs=4,
         warmup_frames=200,
         curriculum=curriculum if algo == "cher" else None,

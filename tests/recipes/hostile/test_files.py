@@ -111,7 +111,7 @@ KINDS = {
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a file of each kind."""
     folder = tmp_path_factory.mktemp("whole")
-    recipe = small(task="hand_v0", algo="her_ibs", epochs=1, epoch_frames=480, hidden=8, keep_buffer=False)
+    recipe = small(task="hand_v0", algo="her_ibs", epochs=1, hidden=8, keep_buffer=False)
     run(build(recipe), folder / "run", progress=False)
     tiny_policy().save(folder / "policy.safetensors", card=False)
     env = make_env("hand_v0", num_envs=2, seed=0)

@@ -63,7 +63,7 @@ def test_an_exported_policy_acts_as_its_run_does(options: dict[str, Any], tmp_pa
     run(components, tmp_path / "run", progress=False)
     written = export_policy(tmp_path / "run", tmp_path / "policy.safetensors", run=1)
     assert written.recipe.run.seed == 1
-    assert written.info.frames == 800
+    assert written.info.frames == 480
     seen = make_env(recipe.task.name, num_envs=4, seed=7).reset()
     shown = make_played_env(TaskEnvs.of(recipe), 4, [7]).reset()
     played = components.greedy(torch.cat((shown, shown)))["action"][4:]  # of the second of two runs

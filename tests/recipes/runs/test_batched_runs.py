@@ -40,7 +40,12 @@ def priorities(components: Components, run: int) -> Tensor:
 @pytest.mark.parametrize("algo", ["her", "filtered_her_ibs", "cher"])
 def test_each_run_follows_the_single_run_with_its_seed(algo: str) -> None:
     """Over two hundred updates."""
-    options: dict[str, Any] = {"algo": algo, "dtype": "float64", "frames_per_update": 8.0}
+    options: dict[str, Any] = {
+        "algo": algo,
+        "dtype": "float64",
+        "frames_per_update": 8.0,
+        "epoch_frames": 800,
+    }
     together, rows = train(small(num_runs=RUNS, seed=5, **options))
     assert together.recipe.total_frames / together.recipe.collection.frames_per_update >= 200
     pairs = [(epoch, index) for epoch in (1, 2) for index in range(RUNS)]

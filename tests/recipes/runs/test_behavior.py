@@ -34,7 +34,7 @@ WAYS: dict[str, dict[str, Any]] = {
 
 
 def recipe(way: str, **options: Any) -> Recipe:
-    return small(**{**WAYS[way], "epoch_frames": 480, **options})
+    return small(**{**WAYS[way], **options})
 
 
 Whole = Callable[[str], tuple[Components, RunResult]]

@@ -10,7 +10,7 @@ from torchrl_her_recipes import build, run
 
 from ..small import small
 
-SHORT = {"epoch_frames": 480, "warmup_frames": 400, "frames_per_update": 16}
+SHORT = {"warmup_frames": 400, "frames_per_update": 16}
 
 
 def test_where_there_is_no_terminal_each_epoch_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,7 +42,6 @@ ALL: dict[str, Any] = {
     "algo": "cher_ibs",
     "seed": 5,  # of which the first stage ends with the first epoch
     "epochs": 3,
-    "epoch_frames": 480,
     "episodes": 10,
     "window": 10,
     "success_threshold": 0.01,
@@ -52,7 +51,7 @@ ALL: dict[str, Any] = {
 }
 
 
-SHORT = small(algo="filtered_her", epochs=2, epoch_frames=480)
+SHORT = small(algo="filtered_her", epochs=2)
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +169,7 @@ def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not
     ],
 )
 def test_ctrl_c_at_any_batch_changes_nothing(options: dict[str, Any], tmp_path: Path) -> None:
-    recipe, draw = small(**{"epoch_frames": 480, **options, "epochs": 3}), random.Random(1)
+    recipe, draw = small(**{**options, "epochs": 3}), random.Random(1)
     run(build(recipe), tmp_path / "whole", progress=False)
     left = recipe.total_frames // (recipe.collection.num_envs * recipe.collection.steps_per_batch)
     batch = draw.randrange(left // 2)
@@ -185,13 +184,13 @@ def test_ctrl_c_at_any_batch_changes_nothing(options: dict[str, Any], tmp_path: 
 
 
 def test_ctrl_c_saves_what_there_is(tmp_path: Path) -> None:
-    components = press_ctrl_c(build(small(epochs=3, pictures=True)), 25)  # in the middle of the third epoch
+    components = press_ctrl_c(build(small(epochs=3, pictures=True)), 14)  # in the middle of the third epoch
     result = run(components, tmp_path / "run", progress=False)
     assert result.interrupted
-    assert [row["frames"] for row in result.rows] == [800, 1_600]
+    assert [row["frames"] for row in result.rows] == [480, 960]
     saved = load_checkpoint(tmp_path / "run" / "checkpoint.pt")
-    assert saved["trainer"]["frames"] == 26 * 80
-    assert saved["trainer"]["measured"]["loss_value"].shape == (24, 1)
+    assert saved["trainer"]["frames"] == 15 * 80
+    assert saved["trainer"]["measured"]["loss_value"].shape == (12, 1)
     assert (tmp_path / "run" / "curves.png").exists()
 
 
@@ -199,7 +198,7 @@ def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_state, "_worlds", lambda _env, _processes: None)
-    recipe = small(epochs=2, epoch_frames=480)
+    recipe = small(epochs=2)
     run(press_ctrl_c(build(recipe), 8), tmp_path / "run", progress=False)
     held = load_checkpoint(tmp_path / "run" / "checkpoint.pt")["buffer"]["writer"]["held"]
     components = build(recipe)
@@ -235,7 +234,7 @@ def test_environments_that_cannot_be_saved_go_on_bit_for_bit_between_epochs(
     ],
 )
 def test_a_finished_run_that_is_given_more_epochs(options: dict[str, Any], tmp_path: Path) -> None:
-    recipe = small(epochs=4, epoch_frames=480, checkpoint_interval=2, **options)
+    recipe = small(epochs=4, checkpoint_interval=2, **options)
     run(build(recipe), tmp_path / "whole", progress=False)
     run(build(recipe.replace(epochs=2)), tmp_path / "part", progress=False)
     (tmp_path / "part" / "config.yaml").write_text((tmp_path / "whole" / "config.yaml").read_text())
@@ -298,7 +297,7 @@ def test_what_cannot_extend_a_run_is_named_and_changes_nothing(
 def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recipe = small(epochs=2, epoch_frames=480, keep_buffer=False)
+    recipe = small(epochs=2, keep_buffer=False)
     run(build(recipe), tmp_path, progress=False)
     assert [path.name for path in tmp_path.glob("checkpoint*")] == ["checkpoint.pt"]
     assert load_checkpoint(tmp_path / "checkpoint.pt")["buffer"] is None
@@ -316,7 +315,7 @@ def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(
 
 
 def test_a_finished_run_draws_its_pictures_again_without_its_buffer(tmp_path: Path) -> None:
-    recipe = small(epochs=2, epoch_frames=480, keep_buffer=False, algo="filtered_her_ibs", pictures=True)
+    recipe = small(epochs=2, keep_buffer=False, algo="filtered_her_ibs", pictures=True)
     run(build(recipe), tmp_path, progress=False)
     names = ("curves.png", "virtual_goals.png", "policy.gif", "policy.safetensors")
     same = (
@@ -345,7 +344,7 @@ def test_a_buffer_that_was_kept_goes_when_it_is_not_wanted_any_more(ended: Path,
 def test_a_default_run_is_small_when_it_has_finished_and_ends_as_one_that_keeps_its_buffer(
     tmp_path: Path,
 ) -> None:
-    options: dict[str, Any] = {"epochs": 2, "epoch_frames": 480, "task": "hand_v1", "algo": "cher_ibs"}
+    options: dict[str, Any] = {"epochs": 2, "task": "hand_v1", "algo": "cher_ibs"}
     for name, keep in (("kept", True), ("small", False)):
         run(build(small(**options, keep_buffer=keep)), tmp_path / name, progress=False)
     kept, own = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("kept", "small"))
@@ -430,17 +429,17 @@ def test_a_full_disk_does_not_end_a_run(tmp_path: Path) -> None:
     (tmp_path / "checkpoint.part.pt").symlink_to("/dev/full")
     said = "no checkpoint after 0 frames, the run continues: .*No space left on device"
     with pytest.warns(UserWarning, match=said):
-        run(build(small(epochs=2, epoch_frames=480)), tmp_path, progress=False)
+        run(build(small(epochs=2)), tmp_path, progress=False)
     assert load_checkpoint(tmp_path / "checkpoint.pt")["trainer"]["epochs"] == 2
 
 
 def test_a_full_disk_does_not_end_the_run_when_its_table_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "metrics.part.csv").symlink_to("/dev/full")
-    with pytest.warns(UserWarning, match=r"no table after 800 frames, the run continues: .*No space left"):
-        result = run(build(small(epochs=2, epoch_frames=800, log="tensorboard")), tmp_path, progress=False)
+    with pytest.warns(UserWarning, match=r"no table after 480 frames, the run continues: .*No space left"):
+        result = run(build(small(epochs=2, log="tensorboard")), tmp_path, progress=False)
     assert len(result.rows) == len(RunFolder(tmp_path).rows()) == 2
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
-    assert [event.step for event in events.Scalars("success/run_0")] == [800, 1600]
+    assert [event.step for event in events.Scalars("success/run_0")] == [480, 960]
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no disk that is always full")
@@ -448,7 +447,7 @@ def test_a_full_disk_at_the_end_says_what_is_missing(tmp_path: Path) -> None:
     (tmp_path / "policy.part.safetensors").symlink_to("/dev/full")
     said = r"cannot write .*: no space left on device; policy\.safetensors will be written by: .* --resume"
     with pytest.raises(OSError, match=said):
-        run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
+        run(build(small(epochs=1)), tmp_path, progress=False)
     resume(tmp_path, progress=False)
     assert (tmp_path / "policy.safetensors").is_file()
 
@@ -475,7 +474,7 @@ def test_parts_that_were_swapped_must_be_given_to_resume(tmp_path: Path) -> None
         components.critic = None
         return components
 
-    recipe = small(epochs=2, epoch_frames=480)
+    recipe = small(epochs=2)
     run(swapped(recipe.replace(epochs=1)), tmp_path / "run", progress=False)
     with pytest.raises(ValueError, match="the run's critic was NoneType, not TensorDictModule"):
         resume(tmp_path / "run", progress=False)

@@ -12,7 +12,7 @@ from torchrl_her_recipes import build, record_demonstrations, resume, run
 
 from ..small import assert_same, small, stop_after
 
-ALL: dict[str, Any] = {"task": "hand_v1", "epochs": 2, "epoch_frames": 480, "episodes": 10, "seed": 5}
+ALL: dict[str, Any] = {"task": "hand_v1", "epochs": 2, "episodes": 10, "seed": 5}
 
 
 @pytest.fixture(scope="module", name="file")

@@ -38,8 +38,8 @@ def test_configuration_versions_and_seed(finished: Path) -> None:
 
 def test_pandas_reads_the_metrics_at_once(finished: Path) -> None:
     table = pd.read_csv(finished / "metrics.csv")
-    assert table["frames"].tolist() == [800, 1_600]
-    assert table["updates"].tolist() == [40, 80]
+    assert table["frames"].tolist() == [480, 960]
+    assert table["updates"].tolist() == [24, 48]
     assert table["epsilon"].tolist() == pytest.approx([0.9, 0.81])
     assert {"success", "distance", "return", "q", "q_bias", "loss_actor", "loss_value"} <= set(table.columns)
     assert (table["rows_virtual"] > 0).all()
@@ -49,7 +49,7 @@ def test_pandas_reads_the_metrics_at_once(finished: Path) -> None:
 def test_tensorboard_reads_the_events(finished: Path) -> None:
     events = EventAccumulator(str(finished / "tensorboard"))
     events.Reload()
-    assert [event.step for event in events.Scalars("success/run_0")] == [800, 1_600]
+    assert [event.step for event in events.Scalars("success/run_0")] == [480, 960]
 
 
 def test_pictures_open(finished: Path) -> None:
@@ -60,7 +60,7 @@ def test_pictures_open(finished: Path) -> None:
 
 
 def test_pictures_that_are_not_wanted_are_not_made_until_they_are(tmp_path: Path) -> None:
-    run(build(small(epochs=1, epoch_frames=480)), tmp_path, progress=False)
+    run(build(small(epochs=1)), tmp_path, progress=False)
     assert not list(tmp_path.glob("*.png")) + list(tmp_path.glob("*.gif"))
     resume(tmp_path, options={"pictures": True}, progress=False)
     pictures = sorted(path.name for path in (*tmp_path.glob("*.png"), *tmp_path.glob("*.gif")))
@@ -79,13 +79,11 @@ def test_a_folder_that_holds_a_run_is_not_written_over(finished: Path) -> None:
         run(build(small()), finished, progress=False)
 
 
-def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_run_is_refused(finished: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is no folder of a run"):
         resume(tmp_path)
-    folder = tmp_path / "run"
-    run(build(small(epochs=1)), folder, progress=False)
     with pytest.raises(ValueError, match="there is no run 4 in"):
-        load_policy(folder, run=4)
+        load_policy(finished, run=4)
 
 
 # The same again

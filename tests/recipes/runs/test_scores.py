@@ -28,7 +28,7 @@ from torchrl_her_recipes.runs.scores import BestPolicy
 
 from ..small import assert_same, small
 
-SHORT: dict[str, Any] = {"epoch_frames": 480, "seed": 3}
+SHORT: dict[str, Any] = {"seed": 3}
 
 
 @pytest.fixture

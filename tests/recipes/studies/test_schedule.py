@@ -90,7 +90,7 @@ def test_ctrl_c_is_passed_on_and_all_are_waited_for(
     assert outcomes == {"a": Outcome(interrupted=True), "b": Outcome(), "c": Outcome(interrupted=True)}
     assert workers.closed
     shown = capsys.readouterr().err
-    assert "1.60k/4.80k steps" in shown  # an epoch of a and of c
+    assert "960/2.88k steps" in shown  # an epoch of a and of c
     assert "2 running, 0 waiting, about" in shown
     assert "saving what there is" in shown
 

@@ -16,7 +16,6 @@ import yaml
 from filelock import FileLock
 from PIL import Image
 
-import torchrl_her_recipes
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.study import Study, load_study, study_names
@@ -32,6 +31,7 @@ from torchrl_her_recipes.studies.study import (
 )
 
 from ..small import SMALL, overrides, small
+from .forked_worker import fork_workers
 from .here import Here
 from .test_schedule import Actors
 
@@ -77,10 +77,11 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     command = ["study", str(path), f"folder={folder}", "--jobs", "1"]
     assert main([*command, "--plan"]) == 0
     said = capsys.readouterr().out
-    assert "2 batched runs to go, 3,200 environment steps in all" in said
-    assert "her/seeds_0           to do                      1,600 steps to go\n" in said
+    assert "2 batched runs to go, 1,920 environment steps in all" in said
+    assert "her/seeds_0           to do                        960 steps to go\n" in said
     assert not folder.exists()
 
+    fork_workers(monkeypatch)
     folder.mkdir()
     (folder / "her").write_text("in the way")
     assert main(command) == 1
@@ -89,11 +90,9 @@ def test_a_study_of_ones_own_says_what_is_to_do_goes_on_after_a_failure_and_draw
     assert "the same command resumes it" in said
 
     (folder / "her").unlink()
-    # another process would take seconds to start
-    monkeypatch.setattr(torchrl_her_recipes, "make_workers", lambda **_options: Here())
     assert main(command) == 0
     said = capsys.readouterr().out
-    assert "1 batched runs to go, 1,600 environment steps in all" in said
+    assert "1 batched runs to go, 960 environment steps in all" in said
     assert re.search(r"^her: success \d+%$", said, re.MULTILINE)
     with Image.open(folder / "mine.png") as picture:
         assert min(picture.size) > 200

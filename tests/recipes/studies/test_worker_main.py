@@ -17,7 +17,7 @@ from ..small import small
 @pytest.mark.long
 def test_told_to_stop_between_two_jobs_it_ends_without_a_word(tmp_path: Path) -> None:
     """A Ctrl-C that strikes then would only keep it from giving back its semaphores."""
-    recipe = small(task="hand_v0", epochs=1, epoch_frames=480, algo="no_hindsight")
+    recipe = small(task="hand_v0", epochs=1, algo="no_hindsight")
     job = Job(label="one", recipe=recipe, folder=tmp_path / "one")
     command = [sys.executable, "-P", "-m", "torchrl_her_recipes.studies.worker_main"]
     with subprocess.Popen(

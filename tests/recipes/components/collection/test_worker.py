@@ -62,7 +62,7 @@ def test_seeds_repeat_what_follows_and_runs_have_their_own() -> None:
 
 
 def test_each_process_draws_the_stages_of_its_episodes() -> None:
-    at_once = {"task": "hand_v1", "algo": "cher", "order": "all_at_once", "num_envs": 64}
+    at_once = {"task": "hand_v1", "algo": "cher", "order": "all_at_once", "num_envs": 64, "epoch_frames": 640}
     one, same, other = (collect([5, 6], seeds, **at_once)["stage"] for seeds in ([7, 8], [7, 8], [7, 9]))
     assert torch.equal(one, same)
     assert torch.equal(one[:32], other[:32])

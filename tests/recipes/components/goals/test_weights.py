@@ -41,7 +41,7 @@ KINDS = {
 
 
 def recipe(case: str, **options: Any) -> Recipe:
-    return small(**{**CASES[case], "epoch_frames": 480, "frames_per_update": 50.0, **options})
+    return small(**{**CASES[case], "frames_per_update": 50.0, **options})
 
 
 @pytest.fixture(scope="module")

@@ -22,19 +22,18 @@ from ....forks import fork
 from ...small import small
 from .test_log_to import SHORT, STEPS, DiesAt
 
-wandb = pytest.importorskip("wandb", reason="needs the extra wandb")
-mlflow = pytest.importorskip("mlflow", reason="needs the extra test")
-
 ALONE = {"WANDB_MODE": "offline", "WANDB_ERROR_REPORTING": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
 
 
 @pytest.fixture(autouse=True)
-def _alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def wandb(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The package, alone; it takes a second to import."""
+    package = pytest.importorskip("wandb", reason="needs the extra wandb")
     for name, value in ALONE.items():
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("WANDB_PROJECT", raising=False)
-    yield
-    wandb.teardown()  # its process
+    yield package
+    package.teardown()  # its process
 
 
 def _die(folder: Path) -> None:
@@ -79,7 +78,7 @@ def wandb_history(folder: Path) -> dict[int, dict[str, Any]]:
 
 
 @pytest.mark.long
-def test_after_a_kill_and_a_resumption_each_step_is_there_once(tmp_path: Path) -> None:
+def test_after_a_kill_and_a_resumption_each_step_is_there_once(wandb: Any, tmp_path: Path) -> None:
     process = fork(_die, tmp_path)
     process.join(180)
     assert process.exitcode == -signal.SIGKILL
@@ -107,7 +106,8 @@ def test_after_a_kill_and_a_resumption_each_step_is_there_once(tmp_path: Path) -
 
 
 def test_mlflow_has_rows_options_and_pictures(tmp_path: Path) -> None:
-    recipe = small(epochs=2, epoch_frames=480, log=[], pictures=True)
+    mlflow = pytest.importorskip("mlflow", reason="needs the extra test")
+    recipe = small(epochs=2, log=[], pictures=True)
     address, artifacts = f"sqlite:///{tmp_path}/mlflow.db", (tmp_path / "artifacts").as_uri()
     logger = MLFlowLogger("throwing", address, artifact_location=artifacts)
     run(build(recipe), tmp_path / "run", callbacks=[LogTo(logger)], progress=False)
@@ -127,7 +127,7 @@ def view(folder: Path) -> RunView:
 
 
 def test_a_run_that_the_service_knows_is_told_what_comes_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    wandb: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from torchrl_her_recipes.runs.loggers import wandb_run  # noqa: PLC0415  (needs the extra)
 
@@ -146,7 +146,9 @@ def test_a_run_that_the_service_knows_is_told_what_comes_behind(
     assert given["resume"] == "allow"
 
 
-def test_without_an_account_one_line_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_account_one_line_says_what_to_do(
+    wandb: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def init(**_options: Any) -> None:
         raise wandb.errors.UsageError("No API key configured.")
 

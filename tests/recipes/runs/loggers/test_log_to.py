@@ -24,7 +24,7 @@ from torchrl_her_recipes.runs.loggers.show import read_film
 from ....forks import fork
 from ...small import small
 
-SHORT: dict[str, Any] = {"epoch_frames": 480, "epochs": 5, "checkpoint_interval": 2}
+SHORT: dict[str, Any] = {"epochs": 5, "checkpoint_interval": 2}
 STEPS = [480, 960, 1_440, 1_920, 2_400]
 
 
@@ -62,7 +62,7 @@ def csv_steps(path: Path) -> list[int]:
 def _finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with two loggers."""
     folder = tmp_path_factory.mktemp("finished")
-    recipe = small(epochs=2, epoch_frames=480, num_runs=2, log=["tensorboard"], pictures=True)
+    recipe = small(epochs=2, num_runs=2, log=["tensorboard"], pictures=True)
     run(build(recipe), folder, callbacks=[LogTo(CSVLogger("csv", str(folder)))], progress=False)
     return folder
 
@@ -108,7 +108,7 @@ def test_after_a_kill_and_a_resumption_each_step_is_there_once(after: int, tmp_p
 
 
 def test_a_logger_that_joins_later_is_told_the_whole_table(tmp_path: Path) -> None:
-    run(build(small(epochs=2, epoch_frames=480)), tmp_path, progress=False)
+    run(build(small(epochs=2)), tmp_path, progress=False)
     assert not (tmp_path / "tensorboard").exists()
     resume(tmp_path, options={"epochs": 3, "log": ["tensorboard"]}, progress=False)
     steps = [event.step for event in events(tmp_path / "tensorboard").Scalars("epoch/run_0")]
@@ -117,7 +117,7 @@ def test_a_logger_that_joins_later_is_told_the_whole_table(tmp_path: Path) -> No
 
 def test_any_logger_of_torchrl_can_be_given(tmp_path: Path) -> None:
     loggers = [CSVLogger("mine", str(tmp_path)), TensorboardLogger("events", str(tmp_path))]
-    recipe = small(epochs=2, epoch_frames=480, log=[], pictures=True)
+    recipe = small(epochs=2, log=[], pictures=True)
     run(build(recipe), tmp_path / "run", callbacks=[LogTo(own) for own in loggers], progress=False)
     assert csv_steps(tmp_path / "mine" / "scalars" / "success" / "run_0.csv") == [480, 960]
     own = events(tmp_path / "events")
@@ -130,7 +130,7 @@ def test_any_logger_of_torchrl_can_be_given(tmp_path: Path) -> None:
 def test_rows_that_a_logger_has_are_left_out(tmp_path: Path) -> None:
     logger = CSVLogger("mine", str(tmp_path))
     teller = LogTo(logger, after=480)
-    run(build(small(epochs=2, epoch_frames=480)), callbacks=[teller], progress=False)
+    run(build(small(epochs=2)), callbacks=[teller], progress=False)
     assert csv_steps(tmp_path / "mine" / "scalars" / "success" / "run_0.csv") == [960]
 
 
@@ -162,7 +162,7 @@ def _flaky(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("flaky")
 def test_a_logger_that_fails_is_opened_anew_and_told_what_it_missed(tmp_path: Path) -> None:
-    recipe = small(epochs=3, epoch_frames=480, log="flaky")
+    recipe = small(epochs=3, log="flaky")
     said = "^log=flaky fails after 960 frames, the run continues: OSError: no network$"
     with pytest.warns(UserWarning, match=said):
         result = run(build(recipe), tmp_path, progress=False)
