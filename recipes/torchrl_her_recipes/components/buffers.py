@@ -72,31 +72,23 @@ def make_buffer(
         capacity: number of transitions of each run; the recipe's if None.
     """
     size, task, runs = recipe.replay.buffer_size, goal_env(env), len(generators)
-    algorithm = recipe.hindsight.algorithm
     check_buffer_size(size, runs, env, devices.replay, not_stored=_NOT_STORED)
     size = size if capacity is None else capacity
-    rule = task_reward(env)
+    make = partial(load_name(recipe.weights.maker), recipe.weights, env=task, space=space)
+    weights = [make(seed=seed) for seed in recipe.seeds if recipe.hindsight.algorithm.virtual]
     counted = None
     if norm is not None:
         counted = norm.update if state is None else partial(count_inputs, norm, state.progress)
-    make = partial(load_name(recipe.weights.maker), recipe.weights, env=task, space=space)
-    weights = [make(seed=seed) for seed in recipe.seeds if algorithm.virtual]
     buffer = TensorDictReplayBuffer(
         storage=PackedStorage(runs * size, device=devices.replay),
-        writer=HERWriter(
-            rule,
-            **(_goals(recipe.hindsight) if algorithm.virtual else {"k": 0}),
-            n_steps=recipe.hindsight.n_steps,
+        writer=_make_writer(
+            recipe.hindsight,
+            env,
             gamma=recipe.learner.gamma,
-            filter_achieved=algorithm.filter,
-            redraw=recipe.hindsight.redraw,
-            refill=recipe.hindsight.refill if algorithm.filter else 1,
-            achieved_reward=reward_range(task)[1],
             weights=[weight for weight in weights if weight is not None] or None,
-            exclude=_NOT_STORED,
             runs=runs,
             generators=generators,
-            stages=_rules(state, rule, every=getattr(recipe.order, "every_stage", False)),
+            stages=_rules(state, task_reward(env), every=getattr(recipe.order, "every_stage", False)),
             on_write=counted,
         ),
         sampler=_make_sampler(recipe.replay, recipe.learner.priority_power, generators, size, devices.replay),
@@ -112,6 +104,21 @@ def make_buffer(
     if norm is not None:
         buffer.append_transform(NormalizeBatch(norm))
     return buffer
+
+
+def _make_writer(options: HindsightConfig, env: EnvBase, **others: Any) -> HERWriter:
+    algorithm = options.algorithm
+    return HERWriter(
+        task_reward(env),
+        **_goals(options),
+        n_steps=options.n_steps,
+        filter_achieved=algorithm.filter,
+        redraw=options.redraw,
+        refill=options.refill if algorithm.filter else 1,
+        achieved_reward=reward_range(goal_env(env))[1],
+        exclude=_NOT_STORED,
+        **others,
+    )
 
 
 def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) -> list[StageRule] | None:
@@ -131,6 +138,8 @@ def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) 
 
 def _goals(options: HindsightConfig) -> dict[str, Any]:
     """Returns the writer's options for numbers and sources of virtual goals."""
+    if not options.algorithm.virtual:
+        return {"k": 0}
     if options.goal_sources is not None:
         return {"goal_sources": options.goal_sources}
     return {"k": options.k, "strategy": options.strategy}

@@ -19,6 +19,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import build, eval_seeds
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.envs import TaskEnvs
+from torchrl_her_recipes.config.groups import RunConfig
 from torchrl_her_recipes.config.loggers import check_installed
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe
@@ -174,39 +175,45 @@ def resume(
         raise ValueError("give resume() either options or components that were made with them, not both")
     with home.at_work():
         recipe = home.recipe()
-        try:
-            state = load_newest_checkpoint(home.checkpoint, keep=recipe.run.keep_checkpoints)
-        except FileNotFoundError:
-            raise ValueError(
-                f"the run in {home.path} cannot be resumed: {home.checkpoint.name} is missing"
-            ) from None
-        with naming(home.checkpoint, "is not of this run"):
-            done, has_buffer = int(state["trainer"]["epochs"]), bool(state["buffer"])
+        state, done = _newest_state(home, keep=recipe.run.keep_checkpoints)
         target = recipe.extended(**options or {}) if components is None else components.recipe
         check_installed(target.run.log)
-        if not has_buffer and (target.run.epochs > done or target.run.keep_buffer):
-            raise ValueError(
-                f"the run in {home.path} cannot be extended beyond {done} epochs: its checkpoint has no "
-                "replay buffer; only runs trained with keep_buffer=true keep it when they have finished"
-            )
-        if options and target.run.epochs < done:
-            raise ValueError(
-                f"epochs must be at least {done}, the number that the run in {home.path} has done, "
-                f"got {target.run.epochs}"
-            )
+        _check_extension(home, target.run, done, has_buffer=bool(state["buffer"]), asked=bool(options))
         current = _Run(components or build(target), home)
         with torch.random.fork_rng(devices=[]):
-            with naming(home.checkpoint, "is not of this run"):
-                load_run_state(current.parts, state)
+            current.restore(home, state, done)
             if options:
                 home.describe(current.recipe)
-            home.policy.unlink(missing_ok=True)  # a policy of an earlier stop: it marks finished runs
-            if current.best.state is None:
-                # It may be newer than the checkpoint, as the last rows may be.
-                home.best.unlink(missing_ok=True)
-            current.save_best(home)
-            current.rows, current.has_buffer = home.rows()[: done * current.recipe.run.num_runs], has_buffer
             return current.train(callbacks, progress=progress)
+
+
+def _newest_state(home: RunFolder, *, keep: int) -> tuple[dict[str, Any], int]:
+    """Returns the state in the newest complete checkpoint, and the number of epochs that were done."""
+    try:
+        state = load_newest_checkpoint(home.checkpoint, keep=keep)
+    except FileNotFoundError:
+        raise ValueError(
+            f"the run in {home.path} cannot be resumed: {home.checkpoint.name} is missing"
+        ) from None
+    with naming(home.checkpoint, "is not of this run"):
+        _, done = state["buffer"], int(state["trainer"]["epochs"])
+    return state, done
+
+
+def _check_extension(
+    home: RunFolder, options: RunConfig, done: int, *, has_buffer: bool, asked: bool
+) -> None:
+    """Raises if a run that has done some epochs cannot go on as its options say."""
+    if not has_buffer and (options.epochs > done or options.keep_buffer):
+        raise ValueError(
+            f"the run in {home.path} cannot be extended beyond {done} epochs: its checkpoint has no "
+            "replay buffer; only runs trained with keep_buffer=true keep it when they have finished"
+        )
+    if asked and options.epochs < done:
+        raise ValueError(
+            f"epochs must be at least {done}, the number that the run in {home.path} has done, "
+            f"got {options.epochs}"
+        )
 
 
 class _Run:
@@ -218,6 +225,17 @@ class _Run:
         self.rows: list[dict[str, float]] = []
         self.parts = parts_of(components, self.trainer) | {"best": self.best}
         self.has_buffer = True
+
+    def restore(self, home: RunFolder, state: dict[str, Any], epochs: int) -> None:
+        """Restores a state in which some epochs were done, and removes what is newer from the folder."""
+        with naming(home.checkpoint, "is not of this run"):
+            load_run_state(self.parts, state)
+        home.policy.unlink(missing_ok=True)  # a policy of an earlier stop: it marks finished runs
+        if self.best.state is None:
+            # It may be newer than the checkpoint, as the last rows may be.
+            home.best.unlink(missing_ok=True)
+        self.save_best(home)
+        self.rows, self.has_buffer = home.rows()[: epochs * self.recipe.run.num_runs], bool(state["buffer"])
 
     @property
     def has_ended(self) -> bool:
