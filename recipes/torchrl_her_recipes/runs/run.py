@@ -181,9 +181,11 @@ def resume(
         _check_extension(home, target.run, done, has_buffer=bool(state["buffer"]), asked=bool(options))
         current = _Run(components or build(target), home)
         with torch.random.fork_rng(devices=[]):
-            current.restore(home, state, done)
+            with naming(home.checkpoint, "is not of this run"):
+                load_run_state(current.parts, state)
             if options:
                 home.describe(current.recipe)
+            current.go_back(home, done, has_buffer=bool(state["buffer"]))
             return current.train(callbacks, progress=progress)
 
 
@@ -226,16 +228,14 @@ class _Run:
         self.parts = parts_of(components, self.trainer) | {"best": self.best}
         self.has_buffer = True
 
-    def restore(self, home: RunFolder, state: dict[str, Any], epochs: int) -> None:
-        """Restores a state in which some epochs were done, and removes what is newer from the folder."""
-        with naming(home.checkpoint, "is not of this run"):
-            load_run_state(self.parts, state)
+    def go_back(self, home: RunFolder, epochs: int, *, has_buffer: bool) -> None:
+        """Goes back to where some epochs were done, and removes what is newer from the folder."""
         home.policy.unlink(missing_ok=True)  # a policy of an earlier stop: it marks finished runs
         if self.best.state is None:
             # It may be newer than the checkpoint, as the last rows may be.
             home.best.unlink(missing_ok=True)
         self.save_best(home)
-        self.rows, self.has_buffer = home.rows()[: epochs * self.recipe.run.num_runs], bool(state["buffer"])
+        self.rows, self.has_buffer = home.rows()[: epochs * self.recipe.run.num_runs], has_buffer
 
     @property
     def has_ended(self) -> bool:
