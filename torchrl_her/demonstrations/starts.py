@@ -81,7 +81,7 @@ class DemonstrationStarts(Transform):
         self.share, self.runs = share, runs
         self._generators = [None] * runs if generators is None else list(generators)
         self.walk = WalkBack([int(demos.lengths.max()) for demos in self._shown], **walk)
-        self._back: Tensor | None = None  # [N], how many steps before the end the present episodes started
+        self._back: Tensor | None = None  # [N], steps from an episode's start to its demonstration's end
         self._asks_elsewhere = False
 
     def show(self, demonstrations: Demonstrations, *, run: int = 0) -> None:

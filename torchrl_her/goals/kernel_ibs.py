@@ -170,7 +170,7 @@ class KernelInstructiveness(InstructiveWeights):
 
     def _check(self, goals: Tensor) -> None:
         if goals.shape[-1] != self._real.shape[1]:
-            raise ValueError(f"real goals have {self._real.shape[1]} numbers, got goals of {goals.shape[-1]}")
+            raise ValueError(f"goals must have {self._real.shape[1]} numbers, got {goals.shape[-1]}")
 
     def _move(self, device: torch.device) -> None:
         """Moves all tensors to the device of the goals."""

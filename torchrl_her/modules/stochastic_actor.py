@@ -40,8 +40,8 @@ class StochasticActorNet(GoalNet):
 class StochasticActor(ProbabilisticActor):
     """TorchRL's actor of SAC, whose draws come from a generator for each of R runs.
 
-    What a run draws then does not depend on which other runs play beside it. Copies share the generators, as
-    they play for the same runs.
+    What a run draws then does not depend on which other runs are trained beside it. Copies of the actor share
+    its generators, since they act for the same runs.
 
     Args:
         *args: arguments of :class:`torchrl.modules.ProbabilisticActor`.

@@ -106,7 +106,7 @@ def compile_library(
 
 
 def shipped_name(source: str, real: str) -> str:
-    """Name of the library that a wheel carries, in the folder of a level.
+    """Returns the name of a compiled library in a wheel, which has a folder for each set of instructions.
 
     Example:
         >>> shipped_name("steps.cpp", "float")

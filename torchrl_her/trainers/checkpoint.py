@@ -263,7 +263,7 @@ def _block(
             "packed": convert(storage.packed[begin:end]),
             "fields": [tuple(field) for field in storage.fields],
         }
-    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # without what transforms add
+    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # a buffer would transform them
     return {"entries": rows.apply(convert).to_dict(), "shape": list(rows.batch_size)}
 
 

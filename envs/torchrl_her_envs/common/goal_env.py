@@ -68,7 +68,7 @@ class GoalEnv(EnvBase):
     def goal_sigma(self) -> float:
         """The final sigma of IBS, as a share of the width of the goals' box.
 
-        It says how far around the task's goals other goals are taken to be useful for learning them.
+        It says how near to one of the task's goals another goal has to be to help in learning it.
         """
         return 0.2
 
@@ -133,9 +133,10 @@ class GoalEnv(EnvBase):
         return {"observation": list(range(observed)), "desired_goal": list(range(observed, observed + goal))}
 
     def action_limits(self) -> tuple[Tensor, Tensor]:
-        """Returns the least and the greatest action, [entries] each, of the type that the task itself takes.
+        """Returns the lowest and the highest action, [entries] each, of the type that the task itself takes.
 
-        They are equal at fixed entries, to which ``action_spec`` gives a width.
+        Both are equal where the task fixes an entry; the bounds of ``action_spec`` differ there, too, since
+        actions are scaled by their difference.
 
         Example:
             >>> from torchrl_her_envs import make_env

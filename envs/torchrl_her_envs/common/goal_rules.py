@@ -245,8 +245,8 @@ def check_rewards(
         return float(missed[0]), equal, False
     if isinstance(given, bool) or not isinstance(given, int | float) or not missed[0] < given <= equal:
         raise ValueError(
-            f"achieved_reward of {name} must be above {missed[0]:g}, the least reward of a pair of goals, "
-            f"and at most {equal:g}, that of equal ones, got {given!r}"
+            f"achieved_reward of {name} must be above {missed[0]:g}, the least reward that was seen, and at "
+            f"most {equal:g}, the reward where achieved and desired goal are equal, got {given!r}"
         )
     return float(missed[0]), float(given), dense
 

@@ -336,7 +336,11 @@ class OwnGoalEnv(GoalEnv):
             if callable(set_seeds := getattr(self._envs[0], "set_seeds", None)) and self._whole:
                 set_seeds(seeds)
             elif self._whole and len(self._envs) != len(seeds):
-                raise ValueError(f"{self._name} is seeded with {len(self._envs)} seeds, got {len(seeds)}")
+                number = len(self._envs)
+                raise ValueError(
+                    f"{self._name} is {number} batches without set_seeds: it needs {number} seeds, "
+                    f"got {len(seeds)}"
+                )
             else:
                 for env, key in zip(self._envs, keys[:: len(keys) // len(self._envs)], strict=True):
                     env.set_seed(key)

@@ -111,7 +111,7 @@ def make_collector(
 ) -> Collector:
     """Runs a policy in the training environments, a few steps of each at a time."""
     if devices == ON_THE_CPU:
-        # All of it: where the policy's is left open, every entry is copied at every step.
+        # For policy and storage, too: with a policy device unset, TorchRL copies every entry in every step.
         places = {"device": env.device}
     else:
         learner, replay = devices

@@ -258,10 +258,10 @@ def _drop_options_of_another_task(below: Nested, given: Nested) -> None:
 
 
 def drop_alternatives(below: Nested, given: Nested) -> None:
-    """Drops values of the base where the same is given by other options.
+    """Drops a setting of the base, as ``epochs``, if the user gives it by another option, as ``frames``.
 
     Raises:
-        ValueError: The same is given twice.
+        ValueError: The user gives a setting by two options.
     """
     for group, (option, others) in _ALTERNATIVES.items():
         asked, base = given.get(group, {}), below.get(group, {})

@@ -1,4 +1,4 @@
-"""Names of the presets and trained policies that come with the package."""
+"""Presets, search spaces, studies and trained policies that come with the package, by name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TRAINED = Path(__file__).parent.parent / "trained"
 
 
 def shipped_names(kind: str) -> list[str]:
-    """Returns the names of the presets, spaces or studies that come with the package.
+    """Returns the names of the presets, search spaces or studies that come with the package.
 
     Args:
         kind: ``preset``, ``space`` or ``study``.

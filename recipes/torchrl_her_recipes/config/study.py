@@ -67,7 +67,10 @@ def read_orders(expect: Mapping[str, Sequence[str]]) -> list[Order]:
     if not isinstance(expect, Mapping) or not all(
         isinstance(orders, list | tuple) for orders in expect.values()
     ):
-        raise ValueError(f"expect must hold lists of orders by metric, such as [cher > her]; got {expect!r}")
+        raise ValueError(
+            "expect must map metrics to lists of comparisons, as in {success: [cher > her]}; "
+            f"got {expect!r}"
+        )
     return [Order.parse(measure, text) for measure, orders in expect.items() for text in orders]
 
 
@@ -148,7 +151,7 @@ class Study:
             yield from ({**varied, "case": case} for case in self.cases) if self.cases else (varied,)
 
     def cells(self) -> Iterator[tuple[str, Recipe]]:
-        """Yields the names and recipes of all combinations; the runs of a recipe are its seeds.
+        """Yields the name and the recipe of each combination; a recipe trains all seeds of its combination.
 
         Raises:
             ValueError: a recipe cannot work, two combinations have the same name or the same recipe, or

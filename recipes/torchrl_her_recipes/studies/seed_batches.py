@@ -19,10 +19,10 @@ _ROWS = 1_280  # rows of a batch's gradient step above which more runs side by s
 
 
 class Batches:
-    """Folders of one combination: its ``seeds_*``, or the folder itself if it is a single run's.
+    """The batches of runs of one combination of a study, a folder ``seeds_*`` each, or a single run's folder.
 
-    What is read are the batches that have come to their end; as long as none has, those that are under
-    way, up to the last epoch that all of them have reached.
+    Finished batches are read. While none is finished, the unfinished ones are, up to the last epoch that all
+    of them have reached.
 
     Args:
         paths: folders; several if each holds some of the seeds. They may not exist yet.

@@ -95,7 +95,7 @@ def test_batches_that_cannot_be_seeded_in_blocks_serve_several_runs_one_each() -
         assert (seen[3:] == wanted).all()
         assert (one[3:] == other).all()
     assert both.render([0, 5]).shape == (2, 4, 6, 3)
-    with pytest.raises(ValueError, match="is seeded with 2 seeds, got 3"):
+    with pytest.raises(ValueError, match="is 2 batches without set_seeds: it needs 2 seeds, got 3"):
         both.set_seeds([1, 2, 3])
     with pytest.raises(ValueError, match="4 environments cannot be shared|cannot be shared"):
         make_own_env(f"{HERE}:make_points", num_envs=4, seed=[1, 2, 3])

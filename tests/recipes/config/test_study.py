@@ -174,7 +174,7 @@ def test_published_numbers_are_of_what_the_study_has() -> None:
 def test_what_is_no_order_is_refused() -> None:
     for expect, message in (
         ({"success": ["her = cher"]}, "an order is written 'a > b' or 'a < b', got 'her = cher'"),
-        ({"success": "her > cher"}, "expect must hold lists of orders by metric"),
+        ({"success": "her > cher"}, "expect must map metrics to lists of comparisons"),
     ):
         with pytest.raises(ValueError, match=message):
             Study(name="mine", vary={"algo": ["her", "cher"]}, expect=expect)

@@ -218,7 +218,7 @@ def test_it_goes_on_as_it_was_saved(tmp_path: Any) -> None:
         for weights in (first, second):
             weights.update(uniform(30, 3, seed=seed))
             weights.step()
-    with pytest.raises(ValueError, match="real goals have 2 numbers, got goals of 3"):
+    with pytest.raises(ValueError, match="goals must have 2 numbers, got 3"):
         KernelInstructiveness(uniform(5, 2), sigma=0.1).load_state_dict(first.state_dict())
 
 
@@ -308,5 +308,5 @@ def test_a_stage_of_a_curriculum_turns_it_off_and_starts_sigma_anew() -> None:
     enter_stage(buffer, make_stage(instructive=True))
     assert not weights.is_uniform
     assert (weights.written, weights.sigma) == (0, 1.5)
-    with pytest.raises(ValueError, match="real goals have 1 numbers, got goals of 3"):
+    with pytest.raises(ValueError, match="goals must have 1 numbers, got 3"):
         weights.update(torch.zeros(4, 3))

@@ -19,7 +19,7 @@ from torchrl_her_recipes.components.learner import LearnerBuilder, Networks
 
 
 class DQNBuilder(LearnerBuilder):
-    """See :func:`~torchrl_her.objectives.make_dqn_loss`."""
+    """Builds networks and loss of double DQN, see :func:`~torchrl_her.objectives.make_dqn_loss`."""
 
     def networks(self, runs: int) -> Networks:
         actor, critic = make_q_actor(

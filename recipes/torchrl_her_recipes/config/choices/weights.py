@@ -26,7 +26,7 @@ WEIGHTS = Kind("weights", Weights, default="none")
 
 @dataclass(frozen=True, kw_only=True)
 class Equal(Weights):
-    """Gives all goals equal weight; counts them if the task states the range of its goals."""
+    """Gives all goals equal weight, and counts them for the metric ``kl`` if their range is known."""
 
     name = "none"
     maker = f"{_MAKERS}:make_counts"
