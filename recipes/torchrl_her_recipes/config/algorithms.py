@@ -10,7 +10,7 @@ from functools import partial
 from torchrl_her_recipes.config.options import AUTO, REGISTERED, what_there_is
 
 STRATEGIES = ("future", "final", "episode")  # goal strategies that come with the library
-RECENT = ("actual", "achieved")  # sources of goals besides strategies: those of recent episodes
+RECENT = ("actual", "achieved")  # sources of virtual goals that are not strategies: goals of recent episodes
 _STRATEGY_REGISTRY = "torchrl_her.goals.strategies"
 
 
@@ -71,7 +71,7 @@ ALGORITHMS: dict[str, Algorithm] = {
 }
 
 
-_UNRESOLVED = Algorithm(name=AUTO, filter=True)  # until the environment decides which one it is
+_UNRESOLVED = Algorithm(name=AUTO, filter=True)  # for ``auto``, until the environment decides the algorithm
 
 
 def register_algorithm(algorithm: Algorithm) -> None:
@@ -86,10 +86,10 @@ def register_algorithm(algorithm: Algorithm) -> None:
 
 
 def get_algorithm(name: str) -> Algorithm:
-    """Returns the algorithm of a name; for ``auto`` the options that all its possible values share.
+    """Returns the algorithm of a name; for ``auto`` the options that all algorithms it can become share.
 
     Raises:
-        ValueError: there is none; the message lists those that there are.
+        ValueError: no algorithm has this name; the message lists the algorithms.
 
     Example:
         >>> get_algorithm("her").filter
@@ -107,11 +107,11 @@ def get_algorithm(name: str) -> Algorithm:
 def check_strategy(name: str) -> None:
     """Raises a ValueError for an unknown goal strategy.
 
-    Other strategies exist only if the library was imported to register them. So if it was not imported,
-    the names that it comes with are all there are, and it need not be imported for the check.
+    Users' strategies are registered with the library, which they import for it. If the library was not
+    imported, only its own strategies exist, and the check does not import it.
 
     Raises:
-        ValueError: it does not exist; the message lists those that do.
+        ValueError: the strategy does not exist; the message lists the strategies.
     """
     known = _known_strategies()
     if name not in known:
@@ -133,7 +133,7 @@ def check_goal_sources(sources: object) -> dict[str, int]:
         raise ValueError(f"goal_sources must be numbers of goals by source, {example}, got {sources!r}")
     known = [*_known_strategies(), *RECENT]
     for name, number in sources.items():
-        if isinstance(name, str) and ":" in name and number is None:  # without the space, YAML reads a name
+        if isinstance(name, str) and ":" in name and number is None:  # YAML needs a space behind the colon
             raise ValueError(f"goal_sources needs a space behind each colon, {example}, got {dict(sources)}")
         if name not in known:
             raise ValueError(

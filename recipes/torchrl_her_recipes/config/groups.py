@@ -20,8 +20,8 @@ class Group:
     """A group of options, which are checked when it is made.
 
     Attributes:
-        needs: Options that have an effect with some values of another one only; see ``idle_options``.
-        prefix: Prefix of its options in messages.
+        needs: Options that have an effect only with some values of another option; see ``idle_options``.
+        prefix: Text before the names of its options in messages.
     """
 
     needs: ClassVar[Needs] = ()
@@ -329,7 +329,7 @@ class EvaluationConfig(Group):
     )
 
 
-_SEEDS = 1 << 31  # leaves room for the seeds of evaluations, which are derived from it
+_SEEDS = 1 << 31  # seeds are below it, to leave room for the larger seeds of evaluations
 
 
 @dataclass(frozen=True, kw_only=True)

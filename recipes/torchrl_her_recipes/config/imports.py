@@ -2,8 +2,8 @@
 
 A recipe can name code, as ``task=module:function`` or ``task=gym:module:ID``. Such a module is imported if
 the user named it (in :func:`~torchrl_her_recipes.make_recipe`, on the command line, by ``--import``), but not
-because a file says so: a run's folder, a policy, a preset or a study may come from another user. There it
-needs a permission: ``with allow_imports():``, or ``--allow-import`` on the command line.
+because a file names it: a run's folder, a policy, a preset or a study may come from another user. A module
+that only a file names needs a permission: ``with allow_imports():``, or ``--allow-import`` in a command.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from pathlib import Path
 
 from torchrl_her_envs.registry import GYM, module_of
 
-# Modules with harmless imports, for gymnasium's ids only: a function could be any of the module's.
+# Harmless to import for an id of gymnasium. Not for ``module:function``, which could call any function.
 _HARMLESS = ("gymnasium", "gymnasium_robotics", "torchrl_her_envs")
 
-_imported: list[str] = []  # worker processes of studies import them, too
+_imported: list[str] = []  # modules that worker processes of studies import, too
 _permitted: set[str] = set()
 _everything: list[bool] = []  # has an entry while all modules are permitted
 
@@ -62,7 +62,7 @@ def look_here() -> None:
 
 
 def foreign_module(task: str) -> str:
-    """Returns the module that a task imports unless it is known to be harmless; empty if there is none.
+    """Returns the module that a task imports; empty if it imports none, or a harmless one.
 
     Example:
         >>> foreign_module("gym:my_module:MyEnv-v0"), foreign_module("gym:FetchReach-v4")

@@ -14,11 +14,11 @@ class LoggerSpec:
     """A logger that ``log=[NAME]`` chooses.
 
     Args:
-        name: name of the logger, and of its folder in that of a run.
+        name: name of the logger, and of its folder in the run's folder.
         factory: function that opens it, as ``module:function``; it is imported when a run begins. It is
-            called with the :class:`~torchrl_her_recipes.RunView` and a number of frames. It takes everything
-            behind these out of what it has logged before, and returns a TorchRL ``Logger`` and up to which
-            frames that has the table already: 0 for a new one.
+            called with the :class:`~torchrl_her_recipes.RunView` and a number of frames. It removes what was
+            logged after this number of frames. It returns a TorchRL ``Logger`` and the number of frames up to
+            which this logger already has the rows of the metrics table: 0 for a new one.
         needs: the package that it needs, which is also the name of the extra; empty for none.
     """
 
@@ -46,7 +46,7 @@ def register_logger(spec: LoggerSpec) -> None:
 
 
 def check_loggers(value: Any) -> tuple[str, ...]:
-    """Returns the names of loggers, checked, in their order; none for None.
+    """Checks the names of loggers and returns them in a tuple; it is empty for None.
 
     Example:
         >>> check_loggers("wandb"), check_loggers(["tensorboard", "wandb"]), check_loggers(None)

@@ -31,8 +31,8 @@ def option(
     """Defines an option: a field of a group of options.
 
     Args:
-        default: the value that works for most tasks; None where the task or the learner has its own, and
-            ``AUTO`` where it follows from the environment before training begins.
+        default: the value that works for most tasks; None if the task or the learner has a default of its
+            own; ``AUTO`` if the value is derived from the environment before training begins.
         help: a few words, shown by ``torchrl-her train -h``.
         at_least, above, at_most, below: the range of a number.
         choices: the values that are allowed.
@@ -59,10 +59,10 @@ def check_options(group: Any) -> None:
 
 
 def idle_options(group: Any) -> dict[str, str]:
-    """Returns the options of a group that have no effect, with the other option that is the reason.
+    """Returns the options of a group that have no effect, each with the setting that is the reason.
 
-    The group's ``needs`` are rows: an option, a function that is true of its values with which others have an
-    effect, and the names of these others.
+    A row of the group's ``needs`` is an option A, a function of A's value, and names of options that have an
+    effect only if the function returns a true value.
 
     Example:
         >>> from torchrl_her_recipes.config.groups import CollectionConfig
@@ -97,7 +97,7 @@ def _check_value(definition: Field[Any], long_name: str, value: Any) -> None:
         "below": lambda limit: value < limit,
     }
     bounds = {name: limit for name, limit in limits.items() if limit is not None}
-    if not all(tests[name](limit) for name, limit in bounds.items()):  # NaN fails all of them
+    if not all(tests[name](limit) for name, limit in bounds.items()):  # NaN fails every test
         allowed = " and ".join(f"{name.replace('_', ' ')} {limit}" for name, limit in bounds.items())
         raise ValueError(f"{long_name} must be {allowed}, got {value}")
     if isinstance(value, float) and not (isfinite(value) or definition.metadata.get("infinite")):

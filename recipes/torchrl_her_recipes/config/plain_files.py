@@ -1,7 +1,7 @@
 """Safe reading of files from untrusted sources: text, YAML, JSON and tables.
 
-Nothing of them is executed, they may not be larger than such files are, and whatever is wrong with one is a
-ValueError of one line that names it.
+Nothing in a file is executed, and files that are too large are refused. Whatever is wrong with a file raises
+a ValueError whose message is one line and names the file.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import Any
 
 import yaml
 
-_LARGEST = 1 << 20  # bytes of a configuration
+_LARGEST = 1 << 20  # bytes of a configuration, at most
 LARGEST_TABLE = 1 << 28
 _DEPTH = 30
-# Errors that damaged content may raise in any reader. A RuntimeError is torch's, or a RecursionError.
+# Errors that damaged content may raise in any reader. RuntimeError stands for torch's and for RecursionError.
 _DAMAGE = (ArithmeticError, AttributeError, AssertionError, LookupError, RuntimeError, TypeError, ValueError)
-_SHOWN = 300  # characters of a reason
+_SHOWN = 300  # characters of a reason that a message shows
 
 
 def shown(value: object, most: int = 80) -> str:
@@ -47,7 +47,7 @@ def naming(path: Path, problem: str = "cannot be read") -> Iterator[None]:
     try:
         yield
     except _DAMAGE as error:
-        if type(error).__name__ == "OutOfMemoryError":  # a RuntimeError of torch's, and no damage
+        if type(error).__name__ == "OutOfMemoryError":  # torch's, and a RuntimeError: no damage
             raise
         cause = reason(error) if isinstance(error, ValueError) else f"it is damaged ({type(error).__name__})"
         raise ValueError(f"{path} {problem}: {cause}") from error
@@ -57,8 +57,8 @@ def read_text(path: Path, *, largest: int = _LARGEST) -> str:
     """Reads the text of a file.
 
     Raises:
-        ValueError: it has more than ``largest`` bytes, or is no text in UTF-8.
-        OSError: it cannot be read.
+        ValueError: the file has more than ``largest`` bytes, or is not text in UTF-8.
+        OSError: the file cannot be read.
     """
     with open(path, "rb") as file:
         data = file.read(largest + 1)
@@ -92,7 +92,7 @@ def parse_yaml(text: str) -> Any:
     """Parses a text in YAML to plain values.
 
     Raises:
-        ValueError: it is not YAML, or repeats values by name.
+        ValueError: the text is not YAML, or has an alias (``*name``).
 
     Example:
         >>> parse_yaml("{a: [1, b]}")
@@ -147,7 +147,7 @@ def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, floa
         path: the file.
 
     Keyword Args:
-        counts: columns that each row must have, of whole numbers of at least 0.
+        counts: columns that each row must have, with whole numbers of at least 0.
     """
     text = read_text(path, largest=LARGEST_TABLE)
     try:
@@ -155,7 +155,7 @@ def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, floa
             {name: number(each) for name, each in row.items()}
             for row in csv.DictReader(text.splitlines(), strict=True)
         ]
-    except (AttributeError, TypeError, ValueError, csv.Error) as error:  # cut short, or no numbers
+    except (AttributeError, TypeError, ValueError, csv.Error) as error:  # cut short, or not numbers
         raise ValueError(f"{path} is damaged: a line is no row of the table") from error
     for name in counts:
         if odd := [row.get(name) for row in rows if not isinstance(row.get(name), int)]:
@@ -164,5 +164,5 @@ def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, floa
 
 
 def number(text: str) -> float:
-    """Parses a number: whole ones as int."""
+    """Parses a number; returns an int if it is written as a whole number."""
     return int(text) if text.isdigit() else float(text)

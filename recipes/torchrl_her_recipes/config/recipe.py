@@ -22,7 +22,7 @@ from torchrl_her_recipes.config.without_effect import without_effect
 # Options that may change when a run resumes, since they do not affect training so far.
 EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints", "keep_buffer", "pictures", "log")
 
-# By group, an option and others that say the same.
+# By group: an option, and other options for the same setting.
 _ALTERNATIVES = {
     "run": ("frames", ("epochs",)),
     "curriculum": ("stages", ("name",)),
@@ -78,7 +78,7 @@ class Recipe:
                 raise ValueError(f"{option}={value} has no effect {why}: leave it out")
 
     def _check_proposed(self) -> None:
-        """Refuses what cannot be used where behavior goals are proposed."""
+        """Refuses options that cannot be used together with proposed behavior goals."""
         proposed, num_envs = self.behavior, self.collection.num_envs
         if not isinstance(proposed, Proposed):
             return
@@ -178,13 +178,13 @@ def check_extending(values: Mapping[str, Any]) -> None:
 def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Recipe:
     """Makes a recipe from options by name: ``make_recipe(task="hand_v0", algo="her", seed=3)``.
 
-    An option is named by itself (``gamma``) or with its group (``{"learner.gamma": 0.95}``); ``task``,
-    ``learner`` and ``curriculum`` are the names of theirs.
+    An option is named by itself (``gamma``) or with its group (``{"learner.gamma": 0.95}``). The groups
+    ``task``, ``learner`` and ``curriculum`` stand for their option ``name``: ``task`` for ``task.name``.
 
     Args:
-        base: values of a preset or of another recipe. Those that ``values`` leave without effect are
+        base: values of a preset or of another recipe. A value that has no effect beside ``values`` is
             dropped, so that a preset of DDPG also serves TD3.
-        values: the options that are asked for. One that has no effect is an error.
+        values: options to set. An option that has no effect raises an error.
 
     Raises:
         ValueError: an option that does not exist or that has no effect, or a value that cannot work.
@@ -203,7 +203,7 @@ def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Reci
 
 
 def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe:
-    """Makes a recipe like :func:`make_recipe`, but from values that the user has not named one by one."""
+    """Makes a recipe like :func:`make_recipe`, but does not permit the import of the task's module."""
     below = place(base or {})
     given = place(values, below)
     if get_algorithm(chosen("hindsight", given, below)).weights is not None:
@@ -227,10 +227,10 @@ def _meant(group: str, *values: Nested) -> str:
 def _drop_options_of_other_choices(below: Nested, given: Nested) -> None:
     """Drops options of the base's choices that the requested choices do not have.
 
-    What is merely a default of the base's choice is left out, too: the other one may have its own.
+    Defaults of the base's choice are dropped, too, since the requested choice may have other defaults.
 
     Raises:
-        ValueError: an option is asked for that ``auto`` does not have on this task.
+        ValueError: the user gives an option that the choice of ``auto`` on this task does not have.
     """
     for group, kind in KINDS.items():
         asked = kind.find(chosen(group, given, below))

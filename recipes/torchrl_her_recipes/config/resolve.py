@@ -1,4 +1,4 @@
-"""Replaces options that are ``auto`` by values that fit what the task's environment is."""
+"""Replaces the value ``auto`` of options by values that fit the task's environment."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.without_effect import without_effect
 
 TERMINATION = "termination"  # option of a task: the rule that ends an episode at its goal
-_WARMUP = 1_000  # environment steps, at least
-_EPISODES = 100  # in an epoch, where environments are stepped one by one
+_WARMUP = 1_000  # least number of environment steps before learning
+_EPISODES = 100  # number in an epoch if environments are stepped one by one
 _AT_ONCE = {"order": "all_at_once", "every_stage": True, "task_share": 1.0}  # order of a found curriculum
-_STAGE_EPOCHS = 10  # epochs after which its first stage ends, learned or not, where goals are weighted
+_STAGE_EPOCHS = 10  # in the first stage of a found curriculum, at most, if goals are weighted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,16 +52,16 @@ def _epoch_frames(collection: CollectionConfig, run: RunConfig, facts: EnvFacts)
     return max(frames, collection.num_envs * collection.steps_per_batch)
 
 
-# In this order: later ones depend on earlier ones.
+# Computed in this order: later values depend on earlier ones.
 _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
     "algo": lambda _recipe, facts: "cher" if facts.stages else "filtered_her",
     "goal_sources": lambda recipe, _facts: recipe.hindsight.sources,
-    # a horizon of half an episode
+    # so that the horizon 1 / (1 - gamma) is half an episode
     "gamma": lambda _recipe, facts: round(min(max(1 - 2 / facts.max_steps, 0.9), 0.99), 4),
     "num_envs": lambda recipe, facts: _num_envs(recipe.collection.processes, facts),
     "frames_per_update": lambda _recipe, facts: 5.0 if facts.batched else 1.0,
     "epoch_frames": lambda recipe, facts: _epoch_frames(recipe.collection, recipe.run, facts),
-    # until each environment has ended an episode, no transition is stored
+    # at least until each environment has ended an episode: transitions are stored at an episode's end
     "warmup_frames": lambda recipe, facts: max(recipe.collection.num_envs * facts.max_steps, _WARMUP),
 }
 
@@ -110,7 +110,7 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
         values = {f"{group}.{name}": _VALUES[name](recipe, facts)}
         if name == "algo" and facts.stages:
             values |= {"stages": facts.stages, "guided_share": 0.5, "guided_per": "step"}
-            # Weights of goals know one stage at a time.
+            # Weights of goals work for one stage at a time, so that weighted goals need stages in sequence.
             values |= _AT_ONCE if recipe.weights.name == "none" else {"stage_epochs": _STAGE_EPOCHS}
         recipe = recipe.replace(**values)
     return recipe

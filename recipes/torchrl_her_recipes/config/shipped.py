@@ -27,7 +27,7 @@ def find_file(kind: str, name: str) -> Path:
     """Returns the file of a preset, space or study, by its name or as the path of a YAML file.
 
     Raises:
-        ValueError: there is no such file; the message lists the names of the package.
+        ValueError: there is no such file; the message lists the names that come with the package.
     """
     path = Path(name) if str(name).endswith((".yaml", ".yml")) else CONF / kind / f"{name}.yaml"
     if "\0" in str(name) or not path.is_file():
@@ -44,7 +44,7 @@ def preset_names() -> list[str]:
 def load_preset(name: str) -> dict[str, Any]:
     """Returns the values of a preset, by the names of options.
 
-    A preset may begin with another one, ``preset: demo``, whose values hold where it has none of its own.
+    A preset may begin with another one (``preset: demo``), whose values it takes for options it does not set.
 
     Args:
         name: one of ``preset_names()``, or the path of a YAML file.
@@ -62,7 +62,7 @@ def _load(name: str, above: tuple[Path, ...]) -> dict[str, Any]:
     values = read_mapping(path)
     first = values.pop("preset", None)
     with naming(path):
-        place(values)  # unknown names
+        place(values)  # raises if a name is unknown
         if first is not None:
             find_file("preset", first)
     return values if first is None else merge(_load(first, (*above, path)), values)
@@ -80,7 +80,7 @@ def policy_files() -> dict[str, Path]:
 
 
 def find_policy(source: str | Path) -> Path:
-    """Returns the file of an exported policy, or of the packaged policy of this name or of this task.
+    """Returns the file of a policy, given by its path, or by the name or the task of a packaged policy.
 
     Raises:
         ValueError: there is no such file; the message lists the packaged policies.

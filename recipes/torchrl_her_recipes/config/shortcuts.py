@@ -33,7 +33,7 @@ GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
     "run": groups.RunConfig,
 }
 KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)}
-# options that had another name before
+# former names of options, and their present names
 FORMER_NAMES = {
     "products": "matmul_dtype",
     "average_decay": "ema_decay",
@@ -53,7 +53,7 @@ TASK_OPTIONS = ("max_steps", "termination", "achieved_reward", "parallel", "info
 
 
 class Entries(dict[str, Any]):
-    """Entries that are set in a mapping, as by ``task.options.bits=8``; its other entries stay."""
+    """Entries to set in an option that is a mapping, as ``task.options.bits=8``; its other entries stay."""
 
 
 def choices_of(group: str) -> dict[str, type[groups.Group]]:
@@ -87,7 +87,7 @@ def chosen(group: str, *values: Nested) -> str:
 
 
 def renamed(name: str) -> list[str]:
-    """Returns the names that an option has now, if it had another one or was in another group before.
+    """Returns the present names of an option that was renamed or moved; empty for any other name.
 
     Example:
         >>> renamed("curriculum.window"), renamed("curriculum.order"), renamed("curriculum.stages")
@@ -106,12 +106,13 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
     """Finds the group and the name of an option.
 
     Args:
-        name: short (``seed``), with its group (``run.seed``), or a group that has a name (``task``). Those of
-            some groups (``demonstrations.file``) are never short.
-        values: Choices by which a short name of several groups is found, the first ones first.
+        name: short (``seed``), with its group (``run.seed``), or a group (``task``) in place of its ``name``.
+            Options of some groups (``demonstrations.file``) have no short name.
+        values: Options that are set. If several groups have the short name, their choices decide, the first
+        values first.
 
     Raises:
-        ValueError: it does not exist, or is not unique; the message names the nearest one.
+        ValueError: the option does not exist, or its short name is not unique; the message suggests names.
 
     Example:
         >>> locate("seed"), locate("learner"), locate("weights.floor")
@@ -157,7 +158,7 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
 
 
 def split_name(name: str) -> list[str]:
-    """Splits a name into that of an option and, if there is one, that of an entry of its mapping.
+    """Splits a name into the name of an option and, if given, the name of an entry in the option's mapping.
 
     Example:
         >>> split_name("run.seed"), split_name("task.options.bits")
@@ -170,8 +171,8 @@ def split_name(name: str) -> list[str]:
 def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
     """Sorts values, by short or long names or as whole groups, into groups.
 
-    Short names that several groups have are looked up among the choices of the values and of ``base``, so
-    they come last. Of values for the same option the last one counts.
+    If several groups have a short name, the choices in the values and in ``base`` decide, so such names are
+    placed last. If an option is given several times, the last value counts.
 
     Example:
         >>> place({"task": "hand_v0", "seed": 3, "run": {"epochs": 2}, "task.options.bits": 8})

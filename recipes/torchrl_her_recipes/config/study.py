@@ -32,7 +32,7 @@ class Order:
 
     Attributes:
         measure: Metric that is compared.
-        more, less: Algorithms with more and with less of it.
+        more, less: Algorithms that are expected to have more and less of the metric.
         text: The order as it was written.
     """
 
@@ -83,21 +83,21 @@ class Study:
         summary: subject of the comparison, in one line.
         recipe: options that all runs have in common; ``num_runs`` is the number of seeds.
         vary: the values that are compared, by the name of their option. All combinations are run. The
-            figure has a panel for each task, and in it a curve for each combination of the others.
-        cases: other options that are compared, by a name of one's own: each case has some of them, and none
-            is crossed with another case, only with what varies. An ablation has a case for each part that
-            it takes away. They may not set how many runs there are, or how long they are, and each of their
-            options must have an effect with all that varies.
+            figure has a panel for each task, and in it a curve for each combination of the other options.
+        cases: sets of other options that are compared, by names that you choose. Each case is combined with
+            all values in ``vary``, and not with other cases. An ablation has a case for each part that it
+            takes away. Cases may not set the number or the length of runs, and each of their options must
+            have an effect in all combinations of ``vary``.
         for_task: options of the runs on some of the tasks alone, by the task's name.
         figure: the metrics that are drawn over environment steps.
         expect: orders that are expected at the end, ``a > b`` or ``a < b`` of two combinations, in lists by
-            metric. The report says on each task whether they hold.
-        published: numbers of others, which stand beside those of the runs in the report: ``numbers`` by
+            metric. The report states for each task whether an order holds.
+        published: results of other authors, which the report shows beside the runs' results: ``numbers`` by
             metric, task and algorithm, and ``where`` and ``notes`` by metric.
 
     Raises:
         ValueError: there is nothing to compare, the values of an option are no list, there are options for a
-            task that is not compared, a case or a task sets what varies, or a metric is unknown.
+            task that is not compared, a case or a task sets an option in ``vary``, or a metric is unknown.
     """
 
     name: str
@@ -133,7 +133,7 @@ class Study:
         read_orders(self.expect)  # raises if an order is not valid
 
     def _check_sets(self, field: str, by: str, is_name: Callable[[str], object]) -> None:
-        """Checks a mapping whose entries are sets of options, none of which may be among those that vary."""
+        """Checks a mapping to sets of options; no set may have an option that is in ``vary``."""
         sets = getattr(self, field)
         if not isinstance(sets, Mapping) or not all(
             isinstance(name, str) and is_name(name) and isinstance(entry, Mapping)
@@ -155,7 +155,7 @@ class Study:
 
         Raises:
             ValueError: a recipe cannot work, two combinations have the same name or the same recipe, or
-                a case sets an option that has no effect with what varies.
+                a case sets an option that has no effect in one of the combinations.
         """
         before: dict[str, Recipe] = {}
         for combination in self.combinations():
@@ -165,7 +165,7 @@ class Study:
             if label in before:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
             for_task = self.for_task.get(_task_of(combination.get("task")), {})
-            # Unlike options of the whole study, these are never dropped silently.
+            # Options of a case or in ``vary`` are never dropped silently, unlike those of the whole study.
             asked = merge(self.cases.get(case, {}), combination)
             try:
                 recipe = compose(merge(self.recipe, for_task), asked)
@@ -218,7 +218,7 @@ def load_study(
         name: one of :func:`study_names`, or the path of a .yaml file.
         seeds: runs of each combination, in place of the study's own number.
         frames: environment steps of each run, rounded up to whole epochs.
-        quick: whether to shrink it so that it ends in minutes.
+        quick: whether to shrink the study so that it ends in minutes.
 
     Raises:
         ValueError: there is no such study, or a number below 1.
@@ -251,7 +251,7 @@ def load_study(
 
 
 def _set_in(options: Mapping[str, Any], names: Iterable[str]) -> list[str]:
-    """Returns which of some options are set, by their names within their groups."""
+    """Returns those of the named options that ``options`` sets, by their names without the group."""
     places = {locate(name) for name in names}
     return [name for group, values in place(options).items() for name in values if (group, name) in places]
 

@@ -25,15 +25,15 @@ def own_version() -> str:
 def check_versions(installed: Callable[[str], str] = metadata.version) -> None:
     """Compares torch, tensordict and torchrl with the ranges that this project requires.
 
-    Beside a torch that it does not fit, TorchRL only warns when it is imported, and fails later, in the
-    middle of a run. So this is asked first, and without importing any of the three.
+    If the installed torch does not fit, TorchRL only warns when it is imported, and fails in the middle of a
+    run. So versions are checked first, without importing any of the three packages.
 
     Raises:
-        ImportError: one of them is outside of its range, or not installed, or tensordict is not of TorchRL's
-            minor release. The message names it and what to install.
+        ImportError: a package is outside of its range or not installed, or tensordict is not of TorchRL's
+            minor release. The message names the package and what to install.
 
     Warns:
-        UserWarning: one of them is inside of its range, but a release that was never tried.
+        UserWarning: a package is inside of its range, but a release that was never tried.
     """
     requirements = {entry.name: entry for entry in map(Requirement, metadata.requires("torchrl-her") or [])}
     have = {name: Version(installed(name)) for name in TRIED}

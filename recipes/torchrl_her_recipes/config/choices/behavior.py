@@ -29,11 +29,11 @@ class Real(Behavior):
 
 @dataclass(frozen=True, kw_only=True)
 class Proposed(Behavior):
-    """Base class: goals that were achieved before, in some of the episodes.
+    """Base class of choices that, in some of the episodes, ask for goals that were achieved before.
 
-    The maker takes the options and ``goals``, a function that makes
-    :class:`~torchrl_her.behavior.BehaviorGoals` from ``weights``, ``factors`` and the like. The maker returns
-    its result. Keyword arguments of the maker:
+    The maker takes the options and the function ``goals``. It calls ``goals`` with ``weights``, ``factors``
+    and the like, and returns the :class:`~torchrl_her.behavior.BehaviorGoals` that this makes. Keyword
+    arguments of the maker:
 
     - ``learner``: options of the learner;
     - ``runs``: number of runs;

@@ -11,11 +11,11 @@ from torchrl_her_recipes.config.options import REGISTERED, nearest
 
 @dataclass(frozen=True, kw_only=True)
 class Choice(Group):
-    """Base of the alternatives of a section, with their options; the docstring begins with a summary.
+    """Base class of the alternatives for a section: fields are options, the docstring begins with a summary.
 
     Attributes:
         name: Name that recipes take.
-        maker: The function or class that makes it, as ``module:name``; it is imported when a run is built.
+        maker: Function or class that makes the component, as ``module:name``; imported when a run is built.
     """
 
     name: ClassVar[str] = ""
@@ -26,12 +26,12 @@ C = TypeVar("C", bound=Choice)
 
 
 class Kind(dict[str, type[C]]):
-    """The choices of a section by name. A call makes the options of one: ``kind(name="mega", cutoff=-5.0)``.
+    """The choices for a section by name. ``kind(name="mega", cutoff=-5.0)`` makes the options of a choice.
 
     Args:
         section: Name of the section.
         base: Base class of the choices.
-        default: Name of the choice of a recipe that names none.
+        default: Name of the choice that is used if a recipe names none.
     """
 
     def __init__(self, section: str, base: type[C], *, default: str) -> None:

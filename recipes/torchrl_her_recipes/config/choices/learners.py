@@ -28,7 +28,7 @@ class LearnerConfig(Choice):
     Attributes:
         actions: kinds of actions that it supports.
         stacks: whether several runs can be trained side by side in one program.
-        priority_power: its loss gives this power of the absolute TD error as a priority.
+        priority_power: its loss gives each transition the absolute TD error to this power as a priority.
         has_epsilon: whether a share epsilon of the actions explores.
         clones: whether its loss can clone the behavior of demonstrations.
     """

@@ -17,9 +17,9 @@ class Order(Choice):
     The maker takes the options and the :class:`~torchrl_her.Curriculum`, and by keyword ``runs`` and
     ``generators`` (of random numbers, one for each run). It returns the
     :class:`~torchrl_her.CurriculumProgress` of the runs, or :class:`~torchrl_her.curriculum.EpisodeStages` if
-    each episode has a stage of its own; with a true option ``every_stage``, transitions are then stored for
-    every stage. A run that begins a stage explores with the epsilon of the option
-    ``stage_epsilon``, or with 1 if the order has no such option.
+    each episode has a stage of its own. In the latter case, an option ``every_stage`` that is true stores
+    transitions for every stage. When a run begins a stage, epsilon starts at the option ``stage_epsilon``,
+    or at 1 if the order has no such option.
     """
 
 

@@ -23,12 +23,12 @@ class Search:
     """A search for good options.
 
     Args:
-        recipe: recipe of the trials, except for the options that are varied. Its ``num_runs`` runs are the
-            seeds of each trial, and its ``seed`` is also that of the sampler.
+        recipe: recipe of the trials, except for the options that are varied. Each trial trains its
+            ``num_runs`` runs, from its ``seed`` on; the sampler of options uses this seed, too.
         space: the options that are varied.
         sampler: ``tpe``, ``random`` or ``cmaes``.
-        pruner: rule by which trials are ended early: ``median``, those below the median of the others at the
-            same epoch; ``halving``, all but the best third at a ninth and at a third of the epochs; ``none``.
+        pruner: rule that ends trials early. ``median`` ends those below the median of the others at the same
+            epoch; ``halving`` all but the best third at a ninth and at a third of the epochs; or ``none``.
 
     Raises:
         ValueError: an unknown sampler or pruner, or a space that the recipe does not take.
@@ -76,7 +76,7 @@ class Search:
 
 
 def difference(search: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """Returns what differs in two searches as plain values, as ``mine, not theirs``; empty if nothing does.
+    """Compares two searches, given as plain values: ``mine, not theirs``, or an empty text if they are equal.
 
     Example:
         >>> from torchrl_her_recipes import make_recipe, space_for

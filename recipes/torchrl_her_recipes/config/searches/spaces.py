@@ -43,7 +43,7 @@ class Space:
             ``{kind: choice, values: [64, 128]}``.
 
     Raises:
-        ValueError: an unknown option or kind, a range that holds nothing, or two ranges for one option.
+        ValueError: an unknown option or kind, an empty range, or two ranges for one option.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Space:
         """Returns the space without options whose values are given.
 
         Raises:
-            ValueError: nothing is left.
+            ValueError: no option is left.
 
         Example:
             >>> load_space("dqn").without({"learner.gamma": 0.9}).ranges.get("gamma")
@@ -84,7 +84,7 @@ class Space:
         """Checks that a recipe accepts the ends of all ranges, and all values of choices.
 
         Raises:
-            ValueError: it does not; the message names the option.
+            ValueError: the recipe refuses such a value; the message names the option.
         """
         for name, values in self.ranges.items():
             for value in values.get("values") or (values["low"], values["high"]):
@@ -96,7 +96,8 @@ class Space:
     def recipe(self, base: Recipe, values: Mapping[str, Any]) -> Recipe:
         """Makes a recipe with given values of the options that are varied.
 
-        Values without effect besides the others are left out; k and strategy replace goal_sources.
+        A value that has no effect beside the others is left out. ``k`` and ``strategy`` replace
+        ``goal_sources``.
 
         Raises:
             ValueError: values that cannot go together.
@@ -106,7 +107,7 @@ class Space:
         return compose(merge(base.to_dict(), given), {})
 
     def values_of(self, recipe: Recipe) -> dict[str, Any]:
-        """Returns a recipe's values of the options that have an effect, inside the ranges or not."""
+        """Returns a recipe's values of the varied options that have an effect, even if outside the ranges."""
         idle = without_effect(recipe)
         places = {name: locate(name, recipe.to_dict()) for name in self.ranges}
         return {
@@ -192,7 +193,7 @@ def load_space(name: str) -> Space:
             ``hidden: {kind: choice, values: [64, 128]}``.
 
     Raises:
-        ValueError: there is no such space, or what the file holds is none; one line that names what is wrong.
+        ValueError: there is no such space, or the file holds no space; the message is one line.
         OSError: the file cannot be read.
 
     Example:
@@ -206,7 +207,7 @@ def space_for(recipe: Recipe) -> Space:
     """Returns the space of a recipe's learner, without options that have no effect.
 
     Raises:
-        ValueError: the learner has none.
+        ValueError: the package has no search space for the learner.
     """
     actions = get_task_spec(recipe.task.name).actions or "continuous"
     learner = BY_ACTIONS[actions] if recipe.learner.name == "auto" else recipe.learner.name
