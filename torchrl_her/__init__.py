@@ -70,7 +70,7 @@ __all__ = [
 
 __version__ = version("torchrl-her")
 
-# Names that left this front in 0.1, with the sub-packages that have them. They go in 0.2.
+# Names that were here until 0.1, with the sub-packages that have them now. 0.2 drops these aliases.
 _MOVED = {
     "DecayingEpsilonGreedy": "modules",
     "make_dqn_loss": "objectives",

@@ -35,8 +35,8 @@ def check_whole(*, least: int = 1, **options: object) -> None:
 def check_finite(tensors: Mapping[str, Tensor]) -> None:
     """Raises an error for tensors that hold NaN or infinity.
 
-    Their sums tell, in a twentieth of the time of ``isfinite`` over all. Sums of finite numbers may overflow:
-    where one is not finite, each number is looked at.
+    The sum of a tensor shows NaN and infinity in a twentieth of the time of ``isfinite``. As sums of finite
+    numbers may overflow, ``isfinite`` decides where a sum is not finite.
 
     Args:
         tensors: tensors of any shapes and types, on one device, by their names in messages.

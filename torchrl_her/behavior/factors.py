@@ -25,9 +25,9 @@ class GoalCandidates(NamedTuple):
         reached: [m, c, o], what was observed when they were achieved.
         start: [m, o], what is observed at the beginning of each episode.
         target: [m, g], the goal that the task itself asks for.
-        counts: R numbers, how many of the m episodes are of each run.
-        known: R tensors [s, g], a sample of the goals that each run has achieved; empty for runs without such
-            episodes, and if no factor asks for it (``GoalFactor.samples``).
+        counts: R numbers of episodes, which sum to m: how many belong to each run.
+        known: R tensors [s, g], a sample of the goals that each run has achieved; empty for runs that begin
+            no episode, and if no factor needs samples (``GoalFactor.samples``).
     """
 
     goals: Tensor
@@ -50,7 +50,7 @@ class GoalFactor:
     The base class gives all goals the same factor.
 
     Attributes:
-        samples: number of achieved goals that it needs in ``GoalCandidates.known``.
+        samples: number of achieved goals that the factor needs in ``GoalCandidates.known``.
 
     Example:
         >>> class NotTooFar(GoalFactor):
@@ -81,13 +81,14 @@ class GoalFactor:
 
 
 class Successes:
-    """The success of recent episodes of R runs: an average that forgets.
+    """Success rates of recent episodes, exponential moving averages for R runs.
 
     Args:
         runs: R.
 
     Keyword Args:
-        memory: episodes after which an episode counts 1 / e of what it counted first.
+        memory: number of later episodes after which an episode's weight has fallen to 1 / e of its first
+            value.
 
     Attributes:
         rate: [R] of float64; ``start`` before the first episode.
@@ -115,16 +116,16 @@ class InverseDensity(GoalFactor):
     """Prefers goals with few others around them: the inverse of their density among all that were achieved.
 
     MEGA proposes the goal of the least density (Pitis et al., Maximum Entropy Gain Exploration for Long
-    Horizon Multi-goal RL, 2020, arXiv 2007.02832). As virtual goals, rare ones are preferred by
+    Horizon Multi-goal RL, 2020, arXiv 2007.02832). To prefer rare goals as virtual goals, use
     :class:`~torchrl_her.goals.RareGoals`.
 
-    Goals are divided by the standard deviations of those that were achieved. The density is a Gaussian kernel
-    estimate for up to three numbers, and one by the nearest neighbors for more.
+    Each coordinate is divided by its standard deviation over the achieved goals. The density is a Gaussian
+    kernel estimate for goals of up to three coordinates, and a nearest-neighbor estimate for more.
 
     Keyword Args:
         samples: achieved goals that the density is estimated from.
         sigma: width of the kernel, in standard deviations.
-        k: number of the neighbor whose distance counts.
+        k: the distance to the k-th nearest goal gives the nearest-neighbor estimate.
 
     Raises:
         ValueError: an option is not positive.
@@ -160,11 +161,11 @@ class InverseDensity(GoalFactor):
 class ValueCutoff(GoalFactor):
     """Leaves out goals that the critics consider out of reach: those with a value below a cut-off.
 
-    Each run has its own cut-off, which moves with the success of its proposed goals. It falls while more than
-    ``high`` of them are achieved, by one step in ``memory`` episodes. It rises while fewer than ``low`` are
-    achieved, up to its first value. If all goals of an episode are below it, the goal with the highest value
-    stays. After Pitis et al., Maximum Entropy Gain Exploration for Long Horizon Multi-goal
-    RL, 2020 (arXiv 2007.02832), section 3.3.
+    Each run has its own cut-off, which moves with the success rate of its proposed goals. The cut-off falls
+    while this rate is above ``high``, by ``step`` in ``memory`` episodes. It rises while the rate is below
+    ``low``, up to its first value. If all of an episode's candidates are below the cut-off, the one with the
+    highest value stays. After Pitis et al., Maximum Entropy Gain Exploration for Long Horizon Multi-goal RL,
+    2020 (arXiv 2007.02832), section 3.3.
 
     Args:
         values: values of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
@@ -172,9 +173,9 @@ class ValueCutoff(GoalFactor):
     Keyword Args:
         runs: R.
         cutoff: first value of the cut-off, which is also its greatest.
-        floor: its least value.
-        step: how far it moves in ``memory`` episodes.
-        low, high: between which success it stays where it is.
+        floor: least value of the cut-off.
+        step: how far the cut-off moves in ``memory`` episodes.
+        low, high: success rates between which the cut-off does not move.
         memory: episodes over which success is averaged.
 
     Attributes:
@@ -243,10 +244,10 @@ class DiscoverScore(GoalFactor):
 
     V and S are the mean and the standard deviation of the critics' values, s0 is the beginning of the
     episode, s_g what was observed when g was achieved, and g* the goal of the task. Each run's alpha rises
-    while fewer than ``target`` of the proposed goals are achieved, so that achievable goals count more, and
+    while the success rate of its proposed goals is below ``target``, so that achievable goals count more, and
     falls otherwise.
 
-    With a single critic S is 0. :class:`InverseDensity` then takes its place.
+    With a single critic S is 0; add :class:`InverseDensity`, which then takes the place of S.
 
     Args:
         values: values of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
@@ -255,9 +256,10 @@ class DiscoverScore(GoalFactor):
         runs: R.
         beta: how much the critics' disagreement counts.
         alpha: first value of alpha.
-        step: how far it moves in ``memory`` episodes whose success is off the target by 1.
-        target: the success that is aimed at.
-        temperature: in the unit of values; the lower, the more the best goal is preferred.
+        step: how far alpha moves in ``memory`` episodes if their success rate is off the target by 1.
+        target: success rate of proposed goals that alpha steers to.
+        temperature: divisor of the score, in the unit of values; the lower, the more the best goal is
+            preferred.
         memory: episodes over which success is averaged.
 
     Attributes:

@@ -15,7 +15,7 @@ from torchrl_her.randomness import Generators, uniform
 class AchievedGoals:
     """The newest achieved goals of R runs, each with what was observed when it was achieved.
 
-    Each run has a ring of its own, which is on the device of the first goals that come.
+    Each run has its own ring buffer, on the device of the first goals that are added.
 
     Args:
         capacity: goals that each run keeps.
@@ -24,7 +24,7 @@ class AchievedGoals:
         runs: R.
 
     Raises:
-        ValueError: ``capacity`` or ``runs`` is below 1; when adding, more goals come at once than fit.
+        ValueError: ``capacity`` or ``runs`` is below 1; when adding, more goals are added at once than fit.
 
     Example:
         >>> memory = AchievedGoals(3, runs=2)
@@ -56,7 +56,7 @@ class AchievedGoals:
             observations: [N, o].
 
         Keyword Args:
-            which: [N] of bool, those that are added; None for all.
+            which: [N] of bool, the goals that are added; None for all.
         """
         number = len(goals) // self.runs
         if number * self.runs != len(goals):
@@ -65,7 +65,7 @@ class AchievedGoals:
             raise ValueError(f"{number} goals of each run do not fit into a memory of {self.capacity}")
         if self._rows is None:
             self._rows = self._empty(goals), self._empty(observations)
-        if self._written.device != goals.device or self._rows[0].device != goals.device:  # a checkpoint's
+        if self._written.device != goals.device or self._rows[0].device != goals.device:  # after loading
             self._rows = self._rows[0].to(goals.device), self._rows[1].to(goals.device)
             self._written = self._written.to(goals.device)
         finite = goals.isfinite().all(-1)
@@ -85,7 +85,7 @@ class AchievedGoals:
         Args:
             counts: R numbers of episodes; 0 where a run has no goals.
             width: goals for each episode.
-            generators: R, one of each run; None for torch's own.
+            generators: R generators, one for each run; None for torch's own.
 
         Returns:
             [sum of counts, width] of int64, for :meth:`goals` and :meth:`observations`, run after run.

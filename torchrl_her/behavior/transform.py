@@ -32,10 +32,10 @@ class BehaviorGoals(Transform):
 
         weight(g) * factor(g) * factor(g) * ...
 
-    where ``weight`` says how useful a goal is, as it does for virtual goals, and the factors how well it can
-    be achieved from here and how far it leads. Then the episode's reward, terminated and done are those of
-    the proposed goal. The other episodes are as the environment has them. Environments for evaluation do
-    without this transform.
+    where ``weight`` says how useful a goal is, as for virtual goals. The factors say how well the goal can be
+    achieved from the episode's start, and how far it leads to the task's goal. The episode's reward,
+    terminated and done are then those of the proposed goal. All other episodes keep the task's own goal.
+    Leave this transform out of environments for evaluation.
 
     | method | weights | update_on | factors | greedy |
     | --- | --- | --- | --- | --- |
@@ -49,39 +49,40 @@ class BehaviorGoals(Transform):
     called.
 
     The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
-    Episodes that end by a time limit count as ended only if that limit lies below this transform.
-    Put the transform around a ParallelEnv and not inside of its workers, which would each have a memory of
-    their own. All that it knows is a part of its ``state_dict()``, and so of the collector's.
+    Episodes that end by a time limit count as ended only if a transform before this one, or the environment,
+    sets that limit. Put the transform around a ParallelEnv and not inside of its workers, each of which would
+    have its own memory of goals. Memory and counts are part of the transform's ``state_dict()``, and so of
+    the collector's.
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated), as the environment's own does.
 
     Keyword Args:
-        weights: weights of goals; for several runs a list, one of each. None for all alike.
-        factors: others by which the weights are multiplied.
+        weights: weights of goals; for several runs a list, one for each run. None for equal weights.
+        factors: the factors by which the weights are multiplied.
         update_on: goals that the weights are updated on: ``achieved`` or ``proposed`` ones.
-        remember: whether achieved goals are remembered; if not, ``memory.add`` says which goals there are.
-        greedy: whether the goal of the greatest product is proposed, and not one in proportion to it.
+        remember: whether the transform remembers achieved goals; if not, add goals by ``memory.add``.
+        greedy: whether the goal of the greatest product is proposed; if not, one in proportion to it.
         real_share: share of the episodes in which the task's own goal stays.
-        candidates: goals of which one is proposed.
-        memory: goals that each run remembers.
+        candidates: number of goals of which one is proposed.
+        memory: number of goals that each run remembers.
         runs: R.
         generators: generators, one for each run; None for torch's own, with one run only.
         achieved_reward: the reward of an achieved goal.
         continues_after_termination: whether the environment can be stepped further after it terminated an
             episode; if not, the episode is truncated there.
-        keys: keys of the entries that are read, and all but the first two written.
+        keys: keys of the entries that are read. All are also written, except observation and achieved goal.
         real_goal_key: key under which the task's own goal is written.
         proposed_key: key under which a bool [..., 1] is written: whether the goal is a proposed one.
         reached_key: key under which a bool [..., 1] is written: whether
             a proposed goal was achieved in the episode.
         stage_key: key of the stage [..., 1] that an episode is played in, if it has one.
-        stage: the one in which goals are proposed.
+        stage: index of the stage in which goals are proposed.
 
     Attributes:
         memory: the achieved goals of each run, :class:`~torchrl_her.behavior.AchievedGoals`.
-        ended, achieved: [R] int64, episodes with proposed goals that have ended, and those in which the goal
-            was achieved, since :meth:`success` was called.
+        ended, achieved: [R] int64, numbers of episodes with proposed goals that have ended, and of those in
+            which the goal was achieved, since :meth:`success` was last called.
 
     Raises:
         ValueError: an option is out of its range; when used, the batch is not R equal blocks.
@@ -230,10 +231,10 @@ class BehaviorGoals(Transform):
         before = self._get(next_tensordict, self.keys.reward)
         ended = self._get(next_tensordict, self.keys.terminated)
         fell = ended & (before < self.achieved_reward)
-        if bool(fell.any()):  # such an end holds for any goal, unless the task's own goal has caused it
+        if bool(fell.any()):  # a fall ends episodes of any goal; an end by the task's own goal is none
             own_reward, own_end = call_reward(self.reward_fn, outcome, real)
             fell = fell & ~own_end
-            reward = reward + (before - own_reward).clamp(max=0.0) * fell  # and its cost does, too
+            reward = reward + (before - own_reward).clamp(max=0.0) * fell  # and costs the same
         reached = self._get(tensordict, reached_key) | (proposed & (reward >= self.achieved_reward))
         terminated = torch.where(proposed, terminated | fell, ended)
         done = terminated
@@ -320,7 +321,7 @@ class BehaviorGoals(Transform):
                 ),
             )
         goals = candidates.goals.take_along_dim(place.unsqueeze(-1), 1).squeeze(1)
-        if not bool(valid.all()):  # the others keep the task's own goal
+        if not bool(valid.all()):  # without a valid goal, the task's own stays
             chosen, goals = chosen.index_put((chosen.clone(),), valid), goals[valid]
             counts = self._counts(chosen, len(begins))
         if self.weights and self.update_on == "proposed":
@@ -328,7 +329,7 @@ class BehaviorGoals(Transform):
         return chosen, goals
 
     def _sample(self, counts: Sequence[int]) -> Sequence[Tensor]:
-        """Draws goals of each run that has episodes: the largest number that a factor needs."""
+        """Draws, for each run that begins episodes, as many goals as the most demanding factor needs."""
         number = max((factor.samples for factor in self.factors), default=0)
         draws = [min(1, count) for count in counts]
         if number == 0:

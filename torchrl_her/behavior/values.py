@@ -24,14 +24,15 @@ class GoalValues:
     steps has the value -(1 - gamma^d) / (1 - gamma).
 
     Args:
-        loss: loss of TorchRL, whose critics are asked; see :func:`~torchrl_her.objectives.critic_values`.
+        loss: loss of TorchRL, whose critics give the values; see
+            :func:`~torchrl_her.objectives.critic_values`.
         actor: the greedy policy.
 
     Keyword Args:
         runs: R, whose networks are stacked.
         before_actor: called with rows [R * n, c] before the actor, R equal blocks in the order of the runs;
             for example :class:`~torchrl_her.ZeroPad`.
-        before_critic: called with them before the critics; for example
+        before_critic: called with these rows before the critics; for example
             :class:`~torchrl_her.modules.RunningNorm`.
         keys: keys of observation and desired goal, which the networks see.
 
@@ -68,7 +69,7 @@ class GoalValues:
         Args:
             observation: [m, o], or [m, c, o] with one for each goal; run after run.
             goals: [m, c, g], or [m, 1, g] with one for all.
-            counts: R numbers, how many of the m are of each run.
+            counts: R numbers of episodes, which sum to m: how many belong to each run.
 
         Returns:
             [m, c, E], on the goals' device.

@@ -19,19 +19,19 @@ from torchrl_her.curriculum.transforms import take_columns
 class GuidedExploration(TensorDictModuleBase):
     """Lets the policy that has learned a stage begin some of the next stage's episodes.
 
-    When a stage begins, nothing in its buffer was achieved yet, and a policy that learns of failure alone
-    soon forgets what it could do: a gripper no longer reaches the block that it should push. In a share of
-    the episodes, a copy of the policy that had learned the stage below acts until that stage's goal is
-    achieved, and then the present policy. That is the self-guided exploration of Luo et al., Relay Hindsight
-    Experience Replay, 2022 (arXiv 2208.00843), here with the stages one after another.
+    When a stage begins, its buffer has no episode that achieved its goal, and a policy that learns from
+    failures alone soon forgets what it could do: a gripper no longer reaches the block that it should push.
+    In a share of the episodes, a copy of the policy that had learned the stage below acts until that stage's
+    goal is achieved, and then the present policy. That is the self-guided exploration of Luo et al., Relay
+    Hindsight Experience Replay, 2022 (arXiv 2208.00843), here with the stages one after another.
 
-    With ``per="step"`` it is drawn anew in each step whether that copy acts, wherever that stage's goal is
-    not achieved: it also goes back to what it has lost. That is how the paper does it.
+    With ``per="step"``, as in the paper, it is drawn in each step whether the copy acts, as long as the goal
+    of the stage below is not achieved at that moment. So the copy also achieves a lost goal again.
 
-    Where each episode has a stage of its own (``stage_key``), it is as in that paper: the policy itself
-    acts, as it would in the first stage, until that stage's goal is achieved, then as in the next one, up to
-    the episode's own stage. With ``per="step"`` it acts as in the stage after the last one whose goal is
-    achieved at the moment, so that all that has to hold for a stage belongs to the goal of the one below.
+    If each episode has its own stage (``stage_key``), the present policy itself guides, as in the paper: it
+    acts as in the first stage until the goal of that stage is achieved, then as in the next stage, up to the
+    episode's own stage. With ``per="step"`` it acts as in the stage after the last one whose goal is achieved
+    at that moment. So the goal of a stage must include all that the next stage requires.
 
     Put it behind the policy and before noise, and an InitTracker of TorchRL's into the environment. The
     environments of R runs are R equal blocks of the batch, in the order of the runs. Under
@@ -42,7 +42,7 @@ class GuidedExploration(TensorDictModuleBase):
         curriculum: the stages.
 
     Keyword Args:
-        share: fraction of episodes that are guided; of those above the first stage, if episodes have stages.
+        share: fraction of episodes that are guided; if episodes have stages, of the episodes above the first.
         per: whether guidance is drawn for each ``"episode"`` or for each ``"step"``.
         runs: R; the weights of R runs are stacked, along the first dimension of each parameter.
         generators: generators, one for each run, or None for torch's own.
@@ -127,7 +127,7 @@ class GuidedExploration(TensorDictModuleBase):
         """Copies the current weights of a run that has learned a stage into the guiding policy.
 
         Args:
-            policy: like the one that this was made with.
+            policy: policy with the same networks as the one given at construction.
             stage: index of the stage.
 
         Keyword Args:
@@ -162,7 +162,7 @@ class GuidedExploration(TensorDictModuleBase):
         if not bool((guided >= 0).any()):
             return tensordict
         acting, after = guided >= 0, guided + 1
-        if self.per == "step" and top is not None:  # what was lost again is done again
+        if self.per == "step" and top is not None:  # achieve again what was lost
             after = self._after_the_last_achieved(state, top)
         else:
             acting &= self._achieved(state, guided)
@@ -188,7 +188,7 @@ class GuidedExploration(TensorDictModuleBase):
             blocks, self.stage.tolist(), self.generators, strict=True
         ):
             first = stage if episode_stage is None else 0
-            if first >= 0 and bool(new.any()):  # without a start, a run draws nothing
+            if first >= 0 and bool(new.any()):  # runs without new episodes draw nothing
                 drawn = torch.rand(new.shape, generator=generator, device=new.device) < self.share
                 drawn = drawn if episode_stage is None else drawn & (episode_stage > 0)
                 guided.copy_(torch.where(new, torch.where(drawn, first, -1), guided))

@@ -25,7 +25,7 @@ def count_inputs(
     input_key: NestedKey = "input",
     stage_key: NestedKey = "stage",
 ) -> Callable[[], None]:
-    """Counts the networks' input of transitions that are written, as :class:`~torchrl_her.ZeroPad` makes it.
+    """Adds the networks' inputs in written transitions to the statistics; see :class:`~torchrl_her.ZeroPad`.
 
     Hand it to the writer as ``HERWriter(on_write=functools.partial(count_inputs, norm, progress))``. Inputs
     that a stage does not use are left out. In the buffer, :class:`~torchrl_her.modules.NormalizeBatch` comes
@@ -33,8 +33,8 @@ def count_inputs(
 
     Args:
         norm: normalization of the input.
-        progress: tells the stage of each run.
-        rows: [n], run after run, as the stages show them.
+        progress: the stage of each run.
+        rows: [n] transitions, run after run, with the observations and goals of their stages.
         runs: indices of the runs that the rows belong to.
         counts: number of rows of each of these runs.
 
@@ -44,7 +44,7 @@ def count_inputs(
         stage_key: key of the stage that each row carries, if episodes have stages of their own.
 
     Returns:
-        What undoes it.
+        A function that undoes the call.
 
     Raises:
         ValueError: an input is not finite; then nothing is counted.
@@ -76,12 +76,12 @@ def restart_inputs(
 ) -> None:
     """Resets the statistics of the inputs that mean something else in the new stage of a run.
 
-    The others go on, so that at first the networks do in the new stage what they did in the old one.
+    All other statistics stay, so that at first the networks do in the new stage what they did in the old one.
 
     Args:
         norm: normalization of the input.
         before: the stage that the run was in.
-        after: the one that it enters.
+        after: the stage that the run enters.
 
     Keyword Args:
         run: index of the run.

@@ -16,10 +16,10 @@ from torchrl_her.randomness import Generators, check_generators, uniform
 class EpisodeStages(CurriculumProgress):
     """Draws the stage of each episode when it begins, so that all stages are trained at once.
 
-    Runs are always in the last stage, which is the full task; it is their episodes that are in stages.
-    :class:`~torchrl_her.StateToObs` draws them, and writes each row's stage, so that one buffer holds rows
-    of all stages and :class:`~torchrl_her.ZeroPad` pads each by its own.
-    :class:`~torchrl_her.curriculum.StageOutcomes` tells how episodes ended. Random numbers are drawn on the
+    Stages belong to episodes here; the runs themselves are always in the last stage, the full task.
+    :class:`~torchrl_her.StateToObs` draws the stages and writes the stage of each row, so that one buffer
+    holds rows of all stages and :class:`~torchrl_her.ZeroPad` pads each by its own.
+    :class:`~torchrl_her.curriculum.StageOutcomes` counts how episodes ended. Random numbers are drawn on the
     CPU. After Luo et al., Relay Hindsight Experience Replay, 2022 (arXiv 2208.00843).
 
     Args:
@@ -29,7 +29,7 @@ class EpisodeStages(CurriculumProgress):
         runs: R.
         generators: generators, one for each run; None for torch's own, with one run only.
         task_share: share of the episodes that are played in the last stage, the full task; the others are
-            drawn evenly from the stages below. None for all stages alike.
+            drawn evenly from the stages below. None gives all stages the same probability.
 
     Raises:
         ValueError: ``runs`` is below 1, several runs have no generators, or the share is outside of [0, 1].
@@ -117,7 +117,7 @@ class TeacherStudent(EpisodeStages):
 
     A stage's progress is the distance between two averages of its success: over its recent episodes, and over
     the newer half of them. A share of the episodes draws all stages with equal probability, so that a stage
-    that stood still is noticed when it moves. After Matiisen et al., Teacher-Student Curriculum
+    without progress is noticed when its success changes. After Matiisen et al., Teacher-Student Curriculum
     Learning, 2017 (arXiv 1707.00183), here with averages that forget in place of windows.
 
     Args:
@@ -126,10 +126,10 @@ class TeacherStudent(EpisodeStages):
     Keyword Args:
         runs: R.
         generators: generators, one for each run; None for torch's own, with one run only.
-        memory: episodes of a stage after which an episode counts 1 / e of what it counted first.
-        uniform_share: share of the episodes that are drawn from all stages alike.
-        still: progress that counts as standing still: it is added to that of all stages, so that chance alone
-            prefers none.
+        memory: number of later episodes of a stage after which an episode's weight has fallen to 1 / e.
+        uniform_share: share of the episodes for which all stages have the same probability.
+        still: constant that is added to the progress of each stage, so that changes of success by chance
+            alone hardly prefer a stage.
 
     Attributes:
         long, short: [R, L] of float64, success over recent episodes, and over the newest.

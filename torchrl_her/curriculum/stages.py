@@ -36,8 +36,8 @@ class CurriculumStage:
         constant_goal: one goal for all episodes, as a gap in a wall, in place of ``desired_goal``; in the
             unit of the achieved goal.
         threshold: the goal is achieved at distances below this, in the unit of the state. The last stage,
-            which is the environment's own task, needs none: relabeled goals then have the reward function
-            that the writer was made with.
+            which is the environment's own task, needs no threshold: its goals are relabeled by the reward
+            function that the writer was made with.
         rewards: rewards of a missed and of an achieved goal, in stages below the last.
         instructive: whether IBS weights apply in this stage.
 
@@ -119,8 +119,8 @@ class Curriculum:
     The network's input is, in each stage, [its n observation entries | its desired goal | zeros],
     as wide as the last stage's. Goals that have fewer entries than the last stage's have zeros behind them.
     Order the state so that a stage's inputs, its observation and then its desired goal, are the first inputs
-    of the next stage. Inputs then keep their meaning, and what was learned carries over: with the hand,
-    reaching sees [hand | ball], throwing [hand | ball | speed | black hole].
+    of the next stage. Inputs then keep their meaning, and what was learned carries over: in the hand tasks
+    the stage of reaching has the inputs [hand | ball], that of throwing [hand | ball | speed | black hole].
 
     Args:
         stages: stages in the order of training, one or more.
@@ -132,7 +132,8 @@ class Curriculum:
     Attributes:
         stages: the stages, with indices in place of names and of constant goals.
         appended: the zero and the constant goals that :meth:`extend` puts behind a state.
-        observation_width, goal_width: widths of these entries with their zeros, those of the last stage.
+        observation_width, goal_width: widths of observations and goals in all stages: those of the last
+            stage, as shorter ones are followed by zeros.
         input_width: width of the network's input.
         first_inputs: number of inputs that the first stage uses; they are the leading ones.
         state_index: [stages, observation_width + 2 * goal_width], indices of observation, achieved and
@@ -398,8 +399,8 @@ class CurriculumProgress:
     def record_run(self, run: int, successes: Tensor) -> bool:
         """Adds samples of success of one run, one after the other.
 
-        A stage ends at the first sample that completes it. The samples after that one were made in the
-        old stage and are dropped, so a call ends at most one stage.
+        A stage ends at the first sample with which the window's mean reaches the threshold. Later samples
+        were made in the old stage and are dropped, so a call ends at most one stage.
 
         Args:
             run: the run's number, from 0.

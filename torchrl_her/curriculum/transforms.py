@@ -157,15 +157,16 @@ class StateToObs(_StageTransform):
     says nothing about the stage's goal, so the critic must bootstrap there.
 
     The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
-    Put the transform around a ParallelEnv and not inside of its workers: they hold copies of ``progress`` and
-    would stay in the stages in which they were started.
+    Put the transform around a ParallelEnv and not inside of its workers: workers hold copies of ``progress``
+    and would stay in the stages in which they were started.
 
     Change stages between episodes, and reset the collector. If a stage changes in mid-episode, the next step
-    is still shown as a whole in the new stage, and the episode is truncated there (done, without a key for
-    ``truncated``). The action of that step was chosen in the old stage. For this the environment must
-    work on the tensors that the collector keeps, so on the policy's device.
+    has the new stage's observations before and after the action, and the episode is truncated there (done,
+    without a key for ``truncated``). The action of that step was chosen in the old stage. For this the
+    environment must work on the tensors that the collector keeps, so on the policy's device.
 
-    GymWrapper shows an entry ``state`` of a dict as ``observation``: put a RenameTransform before this one.
+    GymWrapper renames an entry ``state`` of a dict to ``observation``; a RenameTransform before this one
+    undoes it.
 
     The transform is for environments only. In a replay buffer it would bring the real goal back into
     transitions that were relabeled.
@@ -337,13 +338,14 @@ class StageOutcomes(Transform):
     """Counts successes by stage for :class:`~torchrl_her.curriculum.EpisodeStages`, as episodes end.
 
     Put it behind all transforms that decide where episodes end. Episodes whose goal was proposed
-    (:class:`~torchrl_her.behavior.BehaviorGoals`) do not count: they say little of the stage's own goals.
+    (:class:`~torchrl_her.behavior.BehaviorGoals`) do not count, since their success says little about the
+    stage's own goals.
 
     Args:
         progress: progress that counts the outcomes.
 
     Keyword Args:
-        reward_fn, achieved_reward: tell which goals are achieved in the last stage, where achieving a goal
+        reward_fn, achieved_reward: decide which goals are achieved in the last stage, where achieving a goal
             need not terminate; see :func:`~torchrl_her.goals.is_achieved`.
         keys: keys of the flags ``terminated`` and ``done``, which are read.
         stage_key, proposed_key: read; there need not be a ``proposed_key``.
@@ -478,7 +480,7 @@ class ZeroPad(_StageTransform):
     def _pad(self, observation: Tensor, goal: Tensor, stage: Tensor | None) -> Tensor:
         if stage is None:
             self._check_blocks(observation.shape)
-            if len(stages := self._stages()) == 1:  # without an index, which takes several times as long
+            if len(stages := self._stages()) == 1:  # slices: an index would take several times as long
                 size = len(self.curriculum.stages[stages[0]].observation)
                 unused = observation.new_zeros(*observation.shape[:-1], observation.shape[-1] - size)
                 return torch.cat((observation[..., :size], goal, unused), -1)

@@ -13,7 +13,7 @@ from torchrl_her.replay_buffers.options import HindsightOptions
 
 
 class StageView:
-    """Shows collected transitions as a stage would have: with its observation, goals, reward and ends.
+    """Converts transitions of any stage to another stage: its observation, goals, reward and ends.
 
     With it, a :class:`~torchrl_her.replay_buffers.StageRule` trains a stage on the transitions of all stages.
     Transitions that were played in the stage stay as they are. The others get the reward and the end of the
@@ -27,7 +27,7 @@ class StageView:
 
     Keyword Args:
         state_key: the state vector, which :class:`~torchrl_her.StateToObs` has read.
-        options: has the keys of all other entries; None for the usual ones.
+        options: the writer's options, for the keys of all other entries; None for the default keys.
 
     Example:
         >>> from tensordict import TensorDict
@@ -80,7 +80,7 @@ class StageView:
         next_keys = (under_next(self.observation_key), keys.next_achieved, keys.goals[1])
         for state_key, names in ((self.state_key, current_keys), (under_next(self.state_key), next_keys)):
             entries = self.curriculum.show(entry_of(rows, state_key), self.stage)
-            for key, entry in zip(names, entries, strict=True):  # goals that were proposed stay
+            for key, entry in zip(names, entries, strict=True):  # the stage's own rows keep proposed goals
                 out.set(key, torch.where(played, entry_of(rows, key), entry))
         for key in (keys.stage, under_next(keys.stage)):
             if (stages := out.get(key, None)) is not None:

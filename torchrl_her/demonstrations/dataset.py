@@ -127,7 +127,7 @@ class Demonstrations:
             lengths: [e] int64, which sum to m.
 
         Keyword Args:
-            rows: [n], of which they are taken; those that there are if None.
+            rows: [n], transitions to take from; None for those of the demonstrations.
         """
         states = None if self.states is None else {name: entry[index] for name, entry in self.states.items()}
         rows_taken = (self.rows if rows is None else rows)[index]
@@ -137,7 +137,7 @@ class Demonstrations:
         """Returns the first episodes.
 
         Raises:
-            ValueError: there are fewer, or ``count`` is below 1.
+            ValueError: there are fewer episodes, or ``count`` is below 1.
         """
         if not 1 <= count <= len(self):
             raise ValueError(f"there are {len(self)} demonstrations of {self.task}, {count} were asked for")
@@ -203,10 +203,10 @@ class Demonstrations:
             path: the file.
 
         Keyword Args:
-            force: whether a file that is there is replaced.
+            force: whether an existing file is replaced.
 
         Raises:
-            ValueError: there is one.
+            ValueError: the file exists, and ``force`` is False.
             OSError: the file cannot be written.
         """
         check_free(path, force=force)

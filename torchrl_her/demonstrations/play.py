@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.trainers.trainer import evaluate
 
-_COUNTED = ("key", "step", "episode")  # of the states: where random numbers and time stand
+_COUNTED = ("key", "step", "episode")  # entries of the states that count time and random numbers
 
 
 def demonstrate(
@@ -26,8 +26,8 @@ def demonstrate(
 ) -> Demonstrations:
     """Plays the next episode of each environment with a policy, without exploration.
 
-    The physical states are among them if the environment below the transforms has them: a method
-    ``world_state_dict``, which gives tensors with a row for each environment.
+    The demonstrations include physical states if the environment below the transforms has a method
+    ``world_state_dict``, which returns tensors with a row for each environment.
 
     Args:
         env: batched, [N].

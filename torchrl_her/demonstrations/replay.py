@@ -40,7 +40,7 @@ def write_demonstrations(
 
 
 def demonstration_rows(share: float, batch_size: int) -> int:
-    """Number of rows of a batch that are demonstrations: the share, rounded, but at least one and not all.
+    """Number of demonstrations in a batch: the share of its rows, rounded, but at least one and not all.
 
     Example:
         >>> demonstration_rows(0.125, 256), demonstration_rows(0.001, 256)
@@ -57,12 +57,12 @@ class MixedReplay:
     """A replay buffer of a run's own transitions and one of demonstrations, sampled as one.
 
     In each batch the first rows are a run's own and the last ones demonstrations, which are marked by the
-    flag ``demonstration``. Entries that only one of the two has are left out. Importance weights of either
-    part are divided by their mean, so that a share of the rows has that share of the weight. New priorities
-    go to the buffer that a row came from.
+    flag ``demonstration``. Entries that only one of the two has are left out. Importance weights are divided
+    by their mean within each part, so that demonstrations with a share of the rows have that share of the
+    weight. New priorities go to the buffer that a row came from.
 
-    What is written goes into the buffer of collected transitions, whose writer and size this one shows. A
-    :class:`~torchrl_her.Trainer` takes it in place of a buffer.
+    Transitions are written into the buffer of collected ones; writer and size are those of that buffer. A
+    :class:`~torchrl_her.Trainer` takes this object in place of a buffer.
 
     Nair et al., Overcoming exploration in reinforcement learning with demonstrations, 2018 (arXiv
     1709.10089).
@@ -78,7 +78,7 @@ class MixedReplay:
 
     Raises:
         ValueError: the share is not between 0 and 1, a batch has no room for both, or the buffers are for
-            different numbers of runs; when sampling, it is not for whole batches.
+            different numbers of runs; when sampling, the number of rows is not that of whole batches.
 
     Example:
         >>> from tensordict import TensorDict
@@ -129,7 +129,7 @@ class MixedReplay:
     def sample(self, batch_size: int) -> TensorDictBase:
         """Samples rows [R * S * B]: R equal blocks, one for each run, of S batches of B rows.
 
-        Under ``index``, demonstrations count on from the last row of the storage of collected ones.
+        In ``index``, the rows of demonstrations are numbered from the capacity of the other storage on.
         """
         steps, rest = divmod(batch_size, self.runs * self.batch_size)
         if rest or not steps:

@@ -15,8 +15,8 @@ from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
 def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> Demonstrations:
     """Recomputes the rewards and ends of demonstrations: each ends where its goal terminates it first.
 
-    One that does not terminate any more is truncated at its end. One that had terminated without achieving
-    its goal, as by a fall, still does.
+    A demonstration that no longer terminates is truncated at its end. If it had terminated without achieving
+    its goal, as by a fall, it still terminates there.
 
     Args:
         demonstrations: as recorded.
@@ -63,11 +63,11 @@ def in_stage(
 ) -> Demonstrations:
     """Converts demonstrations of the full task to the view of a stage, like :class:`~torchrl_her.StateToObs`.
 
-    In stages below the last, they end where the stage's goal is achieved. What the environment terminated
-    says nothing about that goal, so others are truncated at their end.
+    In stages below the last, they end where the stage's goal is achieved. All others are truncated at their
+    end, since an end by the environment says nothing about the stage's goal.
 
     Args:
-        demonstrations: whose observation with the desired goal behind it is the state of the curriculum.
+        demonstrations: of the full task; [observation | desired goal] is the curriculum's state.
         curriculum: its stages.
         stage: index of the stage, from 0.
         task_reward: reward of the last stage, the full task, if the curriculum has none for it; as recorded

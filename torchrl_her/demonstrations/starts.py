@@ -19,8 +19,8 @@ class DemonstrationStarts(Transform):
     """Starts a fraction of the episodes at states of demonstrations, with the goals of the demonstrations.
 
     At first episodes start a few steps before the end of a demonstration, so that the goal is near. When
-    enough of them achieve it, starts walk back, see :class:`~torchrl_her.demonstrations.WalkBack`. They have
-    all their steps before them. Other episodes start as the environment says.
+    enough of them achieve it, starts walk back, see :class:`~torchrl_her.demonstrations.WalkBack`. Such an
+    episode has as many steps as any other. All other episodes start as the environment starts them.
 
     The environment below must have a method ``start_at(states, which)``, as those of this library's throwing
     and toy tasks have (:meth:`torchrl_her_envs.BatchedEnv.start_at`). Put the transform first, right around
@@ -28,7 +28,7 @@ class DemonstrationStarts(Transform):
     :meth:`outcomes` behind that one.
 
     The environments of R runs are R equal blocks of the batch. Each run has its own random numbers and walks
-    back by itself. All of it is part of the ``state_dict``.
+    back by itself. Both are part of the ``state_dict``.
 
     Args:
         demonstrations: with physical states. Only those that achieve their goal are used. One for all runs,

@@ -21,8 +21,8 @@ class WalkBack:
         width: number of steps among which starts are drawn: from ``back - width + 1`` to ``back`` steps
             before the end.
         stride: length of a step back.
-        threshold: share of successes at which there is one.
-        samples: number of episodes of which it is the share: the latest ones since the last step back.
+        threshold: share of successes at which starts move a step back.
+        samples: number of the latest episodes whose share of successes counts, all since the last step back.
 
     Attributes:
         back: R, the greatest number of steps before the end at which episodes start.

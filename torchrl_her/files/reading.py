@@ -19,9 +19,9 @@ from zipfile import ZIP_STORED, ZipFile
 import torch
 from torch import Tensor, nn
 
-_STEPS = 1 << 22  # steps of a description: they take a few hundred megabytes at most
+_STEPS = 1 << 22  # opcodes of a pickle: to check them takes a few hundred megabytes at most
 _DEPTH = 100
-_REPEATED = 1 << 24  # numbers of tensors beyond those that are stored
+_REPEATED = 1 << 24  # greatest surplus of the tensors' numbers over the stored ones (expanded views)
 # The last bytes of an archive of torch.save. They give the size and the place of the directory, and the place
 # of what follows it. Other readers of archives disagree on where the directory is if these do not fit.
 _END = struct.Struct("<4s36xQQ4s4xQ4x4s16xH")
@@ -134,8 +134,8 @@ def _check_archive(file: BinaryIO, begin: int) -> None:
 def _check_description(description: bytes) -> None:
     """Refuses a pickle that names or calls anything but makers of tensors, or nests tuples without end.
 
-    A tuple that has the same tuple twice, and so on, is small. Its hash takes time for all of its entries.
-    Lists have no hash, but torch would print one that is called in its error.
+    A tuple that has the same tuple twice, which has another one twice, and so on, takes few bytes, but its
+    hash takes time for all entries written out. Lists have no hash, but torch prints them in an error.
 
     Raises:
         MoreThanDataError: it names something else.

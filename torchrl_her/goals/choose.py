@@ -1,7 +1,7 @@
 """Draws goals for transitions from lists of candidates, in proportion to candidate times weight times filter.
 
-A line is all that a transition may take its goal from: the goals of its episode, or those of a pool that
-many transitions share. What the strategy allows is a part of it.
+A line is a list of goals: those of an episode, or those of a pool that many transitions share. A transition
+may take its goal from the part of a line that the strategy allows.
 """
 
 from __future__ import annotations
@@ -67,11 +67,11 @@ def choose_goals(
         k: number of draws.
 
     Keyword Args:
-        weights: maps goals [L, W, g] to how useful each is, [L, W]; None for all alike.
-        keep: the filter. It is given which transitions are asked for, an index [m] or a slice, and goals
-            [m, c, g] for them. It returns which of them may be drawn, [m, c] of bool; None for all.
+        weights: maps goals [L, W, g] to how useful each is, [L, W]; None for equal weights.
+        keep: the filter. It takes transitions, as an index [m] or a slice, and c goals for each, [m, c, g].
+            It returns which of these goals may be drawn, [m, c] of bool. None keeps all.
         draws: source of the random numbers.
-        tries: worth it where lines are long, and few goals refused.
+        tries: how often refused goals are proposed again; saves time if lines are long and few are refused.
         redraw: False to leave out goals that the filter refuses, and draw no others in their place.
 
     Returns:

@@ -20,8 +20,8 @@ _FARTHEST = 1e140  # coordinates, in sigmas, beyond which squares of float64 wou
 def goal_scale(samples: Tensor) -> Tensor:
     """Returns the standard deviations [g] of samples [n, g], to scale goals of different units.
 
-    One that is less than a hundredth of the greatest counts as that: a number that hardly varies shall not
-    make all goals rare. All are 1 if nothing varies.
+    None is below a hundredth of the greatest, since otherwise a coordinate that hardly varies would make all
+    goals rare. All are 1 if nothing varies.
 
     Example:
         >>> goal_scale(torch.tensor([[0.0, 5.0], [4.0, 5.0]])).tolist()
@@ -40,7 +40,7 @@ def log_kernel_density(points: Tensor, samples: Tensor, sigma: Numbers) -> Tenso
 
     Args:
         points: [..., g], where the density is wanted.
-        samples: [n, g] of it, n at least 1.
+        samples: [n, g] goals of the distribution, n at least 1.
         sigma: standard deviation of the kernel, in the unit of the goals; or g of them.
 
     Returns:
@@ -56,7 +56,7 @@ def log_kernel_density(points: Tensor, samples: Tensor, sigma: Numbers) -> Tenso
     flat, known = _checked(points, samples)
     scale = _scale(sigma, known)
     center = known.mean(0)  # near 0 sums of squares lose the fewest digits
-    # NaN and infinity are marked below; clamped coordinates cannot overflow to the difference of two of them.
+    # NaN and infinity are marked below. Clamped, as squares would overflow to infinity minus infinity.
     flat = ((flat - center) / scale).clamp_(-_FARTHEST, _FARTHEST)
     known = ((known - center) / scale).clamp_(-_FARTHEST, _FARTHEST)
     parts = [_log_sum(part, known) for part in flat.split(max(1, _CHUNK // len(known)))]
@@ -73,8 +73,8 @@ def log_neighbor_density(points: Tensor, samples: Tensor, k: int, *, least_dista
 
     Args:
         points: [..., g], where the density is wanted. A point that is itself a sample is its own neighbor.
-        samples: [n, g] of it.
-        k: number of the neighbor whose distance counts, from 1 to n.
+        samples: [n, g] goals of the distribution.
+        k: from 1 to n; the distance to the k-th nearest sample gives the density.
 
     Keyword Args:
         least_distance: distances below this count as this, in the unit of the goals: at k equal samples the
@@ -118,7 +118,7 @@ def _checked(points: Tensor, samples: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _squares(points: Tensor, samples: Tensor) -> Tensor:
-    """Returns squared distances [m, n], by products: differences would take several times as long."""
+    """Returns squared distances [m, n], by a matrix product: differences take several times as long."""
     products = torch.addmm(samples.square().sum(1), points, samples.T, alpha=-2.0)
     return products.add_(points.square().sum(1, True)).clamp_min_(0.0)
 

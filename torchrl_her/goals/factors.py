@@ -55,8 +55,8 @@ def combine(candidate: Tensor, weight: Tensor | None = None, keep: Tensor | None
 
     Args:
         candidate: [..., T] of bool, from :func:`~torchrl_her.goals.candidates` or ``between``.
-        weight: [..., T], how useful each achieved goal is, at least 0; None for all alike.
-        keep: [..., T] of bool, the filter; None to keep all. The three are broadcast against each other.
+        weight: [..., T], how useful each achieved goal is, at least 0; None for equal weights.
+        keep: [..., T] of bool, the filter; None to keep all. All three arguments are broadcast together.
 
     Returns:
         [..., T] of float.
@@ -132,7 +132,7 @@ def draw_weighted(
     mass = low.unsqueeze(-1) + u * (high - low).unsqueeze(-1)
     # 32 bits are enough, and take half the time
     index = torch.searchsorted(cumulative, mass.flatten(-2), right=True, out_int32=True).view_as(mass)
-    # u * mass can round up to a weight of 0 at the end of the candidates, and beyond it
+    # rounding may move u * mass beyond the last candidate whose weight is not 0
     low, high = (bound.int().unsqueeze(-1) for bound in (first + 1, end))
     return index.clamp_(low, high).long() - 1
 

@@ -164,7 +164,7 @@ def _log_mass(x: Tensor, low: float, high: float, sigma: float) -> Tensor:
     outside = torch.special.erfcx(near / root) - torch.special.erfcx(far / root) * torch.exp(
         -width * (near + far) / 2
     )
-    thin = math.sqrt(2 / math.pi) * width * torch.exp(-width * (near + width / 4) / 2)  # at its middle
+    thin = math.sqrt(2 / math.pi) * width * torch.exp(-width * (near + width / 4) / 2)  # at the box's middle
     outside = torch.where(width * (1 + near) < _THIN, thin, outside)
     mass = torch.where(near > 0, outside, inside).clamp_min(torch.finfo(x.dtype).tiny)
     return mass.log() - near.square() / 2
@@ -174,7 +174,7 @@ def _sigmas(grid: GoalGrid, sigma: Numbers, label: str = "") -> list[float]:
     sigmas, d = _floats(sigma), len(grid.shape)
     if len(sigmas) not in (1, d) or not all(0 < s < math.inf for s in sigmas):
         raise ValueError(f"{label}sigma must be positive and finite, one number or {d}, got {sigma}")
-    # Beyond these bounds nothing changes but that squares overflow: q* is one cell, or uniform.
+    # Beyond these bounds q* is one cell, or uniform, whatever sigma is, and squares would overflow.
     dimensions = zip(sigmas * d if len(sigmas) == 1 else sigmas, grid.cell_size, grid.shape, strict=True)
     return [min(max(s, 1e-12 * size), 1e12 * size * n) for s, size, n in dimensions]
 
@@ -226,4 +226,4 @@ def kl_divergence(q: Tensor, q_star: Tensor) -> Tensor:
         >>> kl_divergence(torch.tensor([0.5, 0.5, 0.0]), torch.tensor([0.25, 0.25, 0.5]))
         tensor(0.6931)
     """
-    return (torch.xlogy(q, q) - torch.xlogy(q, q_star)).sum(-1).clamp_min(0)  # it may round to below 0
+    return (torch.xlogy(q, q) - torch.xlogy(q, q_star)).sum(-1).clamp_min(0)  # rounding may make it negative

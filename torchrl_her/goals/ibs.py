@@ -109,8 +109,8 @@ class Instructiveness(InstructiveWeights, GoalHistogram):
             :class:`~torchrl_her.goals.InstructiveWeights`.
 
     Attributes:
-        sigma, q_star: their present values.
-        final_sigma, final_q_star: their values at the end of the schedule.
+        sigma, q_star: present values of the kernel's sigma and of the target.
+        final_sigma, final_q_star: values of both at the end of the schedule.
 
     Raises:
         ValueError: an option is out of its range, or the target does not fit the grid.

@@ -14,13 +14,13 @@ class InstructiveWeights(GoalWeights):
     Sigma starts larger and shrinks at each :meth:`step` down to its final value. Emptying the buffer
     (``clear``) forgets q but not sigma; :meth:`restart` sets sigma back to its first value, as at the change
     of a curriculum's stage. In stages that are not instructive ``is_uniform`` is True, so that no weights are
-    asked for.
+    computed.
 
     Keyword Args:
         sigma: the final standard deviation of the kernel.
         start_factor: the first sigma divided by the final one; at least 1.
         decay: factor of the covariance in each step, in (0, 1]; 1 never shrinks it.
-        floor: the least weight of a goal. At 0, a goal is no longer drawn once q reaches q* at it.
+        floor: the least weight of a goal. If it is 0, a goal at which q has reached q* is no longer drawn.
         subtract: False for the weights q* alone, without q and floor (the sequential architecture).
 
     Attributes:

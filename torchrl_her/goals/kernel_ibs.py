@@ -23,8 +23,8 @@ class KernelInstructiveness(InstructiveWeights):
 
     q* is the kernel density of the real goals, q that of the virtual goals that were written since the
     buffer was last emptied, with the same kernel. Weights are given in units of the largest q* of a real
-    goal. What they are for, and the schedule of sigma, are as for :class:`~torchrl_her.Instructiveness`; but
-    both densities are smooth here, so that q counts around a goal and not in its cell.
+    goal. The schedule of sigma is that of :class:`~torchrl_her.Instructiveness`. But both densities are
+    smooth here, so that a virtual goal raises q around itself and not in its cell.
 
     Goals that are not finite have weight 0.
 
@@ -34,8 +34,7 @@ class KernelInstructiveness(InstructiveWeights):
 
     Keyword Args:
         sigma: the final standard deviation of the kernel, in the unit of the goals divided by ``scale``.
-        scale: divisor of goals, a number or g of them, where their numbers have different
-            units.
+        scale: divisor of goals, one number or g of them, for goals whose coordinates have different units.
         samples: maximum number of real goals, and of virtual ones, from which densities are computed. The
             virtual ones are a part that is spread evenly over all that were written.
         log_target: maps goals [m, g] and a sigma to the logarithm of the density q* [m], in place of the
@@ -124,12 +123,12 @@ class KernelInstructiveness(InstructiveWeights):
     def update(self, goals: Tensor) -> None:
         """Adds virtual goals to q.
 
-        Each goal has a key, the fraction of its number times the golden ratio, and those with the least keys
-        stay. Such keys are spread evenly over any stretch of numbers, so what stays is, too, and at each
-        moment.
+        A goal's key is the fractional part of its number times the golden ratio, and goals with the least
+        keys stay. Such keys are spread evenly over any range of numbers, so the goals that stay are spread
+        over all that were written so far.
         """
         if self.is_uniform and goals.shape[-1] != self._real.shape[1]:
-            return  # goals of a curriculum's stage, which are not weighed
+            return  # goals of a stage that is not instructive
         self._check(goals)
         goals = goals.detach().reshape(-1, goals.shape[-1])
         goals = goals[goals.isfinite().all(-1)]

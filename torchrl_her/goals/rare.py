@@ -28,14 +28,14 @@ class RareGoals(GoalWeights):
     sets goals of the least density for the agent to pursue; here the same preference chooses goals to
     relabel with.
 
-    Goals are divided by the standard deviations of the remembered goals, so that numbers of different units
+    Goals are divided by the standard deviations of the remembered goals, so coordinates of different units
     count equally. While no goal is remembered, all weights are 1; goals that are not finite have weight 0.
 
     Keyword Args:
         estimator: ``"kernel"`` for a Gaussian kernel around each goal, for a few dimensions; ``"neighbors"``
             for the distance to the k-th nearest goal, for many.
-        sigma: width of the kernel, in standard deviations of the goals; or one for each of their numbers.
-        k: number of the neighbor whose distance counts.
+        sigma: width of the kernel, in standard deviations of the goals; or one for each coordinate.
+        k: with ``"neighbors"``, the distance to the k-th nearest goal gives the density.
         sharpness: weights are ``density ** -sharpness``; None for 1 up to three dimensions and 3 / g beyond,
             since the same ratio of distances is a far greater ratio of densities there.
         limit: largest ratio between the weight of a goal and the weight of a goal of median density, and the

@@ -28,8 +28,8 @@ class RewardFunction(Protocol):
     The achieved goal comes first, as in gymnasium's ``compute_reward``. A function that has an attribute
     ``info_keys`` gets a third argument, the info: a tensordict of these entries of the transition, whose
     dimensions [...] are broadcast against those of the goals. Entries are read under ``next``, or in the root
-    if ``next`` lacks them, as ``action``. The filter, which asks about the state before the action, looks in
-    the root first.
+    if ``next`` lacks them, as it lacks ``action``. The filter, which asks about the state before the action,
+    looks in the root first.
     """
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor, /) -> tuple[Tensor, Tensor]: ...
@@ -63,7 +63,7 @@ def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> T
     Returns:
         [...] of bool.
     """
-    if not achieved_goal.is_floating_point():  # squares of small whole numbers wrap around
+    if not achieved_goal.is_floating_point():  # squares of int8, for example, overflow
         achieved_goal, desired_goal = achieved_goal.float(), desired_goal.float()
     # Coordinate by coordinate: summing over so short a dimension would take torch several times as long.
     pairs = zip(achieved_goal.unbind(-1), desired_goal.unbind(-1), strict=True)
@@ -150,7 +150,7 @@ def outcomes(reward_fn: RewardFunction | None, achieved_goal: Tensor, *parts: Te
     """Returns achieved goals [..., g], with the info that the reward function reads, if it reads any.
 
     Args:
-        reward_fn: whose ``info_keys`` name the entries.
+        reward_fn: function whose ``info_keys`` name the entries; None for no info.
         achieved_goal: [..., g].
         *parts: [...], of the same transitions. Each entry is taken from the first part that has it.
 
@@ -301,7 +301,7 @@ def is_achieved(
 ) -> Tensor:
     """Returns whether steps achieved their goals: by the environment's own flag, else by a reward function.
 
-    The environment's word is the entry ``is_success``. The reward of a step is the last resort, because it
+    The environment's flag is the entry ``is_success``. The reward of a step is the last resort, because it
     may contain more than the goal, such as a cost of actions.
 
     Args:

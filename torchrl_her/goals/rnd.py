@@ -44,8 +44,8 @@ class NetworkNovelty(GoalWeights):
         features: number of outputs of the networks.
         lr: learning rate of the predictor (Adam).
         steps: gradient steps for the goals of one ``update``, at most.
-        batch_size: goals of a gradient step, at most. Of more goals than all steps take, some are left out
-            evenly.
+        batch_size: goals of a gradient step, at most. If all steps together take fewer goals than there are,
+            a part that is spread evenly over them is used.
 
     Raises:
         ValueError: an option is out of its range, or goals have another width than those before.
@@ -184,8 +184,8 @@ def _network(widths: Sequence[int], generator: torch.Generator) -> nn.Sequential
     """Makes linear layers with rectifiers between them, with weights from a generator.
 
     Biases of the first layer are spread over the range of normalized goals. Without them outputs would grow
-    in proportion along each ray from the mean, and the predictor would know them from the goals near the
-    mean.
+    in proportion along each ray from the mean, and the predictor could infer outputs far from the mean from
+    goals near it.
     """
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):

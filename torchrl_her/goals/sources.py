@@ -15,18 +15,18 @@ def check_goal_sources(sources: GoalSources) -> dict[Strategy, int]:
     """Checks the number of virtual goals that each transition gets from each source.
 
     A source is a goal strategy, which gives goals of the transition's own episode, or one of two that look
-    beyond it: ``"actual"``, the goals that were really wanted in recent episodes, and ``"achieved"``, those
-    that were achieved in recent episodes.
+    beyond it: ``"actual"``, the desired goals of recent episodes, and ``"achieved"``, the goals that were
+    achieved in recent episodes.
 
     Args:
         sources: the number of goals, at least 1, of each source.
 
     Returns:
-        The same as a dictionary of its own, with plain numbers.
+        A new dictionary of the same numbers as plain ``int``.
 
     Raises:
         ValueError: there is no source, an unknown one, or a number below 1.
-        TypeError: these are no numbers by source.
+        TypeError: ``sources`` is not a mapping from sources to numbers.
 
     Example:
         >>> check_goal_sources({"future": 2, "actual": 2})

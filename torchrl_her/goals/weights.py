@@ -128,7 +128,7 @@ def normalized_weights(logs: Tensor, goals: Tensor) -> Tensor:
     """Computes weights from their logarithms: the largest is 1, and none is rounded to 0.
 
     Args:
-        logs: [...], of the weights; NaN for a goal that must not be drawn.
+        logs: [...], logarithms of the weights; NaN for a goal that must not be drawn.
         goals: [..., g], which are weighed.
 
     Returns:

@@ -13,20 +13,20 @@ from torch import Tensor, nn
 class PolicyAverage(nn.Module):
     """The exponential moving average of a policy's weights over gradient steps.
 
-    While a policy learns, its success swings from one evaluation to the next. Their average, which does not
-    learn, is steadier and usually better: Polyak and Juditsky, Acceleration of stochastic approximation by
-    averaging, 1992. So play, evaluate and export ``module``, and collect with the policy itself.
+    While a policy learns, its success swings from one evaluation to the next. An average of its weights over
+    time is steadier and usually better: Polyak and Juditsky, Acceleration of stochastic approximation by
+    averaging, 1992. So use ``module`` to act, evaluate and export, and the policy itself to collect.
 
     At first the decay is ``(1 + n) / (10 + n)`` after n steps, so that the first weights are soon forgotten.
-    Buffers, such as running statistics, are copied. Other than torch's ``AveragedModel`` it takes many
-    gradient steps at once, and next to no time, since it is called every few milliseconds.
+    Buffers, such as running statistics, are copied. Unlike in torch's ``AveragedModel``, one call covers many
+    gradient steps, and takes next to no time, as calls may come every few milliseconds.
 
     Args:
-        policy: the one that learns.
+        policy: the policy that learns.
 
     Keyword Args:
         decay: fraction of the average that a gradient step keeps: 0.9995 averages over about 2,000 steps.
-        runs: R independent ones, whose weights are stacked: the first dimension of each parameter.
+        runs: R independent runs, whose weights are stacked along the first dimension of each parameter.
 
     Attributes:
         module: a copy of the policy, with the average weights.
@@ -73,7 +73,7 @@ class PolicyAverage(nn.Module):
 
         Args:
             steps: number of gradient steps since the last call.
-            idle: the runs that made none.
+            idle: the runs that made no gradient step.
         """
         updates = [0 if run in idle else steps for run in range(len(self.steps))]
         self.steps += torch.tensor(updates, device=self.steps.device)
