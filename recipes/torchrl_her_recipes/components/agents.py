@@ -34,7 +34,7 @@ def make_agent(
     state: CurriculumState | None = None,
     device: torch.device = CPU,
 ) -> Agent:
-    """Makes the agent of some runs side by side.
+    """Makes the agent of one run, or of several side by side.
 
     Args:
         builder: Builder of its networks, exploration and loss.
@@ -43,7 +43,7 @@ def make_agent(
         state: Curriculum whose stages the networks see, or None.
         device: Device on which it learns.
     """
-    # The same on all devices.
+    # Made on the CPU, so that the first weights are the same whatever the device.
     actor, critics = _networks(builder, seeds, curriculum, None if state is None else state.curriculum)
     actor, critics = actor.to(device), [critic.to(device) for critic in critics]
     exploration = builder.exploration().to(device)

@@ -46,7 +46,7 @@ def build(recipe: Recipe) -> Components:
     recipe = resolved(recipe)
     envs, seeds, collection = TaskEnvs.of(recipe), recipe.seeds, recipe.collection
     processes = collection.processes
-    # Where processes collect, this environment only shows what theirs are like.
+    # If other processes collect, no episode runs in this environment: it only describes theirs.
     task = envs.make(1 if processes else collection.num_envs, seeds)
     progress = make_progress(recipe.order, envs.curriculum, task, seeds)
     check_order(recipe.order, progress, recipe.weights, processes, recipe.demonstrations.episodes)
@@ -127,5 +127,5 @@ def make_collector(
 
 
 def eval_seeds(seeds: Sequence[int], epoch: int) -> list[int]:
-    """Returns the seeds of an evaluation: for each run and epoch its own, and never one of training."""
+    """Returns the seeds of an evaluation; they differ between runs and epochs, and from seeds of training."""
     return [Stream.EVALUATION + (seed << 20) + epoch for seed in seeds]

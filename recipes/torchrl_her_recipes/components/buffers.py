@@ -32,7 +32,7 @@ from torchrl_her_recipes.config.groups import HindsightConfig, ReplayConfig
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
 
-# Entries of a collected batch that no loss reads: not stored.
+# Entries of a collected batch that are not stored, since no loss reads them.
 _NOT_STORED = (
     "state",
     "achieved_goal",
@@ -67,9 +67,9 @@ def make_buffer(
     Keyword Args:
         space: space of the goals; None if goals are not counted.
         state: the curriculum, or None.
-        norm: counts what is written and normalizes what is sampled; None for raw transitions.
+        norm: statistics, updated by written and applied to sampled transitions; None to normalize nothing.
         devices: devices of the buffer and of the learner that samples from it.
-        capacity: number of transitions of each run; the recipe's if None.
+        capacity: number of transitions of each run; the recipe's number if None.
     """
     size, task, runs = recipe.replay.buffer_size, goal_env(env), len(generators)
     check_buffer_size(size, runs, env, devices.replay, not_stored=_NOT_STORED)
@@ -122,7 +122,7 @@ def _make_writer(options: HindsightConfig, env: EnvBase, **others: Any) -> HERWr
 
 
 def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) -> list[StageRule] | None:
-    """Returns the rules for relabeling episodes of each stage; None unless episodes have stages of their own.
+    """Returns each stage's rules for relabeling; None if stages belong to runs and not to single episodes.
 
     Args:
         every: whether episodes are written for all stages.
@@ -146,7 +146,7 @@ def _goals(options: HindsightConfig) -> dict[str, Any]:
 
 
 def rising_beta(sampler: Sampler, end: float | None, epochs: int) -> list[LinearScheduler]:
-    """Returns the schedule of ``priority_beta``, a step an epoch; none if it stays."""
+    """Returns the schedule of ``priority_beta``, one step for each epoch; no schedule if it is constant."""
     if end is None or not isinstance(sampler, PrioritizedSampler):
         return []
     return [LinearScheduler(sampler, "beta", end, max(1, epochs - 1))]
@@ -161,7 +161,7 @@ def _make_sampler(
 ) -> Sampler:
     if options.sampler == "uniform":
         return RunsSampler(capacity, runs=len(generators), generators=generators, device=device)
-    # Alpha is Schaul's, for absolute TD errors; most of TorchRL's losses give a power of them, the square.
+    # The option alpha is for absolute TD errors (Schaul et al.). Most losses of TorchRL give squared errors.
     return RunsPrioritizedSampler(
         capacity,
         alpha=options.priority_alpha / power,

@@ -41,32 +41,33 @@ class Components(Agent):
 
     Attributes:
         recipe: recipe of the components.
-        env: batched training environments: R equal blocks; where other processes collect, one of each run.
+        env: batched training environments, one block of equal size for each of the R runs. If other processes
+        collect, a block is one environment.
         eval_env: batched environments for evaluation: R equal blocks.
         actor: the greedy policy. With ``normalize=true`` it is a
             :class:`~torchrl_her.modules.NormalizedPolicy`, and losses take its ``actor``.
-        critic: values of (observation, goal, action); what the loss's critics were made from, None if there
-            is none. TD3 and SAC train others like it, see :func:`~torchrl_her.objectives.critic_value`.
+        critic: module from which the loss makes its critics, values of (observation, goal, action); None if
+            there is none. TD3 and SAC train copies, see :func:`~torchrl_her.objectives.critic_value`.
         exploration: turns greedy into exploring actions.
         policy: actor, then the guide if there is one, then exploration.
         collector: runs the policy in the environments.
         buffer: replay buffer of all runs, with the writer that relabels and the sampler.
         loss: any TorchRL loss module.
-        optimizer: over the loss module's parameters.
-        target: moves the target networks.
+        optimizer: optimizer of the loss module's parameters.
+        target: updates the target networks.
         curriculum: the curriculum and the stage of each run, or None.
-        goal_target: q* [cells] of the task's goals, to which the divergence of virtual goals is
-            measured; None if they are not counted in cells.
+        goal_target: q* [cells], the target distribution of IBS over a grid of goals; the divergence of
+            virtual goals is measured to it. None if goals are not counted on a grid.
         generators: sources of the random numbers of each run (exploration, relabeling, sampling).
         rewards: reward of a missed goal and of an achieved goal.
-        bounds: the least and the greatest reward; infinite where there are none.
+        bounds: the least and the greatest reward; infinite if rewards have no bounds.
         norm: statistics of observations and goals by which actor and sampled transitions are normalized, or
             None.
-        average: moving average of the actor, which is evaluated, filmed and saved in its place; or None.
+        average: moving average of the actor, which is evaluated, filmed and saved instead of it; or None.
         guide: policy of the stage below, which begins episodes, see ``guided_share``; or None.
         virtual_env: environments for evaluation at virtual goals, or None.
-        behavior: proposes the goals of episodes, or None. It is one of the environment's transforms, and its
-            state a part of the collector's.
+        behavior: transform of the environment that proposes the goals of episodes, or None. Its state is
+            part of the collector's state.
         demonstrations: recorded episodes, in batches and as starts of episodes; or None.
     """
 
@@ -92,7 +93,7 @@ class Components(Agent):
 
     @property
     def player(self) -> TensorDictModuleBase:
-        """The greedy policy where the environments are: a copy of it, if it learns elsewhere."""
+        """The greedy policy on the device of the environments; a copy if it learns on another device."""
         policy, place = self.greedy, self.eval_env.device or CPU
         return policy if place_of(policy) == place else deepcopy(policy).to(place)
 

@@ -21,7 +21,7 @@ from torchrl_her_recipes.config.choices.weights import Equal, Weights
 from torchrl_her_recipes.config.groups import CurriculumConfig
 from torchrl_her_recipes.config.values import load_name
 
-_STATE = ["observation", "desired_goal"]  # what the state is made of, in this order
+_STATE = ["observation", "desired_goal"]  # entries whose concatenation is the state
 
 
 @dataclass
@@ -30,7 +30,8 @@ class CurriculumState:
 
     Attributes:
         progress: the stage of each run.
-        stage_env: for evaluation at the stages' goals; None where episodes have stages, and not runs.
+        stage_env: environments for evaluation at the goals of the runs' stages; None if each episode has a
+        stage of its own.
     """
 
     progress: CurriculumProgress
@@ -55,7 +56,7 @@ def make_curriculum(options: CurriculumConfig | None, env: EnvBase) -> Curriculu
 
 
 def read_curriculum(stages: object, env: GoalEnv) -> Curriculum:
-    """Returns a curriculum from plain values, for an environment whose state they index.
+    """Returns a curriculum from plain values, which refer to entries of an environment's state.
 
     The state is the observation with the desired goal behind it. Its entries may be given by the names that
     the environment has for them (``env.state_names()``). The last stage is the environment's own task; stages
@@ -63,7 +64,7 @@ def read_curriculum(stages: object, env: GoalEnv) -> Curriculum:
 
     Args:
         stages: a list of mappings with the options of :class:`~torchrl_her.CurriculumStage`.
-        env: its width of the state and its rewards are used.
+        env: environment whose rewards and width of the state are used.
 
     Example:
         >>> from torchrl_her_envs import make_env
@@ -92,14 +93,14 @@ def _read_stage(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumStage
                 "environment judges; leave it out"
             )
         return CurriculumStage(**options, rewards=reward_range(env))
-    except TypeError as error:  # missing or unknown options, or none at all
+    except TypeError as error:  # options are missing or unknown, or this is no mapping
         raise ValueError(f"{options!r} is no stage of a curriculum: {error}") from error
 
 
 def make_curriculum_state(
     progress: CurriculumProgress | None, envs: TaskEnvs, num_envs: int, seeds: Sequence[int]
 ) -> CurriculumState | None:
-    """Returns the curriculum of some runs, and ``num_envs`` environments to evaluate each in its stage."""
+    """Returns the curriculum of some runs, with ``num_envs`` environments that evaluate each in its stage."""
     if progress is None:
         return None
     by_run = not isinstance(progress, EpisodeStages)
@@ -109,12 +110,12 @@ def make_curriculum_state(
 def check_order(
     order: Order, progress: CurriculumProgress | None, weights: Weights, processes: int, demonstrations: int
 ) -> None:
-    """Refuses what cannot be used where each episode has a stage of its own.
+    """Refuses options that cannot be used if each episode has a stage of its own.
 
     Raises:
-        ValueError: The weights cannot tell stages apart; processes collect, each of which would have to know
-            how the episodes of the others ended; or there are demonstrations, which are shown in a run's
-            stage.
+        ValueError: The weights count goals of all stages as one; or processes collect, each of which would
+            need the results of the others' episodes; or there are demonstrations, which are relabeled for
+            one stage of a run.
     """
     if not isinstance(progress, EpisodeStages):
         return
@@ -138,7 +139,7 @@ def check_order(
 def make_progress(
     order: Order, options: CurriculumConfig | None, env: EnvBase, seeds: Sequence[int]
 ) -> CurriculumProgress | None:
-    """Returns the stages of some runs at their beginning; None without a curriculum."""
+    """Returns the stages of some runs at the beginning of training; None without a curriculum."""
     if (curriculum := make_curriculum(options, env)) is None:
         return None
     progress: CurriculumProgress = load_name(order.maker)(
@@ -159,12 +160,12 @@ def make_threshold(options: Threshold, curriculum: Curriculum, *, runs: int, **_
 
 
 def make_all_at_once(options: AllAtOnce, curriculum: Curriculum, **runs: Any) -> EpisodeStages:
-    """Draws each episode's stage, with the same probabilities all the time."""
+    """Draws each episode's stage, with constant probabilities."""
     return EpisodeStages(curriculum, **runs, task_share=options.task_share)
 
 
 def make_teacher(options: Teacher, curriculum: Curriculum, **runs: Any) -> TeacherStudent:
-    """Draws each episode's stage, and rather the stages whose success changes."""
+    """Draws each episode's stage; a stage whose success changes is more probable."""
     return TeacherStudent(
         curriculum,
         **runs,
@@ -182,7 +183,7 @@ def make_played_env(
     pictures: bool = False,
     behavior: BehaviorGoals | None = None,
 ) -> EnvBase:
-    """Environments as a trained policy sees them: at the top of the curriculum, if there is one."""
+    """Returns environments for a trained policy: in the last stage of the curriculum, if there is one."""
     env = envs.make(num_envs, seeds, pictures=pictures)
     curriculum = make_curriculum(envs.curriculum, env)
     progress = None if curriculum is None else at_the_top(curriculum, len(seeds))
@@ -190,7 +191,7 @@ def make_played_env(
 
 
 def is_guided(options: CurriculumConfig | None, progress: CurriculumProgress | None) -> bool:
-    """Returns whether the policy of the stage below begins some of the episodes."""
+    """Returns whether the policy of the stage below chooses the first actions of some episodes."""
     if options is None or progress is None:
         return False
     return options.guided_share > 0 and len(progress.curriculum) > 1
@@ -211,7 +212,7 @@ def in_stages(
         progress: stages of the runs; None without a curriculum.
 
     Keyword Args:
-        begins: whether steps say if they are the first of an episode, as ``is_init``.
+        begins: whether steps have an entry ``is_init``, which is true of an episode's first step.
         behavior: proposes goals, if there is one.
         starts: starts episodes at demonstrations; None if there are no such episodes.
     """

@@ -30,7 +30,7 @@ class RunDemonstrations:
 
     Attributes:
         recorded: demonstrations from the file that are used, with the goals of the full task.
-        env: environment of the task, whose reward runs without a curriculum have.
+        env: environment of the task; its rewards are used if there is no curriculum.
         state: the curriculum, or None.
         buffer: relabeled rows of the demonstrations; None if batches contain none.
         starts: starts episodes at states of demonstrations; None if no episode does so.
@@ -43,7 +43,7 @@ class RunDemonstrations:
     starts: DemonstrationStarts | None = None
 
     def shown(self, run: int) -> Demonstrations:
-        """Returns the demonstrations as the stage of a run sees them, with the task's rewards."""
+        """Returns the demonstrations with observations and goals of a run's stage, and the task's rewards."""
         rule = task_reward(self.env)
         if self.state is None:
             return with_reward(self.recorded, rule)
@@ -95,11 +95,11 @@ def load_demonstrations(
     seeds: Sequence[int],
     state: CurriculumState | None,
 ) -> RunDemonstrations | None:
-    """Returns the demonstrations of some runs, without a buffer yet; None if options ask for no episode.
+    """Returns the demonstrations of some runs, still without a buffer; None if ``episodes`` is 0.
 
     Raises:
-        ValueError: another option cannot be beside them, the file cannot be read, is of another task, holds
-            too few episodes, or has nothing that episodes could start at.
+        ValueError: an option cannot be used with demonstrations, or the file cannot be read, is of another
+            task, has too few episodes, or has no states that episodes could start at.
     """
     if options.episodes == 0:
         return None
@@ -135,7 +135,7 @@ def load_demonstrations(
 
 
 def _check(every: Demonstrations, file: str, task: str, env: EnvBase) -> None:
-    """Refuses demonstrations of something else."""
+    """Refuses demonstrations of another task, or whose observations or goals have other widths."""
     if every.task != task:
         raise ValueError(f"{file} holds demonstrations of {every.task}, not of {task}")
     base: Any = goal_env(env)
@@ -154,7 +154,7 @@ def _check(every: Demonstrations, file: str, task: str, env: EnvBase) -> None:
 
 
 def _scaled(recorded: Demonstrations, env: EnvBase) -> Demonstrations:
-    """Demonstrations with actions from -1 to 1, as learners take them, instead of the task's own."""
+    """Returns demonstrations whose actions are scaled to -1 to 1, as learners take them."""
     low, high = action_bounds(env)
     if low.eq(-1).all() and high.eq(1).all():
         return recorded
@@ -165,7 +165,7 @@ def _scaled(recorded: Demonstrations, env: EnvBase) -> Demonstrations:
 
 
 def make_cloning(options: DemonstrationsConfig) -> Cloning | None:
-    """Returns how losses clone demonstrations; None if they do not."""
+    """Returns the settings with which losses clone demonstrations; None if losses do not clone them."""
     if not options.in_batches or options.bc_weight == 0:
         return None
     return Cloning(weight=options.bc_weight, q_filter=options.q_filter)

@@ -12,14 +12,14 @@ from torchrl_her_recipes.config.choices.learners import LearnerConfig
 from torchrl_her_recipes.config.groups import ReplayConfig
 
 CPU = torch.device("cpu")
-_WORTH_IT = 1e9  # multiplications in a gradient step of all runs from which on a GPU pays off
+_WORTH_IT = 1e9  # multiplications in a gradient step of all runs; from this number on a GPU is faster
 
 
 class Devices(NamedTuple):
     """Devices of the parts of a run. Environments are on the CPU.
 
     Attributes:
-        learner: device of networks, losses, optimizer and the policy that plays.
+        learner: device of networks, losses, optimizer and the policy that acts.
         replay: device of storage, priorities and relabeling.
     """
 
@@ -53,7 +53,7 @@ def make_generators(seeds: Sequence[int], device: torch.device) -> list[torch.Ge
 
 
 def _find(name: str, option: str, word: str) -> torch.device:
-    """Returns the device of a name; raises an error if it is missing or cannot draw random numbers."""
+    """Returns the device with this name; raises an error if it is missing or cannot draw random numbers."""
     try:
         device = torch.device(name)
     except RuntimeError:

@@ -20,11 +20,11 @@ from torchrl_her_recipes.config.groups import CurriculumConfig, TaskConfig
 from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
 
-_AT_ONCE = 20  # most of gymnasium's environments in an evaluation, since each takes 10 MB and more
+_AT_ONCE = 20  # gymnasium environments in an evaluation, at most: each takes 10 MB or more
 
 
 def evaluation_envs(task: str, episodes: int) -> int:
-    """Returns the number of environments in which each run is evaluated, some of them several times.
+    """Returns the number of environments that evaluate each run; each may play several episodes.
 
     Example:
         >>> evaluation_envs("hand_v0", 45), evaluation_envs("gym:FetchPush-v4", 45)
@@ -41,7 +41,7 @@ class TaskEnvs:
     Attributes:
         task: Task and its options.
         dtype: Name of the type of observations and rewards.
-        gamma: Discount factor, which defines the worth of never achieving the goal.
+        gamma: Discount factor, from which the return of never achieving the goal is computed.
         curriculum: Options of the curriculum; None without one.
     """
 
@@ -66,10 +66,10 @@ class TaskEnvs:
             seeds: Seeds of the environments.
 
         Keyword Args:
-            pictures: Whether they are to give pictures, if they can.
-            scaled: Whether continuous actions are from -1 to 1, whatever the task's own bounds are, and
-                failures are worth what ``task.failure`` says, as learners take them. Exported policies and
-                recorded demonstrations have the task's own.
+            pictures: Whether the environments are made to render pictures, if they can.
+            scaled: Whether environments are as learners take them: continuous actions go from -1 to 1, and
+                failures have the reward that ``task.failure`` gives. If not, actions have the task's own
+                bounds, as in exported policies and recorded demonstrations.
         """
         task = self.task
         if foreign_module(task.name):

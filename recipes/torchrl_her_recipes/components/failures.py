@@ -1,4 +1,4 @@
-"""The worth of failures, which end an episode without its goal, as a fall or a crash does."""
+"""The reward of failures, which end an episode before its goal is achieved, as a fall or a crash does."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torchrl_her.goals.rewards import is_achieved
 
 
 class Failures(Transform):
-    """Sets the reward of steps in which the environment ended an episode without its goal, or cuts it off.
+    """Sets the reward of a failure, a step that ends an episode without its goal, or truncates there.
 
-    With a reward of -1 a step, the best that can be done is to fall soon. A failure that is worth what never
-    achieving the goal is worth, ``missed_reward / (1 - gamma)``, never pays. Hindsight keeps what a failure
-    costs, so this holds for virtual goals, too.
+    With a reward of -1 for each step, failing soon can give the best return. It never does if the reward of
+    a failure is the return of never achieving the goal, ``missed_reward / (1 - gamma)``. Relabeling keeps
+    what a failure costs, so this holds for virtual goals, too.
 
     Args:
         worth: the reward of a failure; None to truncate the episode there, with the reward as it is.

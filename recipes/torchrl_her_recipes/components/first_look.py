@@ -26,9 +26,9 @@ _SELDOM = 0.5  # share of episodes in which the achieved goal changes: Panda's t
 _FACTS: dict[str, EnvFacts] = {}  # cache, by task
 _SECONDS = 20.0  # no further episodes begin after this time
 _FUTURE = 16  # later goals of an episode that each transition is tried with
-_DIGITS = 1e-4  # relative difference up to which two rewards count as equal
-_TOUCH = 0.1  # quantile of distances while the object moves: touch; farther away it may roll by itself
-_NEAR = 0.5  # a hand is at most this share of its usual distance from an object that moves
+_DIGITS = 1e-4  # two rewards with at most this relative difference count as equal
+_TOUCH = 0.1  # quantile of distances while the object moves that counts as touch; farther away it may roll
+_NEAR = 0.5  # a hand is nearer to a moving object than this share of its usual distance
 _PAIRS = 32  # number of pairs of goals from which the distance of achieved goals is estimated
 _HALVINGS = 20
 
@@ -40,15 +40,15 @@ class Facts:
     """Facts about a task from random actions.
 
     Attributes:
-        steps, episodes: numbers of steps and of finished episodes that were played.
+        steps, episodes: numbers of steps and of finished episodes.
         seconds: duration of one step.
         max_steps: length of an episode.
-        actions: the least and the greatest value of each entry; None if actions are discrete.
+        actions: the least and the greatest value of each entry of actions; None if actions are discrete.
         scales: the least and the greatest standard deviation of entries of the observation.
-        disagree: share of steps whose reward is not that of ``compute_reward``, failures aside.
+        disagree: share of steps, except failures, whose reward differs from that of ``compute_reward``.
         achieved: share of the episodes in which the goal was achieved.
         moved: share of the episodes with a goal that the first state had not achieved, by the reward.
-        kept: share of transitions for which the filter finds a later goal of the episode.
+        kept: share of transitions with a later goal of the episode that the filter keeps.
         fallen: share of the episodes that terminated without the goal, as by a fall.
         constant: entries of the observation that never changed.
         goal_inside: entries of the observation that are the desired goal.
@@ -80,10 +80,10 @@ class Facts:
 def resolved(recipe: Recipe) -> Recipe:
     """Returns the recipe with a value for each option that is ``auto``, chosen from facts about the task.
 
-    If environments are stepped one by one, random actions are played if stages may have to be found, or if
-    it is unknown what ends an episode at its goal. Stages are looked for if ``algo`` is ``auto``, or if it
-    learns stages and neither the recipe nor the task has any. The result is stored in the recipe, so that a
-    resumed run and other processes need not play them again.
+    If environments are stepped one by one, random actions are taken if stages may have to be found, or if
+    it is unknown what ends an episode at its goal. Stages are looked for if ``algo`` is ``auto``, or if the
+    algorithm learns stages and neither the recipe nor the task has any. The recipe stores the result, so
+    that a resumed run and other processes need not take random actions again.
     """
     auto = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
     needs_stages = auto or (recipe.hindsight.algorithm.curriculum and recipe.curriculum.stages is None)
@@ -109,23 +109,23 @@ def resolved(recipe: Recipe) -> Recipe:
 
 
 def _watched(envs: TaskEnvs) -> TaskEnvs:
-    """Returns a maker of environments with their own rewards of failures, and all ends if they are open."""
+    """Returns a maker of environments that keep rewards of failures and, if open, watch ends at goals."""
     ends = {TERMINATION: "watch"} if ends_open(envs.task) else {}
     options = {**(envs.task.options or {}), **ends} or None
     return replace(envs, task=replace(envs.task, options=options, failure="environment"))
 
 
 def _needed_stages(facts: Facts, auto: bool) -> list[dict[str, Any]] | None:
-    """Returns stages for a task, the same for each seed; None if there are none, or no need for them.
+    """Returns stages for a task, the same for each seed; None if none are found or needed.
 
-    A task in which episodes end in failures gets none, since a failure says nothing about the goals of a
-    stage below the task. If ``algo`` is ``auto``, the achieved goal must seldom change by chance, besides.
+    A task in which episodes end in failures gets no stages, since a failure says nothing about the goals of
+    a lower stage. If ``algo`` is ``auto``, stages are needed only if chance seldom changes the achieved goal.
     """
     return None if facts.fallen > 0 or (auto and facts.moved >= _SELDOM) else facts.stages or None
 
 
 def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SECONDS) -> Facts:
-    """Plays random actions on the task of a recipe.
+    """Takes random actions in the task of a recipe, and returns facts about the task.
 
     Args:
         recipe: recipe with the task, and with the seed of environments and actions.
@@ -189,14 +189,14 @@ def _facts(
         after = outcomes(rule, goals, episode["next"])
         some_kept.append(_kept(before, goals, meets))
         if not episode["next", "done"][-1]:
-            continue  # it was cut off by the end of the look
+            continue  # unfinished, since the number of steps was reached
         moved.append(not bool(meets(before[:1], goals).all()))
         achieved.append(bool(meets(after, episode["next", "desired_goal"]).any()))
         last = episode["next"][-1:]
         fallen.append(bool(last["terminated"].all() and not is_achieved(last, **judged_by).all()))
     reached = outcomes(rule, rows["next", "achieved_goal"], rows["next"])
     computed, reward = ask_reward(rule, reached, rows["next", "desired_goal"])[0], rows["next", "reward"]
-    # A failure may have a penalty that the reward function does not know.
+    # A failure may have a penalty that ``compute_reward`` does not give.
     went_on = ~rows["next", "terminated"] | (computed >= achieved_reward)
     differ = went_on & ((reward - computed).abs() > _DIGITS * (1 + computed.abs()))
     observations = rows["observation"].double()
@@ -251,13 +251,13 @@ def _columns(observations: Tensor, goal: Tensor) -> list[int]:
 
 
 def propose_stages(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
-    """Proposes a curriculum of two stages: first bring the hand to the object, then the task itself.
+    """Proposes a curriculum of two stages: bringing the hand to the object, then the task itself.
 
-    The object is what the achieved goal is about; the observation must contain it. The hand is g neighboring
-    entries of the observation that are nearer to the object in steps in which the object moves than in other
-    steps. The first stage is achieved where the hand touches the object. Fingers that go around the object
-    come nearer than half of the distance at which the task's goals are achieved; then half of that distance
-    is the threshold of the first stage.
+    The achieved goal is taken as the position of the object; the observation must contain it. The hand is g
+    neighboring entries of the observation that are nearer to the object in steps in which the object moves
+    than in other steps. The first stage is achieved if the hand touches the object. Fingers around the object
+    may come nearer than half of the distance at which the task's goals are achieved; in this case the
+    threshold of the first stage is half of that distance.
 
     Args:
         rows: transitions [n] of random actions.
@@ -287,7 +287,7 @@ def propose_stages(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
         return []
     others = [
         entry for entry in range(wide) if entry not in place
-    ]  # and the goal of the first stage behind them
+    ]  # without the object, which is the first stage's goal
     reach = {
         "observation": others,
         "achieved_goal": list(range(best, best + width)),

@@ -41,7 +41,7 @@ class Agent:
 
 @dataclass(frozen=True, kw_only=True)
 class AgentShape:
-    """Inputs and outputs of the networks of some runs side by side.
+    """Inputs and outputs of the networks of one run, or of several side by side.
 
     Attributes:
         task: Name of the task, for messages.
@@ -61,7 +61,7 @@ class AgentShape:
 
 
 def acting(actor: TensorDictModuleBase, norm: RunningNorm | None) -> TensorDictModuleBase:
-    """Returns an actor as it plays, on what environments show."""
+    """Returns an actor for entries as environments give them; it normalizes them if ``norm`` is given."""
     return actor if norm is None else NormalizedPolicy(actor, norm)
 
 
@@ -74,7 +74,7 @@ class LearnerBuilder(ABC):
 
     Keyword Args:
         generators: Sources of random numbers, one for each run; None for torch's own.
-        cloning: How the loss clones demonstrations; None if it does not.
+        cloning: Settings with which the loss clones demonstrations; None if it does not clone them.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class LearnerBuilder(ABC):
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """The rewards whose returns targets are clamped to; None if they are not clamped."""
+        """Least and greatest reward, to whose returns targets are clamped; None without clamped targets."""
         return self.shape.rewards if getattr(self.options, "clamp_targets", True) else None
 
     @abstractmethod
@@ -99,7 +99,7 @@ class LearnerBuilder(ABC):
         """Returns the actor and the critics of some runs side by side."""
 
     def norm(self) -> RunningNorm | None:
-        """Statistics of inputs of each run, before anything was counted; None if nothing is normalized."""
+        """Returns new statistics of the inputs of each run; None if inputs are not normalized."""
         options = self.options
         if not options.normalize:
             return None
@@ -111,17 +111,17 @@ class LearnerBuilder(ABC):
         )
 
     def player(self, runs: int) -> TensorDictModule:
-        """Returns the actor alone; override this where critics need not be made for it."""
+        """Returns the actor alone. Override this if the learner can make an actor without making critics."""
         return self.networks(runs)[0]
 
     def greedy(self, actor: TensorDictModule) -> nn.Module:
-        """Returns the network of an exported policy: (observation, goal), as tensors, to the greedy action.
+        """Returns the network of an exported policy, from tensors (observation, goal) to the greedy action.
 
         Args:
             actor: actor of a single run, from :meth:`player`; the result shares its weights.
 
         Raises:
-            ValueError: the actor writes more than the action. Then a builder overrides this.
+            ValueError: the actor writes more than the action. A builder of such actors must override this.
         """
         if list(actor.out_keys) != ["action"]:
             raise ValueError(
@@ -141,7 +141,7 @@ class LearnerBuilder(ABC):
         """
 
     def exploration(self) -> Exploration:
-        """Turns greedy into exploring actions; here for continuous ones."""
+        """Returns the module that turns greedy into exploring actions, here for continuous actions."""
         spec = self.action_spec
         return DecayingEpsilon(
             spec.low, spec.high, generators=self.generators, **self.epsilon(), **self.action_noise()
@@ -153,6 +153,6 @@ class LearnerBuilder(ABC):
         return {"start": options.epsilon_start, "decay": options.epsilon_decay, "end": options.epsilon_end}
 
     def action_noise(self) -> dict[str, float]:
-        """Noise and share of uniform actions, as far as the learner has these options."""
+        """Returns the options for noise and the share of uniform actions that the learner has."""
         names = {"noise": "action_noise", "uniform_share": "uniform_share"}
         return {to: getattr(self.options, name) for to, name in names.items() if hasattr(self.options, name)}

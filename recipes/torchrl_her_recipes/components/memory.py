@@ -1,4 +1,4 @@
-"""Replay buffers that a machine's memory cannot hold: refused by the name of their option."""
+"""Refuses replay buffers that do not fit into a machine's memory, with the name of their option."""
 
 from __future__ import annotations
 

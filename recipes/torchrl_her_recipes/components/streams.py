@@ -11,7 +11,7 @@ from torchrl_her_recipes.components.devices import CPU, make_generators
 
 
 class Stream(IntEnum):
-    """Offset of a part's seeds from the seeds of the runs, which are below ``2 ** 31``."""
+    """Numbers added to the seeds of the runs, which are below ``2 ** 31``, to make the seeds of a part."""
 
     EVALUATION = 1 << 32
     PROPOSED_GOALS = 1 << 33
@@ -21,5 +21,5 @@ class Stream(IntEnum):
 
 
 def generators_of(seeds: Sequence[int], stream: Stream) -> list[torch.Generator]:
-    """Returns the generators of a part of a run, one for each run's seed."""
+    """Returns the generators of a part, one for each run, seeded from the run's seed."""
     return make_generators([stream + seed for seed in seeds], CPU)

@@ -33,12 +33,12 @@ class Callback:
     """Base class of callbacks. Override the methods that you need; here they do nothing.
 
     ``on_batch`` and ``on_epoch`` may return True to stop the run in good order: its checkpoint, pictures and
-    policy are written as at its end, and :func:`~torchrl_her_recipes.resume` can go on from there. All
-    callbacks are called, in their order, also if an earlier one asks for a stop. What they raise ends the run
-    at once, and ``on_end`` is then not called.
+    policy are written as at its end, and :func:`~torchrl_her_recipes.resume` can continue it. All callbacks
+    are called, in their order, even if an earlier one returns True. An error that a callback raises ends the
+    run at once, and ``on_end`` is then not called.
 
-    Checkpoints hold nothing of a callback. One that decides from ``rows`` decides after a resumption as it
-    would have without it.
+    Checkpoints do not contain callbacks. If a callback decides from ``rows`` alone, resuming the run does not
+    change its decisions.
 
     Example:
         >>> class FrameLimit(Callback):
@@ -56,8 +56,8 @@ class Callback:
     def on_epoch(self, run: RunView) -> bool | None:
         """Called after each evaluation; returns whether to stop.
 
-        Its rows are at the end of ``rows``. What is changed here, numbers in these rows included, is in the
-        table and the checkpoint of this epoch.
+        The new rows are at the end of ``rows``. What this method changes, as numbers in these rows, goes into
+        the table and the checkpoint of this epoch.
         """
         return None
 
@@ -68,15 +68,15 @@ class Callback:
 class EarlyStopping(Callback):
     """Stops a run when the median of a metric was good enough in some evaluations in a row.
 
-    The median is that of the runs side by side.
+    The median is over the runs that are trained side by side.
 
     Args:
         metric: a column of the table of metrics.
 
     Keyword Args:
         at_least: the smallest value that is good enough.
-        at_most: the largest value that is good enough, for metrics such as ``distance``. Give one of the two.
-        epochs: evaluations in a row.
+        at_most: the largest value that is good enough, for metrics such as ``distance``. Give either bound.
+        epochs: number of evaluations in a row that must be good enough.
 
     Raises:
         ValueError: both bounds or none are given, ``epochs`` is below 1; when running, the table has no such
@@ -108,17 +108,17 @@ class EarlyStopping(Callback):
         return self.reached(run.rows)
 
     def reached(self, rows: Sequence[dict[str, float]]) -> bool:
-        """Returns whether the last evaluations of a table are all good enough; NaN is not.
+        """Returns whether the last evaluations of a table are all good enough; NaN never is good enough.
 
         Args:
             rows: the table, with a row for each epoch and run.
 
         Raises:
-            ValueError: it has no column with the name of the metric.
+            ValueError: the table has no column with the name of the metric.
         """
         last = sorted({row["epoch"] for row in rows})[-self.epochs :]
         if rows and not any(self.metric in row for row in rows) and rows[-1].get("updates", 1) > 0:
-            # Losses are measured from the first update on.
+            # Only after the first update, since columns of losses are missing before.
             raise ValueError(f"metric must be one of {', '.join(rows[-1])}, got {self.metric!r}")
         return len(last) == self.epochs and all(
             self._is_good([row.get(self.metric, math.nan) for row in rows if row["epoch"] == epoch])

@@ -8,9 +8,9 @@ from torchrl_her_recipes.components.first_look import Facts, resolved
 from torchrl_her_recipes.config.algorithms import Algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
-_SELDOM = 0.5  # fraction of the episodes
-_UNLIKE = 100  # times as large
-_SLOW = 5e-3  # seconds: slower environments take longer for a step than a gradient step does
+_SELDOM = 0.5  # fraction of the episodes below which something happens seldom
+_UNLIKE = 100  # ratio of scales above which observations need normalization
+_SLOW = 5e-3  # seconds of a step in a slow environment: about the time of a gradient step
 _MOSTLY = 0.5
 _ROUNDED = 0.005
 
@@ -65,7 +65,7 @@ def advice(facts: Facts, recipe: Recipe, stages_file: str = "stages.yaml") -> li
 
 
 def _percent(share: float) -> str:
-    """Formats a fraction as a percentage; one above 0 is never shown as 0%."""
+    """Formats a fraction as a percentage; a fraction above 0 never becomes 0%."""
     return "less than 1%" if 0 < share < _ROUNDED else f"{share:.0%}"
 
 

@@ -51,7 +51,7 @@ def stage_success(
 def move_on(components: Components, state: CurriculumState, samples: Tensor, frames: int) -> list[str]:
     """Moves runs that have learned their stage to the next one, and returns a message for each of them."""
     before, evaluations = state.progress.stages, state.progress.evaluations
-    # As many as the window takes: more in one evaluation would give a lucky streak many chances.
+    # At most a window's number: with more samples in an evaluation, a lucky streak becomes more likely.
     moved = state.progress.record(samples[:, : state.progress.window])
     learner, exploration, lines = components.recipe.learner, components.exploration, []
     for run in moved.nonzero().flatten().tolist():

@@ -23,13 +23,13 @@ from torchrl_her_recipes.runs.notices import saturation
 def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor]:
     """Computes metrics of policy and critics from greedy episodes of each run, [R] each.
 
-    ``q`` is the value of the first action as the loss's own critics see it (see
-    :func:`~torchrl_her.objectives.critic_value`), and ``q_bias`` is that minus the return of the policy that
-    played: the average of the actor, if there is one. Both are missing if the loss has no such critics.
+    ``q`` is the value of the first action by the loss's own critics (see
+    :func:`~torchrl_her.objectives.critic_value`). ``q_bias`` is ``q`` minus the return of the evaluated
+    policy: the average of the actor, if there is one. Both are missing if the loss has no such critics.
     """
     recipe, judged_by = components.recipe, judging(components.eval_env)
     succeeded = success(rollout, **judged_by)
-    # An episode that is truncated at its goal is assumed to stay there.
+    # Return after truncation: an episode that is truncated at its goal is assumed to stay there.
     missed, achieved = components.rewards
     tail = torch.where(succeeded, achieved, missed).to(rollout["next", "reward"].dtype)
     returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=tail)
@@ -61,7 +61,7 @@ def written(components: Components, run: int) -> dict[str, float]:
     elif isinstance(weights, InstructiveWeights):
         divergence = weights.divergence
     if divergence is not None:
-        # q* belongs to the full task
+        # q* is of the full task's goals, so that lower stages have no divergence from it
         full = components.curriculum is None or components.curriculum.at_the_top(run)
         counts["kl"] = divergence if full else math.nan
     return counts

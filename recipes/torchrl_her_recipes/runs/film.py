@@ -18,7 +18,7 @@ from torchrl_her_recipes.components.curricula import make_played_env
 from torchrl_her_recipes.components.envs import TaskEnvs
 
 FPS = 12  # half the true speed of the throwing tasks, as a throw takes half a second
-_FILMED = 6  # environments
+_FILMED = 6  # environments in the video
 
 
 def film_policy(
@@ -26,8 +26,8 @@ def film_policy(
 ) -> None:
     """Makes a video of greedy episodes of one of the runs, if its environment can be rendered.
 
-    Environments that only give pictures if they are made for it are made anew. Drawing them may need what a
-    machine lacks, such as a display: then there is a warning instead of a film.
+    Some environments render only if they are made for it; such environments are made anew. If rendering
+    fails, as on a machine without a display, there is a warning and no video.
     """
     count = env.numel() // len(seeds)
     filmed = min(_FILMED, count)
@@ -38,7 +38,7 @@ def film_policy(
             with closing(make_played_env(envs, filmed, seeds, pictures=True)) as drawn:
                 if goal_env(drawn).can_render:
                     _film(player, drawn, out, run * filmed, filmed)
-        except Exception as error:  # a renderer may raise any error; the run itself is done
+        except Exception as error:  # a renderer may raise any error, which must not end a run that is done
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"no {out.name}: the environment could not be drawn: {reason}", stacklevel=2)
 

@@ -22,7 +22,7 @@ from torchrl_her_recipes.config.plain_files import naming, read_json, read_mappi
 from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
 from torchrl_her_recipes.config.recipe import Recipe
 
-_COUNTED = ("run", "seed", "epoch", "frames")  # columns of the table
+_COUNTED = ("run", "seed", "epoch", "frames")  # columns with whole numbers
 _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict", "gymnasium", "pymunk", "numpy")
 
 
@@ -40,7 +40,7 @@ class RunFolder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.config = self.path / "config.yaml"
-        self.checkpoint = self.path / "checkpoint.pt"  # the newest
+        self.checkpoint = self.path / "checkpoint.pt"  # the newest checkpoint
         self.policy = self.path / f"policy{POLICY_SUFFIX}"
         self.best = self.path / f"best{POLICY_SUFFIX}"
         self.about = self.path / "run.json"
@@ -58,7 +58,7 @@ class RunFolder:
 
     @classmethod
     def of(cls, source: str | Path) -> RunFolder | None:
-        """Finds the folder of a run from itself or from a policy's file in it; None for other paths.
+        """Returns the run folder at a path, or around a policy's file at this path; None for other paths.
 
         Args:
             source: the folder, or the file of one of its policies.
@@ -75,13 +75,13 @@ class RunFolder:
     def at_work(self, *, wait: float = 0.0) -> Iterator[None]:
         """Keeps other processes from training into the folder, and removes unfinished files of a killed run.
 
-        The end of a process ends this, however it comes. The same process may do so more than once.
+        The folder is free again when the process ends, even if it is killed. A process may enter twice.
 
         Args:
-            wait: seconds for another process to end: one whose parent is gone first saves its run.
+            wait: seconds to wait for another process to end; one that lost its parent first saves its run.
 
         Raises:
-            ValueError: another process is at work in it.
+            ValueError: another process is at work in the folder.
         """
         lock = FileLock(self.path / ".lock", is_singleton=True)
         try:
@@ -99,8 +99,8 @@ class RunFolder:
         """Makes the folder.
 
         Raises:
-            ValueError: there is a run in it already.
-            OSError: it cannot be made.
+            ValueError: the folder has a run already.
+            OSError: the folder cannot be made.
         """
         if self.config.exists():
             raise ValueError(
@@ -109,7 +109,7 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
 
     def describe(self, recipe: Recipe) -> None:
-        """Writes the recipe and the versions that run it."""
+        """Writes the recipe, and the versions of the packages that train it."""
         about = {
             "seed": recipe.run.seed,
             "python": platform.python_version(),
@@ -129,8 +129,8 @@ class RunFolder:
         """Reads the recipe. If this user has trained the run, the module that its task names is permitted.
 
         Raises:
-            ValueError: this is no folder of a run, its configuration cannot be read, or a link in it leads
-                out of it, so that what is written would go elsewhere.
+            ValueError: this is no folder of a run, its configuration cannot be read, or a link in the folder
+                leads out of it, so that files would be written elsewhere.
         """
         if not self.config.is_file():
             inside = sorted(config.parent.name for config in self.path.glob("*/config.yaml"))
@@ -189,7 +189,7 @@ class RunFolder:
         """Reads the metrics table so far.
 
         Raises:
-            ValueError: it is damaged.
+            ValueError: the table is damaged.
         """
         try:
             return read_table(self.metrics, counts=_COUNTED)
@@ -200,7 +200,7 @@ class RunFolder:
 def remember(config: Path, task: str) -> None:
     """Records that this user has trained the run of a ``config.yaml``, if its task names a module.
 
-    Nothing is noted where the user's state directory cannot be written.
+    Does nothing if the user's state directory cannot be written.
     """
     if not foreign_module(task):
         return

@@ -18,7 +18,7 @@ _LARGEST = 1 << 27  # bytes of all arrays of a file
 
 @dataclass(frozen=True)
 class GoalMap:
-    """Histograms over a grid of goals: n x n cells of the screen, the first index goes right, the second up.
+    """Histograms over a grid of n x n goals on the screen: the first index goes right, the second up.
 
     Attributes:
         counts: [R, n, n], virtual goals of each run written since its buffer was last emptied; [R, n] for
@@ -31,7 +31,7 @@ class GoalMap:
 
     @property
     def share(self) -> np.ndarray:
-        """Returns q [n, n], the mean of the runs."""
+        """Returns q [n, n], the share of virtual goals in each cell, as the mean of the runs."""
         totals = self.counts.sum(tuple(range(1, self.counts.ndim)), keepdims=True)
         return (self.counts / np.maximum(totals, 1)).mean(0)
 
@@ -42,10 +42,10 @@ class GoalMap:
 
     @classmethod
     def load(cls, path: Path) -> GoalMap:
-        """Reads what :meth:`save` wrote.
+        """Reads a map from a file that :meth:`save` wrote.
 
         Raises:
-            ValueError: there is no such file, as the run has written no virtual goals, or it is damaged.
+            ValueError: the file is damaged, or missing because the run has written no virtual goals.
         """
         if not path.is_file():
             raise ValueError(f"{path.parent} has no {path.name}: the run has written no virtual goals")
@@ -54,7 +54,7 @@ class GoalMap:
 
     @classmethod
     def of(cls, path: Path, counts: np.ndarray | None, target: np.ndarray | None) -> GoalMap:
-        """Makes a map from the arrays of a file, checked.
+        """Checks the arrays of a file and makes a map from them.
 
         Raises:
             ValueError: arrays are missing, or do not form a map; the message names the file.

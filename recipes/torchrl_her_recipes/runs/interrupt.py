@@ -28,7 +28,7 @@ def soft_interrupt() -> Iterator[Callable[[], None]]:
         >>> with soft_interrupt() as check:
         ...     check()  # raises Interrupted after Ctrl-C
     """
-    pressed: list[float] = []  # when
+    pressed: list[float] = []  # times of signals
 
     def check() -> None:
         if pressed:

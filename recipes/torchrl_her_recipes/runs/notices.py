@@ -15,10 +15,10 @@ from torchrl_her_recipes.config.recipe import Recipe
 Row = dict[str, float]  # row of the table of metrics: one epoch of one run
 
 _AT_BOUND = 0.99  # fraction of the way from the middle of the range to its end
-_NEARLY_ALL = 0.95  # fraction of the entries of all actions, or of virtual rows
-_STREAK = 3  # epochs in a row
+_NEARLY_ALL = 0.95  # fraction of the entries of all actions, or of virtual rows, that counts as nearly all
+_STREAK = 3  # epochs in a row that show a problem before it is reported
 _LONG = 5
-_LITTLE = 0.5  # success from which on full speed may well be the right policy
+_LITTLE = 0.5  # success; above it, actions at their bounds may well be right
 _FEW = 0.02  # fraction of the transitions
 _BEYOND = 0.25  # fraction of the range of returns
 
@@ -28,11 +28,11 @@ def saturation(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
     Args:
         action: [..., a].
-        low: [a], the least action; with an infinite bound, an entry is never at it.
+        low: [a], the least action; an entry never counts as being at an infinite bound.
         high: [a], the greatest action.
 
     Returns:
-        [...], from 0 to 1.
+        Fractions from 0 to 1, [...].
 
     Example:
         >>> import torch
@@ -54,7 +54,7 @@ def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) ->
         bounds: the least and the greatest reward; infinite if there are none.
 
     Returns:
-        The lines; none where all is well.
+        The lines; an empty list if there is no new problem.
     """
     runs: dict[float, list[Row]] = {}
     for row in rows:
@@ -116,7 +116,7 @@ def _nothing_to_relabel(task: str, algorithm: Algorithm, rows: Sequence[Row]) ->
 
 
 def _saturated(learner: LearnerConfig, rows: Sequence[Row]) -> str | None:
-    """An actor that ends in tanh gets almost no gradient where its actions are at their bounds."""
+    """Reports actions at their bounds, where an actor that ends in tanh gets almost no gradient."""
     last = rows[-_STREAK:]
     stuck = [row.get("saturation", 0.0) >= _NEARLY_ALL and _success(row) < _LITTLE for row in last]
     if len(last) < _STREAK or not all(stuck):
@@ -132,7 +132,7 @@ def _saturated(learner: LearnerConfig, rows: Sequence[Row]) -> str | None:
 
 
 def _beyond(learner: LearnerConfig, bounds: tuple[float, float], rows: Sequence[Row]) -> str | None:
-    """No return can have such values as the critic gives."""
+    """Reports values of the critic that are outside of the range of possible returns."""
     gamma = float(learner.gamma)
     horizon = 1 / (1 - gamma) if gamma < 1 else math.inf
     low, high = min(0.0, horizon * bounds[0]), max(0.0, horizon * bounds[1])
@@ -180,5 +180,5 @@ def _differ(runs: Sequence[Sequence[Row]]) -> bool:
 
 
 def _means(values: Sequence[float]) -> list[float]:
-    """Computes the mean of every few values in a row."""
+    """Computes the moving average of values, over as many epochs as a problem must last."""
     return [sum(values[end - _STREAK : end]) / _STREAK for end in range(_STREAK, len(values) + 1)]

@@ -20,7 +20,7 @@ from torchrl_her_recipes.runs.goal_map import GoalMap
 
 Rows = Sequence[dict[str, float]]
 
-COLORS = {  # colors of algorithms, the same in every picture; others take them in this order
+COLORS = {  # colors of algorithms, equal in all pictures; other labels take unused ones in this order
     "her": "#dd6b20",
     "filtered_her": "#805ad5",
     "filtered_her_ibs": "#2b6cb0",
@@ -39,7 +39,7 @@ _SCREEN = 300  # pixels of the picture behind a heat map
 
 
 def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
-    """Draws the curves of a run; of several the median, the 33rd to 67th percentile, and each of them."""
+    """Draws the curves of a run. For several runs, draws median, 33rd to 67th percentile, and each run."""
     figure = Figure(figsize=(14, 6), layout="constrained")
     figure.suptitle(title)
     for axes, (name, label, limits) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
@@ -64,7 +64,7 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Writes a picture, whole or not at all."""
+    """Writes a picture to a file; an interrupted write leaves no partial file."""
     with written(path) as part:
         figure.savefig(part, dpi=110)
 
@@ -75,9 +75,9 @@ def plot_comparison(
     """Draws metrics over environment steps: medians, and the 33rd to 67th percentile of the runs.
 
     Args:
-        panels: title of each panel to the curves in it, label to table of metrics.
+        panels: title of each panel to its curves, which map labels to tables of metrics.
         path: path of the picture.
-        metrics: metrics to draw, one panel each; those of several titles have a row each.
+        metrics: metrics to draw, one panel each; with several titles, each metric has a row of panels.
     """
     columns = [(title, curves, name) for name in metrics for title, curves in panels.items()]
     rows = len(metrics) if len(panels) > 1 else 1
@@ -160,14 +160,14 @@ def draw_curve(
 
 
 def band(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns frames, and the 33rd, 50th and 67th percentile of a metric there, [n] each."""
+    """Returns numbers of frames, and the 33rd, 50th and 67th percentile of a metric after them, [n] each."""
     frames, values = by_frames(rows, name)
     low, middle, high = np.percentile(values, [33, 50, 67], axis=1)
     return frames, low, middle, high
 
 
 def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a metric as (frames [n], values [n, R])."""
+    """Returns the numbers of frames [n] of the evaluations, and a metric of the R runs there, [n, R]."""
     if missing := [row for row in rows if name not in row]:
         raise ValueError(f"these runs did not measure {name}; they have {', '.join(missing[0])}")
     groups: dict[float, list[float]] = {}
@@ -177,7 +177,7 @@ def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plot_goals(goals: GoalMap, env: GoalEnv, path: Path, *, title: str = "") -> None:
-    """Draws a heat map of virtual goals beside that of the target q*, in the same colors."""
+    """Draws a heat map of virtual goals beside a heat map of their target q*, in the same colors."""
     figure = Figure(figsize=(9.6, 4.6), layout="constrained")
     figure.suptitle(title)
     limit = max(float(goals.target.max()), 1e-9)
@@ -194,11 +194,11 @@ def plot_goals(goals: GoalMap, env: GoalEnv, path: Path, *, title: str = "") -> 
 def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> None:
     """Draws a heat map [n, n] over a picture of the environment, on given axes; colors end at ``limit``.
 
-    The environment says in which box goals can lie, where the edges of its picture are, and which regions
-    are worth drawing. Without a picture the heat map is on white.
+    The environment gives the box of its goals, the edges of its picture, and the regions that are worth
+    drawing. Without a picture the heat map is drawn on white.
 
     Raises:
-        ValueError: its goals do not lie in a box of two dimensions.
+        ValueError: the environment's goals do not lie in a box of two dimensions.
     """
     box = env.goal_box()
     if box is None or len(box[0]) != 2:

@@ -17,15 +17,15 @@ from torchrl_her_recipes.config.policy_header import METADATA_KEY, read_header
 
 
 def write_policy(path: Path, weights: Mapping[str, Tensor], description: Mapping[str, Any]) -> None:
-    """Writes weights and their description, whole or not at all.
+    """Writes weights and their description; an interrupted write leaves no partial file.
 
     Args:
         path: The file.
-        weights: ``state_dict()`` of a policy. Entries that are no tensors are left out.
-        description: Plain values, which JSON can hold.
+        weights: ``state_dict()`` of a policy. Entries that are not tensors are left out.
+        description: Plain values that can be written as JSON.
     """
     tensors = {
-        name: value.detach().to("cpu", copy=True).contiguous()  # safetensors takes no views of one storage
+        name: value.detach().to("cpu", copy=True).contiguous()  # safetensors refuses shared storage
         for name, value in weights.items()
         if isinstance(value, Tensor)
     }

@@ -14,7 +14,7 @@ from torchrl_her.trainers.trainer import Trainer
 class Progress:
     """Shows the progress of a run on the standard error stream.
 
-    On a terminal it is a bar; where that goes into a file or to another program, a line for each epoch.
+    On a terminal, shows a bar; if the stream goes to a file or another program, a line for each epoch.
     """
 
     def __init__(self, trainer: Trainer, *, epochs: int, frames: int, show: bool) -> None:

@@ -47,8 +47,8 @@ class RunResult:
     Attributes:
         rows: the table of metrics, with a row for each epoch and run.
         folder: the folder with all files of the run, or None.
-        interrupted: whether it was stopped by Ctrl-C or a signal.
-        stopped: whether a callback stopped it before its last epoch.
+        interrupted: whether Ctrl-C or a signal stopped the run.
+        stopped: whether a callback stopped the run before its last epoch.
     """
 
     rows: list[dict[str, float]]
@@ -89,7 +89,7 @@ def run(
         progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
 
     Raises:
-        ValueError: the folder holds a run already, or a logger cannot begin.
+        ValueError: the folder holds a run already, or a logger cannot be opened.
         ImportError: a logger's package is not installed.
 
     Example:
@@ -123,14 +123,14 @@ def run_score(
     """Trains, and returns the score of the result, which any program for searches can maximize.
 
     Args:
-        recipe: its ``num_runs`` runs, side by side, are the seeds that the score is the median of.
+        recipe: its ``num_runs`` runs are trained side by side; the score is their median.
         folder: folder for the run's files; None writes nothing.
         callbacks: called on the way; they may stop the run.
         progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
 
     Raises:
         ValueError: the folder holds a run already.
-        KeyboardInterrupt: by Ctrl-C; with a folder, what there is was saved in it.
+        KeyboardInterrupt: Ctrl-C was pressed. If a folder was given, the unfinished run is saved in it.
     """
     result = run(build(recipe), folder, callbacks=callbacks, progress=progress)
     if result.interrupted:
@@ -148,26 +148,26 @@ def resume(
 ) -> RunResult:
     """Continues a run from its newest complete checkpoint, or extends one that has ended.
 
-    A finished run can be given more epochs only if its recipe said ``keep_buffer=True``. Otherwise its
-    checkpoint has no replay buffer any more, and all that is made again are its pictures and its policy.
+    A finished run can be given more epochs only if its recipe has ``keep_buffer=True``. Otherwise its last
+    checkpoint has no replay buffer, and only its pictures and its policy are made again.
 
-    With the tasks of this library the result is bit for bit that of a run that never stopped. With
-    environments of gymnasium and your own it is if the run stopped between two epochs: they are seeded anew
-    in each epoch. After a stop within an epoch, the rest of that epoch consists of new episodes. An
-    environment must draw from the generator that it seeds alone, and begin episodes without earlier state.
+    With the tasks of this library the result is bit for bit that of a run that never stopped. Environments of
+    gymnasium and your own are seeded anew in each epoch, so for them this holds if the run stopped between
+    two epochs. After a stop within an epoch, the rest of that epoch consists of new episodes. Such an
+    environment must draw only from the generator that it seeds, and keep no state from earlier episodes.
 
     Args:
         folder: folder of the run.
-        components: newly made ones, if those of the run were not the ones of its recipe.
+        components: newly made components, if the run had other components than its recipe makes.
         options: other values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``, ``keep_buffer``,
             ``pictures`` or ``log``, which are written into the folder's configuration.
-        callbacks: called on the way; they may stop the run. Those of its beginning are not remembered.
+        callbacks: called on the way; they may stop the run. Callbacks of the first start are not kept.
         progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
 
     Raises:
-        ValueError: there is no run in the folder, no checkpoint is complete, there is no replay buffer to go
-            on with, an option would change what was trained, fewer epochs are asked for than were done, both
-            options and components are given, or the components differ from those of the run.
+        ValueError: there is no run in the folder, no checkpoint is complete, more epochs need a replay buffer
+            that the checkpoint lacks, an option would change the training so far, ``epochs`` is less than
+            was done, both options and components are given, or the components differ from the run's.
     """
     home = RunFolder(folder)
     home.recipe()  # raises before a lock is left in a folder that is not a run's
@@ -205,7 +205,7 @@ def _newest_state(home: RunFolder, *, keep: int) -> tuple[dict[str, Any], int]:
 def _check_extension(
     home: RunFolder, options: RunConfig, done: int, *, has_buffer: bool, asked: bool
 ) -> None:
-    """Raises if a run that has done some epochs cannot go on as its options say."""
+    """Raises an error if a run cannot continue with its options after the epochs that it has done."""
     if not has_buffer and (options.epochs > done or options.keep_buffer):
         raise ValueError(
             f"the run in {home.path} cannot be extended beyond {done} epochs: its checkpoint has no "
@@ -229,10 +229,10 @@ class _Run:
         self.has_buffer = True
 
     def go_back(self, home: RunFolder, epochs: int, *, has_buffer: bool) -> None:
-        """Goes back to where some epochs were done, and removes what is newer from the folder."""
-        home.policy.unlink(missing_ok=True)  # a policy of an earlier stop: it marks finished runs
+        """Restores the table and the best policy as of the given epoch, and removes newer files."""
+        home.policy.unlink(missing_ok=True)  # left by an earlier stop; only finished runs must have it
         if self.best.state is None:
-            # It may be newer than the checkpoint, as the last rows may be.
+            # The best policy's file may be newer than the checkpoint, as the last rows of the table may be.
             home.best.unlink(missing_ok=True)
         self.save_best(home)
         self.rows, self.has_buffer = home.rows()[: epochs * self.recipe.run.num_runs], has_buffer
@@ -249,7 +249,7 @@ class _Run:
         hooks, view = [*callbacks, *loggers], RunView(self.components, trainer, rows, home)
         threads = torch.get_num_threads()
         torch.set_num_threads(recipe.run.threads)
-        torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal, ten times as slow
+        torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal: ten times slower
         display = Progress(trainer, epochs=recipe.run.epochs, frames=recipe.total_frames, show=progress)
         interrupted = stopped = saved = False
         with soft_interrupt() as check, ExitStack() as opened:  # covers saving at the end
@@ -324,7 +324,7 @@ class _Run:
                     run
                 )
             rows.append({**counters, **times, **values, **written(components, run)})
-        self.best.see(rows, components.greedy)  # before a new stage changes it
+        self.best.see(rows, components.greedy)  # before a new stage changes what success means
         if state is not None:
             for line in move_on(components, state, samples, trainer.frames):
                 display.say(line)
@@ -332,9 +332,9 @@ class _Run:
         self.rows += rows
 
     def save(self, home: RunFolder, *, goals: bool = True) -> bool:
-        """Writes a checkpoint; returns whether that succeeded. The last one has no replay buffer.
+        """Writes a checkpoint; returns whether that succeeded. The last checkpoint has no replay buffer.
 
-        Before it the histogram of virtual goals, which later needs the buffer, unless ``goals`` is False.
+        Unless ``goals`` is False, writes the histogram of virtual goals first, since it needs the buffer.
         """
         if goals:
             with self._despite_a_full_disk("map of goals"):
@@ -355,7 +355,7 @@ class _Run:
                 self.best.is_new = False
 
     def save_goals(self, home: RunFolder) -> GoalMap | None:
-        """Writes the histogram of virtual goals and returns it; without a buffer, reads the old one."""
+        """Writes the histogram of virtual goals and returns it; without a buffer, reads the earlier file."""
         if not self.has_buffer:
             return GoalMap.load(home.goal_map) if home.goal_map.is_file() else None
         goals = goal_map(self.components.buffer, self.components.goal_target)

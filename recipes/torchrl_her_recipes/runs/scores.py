@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 LAST = 3  # number of last evaluations whose mean is a run's result
-_SCORED = 5  # the same number for searches
+_SCORED = 5  # number of last evaluations whose mean searches maximize
 
 
 def at_the_end(rows: Sequence[dict[str, float]], name: str, *, evaluations: int = LAST) -> list[float]:
@@ -66,14 +66,14 @@ def score(rows: Sequence[dict[str, float]], *, last: int = _SCORED) -> float:
 
 
 class BestPolicy:
-    """The policy of the evaluation with the best success so far; the latest of several equal ones.
+    """The policy of the evaluation with the best success so far, or of the latest one if several are equal.
 
-    Of several runs side by side the median counts, and the policies of all of them are kept.
+    If several runs are trained side by side, their median success counts, and the policies of all are kept.
 
     Attributes:
         state: the weights ``actor``, and the ``epoch`` and ``success`` of the evaluation; None before the
-            first one.
-        is_new: whether the state has to be written: set to False when that is done.
+            first evaluation.
+        is_new: whether the state has to be written; set it to False when it is written.
 
     Example:
         >>> from torchrl_her.modules import make_actor
@@ -97,12 +97,12 @@ class BestPolicy:
         self.state, self.is_new = state, state is not None
 
     def see(self, rows: Sequence[dict[str, float]], actor: TensorDictModuleBase) -> None:
-        """Takes a policy if its evaluation is at least as good as the best one before."""
+        """Keeps a policy if its evaluation is at least as good as the best evaluation before."""
         success = statistics.median(row["success"] for row in rows)
         if self.state is not None and success < self.state["success"]:
             return
         weights = {
             name: value.detach().to("cpu", copy=True) if isinstance(value, Tensor) else value
-            for name, value in actor.state_dict().items()  # copies, which gradient steps leave alone
+            for name, value in actor.state_dict().items()  # copied: gradient steps change weights
         }
         self.load_state_dict({"actor": weights, "epoch": int(rows[0]["epoch"]), "success": success})

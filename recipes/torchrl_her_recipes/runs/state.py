@@ -29,7 +29,7 @@ from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
 
 _NETWORKS = ("loss", "optimizer", "target", "exploration", "norm", "average", "guide")
-_ROWS = ("buffer", "demonstrations")  # the largest part of a checkpoint
+_ROWS = ("buffer", "demonstrations")  # parts with transitions, the largest ones of a checkpoint
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             set_stage_goals(buffer.writer, state.progress.stage_of(run), run=run)
 
     def begin_episodes(_state: dict[str, Any]) -> None:
-        if trainer.in_epoch:  # the episodes of such environments cannot be resumed
+        if trainer.in_epoch:  # the environments' state is not saved: their episodes cannot resume
             collector.reset()
             if isinstance(buffer.writer, HERWriter):
                 buffer.writer.end_episodes()
@@ -82,7 +82,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             partial(torch.cuda.get_rng_state, device), partial(torch.cuda.set_rng_state, device=device)
         ),
         "progress": None if state is None else Part(state.progress.state_dict, load_progress),
-        "demonstrations": components.demonstrations,  # rewards of stages follow from the progress
+        "demonstrations": components.demonstrations,  # rewards need the stage in the progress
         "collector": Part(
             partial(collector_state_dict, collector), partial(load_collector_state_dict, collector)
         ),
@@ -95,13 +95,14 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
 
 
 def run_state(parts: dict[str, Any], *, buffer: bool = True) -> dict[str, Any]:
-    """Returns the states of parts as tensors and plain data. Rows are views of the buffer: save them at once.
+    """Returns the states of parts as tensors and plain data.
 
     Args:
         parts: parts from :func:`parts_of`.
 
     Keyword Args:
-        buffer: whether with the replay buffer and that of demonstrations, without which a run cannot go on.
+        buffer: whether to include transitions, of demonstrations too; a run cannot continue without them.
+        They are views of the buffer: save them before it changes.
     """
     return {name: part.state_dict() if buffer or name not in _ROWS else None for name, part in parts.items()}
 
@@ -110,7 +111,7 @@ def load_run_state(parts: dict[str, Any], state: dict[str, Any]) -> None:
     """Restores a state from :func:`run_state` in newly built parts; a buffer without state stays empty.
 
     Raises:
-        ValueError: the state is of other parts, or these are of other types or have other settings.
+        ValueError: the state has other parts, or the parts have other types or other settings.
     """
     if others := sorted(parts.keys() ^ state.keys()):
         raise ValueError(
@@ -123,7 +124,7 @@ def load_run_state(parts: dict[str, Any], state: dict[str, Any]) -> None:
 
 
 def seed_epoch(env: EnvBase, seeds: Sequence[int], processes: int, trainer: Trainer) -> None:
-    """Seeds environments whose state no checkpoint holds, so that a resumed run plays the same epoch."""
+    """Seeds environments whose state is not in checkpoints, so that a resumed run has the same episodes."""
     begins = trainer.epochs > 0 and not trainer.in_epoch
     if begins and processes == 0 and _worlds(env, processes) is None:
         goal_env(env).set_seeds([derive_seed(seed, trainer.epochs) for seed in seeds])

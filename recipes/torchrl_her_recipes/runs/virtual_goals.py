@@ -1,4 +1,4 @@
-"""Evaluates success and values of critics at virtual goals, in greedy episodes that have them as goals."""
+"""Evaluates success and values of critics at virtual goals, in greedy episodes that ask for them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.runs.curriculum import play_greedily
 from torchrl_her_recipes.runs.evaluation import measure
 
-_TRIES = 8  # rows that are drawn for each goal, since some are real
+_TRIES = 8  # rows that are drawn for each virtual goal, since some rows are real
 _NAMES = ("success", "q", "q_bias")
 
 
@@ -23,15 +23,15 @@ def at_virtual_goals(components: Components, epoch: int) -> dict[str, Tensor]:
     """Measures greedy episodes of each run that have virtual goals, [R] each.
 
     Returns:
-        ``virtual_success``, ``virtual_q`` and ``virtual_q_bias``, which are to virtual goals what ``success``
-        and so on are to the task's own; NaN for runs without virtual goals, or below the last stage.
+        ``virtual_success``, ``virtual_q`` and ``virtual_q_bias``: the metrics ``success``, ``q`` and
+        ``q_bias`` at virtual goals; NaN for runs without virtual goals, or below the last stage.
     """
     env = components.virtual_env
     if env is None:
         return {}
     has_goals = torch.tensor(ask_for_virtual_goals(components, env, epoch))
     played = play_greedily(components, env, epoch)
-    # The environment's own flag is about its own goals.
+    # Success must be computed: the environment's flag ``is_success`` is about its own goals.
     measures = measure(components, played.exclude(("next", "is_success")))
     return {
         f"virtual_{name}": measures[name].masked_fill(~has_goals, torch.nan)

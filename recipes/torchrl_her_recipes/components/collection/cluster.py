@@ -13,7 +13,7 @@ from typing import Any
 import ray
 from ray.exceptions import RayTaskError
 
-_PATIENCE = 5.0  # seconds until an address that does not answer is given up
+_PATIENCE = 5.0  # seconds to wait for an address to answer
 
 
 def join(address: str) -> bool:
@@ -23,10 +23,10 @@ def join(address: str) -> bool:
         address: HOST:PORT, or ``auto`` for the one that this machine is a node of.
 
     Returns:
-        Whether it was not before.
+        True if this process joined, False if it was part of the cluster already.
 
     Raises:
-        ConnectionError: there is none, or this process is part of another one.
+        ConnectionError: there is no such cluster, or this process is part of another one.
     """
     if ray.is_initialized():
         current = ray.get_runtime_context().gcs_address

@@ -46,10 +46,10 @@ if TYPE_CHECKING:
     from torchrl_her_recipes.components.collection.ray_workers import NodeWorkers
 
 _ON_RAY = "torchrl_her_recipes.components.collection.ray_workers:NodeWorkers"
-_SECONDS = 1.0  # between two looks at whether processes still run
+_SECONDS = 1.0  # between two checks that all processes still run
 _FAILED = "a process failed: worker {} (exit code {})"
-_TRACEBACK = "Worker traceback:"  # what TorchRL's message has below that is in ``__cause__``
-_EXIT_PRIORITY = 100  # at exit, before Python waits for processes that are still there
+_TRACEBACK = "Worker traceback:"  # TorchRL's message repeats ``__cause__`` below this line
+_EXIT_PRIORITY = 100  # ends processes before Python, at its exit, waits for them
 
 
 class CheckedWeightSync(SharedMemWeightSyncScheme):
@@ -61,11 +61,11 @@ class CheckedWeightSync(SharedMemWeightSyncScheme):
 
 
 class SyncWorkers(MultiSyncCollector):
-    """All processes collect a batch together. Each has its place in it."""
+    """All processes collect a batch together. Row k of the batch always belongs to the same environment."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="collection")  # which waits for batches
-        self._batch: Future[TensorDictBase] | None = None  # that is being collected
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="collection")  # waits for batches
+        self._batch: Future[TensorDictBase] | None = None  # the batch that is being collected
         super().__init__(*args, cat_results="stack", **options)
 
     def begin(self, beginnings: Sequence[Beginning]) -> None:
@@ -76,13 +76,13 @@ class SyncWorkers(MultiSyncCollector):
         self.map_fn("begin", [(beginning,) for beginning in beginnings])
 
     def ahead(self, weights: TensorDictBase) -> None:
-        """Starts collecting the next batch with these weights of the policy, unless that is under way."""
+        """Starts collecting the next batch with these weights of the policy, unless it has been started."""
         if self._batch is None:
-            self.update_policy_weights_(weights)  # while no process looks at them
+            self.update_policy_weights_(weights)  # while no process reads the shared weights
             self._batch = self._thread.submit(self.next)
 
     def take(self, weights: TensorDictBase) -> TensorDictBase:
-        """Returns the next batch [..., T], time last; the first dimension may be the processes."""
+        """Returns the next batch [..., T]; its first dimension may be the processes."""
         self.ahead(weights)
         assert self._batch is not None
         batch = self._batch.result()
@@ -91,20 +91,20 @@ class SyncWorkers(MultiSyncCollector):
 
     def _shutdown_main(self, timeout: float | None = None) -> None:
         super()._shutdown_main(timeout)
-        self._thread.shutdown(wait=False)  # no waiting: the thread itself may call this
+        self._thread.shutdown(wait=False)  # a thread cannot wait for itself, and this may run in it
 
 
 class AsyncWorkers(MultiAsyncCollector):
-    """Each process collects batches of its own, one after the other; the first that is ready comes first."""
+    """Each process collects its own batches without waiting for others; finished batches queue up."""
 
-    running: bool  # whether each process has a batch under way; untyped there
+    running: bool  # whether each process has a batch under way; TorchRL gives no type
 
     @property
     def _queue_len(self) -> int:
         return self.num_workers  # TorchRL's is 1: with a full queue a process would throw its batch away
 
     def begin(self, beginnings: Sequence[Beginning]) -> None:
-        if self.running:  # TorchRL's own reset() may take the batches under way for new ones
+        if self.running:  # TorchRL's own reset() may return batches from before the reset
             for _ in range(self.num_workers):
                 _get(self._get_from_queue, self.procs)
             self.running, self._iterator = False, None
@@ -129,15 +129,15 @@ class ProcessCollector(BaseCollector):
 
     With ``sync=true`` all processes collect a batch [R * E, T] together, where row k always belongs to the
     same environment. After :meth:`collect_ahead` they collect the next batch while the caller learns from
-    the last one. The policy that plays in such a batch is always one batch old, and the same seed gives the
+    the last one. The policy that acts in such a batch is always one batch old, and the same seed gives the
     same batches. With ``sync=false`` no process waits for another: a batch [R * E / N, T] comes from the
-    first process that is ready, and rows carry ids of their environments.
+    first process that has finished one, and rows carry ids of their environments.
 
     With ``ray=ADDRESS`` the processes are on the nodes of a Ray cluster, see
     :class:`~torchrl_her_recipes.components.collection.ray_workers.NodeWorkers`.
 
-    All random numbers of a process follow from the seed of each run, the process's number and the number of
-    resets.
+    All random numbers of a process are determined by the seed of each run, the index of the process and the
+    number of resets.
 
     Args:
         options: Options of collecting.
@@ -179,13 +179,13 @@ class ProcessCollector(BaseCollector):
         return batch if self.storing_device == CPU else batch.to(self.storing_device)
 
     def collect_ahead(self) -> None:
-        """Lets the next batch be collected meanwhile, with the present weights of the policy."""
+        """Starts the next batch with the present weights of the policy, and returns at once."""
         if self._workers is not None:
             with self._ended_by_errors():
                 self._workers.ahead(self._weights())
 
     def reset(self, index: object = None, **kwargs: object) -> None:
-        """Begins new episodes everywhere; what is being collected is dropped."""
+        """Begins new episodes in all environments, and drops the batches that are being collected."""
         with self._ended_by_errors():
             if self._workers is None:
                 self._workers = self._start()
@@ -205,7 +205,7 @@ class ProcessCollector(BaseCollector):
             yield self.next()
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
-        """Random numbers follow from the recipe's seed."""
+        """Raises an error: the recipe's seed determines all random numbers."""
         raise NotImplementedError("seeds of processes that collect are those of the recipe: set its seed")
 
     def state_dict(self) -> OrderedDict:
@@ -227,16 +227,16 @@ class ProcessCollector(BaseCollector):
             return start(processes=config.processes, sync=config.sync)
         _check_main_script(f"processes={config.processes}")
         kind = SyncWorkers if config.sync else AsyncWorkers
-        with _interrupts_later():  # processes that were interrupted while they start would say so at length
+        with _interrupts_later():  # else each process that Ctrl-C ends while it starts prints a traceback
             workers = kind(
                 [make] * config.processes,
                 _to_send(self.policy),
                 frames_per_batch=frames * (config.processes if config.sync else 1),
                 total_frames=-1,
-                device="cpu",  # all of it, as where this process collects
+                device="cpu",  # for environments, policy and storage
                 collector_class=WorkerCollector,
                 exploration_type=ExplorationType.RANDOM,
-                num_threads=torch.get_num_threads(),  # of this process
+                num_threads=torch.get_num_threads(),  # TorchRL sets it in this process
                 num_sub_threads=1,
                 weight_sync_schemes={"policy": CheckedWeightSync()},
                 init_fn=begin_process,
@@ -266,7 +266,7 @@ class ProcessCollector(BaseCollector):
         except Exception as error:
             self.shutdown()
             reason, traceback, _ = str(error).partition(_TRACEBACK)
-            if traceback:  # of a process that could not start
+            if traceback:  # only if a process could not start
                 raise RuntimeError(f"a process that collects cannot start: {reason.strip()}") from error
             if isinstance(error, RuntimeError) and "process failed" in reason:
                 raise RuntimeError(
@@ -277,7 +277,7 @@ class ProcessCollector(BaseCollector):
 
 
 def _check_main_script(asked: str) -> None:
-    """Raises a RuntimeError if processes that import the main script would train, too, and so never start."""
+    """Raises a RuntimeError if the main script has no guard: processes that import it would train, too."""
     path = getattr(sys.modules["__main__"], "__file__", None)
     if path is None or multiprocessing.get_start_method(allow_none=True) == "fork":
         return
@@ -293,7 +293,7 @@ def _get(get: Callable[..., Any], processes: Sequence[BaseProcess]) -> Any:
     """Waits for the next item of a queue that processes write to, as long as all of them are alive.
 
     Raises:
-        RuntimeError: one of them has ended.
+        RuntimeError: one of the processes has ended.
     """
     while True:
         try:
@@ -322,8 +322,8 @@ def _in_blocks(batch: TensorDictBase, runs: int) -> TensorDictBase:
 def _to_send(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     """Returns a copy of a policy for other processes, which share the memory of its weights.
 
-    It has no generators of random numbers: each process makes its own, and two of them cannot be sent
-    together.
+    The copy has no generators of random numbers: each process makes its own, and a policy with two generators
+    cannot be sent.
     """
     copy = deepcopy(policy).to(CPU)
     for module in drawing_modules(copy):

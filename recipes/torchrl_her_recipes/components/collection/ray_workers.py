@@ -17,18 +17,18 @@ from torchrl.envs.utils import ExplorationType
 from torchrl_her_recipes.components.collection.cluster import join, one_line, resource
 from torchrl_her_recipes.components.collection.worker import Beginning, NodeCollector
 
-_SECONDS = 1.0  # between two looks at whether there still are nodes
-_DEATHS = 3  # of a process without a batch in between, until the run ends
+_SECONDS = 1.0  # between two checks that the cluster still has nodes
+_DEATHS = 3  # after which the run ends, if the process sent no batch in between
 _ON_A_CORE = {"num_cpus": 1, "num_gpus": 0, "scheduling_strategy": "SPREAD"}
 
 
 class NodeWorkers(RayCollector):
-    """Processes on the nodes of a Ray cluster, each with a core, which are sent weights and send batches.
+    """Processes on the nodes of a Ray cluster, one core each, which receive weights and return batches.
 
-    The nodes need this package only. If a node dies, a new process on another node replaces each process that
+    The nodes need only this package. If a node dies, a new process on another node replaces each process that
     was lost, as soon as a core is free, and begins new episodes. The unfinished batch of a lost process is
-    dropped, and so is the rest of its open episodes. The writer keeps the part that was sent, and stores it
-    when the episodes are ended (at each epoch of a :class:`~torchrl_her.Trainer`).
+    dropped, and so is the rest of its open episodes. The part of these episodes that was sent is kept, and
+    stored when open episodes are ended (at each epoch of a :class:`~torchrl_her.Trainer`).
 
     Args:
         address: address of the cluster, HOST:PORT, or ``auto`` for the cluster of this machine.
@@ -38,12 +38,12 @@ class NodeWorkers(RayCollector):
     Keyword Args:
         processes: N, the number of processes.
         frames: number of frames in a batch of one process.
-        sync: whether a batch [N, ...] joins all processes; if not, it is from the first that is ready.
+        sync: whether a batch [N, ...] joins all processes; if not, a batch is from the first process ready.
 
     Raises:
         ConnectionError: there is no such cluster.
         ValueError: fewer than N cores of the cluster are free.
-        RuntimeError: a process failed for another reason than its death, or died time after time.
+        RuntimeError: a process raised an error, or died several times without sending a batch.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class NodeWorkers(RayCollector):
         self._beginnings: list[Beginning] = []
         self._to_begin: set[int] = set()  # processes that are to begin new episodes with their next batch
         self._lives = [1] * processes
-        self._deaths = [0] * processes  # since a batch came
+        self._deaths = [0] * processes  # since the last batch of each process
         self._make_env = make_env
         try:
             super().__init__(
@@ -102,7 +102,7 @@ class NodeWorkers(RayCollector):
             self._order(weights, set(range(self.num_collectors)) - set(batches))
             ready, _ = ray.wait(
                 list(self._orders.values()), timeout=_SECONDS
-            )  # of several, the one that was started first
+            )  # the one that was started first, if several are ready
             if not ready and resource("CPU") == 0:
                 raise RuntimeError("no node that could collect is left in the cluster")
             for process in [index for index, order in self._orders.items() if order in ready]:

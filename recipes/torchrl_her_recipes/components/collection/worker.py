@@ -1,4 +1,4 @@
-"""The environments and the collector of a process, and how its episodes begin anew."""
+"""The environments and the collector of a process, and the seeds and stages of its new episodes."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def make_worker_env(
     """Makes a process's share of the environments of all runs: R equal blocks, as their stages see them.
 
     Args:
-        envs: Maker of the environments. The process that sends it was permitted to import what its task
-            names.
+        envs: Maker of the environments. The module that its task names is imported without a check, since
+            the process that sends the maker was permitted to import it.
         order: Order of the stages, if there is a curriculum.
         options: Options of collecting.
         seeds: Seeds of the runs.
@@ -55,7 +55,7 @@ def make_worker_env(
     env = envs.make(share_of_envs(options), seeds)
     progress = make_progress(order, envs.curriculum, env, seeds)
     env = in_stages(env, progress, begins=is_guided(envs.curriculum, progress))
-    # Only ids tell there which environment a row belongs to: batches come one by one, or a node is replaced.
+    # Without sync, and on nodes that can be replaced, a row's environment does not follow from its position.
     if not options.sync or options.ray is not None:
         env = env if isinstance(env, TransformedEnv) else TransformedEnv(env)
         env.append_transform(EnvIds())
@@ -63,16 +63,16 @@ def make_worker_env(
 
 
 def begin_process() -> None:
-    """Prepares a process that is to collect; its first call, before environment and policy are made."""
+    """Prepares a process for collecting. It must run before environment and policy are made."""
     if hasattr(os, "setpgrp"):
-        # Ctrl-C and signals to a whole group of processes are for the learner, which ends the others.
+        # Ctrl-C and signals to a group of processes must reach the learner only, which ends the others.
         os.setpgrp()
     torch.set_flush_denormal(True)  # as the learner does
 
 
 @dataclass(frozen=True)
 class Beginning:
-    """All that the episodes of a process depend on, from one reset to the next.
+    """Seeds and stages that determine the episodes of a process until the next reset.
 
     Attributes:
         env_seeds: seeds of the process's environments, one for each run.
@@ -85,7 +85,7 @@ class Beginning:
     progress: dict[str, Any] | None = None
 
     def again(self, life: int) -> Beginning:
-        """Returns new seeds for a process that replaces a dead one, for the ``life``-th time."""
+        """Returns a copy with new seeds, for the ``life``-th process that replaces a dead one."""
         return replace(
             self,
             env_seeds=[derive_seed(seed, life) for seed in self.env_seeds],
@@ -108,10 +108,10 @@ class WorkerCollector(Collector):
     """Collector of a process; its random numbers begin anew with each reset, so that runs can be resumed."""
 
     def begin(self, beginning: Beginning) -> None:
-        """Begins new episodes everywhere."""
+        """Begins new episodes in all environments."""
         goal_env(self.env).set_seeds(beginning.env_seeds)
         first = beginning.seeds[0]
-        torch.manual_seed(first)  # a policy of one's own may draw from torch's own generator
+        torch.manual_seed(first)  # users' policies may draw from torch's own generator
         np.random.seed(first % (1 << 32))
         random.seed(first)
         for module in drawing_modules(self.policy):
@@ -126,9 +126,9 @@ class WorkerCollector(Collector):
 
 
 class NodeCollector(WorkerCollector):
-    """The collector in a process on a node of a cluster, which gets weights with each order.
+    """The collector in a process on a node of a cluster, which gets weights with each request for a batch.
 
-    Errors are given back as a line of text: Ray ends a process over some of those that are raised.
+    Errors are returned as a line of text, since Ray ends a process if some types of errors are raised.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -157,5 +157,5 @@ class NodeCollector(WorkerCollector):
 
 
 def _progress_of(env: TransformedEnv) -> CurriculumProgress:
-    """Returns the progress that an environment's transforms look at."""
+    """Returns the progress that an environment's transforms read stages from."""
     return next(transform.progress for transform in env.transform if isinstance(transform, StateToObs))

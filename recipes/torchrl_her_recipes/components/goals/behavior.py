@@ -57,7 +57,7 @@ def make_behavior(
 
 
 def make_asking(seeds: Sequence[int], env: EnvBase, *, memory: int) -> BehaviorGoals:
-    """Returns the transform that lets episodes ask for any goals put into its memory, for evaluation."""
+    """Returns a transform for evaluation: episodes ask for the goals that are put into its memory."""
     return _goals(seeds, env, remember=False, real_share=0.0, candidates=1, memory=memory)
 
 
@@ -93,7 +93,7 @@ def make_mega(
     values: MakeValues,
     **_: Any,
 ) -> BehaviorGoals:
-    """Proposes the rarest achieved goal that the critic believes in."""
+    """Proposes the rarest achieved goal whose value by the critic is above a cutoff."""
     cutoffs = scaled_cutoffs(options.cutoff, learner.gamma, rewards)
     factors = [InverseDensity(), ValueCutoff(values(), runs=runs, **cutoffs)]
     return goals(factors=factors, greedy=True, candidates=options.candidates)
@@ -104,7 +104,7 @@ def scaled_cutoffs(cutoff: float, gamma: float, rewards: tuple[float, float]) ->
     missed, achieved = rewards
 
     def value(cutoff: float) -> float:
-        reached = min(1.0, max(0.0, 1.0 + cutoff * (1.0 - gamma)))  # gamma^d of a goal that takes d steps
+        reached = min(1.0, max(0.0, 1.0 + cutoff * (1.0 - gamma)))  # gamma^d for a goal d steps away
         return missed * (1.0 - reached) / (1.0 - gamma) + achieved * reached
 
     floor, step = value(-1.0 / (1.0 - gamma)), abs(value(-1.0) - value(0.0))
@@ -115,7 +115,7 @@ def make_discover(
     options: Discover, goals: MakeGoals, *, learner: LearnerConfig, runs: int, values: MakeValues, **_: Any
 ) -> BehaviorGoals:
     """Proposes the achievable and new goal that leads farthest towards the task's goal."""
-    several = getattr(learner, "critics", 1) > 1  # their disagreement shows what is new
+    several = getattr(learner, "critics", 1) > 1  # goals on which critics disagree are new
     score = DiscoverScore(values(), runs=runs)
     factors = [score] if several else [InverseDensity(), score]
     return goals(factors=factors, greedy=True, candidates=options.candidates)

@@ -20,19 +20,19 @@ from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.choices.weights import Equal, SequentialIBS
 from torchrl_her_recipes.config.groups import Group
 
-_SAMPLES = 10_000  # goals, if they do not fill a box
+_SAMPLES = 10_000  # goals that are drawn if goals do not fill a box
 _RESETS = 1_000  # episodes whose goals are collected, if the environment has no distribution of goals
-MOST_DIMENSIONS = 3  # that a grid is kept over
+MOST_DIMENSIONS = 3  # of a grid
 
 
 @dataclass(frozen=True)
 class GoalSpace:
-    """A grid over the goals of a task, and where on it the task's own goals lie.
+    """A grid over the goals of a task, and the distribution of the task's own goals on it.
 
     Attributes:
-        grid: over the goals.
-        target_at: gives q* [cells] of the task's goals for a sigma in the unit of the goals.
-        sigma: the final one.
+        grid: cells that cover the goals.
+        target_at: returns q* [cells], the task's goals smoothed by a sigma that is in the unit of the goals.
+        sigma: the final sigma.
     """
 
     grid: GoalGrid
@@ -41,17 +41,17 @@ class GoalSpace:
 
     @property
     def target(self) -> Tensor:
-        """q* [cells] at the final sigma; reported divergences are to it."""
+        """q* [cells] at the final sigma, to which reported divergences are measured."""
         return self.target_at(self.sigma)
 
 
 @dataclass(frozen=True)
 class KernelSpace:
-    """Goals of the task itself, where no grid is kept over them.
+    """Goals of the task itself, for weights that use kernel densities instead of a grid.
 
     Attributes:
-        goals: [n, g].
-        sigma: the final one, in the unit of the goals.
+        goals: n goals with g coordinates, [n, g].
+        sigma: the final sigma, in the unit of the goals.
     """
 
     goals: Tensor
@@ -59,10 +59,10 @@ class KernelSpace:
 
 
 def goal_space(options: Group, envs: TaskEnvs, env: EnvBase, num_envs: int) -> GoalSpace | KernelSpace | None:
-    """Returns the space of a task's goals: the range that the task states, or else a box around goals of it.
+    """Returns the space of a task's goals: the range that the task states, or a box around sampled goals.
 
-    For kernel densities it is goals of the task. None if the options (of weights or of behavior goals) need
-    none, or if goals are merely counted and the task states no range.
+    For kernel densities, the space is a sample of goals. It is None if the options need no space, or if goals
+    are merely counted and the task states no range.
 
     Args:
         options: Options of weights or of behavior goals.
@@ -71,8 +71,8 @@ def goal_space(options: Group, envs: TaskEnvs, env: EnvBase, num_envs: int) -> G
         num_envs: Number of environments that are reset to collect goals, if the task states no distribution.
 
     Raises:
-        ValueError: instructive goals are preferred, but the goals of the task lie around its start states, or
-            a grid is asked for and they have too many coordinates for one.
+        ValueError: the options prefer instructive goals, but the goals of the task lie around its start
+            states; or the options choose a grid, but goals have too many coordinates for a grid.
     """
     if not isinstance(options, Equal):
         return None
@@ -107,7 +107,7 @@ def _without_grid(task: str, choice: str, width: int) -> bool:
 
 
 def _kernel(task: str, env: Any, options: SequentialIBS, box: Box | None, goals: Tensor) -> KernelSpace:
-    """Goals of the task. Its own share for sigma grows with the root of their width, as distances do."""
+    """Returns goals of the task. Its default sigma grows with the root of their width, as distances do."""
     if options.recent is not None:
         raise ValueError(
             f"recent={options.recent} has no effect on {task}, where q is a kernel density: leave it out"
@@ -142,7 +142,7 @@ def _sampled(env: Any, options: SequentialIBS, goals: Tensor) -> GoalSpace:
 
 
 def _desired_goals(envs: TaskEnvs, env: Any, num_envs: int) -> Tensor:
-    """Goals [n, g] of float64, as episodes have them."""
+    """Returns desired goals of episodes, [n, g] of float64."""
     distribution = getattr(env, "goal_distribution", None)
     if distribution is not None:
         return distribution.sample(_SAMPLES, generator=torch.Generator().manual_seed(0)).double()
@@ -152,5 +152,5 @@ def _desired_goals(envs: TaskEnvs, env: Any, num_envs: int) -> Tensor:
 
 
 def _share(options: Equal, env: Any) -> float:
-    """Returns the final sigma as a share of the space."""
+    """Returns the final sigma as a share of the width of the goals' space."""
     return getattr(options, "sigma", None) or env.goal_sigma

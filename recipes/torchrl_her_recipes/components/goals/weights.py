@@ -32,7 +32,7 @@ def make_instructive(
 
 
 def make_rare(options: Rare, *, env: Any, **_: Any) -> RareGoals:
-    """Prefers goals with few others around them: by a kernel in few dimensions, by neighbors in many."""
+    """Prefers goals with few others around: by a kernel density or, in many dimensions, by neighbors."""
     return RareGoals(
         estimator="kernel" if goal_width(env) <= MOST_DIMENSIONS else "neighbors",
         sharpness=options.sharpness,
@@ -41,5 +41,5 @@ def make_rare(options: Rare, *, env: Any, **_: Any) -> RareGoals:
 
 
 def make_network_novelty(options: RND, *, seed: int, **_: Any) -> NetworkNovelty:
-    """Prefers goals that are new to a network, whose first weights come from the run's seed."""
+    """Prefers goals that are new to a network (RND), which is initialized from the run's seed."""
     return NetworkNovelty(seed=seed, sharpness=1.0 if options.sharpness is None else options.sharpness)

@@ -48,7 +48,7 @@ class SACBuilder(DDPGBuilder):
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Bounds of rewards, as for other learners; asked for where there are none, clamping is an error."""
+        """Bounds as of other learners; clamping raises an error if the task's rewards have no bounds."""
         if self.options.clamp_targets and not all(map(math.isfinite, self.shape.rewards)):
             raise ValueError(
                 f"clamp_targets=true has no effect on {self.shape.task}, whose rewards have no bounds: "
@@ -57,5 +57,5 @@ class SACBuilder(DDPGBuilder):
         return super().bounds
 
     def epsilon(self) -> dict[str, float]:
-        """None: the policy explores by itself."""
+        """Returns no schedule: the policy explores by itself."""
         return {"start": 0.0, "decay": 1.0, "end": 0.0}

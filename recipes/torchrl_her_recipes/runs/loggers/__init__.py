@@ -1,1 +1,1 @@
-"""Loggers of TorchRL for ``log=NAME``, opened so that a resumed run continues in them, and what they get."""
+"""Opens TorchRL's loggers for ``log=NAME``, so that resumed runs continue in them, and logs runs to them."""

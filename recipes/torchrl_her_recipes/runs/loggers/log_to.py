@@ -14,7 +14,7 @@ from torchrl_her_recipes.config.values import load_name
 from torchrl_her_recipes.runs.callbacks import Callback, RunView
 from torchrl_her_recipes.runs.loggers.show import show_file
 
-_OF_A_ROW = ("run", "seed")  # columns that identify a row, and are no metrics
+_OF_A_ROW = ("run", "seed")  # columns that identify a row and are not logged as metrics
 
 
 class LogTo(Callback):
@@ -119,7 +119,7 @@ class LogByName(Callback):
                 warnings.warn(f"log={self.name} was not closed: {_reason(error)}", stacklevel=2)
 
     def _opened(self, run: RunView) -> LogTo:
-        """Returns the logger, which is opened first, and gets the rows so far, if it is not open."""
+        """Returns the logger; if it is not open, opens it first and logs the rows so far."""
         if self._teller is None:
             logger, known = load_name(LOGGERS[self.name].factory)(run, self._kept)
             self._teller = LogTo(logger, after=known)

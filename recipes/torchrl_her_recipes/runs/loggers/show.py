@@ -1,4 +1,4 @@
-"""Passes pictures and videos to loggers, in the form of each."""
+"""Passes pictures and videos to loggers, in the form that each logger takes."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from torchrl.record.loggers.common import Logger
 
 @singledispatch
 def show_file(logger: Logger, name: str, path: Path, step: int) -> None:
-    """Passes a picture (``.png``) or a video (``.gif``) to a logger; does nothing for loggers without them.
+    """Passes a picture (``.png``) or a video (``.gif``) to a logger; does nothing if it takes no such files.
 
-    A logger of your own kind is shown films by its ``log_video``. To show it pictures as well, register a
-    function for its class: ``@show_file.register``.
+    A logger of your own gets videos through its method ``log_video``. To pass pictures to it, register a
+    function for its class with ``@show_file.register``.
 
     Args:
-        logger: who is to show it.
-        name: name in the logger.
+        logger: logger that gets the file.
+        name: name of the picture or video in the logger.
         path: path of the file.
-        step: number of frames at which it was made.
+        step: number of frames at which the file was made.
     """
     if path.suffix == ".gif":
         logger.log_video(name, read_film(path), step=step)
@@ -55,7 +55,7 @@ def _(logger: WandbLogger, name: str, path: Path, step: int) -> None:
 def _(logger: MLFlowLogger, _name: str, path: Path, _step: int) -> None:
     from mlflow import MlflowClient  # noqa: PLC0415  (an extra)
 
-    client = MlflowClient(logger.log_dir)  # that is the address of the service
+    client = MlflowClient(logger.log_dir)  # TorchRL stores the address of the service there
     client.log_artifact(logger.experiment.info.run_id, str(path), "pictures")
 
 

@@ -13,7 +13,7 @@ from torchrl.record.loggers import TensorboardLogger
 from torchrl_her_recipes.runs.callbacks import RunView
 
 _NAME = "tensorboard"
-_PATIENCE = 3  # seconds: tolerance for a clock that was set back
+_PATIENCE = 3  # seconds; does not wait if the clock was set back by more
 
 
 class TensorboardEvents(TensorboardLogger):
@@ -24,7 +24,7 @@ class TensorboardEvents(TensorboardLogger):
         log_dir: path of its parent folder.
 
     Keyword Args:
-        purge_step: the first step that does not count any more; None keeps all.
+        purge_step: step from which on earlier events are dropped; None keeps all events.
     """
 
     def __init__(self, exp_name: str, log_dir: str, *, purge_step: int | None = None) -> None:

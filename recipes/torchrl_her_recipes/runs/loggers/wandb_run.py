@@ -32,7 +32,7 @@ def open_wandb(run: RunView, _frames: int) -> tuple[WandbRun, int]:
     """Opens a logger into the project ``WANDB_PROJECT`` or ``torchrl-her``; a resumed run keeps its id.
 
     A run that is offline (``WANDB_MODE=offline``) logs the whole table again, and replaces earlier files.
-    The service cannot delete rows: it keeps those that it has, and gets only later ones.
+    If it is online, the service cannot delete rows: it keeps the rows that it has, and gets only later ones.
     """
     assert run.folder is not None
     home = run.folder.path
