@@ -1,4 +1,4 @@
-"""``torchrl-her check``: a look at a task before anything is trained."""
+"""``torchrl-her check``: facts about a task from random actions, before anything is trained."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def _import(context: click.Context, _parameter: click.Parameter, modules: tuple[
     try:
         import_modules(modules)
     except ValueError:
-        if not context.resilient_parsing:  # a mistake must not end the completion of a command
+        if not context.resilient_parsing:  # while the shell completes a command, errors must not end it
             raise
 
 
@@ -84,7 +84,7 @@ def group(context: click.Context) -> None:
 
 def _permit(context: click.Context, _parameter: click.Parameter, given: bool) -> None:
     if given:
-        context.with_resource(allow_imports())  # until the command ends
+        context.with_resource(allow_imports())  # permits imports until the command ends
 
 
 _may_import = click.option(
@@ -101,7 +101,7 @@ group.add_command(listing)
 
 
 class _Notices(logging.Handler):
-    """Log handler that prints notices of environments, each in a line like a warning's."""
+    """Log handler that prints each notice of an environment in one line, as warnings are printed."""
 
     def emit(self, record: logging.LogRecord) -> None:
         say_line(("warning: " if record.levelno >= logging.WARNING else "") + record.getMessage())

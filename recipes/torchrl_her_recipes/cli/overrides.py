@@ -12,7 +12,7 @@ from torchrl_her_recipes.config.plain_files import parse_yaml
 from torchrl_her_recipes.config.shipped import preset_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, locate, split_name
 
-ARGUMENTS = ("preset", "folder")  # besides options; names, even if YAML reads something else in them
+ARGUMENTS = ("preset", "folder")  # arguments besides options; their values are always names
 _OPENING, _CLOSING = "[{(", "]})"
 
 
@@ -20,7 +20,7 @@ def parse_override(text: str) -> tuple[str, str]:
     """Splits an argument ``NAME=VALUE`` into the name and the text of the value, and checks the name.
 
     Raises:
-        ValueError: it has no ``=``, or no option has this name.
+        ValueError: the argument has no ``=``, or no option has its name.
 
     Example:
         >>> parse_override("seed=3")
@@ -37,7 +37,7 @@ def parse_override(text: str) -> tuple[str, str]:
 
 def _path(name: str, value: str) -> tuple[str, ...]:
     """Returns group, option and mapping entry that a name refers to."""
-    if name in ARGUMENTS or (name in GROUPS and value.startswith("{")):  # or a whole group
+    if name in ARGUMENTS or (name in GROUPS and value.startswith("{")):  # {...}: a whole group
         return (name,)
     option, *entry = split_name(name)
     return (*locate(option), *entry)
@@ -62,7 +62,7 @@ def check_once(arguments: Sequence[tuple[str, str]]) -> None:
 
 
 def _meant(text: str) -> str:
-    """Returns a hint for a task's or another name that lacks ``task=``; empty if there is none."""
+    """Returns a hint if an argument is a known name without its option, as a task without ``task=``."""
     for name, known in (
         ("task", task_names()),
         ("algo", ALGORITHMS),

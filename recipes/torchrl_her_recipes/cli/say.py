@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
-if TYPE_CHECKING:  # importing it would import torch
+if TYPE_CHECKING:  # importing this module would import torch
     from torchrl_her_recipes.studies.study import StudyResult
 
 FAILED = 1

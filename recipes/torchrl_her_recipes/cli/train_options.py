@@ -105,7 +105,7 @@ class OptionsCommand(click.Command):
 
 
 def _rows(group: str) -> Iterator[tuple[str, str]]:
-    """Returns the options of a group and their help, and names the choices that an option is limited to."""
+    """Yields options of a group with their help; it names the choices that have an option, if not all do."""
     if kind := KINDS.get(group):
         known = f"one of {', '.join(kind)}; `torchrl-her list` describes them"
         yield _written(group, "name", kind.default), known
@@ -133,7 +133,7 @@ def _written(group: str, name: str, default: Any) -> str:
 
 
 def complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Completes the names of options, short or with their group, and values that are names."""
+    """Completes names of options (short or with their group), and values of options that take names."""
     options = option_names()
     name, equals, begun = incomplete.partition("=")
     if equals:

@@ -79,8 +79,8 @@ def tune(
 
 
 def _say_trial(line: str) -> None:
-    tqdm.write(line)  # above the bar, if there is one
-    sys.stdout.flush()  # to be seen at once in a file, too
+    tqdm.write(line)  # written above the progress bar, if there is one
+    sys.stdout.flush()  # so that a file gets the line at once, too
 
 
 def _say(result: SearchResult) -> int:

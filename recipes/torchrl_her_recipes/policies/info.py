@@ -16,7 +16,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 KEYS = ("observation", "desired_goal")
 
 _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict")
-_WIDEST = 1 << 16  # width of an entry or an action above which a file counts as damaged
+_WIDEST = 1 << 16  # a file with an entry or action that is wider counts as damaged
 _FLOATS = ("float32", "float64")
 _WHOLE = ("bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 
@@ -31,18 +31,18 @@ class PolicyInfo:
         dtype: dtype of ``observation`` and ``desired_goal``.
         action_shape: shape of one action: [width], or [] for an integer.
         action_dtype: ``"int64"`` for an integer, otherwise the dtype of the inputs.
-        task_dtype: type of the actions that the task itself takes, to which :meth:`Policy.predict` rounds.
+        task_dtype: type of the actions that the task itself takes; :meth:`Policy.predict` returns this type.
         low, high: the least and the greatest actions that the task takes, one number for each entry.
-        normalize_clip: normalized inputs are clipped to plus and minus this; None if the policy does not
-            normalize. It normalizes by itself: what it reads is what the task shows.
+        normalize_clip: bound to which normalized inputs are clipped; None if the policy does not normalize.
+            The policy normalizes inside: its inputs are the task's observations and goals as they are.
         algorithm, learner, seed, frames: origin of the policy; frames are environment steps.
         success: share of 1,000 greedy episodes of the task at whose last step the goal is achieved, with
             starts and goals that no training has seen.
-        reached: share of them in which it is achieved at some step; NaN if it was not measured.
+        reached: share of these episodes whose goal is achieved at some step; NaN if it was not measured.
         versions: versions of the packages that exported it; may be empty.
 
     Raises:
-        ValueError: a value that no policy has.
+        ValueError: a value that no policy can have.
 
     Example:
         >>> from torchrl_her_recipes import load_policy
@@ -75,7 +75,7 @@ class PolicyInfo:
                 raise ValueError(f"{name} of a policy must {wanted}, got {got!r}")
 
     def _checks(self) -> Iterator[tuple[str, bool, str]]:
-        """Yields the name of each value, whether it is one that a policy has, and what it must be."""
+        """Yields the name of each value, whether the value is valid, and a description of valid ones."""
         for name in ("task", "algorithm", "learner"):
             yield name, isinstance(getattr(self, name), str), "be a name"
         for name in ("seed", "frames"):
@@ -125,7 +125,7 @@ class PolicyInfo:
         """Restores the info from :meth:`to_dict`, with lists in place of tuples.
 
         Raises:
-            ValueError: A value is missing or unknown, or one that no policy has.
+            ValueError: A value is missing, unknown or not valid.
         """
         try:
             lists = {name: tuple(values[name]) for name in ("action_shape", "low", "high")}
@@ -151,7 +151,7 @@ class PolicyInfo:
             task: name of their task.
 
         Raises:
-            ValueError: they do; the message has both.
+            ValueError: they do not fit; the message describes the policy's entries and the environments'.
         """
         entries = describe_env(env)
         expected = {"widths": self.widths, "action_shape": self.action_shape}

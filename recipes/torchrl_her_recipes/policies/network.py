@@ -1,4 +1,4 @@
-"""The network of an exported policy, made from what its info says, without the task's environments."""
+"""The network of an exported policy, made from its :class:`PolicyInfo` without the task's environments."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ _CONSTANTS = ("mean", "std", "limit")  # buffers of an entry's normalization
 def _action_spec(info: PolicyInfo) -> TensorSpec:
     if info.discrete:
         return Categorical(int(info.high[0]) + 1, dtype=torch.int64)
-    return Bounded(-1.0, 1.0, shape=info.action_shape, dtype=torch.float32)  # arguments of learners
+    return Bounded(-1.0, 1.0, shape=info.action_shape, dtype=torch.float32)  # as learners' actions are
 
 
 def load_network(
     info: PolicyInfo, options: LearnerConfig, weights: Mapping[str, Tensor]
 ) -> TensorDictModuleBase:
-    """Makes the greedy policy of given weights, from ``observation`` and ``desired_goal`` to ``action``.
+    """Makes a greedy policy with given weights: from ``observation`` and ``desired_goal`` to ``action``.
 
     Args:
-        info: says the widths.
+        info: widths of inputs and actions.
         options: options of the learner, which define the network.
-        weights: ``state_dict()`` of its actor, with its normalization if there is one.
+        weights: ``state_dict()`` of the actor, with its normalization if there is one.
 
     Raises:
-        ValueError: these are not the weights of such an actor. Nothing of its size was made then.
+        ValueError: the weights do not fit the actor; raised before memory for the actor is taken.
     """
     shape = AgentShape(
         task=info.task,
@@ -89,7 +89,7 @@ class ScaledActions(nn.Module):
     """A network whose actions are scaled from [-1, 1] to a task's bounds.
 
     Args:
-        net: gives actions [..., actions] from -1 to 1.
+        net: network whose actions [..., actions] are from -1 to 1.
         low, high: the least and the greatest action, one number for each entry.
 
     Example:
@@ -109,7 +109,7 @@ class ScaledActions(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Maps inputs [..., width] to actions [..., actions]."""
         action = self.middle + self.reach * self.net(*inputs)
-        return action.minimum(self.high).maximum(self.low)  # rounding may lead out of the bounds
+        return action.minimum(self.high).maximum(self.low)  # rounding may exceed the bounds
 
 
 class TensorPolicy(nn.Module):
@@ -151,10 +151,10 @@ class TensorPolicy(nn.Module):
 
     @torch.no_grad()
     def deviation(self, action: Tensor, observation: Tensor, desired_goal: Tensor) -> Tensor:
-        """Returns how far actions are from this policy's, [rows].
+        """Returns how far given actions are from this policy's actions, [rows].
 
-        It is the greatest difference of an action's entries. For integers it is by how much the value of
-        the action is below the greatest one, since two actions may have the same value.
+        For continuous actions it is the greatest difference of an entry. For integers it is the difference
+        between the values of the best action and the given one, since two actions may have the same value.
         """
         inputs = self.normalized(observation, desired_goal)
         if not action.is_floating_point():

@@ -27,15 +27,15 @@ from torchrl_her_recipes.policies.info import KEYS, PolicyInfo
 from torchrl_her_recipes.policies.network import TensorPolicy
 
 SUFFIX = ".onnx"
-TOLERANCE = 1e-5  # difference of actions, relative to the greatest one if that is above 1
+TOLERANCE = 1e-5  # greatest difference of actions; relative to the greatest action if that is above 1
 
-_OPSET = 18  # the lowest that torch's exporter writes without converting; runtimes have it since 2023
+_OPSET = 18  # the lowest version that torch's exporter writes by itself; runtimes have it since 2023
 
 
 def need_onnx() -> ModuleType:
     """Returns the package ``onnxruntime``, if all packages for writing ONNX files are installed."""
     try:
-        # All are an extra that few need, and take a second to import.
+        # Imported here, since these packages are an extra that few users need, and take a second to import.
         import onnx  # noqa: F401, PLC0415
         import onnxruntime  # noqa: PLC0415
         import onnxscript  # noqa: F401, PLC0415
@@ -54,23 +54,24 @@ def write_onnx(
     *,
     states: TensorDictBase,
 ) -> PolicyInfo:
-    """Writes a policy as an ONNX file that takes any number of rows and gives their actions, in float32.
+    """Writes a policy as an ONNX file, which maps any number of rows to actions, in float32.
 
     The graph has the inputs ``observation`` [batch, width] and ``desired_goal`` [batch, width] and the output
     ``action`` [batch, width], or integers [batch]. Normalization and the scaling of actions are inside.
-    The facts and the recipe are in the file's metadata, as JSON.
+    ``info`` and ``recipe`` are in the file's metadata, as JSON.
 
-    The file gets its name only after onnxruntime has given the policy's actions with what was written.
+    The file is written under another name first. It is renamed when onnxruntime has returned the policy's
+    actions with it.
 
     Args:
         policy: The network of :func:`~torchrl_her_recipes.policies.network.load_network`.
-        info: Facts about the policy.
+        info: Inputs, outputs and origin of the policy.
         recipe: Values of the recipe of the run that trained it.
         path: The file.
         states: Rows of ``observation`` and ``desired_goal`` on which the actions are compared.
 
     Returns:
-        The facts about the policy of the file.
+        The info about the policy as it is in the file.
 
     Raises:
         ValueError: onnxruntime gives other actions.
@@ -95,7 +96,7 @@ def write_onnx(
 def _check_actions(module: TensorPolicy, action: Tensor, info: PolicyInfo, inputs: dict[str, Tensor]) -> None:
     """Raises a ValueError if actions differ from the policy's by more than :data:`TOLERANCE`.
 
-    Of integers, the values are compared: two actions may have the same value.
+    For integers, the values of actions are compared, since two actions may have the same value.
     """
     worst = float(module.deviation(action, *inputs.values()).nan_to_num(torch.inf).max())
     scale = max([1.0, *(abs(side) for side in (*info.low, *info.high) if abs(side) < float("inf"))])
@@ -110,7 +111,7 @@ def _check_actions(module: TensorPolicy, action: Tensor, info: PolicyInfo, input
 
 def _graph_of(module: TensorPolicy, info: PolicyInfo) -> Any:
     """Converts the policy to a protobuf without traces of the machine that made it."""
-    inputs = tuple(torch.zeros(2, info.widths[key]) for key in KEYS)  # 2 rows: torch takes 1 for a constant
+    inputs = tuple(torch.zeros(2, info.widths[key]) for key in KEYS)  # torch takes a size of 1 for a constant
     batch = torch.export.Dim("batch")
     with _silent():
         program = torch.onnx.export(
@@ -143,7 +144,7 @@ def _silent() -> Iterator[None]:
     log.setLevel(logging.ERROR)  # suppresses a notice that torchvision is missing
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about equal batch sizes, and deprecated calls in the exporter
+            warnings.simplefilter("ignore")  # warnings about equal batch sizes and deprecated calls
             yield
     finally:
         log.setLevel(level)

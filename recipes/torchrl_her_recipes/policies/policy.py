@@ -1,4 +1,4 @@
-"""Trained policies: of runs, of files, and those that come with the package."""
+"""Trained policies: loaded from runs, from files, or from those that come with the package."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ _COMPARED = 1 << 42  # and for those on whose states an ONNX file is compared wi
 class Policy(TensorDictModuleBase):
     """A trained greedy policy: reads ``observation`` and ``desired_goal``, writes ``action``.
 
-    It acts in any TorchRL environment, collector or :func:`~torchrl_her.evaluate`, and by :meth:`predict` on
-    arrays of gymnasium's.
+    It acts in TorchRL's environments and collectors and in :func:`~torchrl_her.evaluate`. For gymnasium's
+    arrays it has :meth:`predict`.
 
     Args:
-        info: Facts about the policy: its inputs, its actions, its success.
-        recipe: Recipe of the run that trained it, of its seed alone. Its task may be a harder one.
+        info: Inputs, actions and success of the policy.
+        recipe: Recipe of the run that trained it, with this run's seed only. Its task may be a harder one.
         weights: Weights of the run's actor, with its normalization if there is one.
         source: Name, folder or file that the policy was loaded from.
 
     Raises:
-        ValueError: These are not the weights of such an actor.
+        ValueError: The weights do not fit the actor that info and recipe describe.
 
     Example:
         >>> policy = Policy.load("hand_v1")
@@ -87,8 +87,8 @@ class Policy(TensorDictModuleBase):
         Args:
             source: Name of a policy that comes with the package, or of its task, a ``.safetensors`` file that
                 :meth:`save` wrote, the folder of a run, or the file of a policy in it.
-            run: Index of the run, of several side by side in a folder; the run with the median success if
-                None.
+            run: Index of the run, if the folder has several side by side; the run with the median success
+                if None.
             best: Whether to take the policy of the evaluation with the best median success, not the last.
 
         Raises:
@@ -152,7 +152,7 @@ class Policy(TensorDictModuleBase):
             versions=present_versions(),
         )
         curriculum, width = make_curriculum(envs.curriculum, env), sum(info.widths.values())
-        # positions of the network's inputs in the observation and the desired goal behind it
+        # positions of the network's inputs in the concatenated observation and desired goal
         places = torch.arange(width)
         if curriculum is not None:
             last = curriculum.state_index[-1]
@@ -167,17 +167,17 @@ class Policy(TensorDictModuleBase):
 
     @torch.no_grad()
     def predict(self, observation: Mapping[str, np.ndarray], **_kwargs: Any) -> tuple[np.ndarray, None]:
-        """Returns the action for one observation of gymnasium's, or for several, as Stable-Baselines3 does.
+        """Returns actions for one observation of gymnasium's or for several, like Stable-Baselines3's method.
 
         Args:
             observation: Arrays ``observation`` and ``desired_goal``, [width] or [n, width]; other entries are
                 not read.
-            _kwargs: Not read: ``deterministic``, ``state`` and the like of Stable-Baselines3. The policy is
-                greedy.
+            _kwargs: Arguments of Stable-Baselines3, as ``deterministic`` and ``state``. They have no effect:
+                the policy is greedy and has no state.
 
         Returns:
-            The action, [width] or [n, width], in the bounds and of the type of the task's own, and None in
-            place of a recurrent state.
+            The action, [width] or [n, width], within the task's own bounds and of its type; and None in place
+            of a recurrent state.
 
         Example:
             >>> import gymnasium, torchrl_her_envs
@@ -209,11 +209,11 @@ class Policy(TensorDictModuleBase):
         Args:
             number: Number of environments.
             seed: Seed of their starts and goals.
-            pictures: Whether they give pictures, if they can.
+            pictures: Whether the environments render pictures, if they can.
 
         Raises:
-            ValueError: They differ from what the policy was trained on, or the task names a module that must
-                not be imported.
+            ValueError: The environments differ from those that the policy was trained on, or the task names a
+                module that must not be imported.
         """
         envs = TaskEnvs.of(self.recipe.replace(task=self.info.task))
         env = envs.make(number, [seed], pictures=pictures, scaled=False)
@@ -236,16 +236,16 @@ class Policy(TensorDictModuleBase):
         """Writes the policy as a file: for :meth:`load` if its suffix is ``.safetensors``, for onnxruntime if
         it is ``.onnx``.
 
-        An ONNX file is only left behind if onnxruntime gives the policy's actions to 1e-5 on states of the
-        task.
+        An ONNX file is removed unless onnxruntime returns the policy's actions with it, to 1e-5, on states
+        of the task.
 
         Args:
             path: The file.
             card: Whether a model card is written beside the file, with the suffix ``.md``.
 
         Raises:
-            ValueError: The suffix is another one, the card would replace a page that is none, or the ONNX
-                file does not act as the policy does.
+            ValueError: The suffix is another one, the card would replace a page that is not a model card, or
+                the actions of the ONNX file differ from the policy's.
             ImportError: The suffix is ``.onnx``, and the extra ``onnx`` is missing.
             OSError: The file cannot be written.
         """
@@ -278,14 +278,15 @@ def export_policy(
     best: bool = False,
     card: bool = True,
 ) -> Policy:
-    """Exports the policy of a run, measured on 1,000 episodes, to a small file, and writes a page about it.
+    """Measures the policy of a run on 1,000 episodes, and writes it to a small file and a page about it.
 
     Args:
         source: The policy, as for :meth:`Policy.load`.
         out: The file; its suffix ``.safetensors`` or ``.onnx`` is its format, see :meth:`Policy.save`.
-        run: Index of the run, of several side by side in a folder; the run with the median success if None.
-        task: Name of the task that the policy is for, if not the run's own: one that shows and takes the
-            same.
+        run: Index of the run, if the folder has several side by side; the run with the median success if
+        None.
+            task: Name of the task that the policy is for, if not the run's own. Its observations, goals and
+            actions must have the same widths.
         best: Whether to take the policy of the evaluation with the best median success, not the last.
         card: Whether a model card is written beside the file, with the suffix ``.md``.
 
@@ -325,12 +326,12 @@ def _check_out(path: Path, *, card: bool) -> None:
 
 
 def _as_shown(actor: dict[str, Tensor], places: Tensor, width: int) -> dict[str, Tensor]:
-    """Returns an actor's weights for reordered inputs; unused inputs get weight 0.
+    """Returns an actor's weights for the inputs in another order; inputs that it does not use get weight 0.
 
     Args:
         actor: Weights of the actor and its normalization.
         places: New position of each input.
-        width: Number of inputs then.
+        width: Number of inputs in the new order.
     """
     moved = dict(actor)
     for key, value in actor.items():

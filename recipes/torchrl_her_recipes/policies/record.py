@@ -22,8 +22,8 @@ from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.policies.policy import Policy
 
 EXPERT = "expert"
-_AT_ONCE, _OF_GYM_AT_ONCE = 100, 10  # environments
-_MOST = 10  # episodes that are played for each one that is asked for, at most
+_AT_ONCE, _OF_GYM_AT_ONCE = 100, 10  # environments that are stepped together
+_MOST = 10  # at most this number of episodes is played for each requested one
 
 Player = Callable[[TensorDictBase], TensorDictBase]
 
@@ -59,8 +59,8 @@ def record_demonstrations(
     there. :meth:`~torchrl_her.demonstrations.Demonstrations.load` reads it.
 
     Args:
-        task: its name.
-        out: the file.
+        task: name of the task.
+        out: file for the demonstrations.
 
     Keyword Args:
         episodes: number of episodes to write; at most ten times as many are played.
@@ -68,7 +68,7 @@ def record_demonstrations(
             with the package; or the file of an exported one. None: the scripted controller.
         seed: seed of starts and goals.
         keep_all: whether episodes that fail are written, too; then no more than ``episodes`` are played.
-        force: whether a file that is there is replaced.
+        force: whether an existing file is replaced.
 
     Raises:
         ValueError: there is no such task or policy, the policy is for another kind of task, the file exists,
@@ -89,7 +89,7 @@ def record_demonstrations(
 
 
 def _find_policy(task: str, env: EnvBase, policy: str | Path | None) -> tuple[Player, str]:
-    """Finds a policy that plays in some environments, and its name."""
+    """Returns a policy that acts in the given environments, and its name."""
     if policy is None or str(policy) == EXPERT:
         try:
             return make_controller(env), "the scripted controller"
@@ -106,7 +106,7 @@ def _find_policy(task: str, env: EnvBase, policy: str | Path | None) -> tuple[Pl
 def _play(
     env: EnvBase, player: Player, name: str, episodes: int, *, keep_all: bool, facts: dict[str, Any]
 ) -> Recorded:
-    """Plays one episode after the other in each environment, until there are enough."""
+    """Plays episodes one after the other in each environment, until there are enough to write."""
     reward, parts = reward_range(goal_env(env))[1], []
     kept = played = achieved = 0
     while kept < episodes and played < _MOST * episodes:

@@ -19,11 +19,11 @@ from torchrl_her_recipes.policies.policy import Policy
 from torchrl_her_recipes.runs.film import FPS
 
 _GAP = 8  # pixels between policies
-_HOLD = 25  # times that the last frame of a film is repeated
+_HOLD = 25  # number of times that a video repeats its last frame
 
 
 class Seen(NamedTuple):
-    """Number of goals that a policy achieved, of those that it had."""
+    """Number of goals that a policy achieved, and number of all goals that it had."""
 
     achieved: int
     goals: int
@@ -39,7 +39,7 @@ class Viewer:
         goals: Number of goals, side by side.
         seed: Seed of goals and starts.
         size: Pixels of one environment.
-        named: Whether names and successes stand below the pictures.
+        named: Whether names and successes are written below the pictures.
 
     Raises:
         ValueError: The policies are of different tasks, or an environment gives no pictures.
@@ -83,7 +83,7 @@ class Viewer:
 
     @property
     def step_count(self) -> int:
-        """Steps since the start of these episodes."""
+        """Steps since the start of the present episodes."""
         return max(episodes.step_count for episodes in self._episodes)
 
     @property
@@ -103,7 +103,7 @@ class Viewer:
 
     @property
     def seen(self) -> list[Seen]:
-        """Achieved goals of each policy since the first start, and the number of ended episodes."""
+        """Number of achieved goals and of ended episodes of each policy, since the first start."""
         pairs = zip(self._before, self._episodes, strict=True)
         return [
             Seen(before.achieved + episodes.achieved, before.goals + episodes.worlds - len(episodes.running))
@@ -143,7 +143,7 @@ class Viewer:
             out: A .gif or .mp4 file.
 
         Returns:
-            Goals that each policy achieved, and all.
+            Number of goals that each policy achieved, and number of all goals.
         """
         self.start()
         frames = [self.frame()]
@@ -181,9 +181,9 @@ def _described(task: TaskConfig) -> str:
 
 
 def _labels_of(policies: Sequence[Policy]) -> list[str]:
-    """Returns short names of policies that tell them apart: the last part of each path, or all of it.
+    """Returns short names of policies: the last part of each path, or the whole path if parts are equal.
 
-    Two policies that are called the same stay so.
+    Policies with the same path have the same name.
     """
     sources = [policy.source for policy in policies]
     short = [Path(source).name or source for source in sources]

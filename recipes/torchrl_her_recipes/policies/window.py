@@ -15,8 +15,8 @@ from torchrl_her_recipes.policies.viewer import Seen, Viewer
 from torchrl_her_recipes.runs.film import FPS
 
 _RATES = (1, 2, 4, 8, FPS, 25, 50, 100, 200)  # steps a second
-_LOOKS = 30  # times a second that keys are looked for, at least
-_MOST_NUMBERS = 3  # coordinates of a goal up to which they are shown
+_LOOKS = 30  # times a second that keys are read, at least
+_MOST_NUMBERS = 3  # goals with more coordinates are not written out
 _KEYS = "space: pause    n: one step    r: next goals    + -: speed    q: quit"
 
 
@@ -27,7 +27,7 @@ def play(
     best: bool = False,
     **view: Any,
 ) -> list[Seen]:
-    """Shows policies on the same starts and goals: as a film, or in a window until it is closed.
+    """Shows policies on the same starts and goals: in a video, or in a window until the user closes it.
 
     Keys in the window: space pauses, n or the right arrow takes one step, r goes on to the next goals, plus
     and minus change the speed, q or escape quits.
@@ -42,7 +42,7 @@ def play(
             ``torchrl_her_recipes.policies.viewer.Viewer``.
 
     Returns:
-        Goals that each policy achieved, and all that it had.
+        Number of goals that each policy achieved, and number of all goals that it had.
 
     Raises:
         ValueError: There is no such policy, the policies are of different tasks, nothing can be drawn, or
@@ -71,7 +71,7 @@ def play(
 
 def show(viewing: Viewing, window: KeyWindow) -> None:
     """Shows episodes in a window until it is closed."""
-    due = 0.0  # steps; each look at the keys adds its share of one
+    due = 0.0  # number of steps to take; grows each time that keys are read
     while not viewing.over:
         window.show(viewing.frame().numpy())
         rate, looks = viewing.rate, max(_LOOKS, viewing.rate)
@@ -88,7 +88,7 @@ class Viewing:
     """State of a viewing: episodes, their speed, and whether they are paused.
 
     Attributes:
-        paused: whether no steps are taken unless they are asked for.
+        paused: whether steps are taken only if the user presses a key for one.
         over: whether the user has quit.
     """
 

@@ -1,6 +1,6 @@
 """Interquartile means and their bootstrap intervals, by SciPy and `arch`.
 
-What Agarwal et al., *Deep Reinforcement Learning at the Edge of the Statistical Precipice*, 2021, recommend
+Agarwal et al., *Deep Reinforcement Learning at the Edge of the Statistical Precipice*, 2021, recommend them
 for few runs on several tasks.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 try:
     from arch.bootstrap import IndependentSamplesBootstrap
     from scipy.stats import trim_mean
-except ImportError as error:  # they are large, and only reports need them
+except ImportError as error:  # not always installed: large, and only for reports
     raise ImportError("reports need the package arch: pip install '.[report]'") from error
 
 REPETITIONS = 2_000
@@ -47,7 +47,7 @@ def interquartile_means(groups: Sequence[Sequence[float] | np.ndarray]) -> np.nd
         [0.6, 1.5]
     """
     means = np.empty(len(groups))
-    for size in {len(group) for group in groups}:  # one call for all of a size: a bootstrap makes thousands
+    for size in {len(group) for group in groups}:  # one call for each size: a bootstrap makes thousands
         places = [place for place, group in enumerate(groups) if len(group) == size]
         means[places] = trim_mean(np.array([groups[place] for place in places]), _CUT, axis=1)
     return means
@@ -63,8 +63,8 @@ def bootstrap(
 ) -> tuple[list[Interval], list[Interval]]:
     """Computes interquartile means of groups of samples, and their differences, with 95 % intervals.
 
-    The bootstrap is stratified: each repetition draws every sample anew from its own runs, so a group (an
-    algorithm on several tasks) always has as many runs of each task as there are.
+    The bootstrap is stratified. Each repetition redraws every sample (runs of an algorithm on one task) from
+    its own runs, so that each task keeps its number of runs in a group (the algorithm on several tasks).
 
     Args:
         samples: the runs of each algorithm on each task.
@@ -74,8 +74,8 @@ def bootstrap(
         seed: seed of its random numbers.
 
     Returns:
-        One interval for each group, and one for each pair. The ends of those that one run alone stands
-        for are NaN.
+        One interval for each group, and one for each pair. If a sample has one run only, the ends of the
+        intervals that use it are NaN.
 
     Example:
         >>> means, differences = bootstrap([[0.5, 0.5], [0.25, 0.25]], [[0], [1]], [(0, 1)])

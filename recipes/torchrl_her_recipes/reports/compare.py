@@ -18,12 +18,12 @@ from torchrl_her_recipes.reports.results import Combination
 from torchrl_her_recipes.runs.scores import LAST, at_the_end
 
 ALL_TASKS = "all tasks"
-_COUNTED = ("kl", "rows_")  # metrics accumulated over a run, of which only the last evaluation counts
+_COUNTED = ("kl", "rows_")  # metrics that accumulate over a run, so that only their last value counts
 
 
 @dataclass(frozen=True)
 class Final:
-    """Result of one algorithm on one task, or on all: a row of the table."""
+    """Result of one algorithm on one task, or on all tasks together: a row of the table."""
 
     measure: str
     task: str
@@ -44,9 +44,9 @@ class Final:
 
 @dataclass(frozen=True)
 class Difference:
-    """The interquartile mean of one algorithm minus that of another: a row of the table.
+    """Difference between the interquartile means of two algorithms: a row of the table.
 
-    ``apart``: whether the intervals of the two have no point in common.
+    ``apart``: whether the intervals of the two means have no point in common.
     """
 
     measure: str
@@ -59,7 +59,7 @@ class Difference:
     apart: bool
 
     def minus_other(self, first: str) -> Interval:
-        """Returns the mean of ``first``, one of the two algorithms, minus that of the other."""
+        """Returns the mean of ``first``, one of the two algorithms, minus the mean of the other."""
         if first == self.first:
             return Interval(self.difference, self.low, self.high)
         return Interval(-self.difference, -self.high, -self.low)
@@ -68,7 +68,7 @@ class Difference:
 class Verdict(StrEnum):
     """Outcome of an expected order."""
 
-    APART = "holds, apart"  # the intervals of the two algorithms
+    APART = "holds, apart"  # the intervals of the two algorithms have no common point
     HOLDS = "holds, overlap"
     UNDECIDED = "undecided"
     REVERSED = "reversed"
@@ -103,8 +103,8 @@ def compare(
 ) -> tuple[list[Final], list[Difference]]:
     """Returns the results of all combinations, and the differences of each two algorithms on the same task.
 
-    Algorithms that are at their end on all tasks of the study are compared on all of them together, too.
-    Those that are not at their end have no part in differences.
+    Differences are computed for finished runs only. Algorithms whose runs are finished on all tasks of the
+    study are compared on all tasks together, too.
     """
     measured = [cell for cell in cells if values_of(cell, measure)]
     samples = [values_of(cell, measure) for cell in measured]
@@ -147,13 +147,13 @@ def judge(
 ) -> list[Judged]:
     """Judges whether expected orders hold, on each task of a study and, for success, on all tasks together.
 
-    An order holds if the 95 % interval of the difference lies on its side of 0. That is less than asking
-    for intervals of the two algorithms that lie apart, which is said, too.
+    An order holds if the 95 % interval of the difference lies on the expected side of 0. A stricter test is
+    reported, too: whether the intervals of the two algorithms have no point in common.
 
     Args:
         cells: combinations of the study.
-        orders: the expected ones; those of algorithms that the study does not have are left out.
-        differences: all differences.
+        orders: the expected orders; orders of algorithms that the study does not have are left out.
+        differences: differences from :func:`compare`.
     """
     tasks = list(dict.fromkeys(cell.task for cell in cells))
     algorithms = {cell.algorithm for cell in cells}
@@ -173,14 +173,14 @@ def _judge(
         if (gap.measure, gap.task) == (order.measure, task) and {gap.first, gap.second} == pair:
             verdict = _verdict(gap.minus_other(order.more), apart=gap.apart)
             why = "too few runs" if verdict is Verdict.OPEN else ""
-            written = gap.minus_other(order.text.split()[0])  # a < b is about a minus b
+            written = gap.minus_other(order.text.split()[0])  # for a < b, the page shows a minus b
             return Judged(order.measure, task, order.text, verdict, *written, why)
     unknown = (math.nan, math.nan, math.nan)
     return Judged(order.measure, task, order.text, Verdict.OPEN, *unknown, _why(cells, order, task))
 
 
 def _verdict(rise: Interval, *, apart: bool) -> Verdict:
-    """Returns the verdict on an order, from the algorithm with more of a metric minus that with less."""
+    """Returns the verdict on an order, from the mean that is expected to be greater minus the other mean."""
     if math.isnan(rise.low):
         return Verdict.OPEN
     if rise.low > 0:

@@ -17,7 +17,7 @@ MEASURES = {  # metric to its name on the page
     "rows_useful_virtual_positive": "positive rewards, virtual rows that count",
 }
 
-SIGNS = {  # verdict to a sign for it, and a class of the page
+SIGNS = {  # verdict to its sign on the page, and the sign's CSS class
     Verdict.APART: ("✓", "good"),
     Verdict.HOLDS: ("(✓)", "good"),
     Verdict.UNDECIDED: ("?", "fair"),
@@ -27,7 +27,7 @@ SIGNS = {  # verdict to a sign for it, and a class of the page
 
 
 def show(value: float | None, measure: str) -> str:
-    """Formats a number of a measure; a dash if there is none.
+    """Formats the value of a metric; a dash if there is no value.
 
     Example:
         >>> show(0.614, "success"), show(1.0, "kl"), show(12345.6, "rows_real_positive"), show(None, "kl")
@@ -46,7 +46,7 @@ def show_interval(row: Final, measure: str) -> str:
 
 
 def show_range(low: float, high: float, measure: str) -> str:
-    """Formats the ends of an interval in brackets; empty if they are not known.
+    """Formats the ends of an interval in brackets; empty if the ends are not known.
 
     Example:
         >>> show_range(0.27, 0.45, "success")

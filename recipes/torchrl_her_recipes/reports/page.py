@@ -26,7 +26,7 @@ from torchrl_her_recipes.runs.plots import band
 from torchrl_her_recipes.runs.scores import LAST, last_success
 from torchrl_her_recipes.studies.plan import duration
 
-_AT_THE_END = ("success", "reached", "distance", "kl", "q_bias")  # shown with intervals
+_AT_THE_END = ("success", "reached", "distance", "kl", "q_bias")  # metrics shown with intervals
 _ABOUT = ("label", "task", "algorithm", "state", "runs", "epoch", "frames", "seconds", "differs")
 
 
@@ -34,9 +34,9 @@ def write_report(study: Study, folder: Path, out: Path) -> Path:
     """Writes a page about the results of a study so far, without training anything.
 
     Args:
-        study: study that is meant.
-        folder: with a folder of each of its combinations, of which some may be missing or not at their end;
-            or with the files that :func:`~torchrl_her_recipes.write_results` made of them.
+        study: study to report on.
+        folder: folder with a folder for each combination, some of which may be missing or unfinished; or
+            with the files that :func:`~torchrl_her_recipes.write_results` made from these folders.
         out: folder for the page and its tables; pictures go into its `figures`.
 
     Returns:

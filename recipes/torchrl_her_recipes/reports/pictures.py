@@ -21,7 +21,7 @@ from torchrl_her_recipes.reports.results import Combination
 from torchrl_her_recipes.runs.plots import Rows, band, colors, draw_curves, draw_goals
 
 _MIME = {".svg": "image/svg+xml", ".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}
-_WIDTH, _HEIGHT = 4.4, 3.9  # inches: as wide as a phone, in letters that can be read there
+_WIDTH, _HEIGHT = 4.4, 3.9  # inches: the width of a phone, on which letters stay readable
 _INK = "#1a202c"
 
 
@@ -71,7 +71,7 @@ def draw_pictures(
 def _curve(
     task: str, name: str, curves: Mapping[str, Rows], palette: Mapping[str, str], figures: Path
 ) -> Picture:
-    """Draws a metric of several algorithms; beside Q of the start, the medians of the returns are dashed."""
+    """Draws a metric of several algorithms; for Q of the first state, returns are added as dashed medians."""
     figure, axes = _panel(task)
     draw_curves(axes, curves, name, palette)
     handles, _ = axes.get_legend_handles_labels()
@@ -123,7 +123,7 @@ def _final(
 def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Picture]:
     """Draws a heat map of each algorithm's virtual goals, and one of their target."""
     if task not in TASKS:
-        return []  # there is no screen to draw them on
+        return []  # goals of these tasks cannot be drawn on a screen
     maps = {cell.algorithm: cell.goals for cell in cells if cell.goals is not None}
     if not maps:
         return []
@@ -152,10 +152,10 @@ def _panel(title: str, *, height: float = _HEIGHT) -> tuple[Figure, Axes]:
 
 
 def _save(figure: Figure, stem: Path) -> Path:
-    """Writes a picture as .svg, which is returned, and as .png for programs that cannot show that."""
+    """Writes a picture as .svg, and as .png for programs that cannot show .svg; returns the .svg file."""
     path = Path(f"{stem}.svg")
     figure.savefig(path, metadata={"Date": None})
-    figure.set_layout_engine("none")  # it is laid out already, which takes longer than drawing it
+    figure.set_layout_engine("none")  # laid out before; doing so again takes longer than drawing
     figure.savefig(f"{stem}.png", dpi=120)
     return path
 

@@ -17,19 +17,19 @@ from torchrl_her_recipes.studies.seed_batches import Batches
 class Combination:
     """Combination of a study, and the results of its runs so far.
 
-    It holds plain values, so that it can come from the folders of runs as well as from files of results.
+    It holds plain values, so that it can be read from folders of runs as well as from files of results.
 
     Attributes:
-        label: its name, which is that of its folder.
+        label: name of the combination and of its folder.
         task: the task that was learned.
-        algorithm: name that distinguishes it from the others on the same task.
-        options: the options that the study varies, and their values here.
-        rows: its table of metrics, one row for each epoch and run.
+        algorithm: name that distinguishes the combination from others on the same task.
+        options: the options that the study varies, and their values in this combination.
+        rows: table of metrics, one row for each epoch and run.
         done: whether the runs in its table have reached their last epoch.
         epochs: the last epoch of its runs.
         planned: number of its runs in the study.
-        seconds: how long its runs took, one core each; NaN if that is not known.
-        differs: options that are not the study's, in words.
+        seconds: duration of its runs on one core each; NaN if it is not known.
+        differs: options whose values differ from the study's, in words.
         goals: histogram of its virtual goals; None if they were not counted.
     """
 

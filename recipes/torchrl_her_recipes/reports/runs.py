@@ -56,7 +56,7 @@ def write_runs_report(folders: Sequence[Path], out: Path) -> Path:
 
 
 def _newest_film(folders: Sequence[Path]) -> Picture | None:
-    """Returns the newest film in the folders of runs; None if there is no film that a page has room for."""
+    """Returns the newest video in the folders of runs; None if no video is small enough for the page."""
     homes = [home.path for folder in folders for home in Batches(folder).homes]
     films = [path for home in homes for path in home.glob("*.*") if path.suffix in _FILMS]
     whole = [path for path in films if not path.stem.endswith(".part") and path.stat().st_size <= _LARGEST]
@@ -78,7 +78,7 @@ def _runs_in(folder: Path) -> list[Path]:
 
 
 def _by_recipe(paths: Sequence[Path]) -> list[list[Path]]:
-    """Returns the folders in groups that differ in nothing but their seeds, and have different ones."""
+    """Groups folders by recipe: runs of a group have equal options except for seeds, which differ."""
     groups: list[tuple[Recipe, set[int], list[Path]]] = []
     for path in paths:
         recipes = [home.recipe() for home in Batches(path).homes]
@@ -97,7 +97,7 @@ def _by_recipe(paths: Sequence[Path]) -> list[list[Path]]:
 
 
 def _labels(groups: Sequence[Sequence[Path]]) -> list[str]:
-    """Returns the last part of each group's first path, without the seed of several; else all of the path."""
+    """Returns names for groups: the last part of the first path, without seeds, or else the whole path."""
     names = [
         re.sub(r"_s\d+(_\d+)?$", "", group[0].resolve().name) if len(group) > 1 else group[0].resolve().name
         for group in groups

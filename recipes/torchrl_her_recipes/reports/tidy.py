@@ -68,8 +68,8 @@ def read_study(study: Study, folder: Path) -> Results:
     """Reads the results of a study, from the folders of its runs or from the files made of them.
 
     Args:
-        study: study that is meant.
-        folder: with a folder of each combination, or with the files of :func:`write_results`.
+        study: study whose results are read.
+        folder: folder with a folder for each combination, or with the files of :func:`write_results`.
     """
     if not is_results(folder):
         facts = {name: getattr(study, name) for name in ("name", "summary", "expect", "published")}
@@ -87,18 +87,18 @@ def write_results(
 
     - ``runs.csv`` has a row for each run and evaluation: the combination (``label``, ``task``, ``algorithm``
       and the other options that the study varies), ``seed``, ``epoch``, ``frames`` and all metrics, with six
-      significant digits. An empty place is a metric that the combination does not have. Above one
-      megabyte it is compressed: ``runs.csv.gz``.
+      significant digits. If the combination does not have a metric, its place is empty. A table of more
+      than one megabyte is compressed: ``runs.csv.gz``.
     - ``goals.npz`` has the histograms of virtual goals, ``LABEL.counts`` and ``LABEL.target`` for each
       combination, if there are any.
     - ``about.yaml`` has the command, the versions, the date, the study's recipe, and the state of each
       combination.
 
     Args:
-        study: study that is meant.
-        folder: with a folder of each of its combinations; some may be missing or not at their end.
+        study: study whose results are written.
+        folder: folder with a folder for each combination; some may be missing or unfinished.
         out: folder for the files.
-        command: the command, or several, that made the runs; by default ``torchrl-her study NAME``.
+        command: the command or commands that trained the runs; by default ``torchrl-her study NAME``.
 
     Returns:
         The folder of the files.
@@ -127,7 +127,7 @@ def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Pat
     _write_table(cells, out)
     _write_goals(cells, out / _GOALS)
     states = {cell.label: {name: getattr(cell, name) for name in _KEPT} for cell in cells}
-    # Through JSON: YAML takes neither numpy's numbers nor subclasses of dict.
+    # Converted through JSON, since YAML writes neither numpy's numbers nor subclasses of dict.
     plain = json.loads(json.dumps({**about, "combinations": states}, default=np.generic.item))
     text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=110)
     # Written last: a folder with this file counts as results.
@@ -159,7 +159,7 @@ def read_results(folder: Path) -> Results:
 
 def _write_table(cells: Sequence[Combination], out: Path) -> None:
     names = dict.fromkeys(name for cell in cells for name in cell.options)
-    # Tasks and algorithms that are varied are columns of their own already.
+    # Options whose values are the task or the algorithm are left out, since both have columns already.
     options = [
         name
         for name in names
@@ -177,7 +177,7 @@ def _write_table(cells: Sequence[Combination], out: Path) -> None:
                 writer.writerow([*head, *(_number(row.get(name)) for name in (*_KEYS, *metrics))])
     packed.unlink(missing_ok=True)
     if plain.stat().st_size > _LARGE:
-        # Without a time stamp: the same bytes every time.
+        # Without a time stamp, so that equal results give equal bytes.
         packed.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
         plain.unlink()
 

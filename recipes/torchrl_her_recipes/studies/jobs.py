@@ -1,4 +1,4 @@
-"""Jobs of a study: a job is a batched run with its folder, on this machine or another."""
+"""Jobs of a study. A job trains runs side by side into a folder, on this machine or another."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _ORPHAN = 300.0  # seconds that a worker whose study was killed has to save its 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """Batched run of a study.
+    """Runs of a study that one worker trains side by side.
 
     Args:
-        label: names it within the study.
-        recipe: recipe of the run.
-        folder: folder of the run.
-        around: context manager around the run in its process, as ``module:name``, that gives
-            the run's callbacks; empty if nothing does.
+        label: name of the job within the study.
+        recipe: recipe of the runs.
+        folder: folder of the runs.
+        around: context manager around the job in its process, as ``module:name``, which yields callbacks;
+            empty for no context manager.
         options: arguments of the context manager, plain values by name.
     """
 
@@ -43,7 +43,7 @@ class Job:
     def to_plain(self) -> dict[str, Any]:
         """Converts the job to plain values for another process, with the modules that it must import first.
 
-        They register the tasks and learners that the recipe may name.
+        These modules register the tasks and learners that the recipe may name.
         """
         recipe, modules = self.recipe.to_dict(), imported_modules()
         plain = {"label": self.label, "recipe": recipe, "folder": str(self.folder), "modules": modules}
@@ -58,7 +58,7 @@ class Job:
         """
         import_modules(values["modules"])
         recipe = Recipe.from_dict(values["recipe"])
-        permit_task(recipe.task.name)  # checked where the study was started
+        permit_task(recipe.task.name)  # was checked in the process that started the study
         around = {name: values[name] for name in ("around", "options")}
         return cls(label=values["label"], recipe=recipe, folder=Path(values["folder"]), **around)
 
@@ -75,9 +75,9 @@ class Outcome:
     """Outcome of a job.
 
     Attributes:
-        interrupted: whether it was stopped; it can go on.
-        error: why it failed, in one line; empty if it did not.
-        died: whether its process ended instead of saying so.
+        interrupted: whether the job was stopped; it can be resumed.
+        error: reason of a failure, in one line; empty if the job did not fail.
+        died: whether the process of the job ended without an outcome.
     """
 
     interrupted: bool = False
@@ -86,13 +86,13 @@ class Outcome:
 
 
 def can_resume(folder: Path) -> bool:
-    """Checks whether a folder has a checkpoint of this job's run."""
+    """Returns whether a folder has a checkpoint to resume from."""
     home = RunFolder(folder)
     return home.config.exists() and bool(home.checkpoints)
 
 
 def read_progress(folder: Path) -> Progress:
-    """Reads the progress of a run from the last line of its table, which is cheap.
+    """Reads the progress of a run from the last line of its table, without reading the rest.
 
     Example:
         >>> read_progress(Path("nowhere"))
@@ -102,7 +102,7 @@ def read_progress(folder: Path) -> Progress:
         lines = read_text(RunFolder(folder).metrics, largest=LARGEST_TABLE).splitlines()
     except (OSError, ValueError):  # the table is missing or damaged
         return Progress()
-    with suppress(IndexError, ValueError, KeyError):  # the table lost its end in a power failure
+    with suppress(IndexError, ValueError, KeyError):  # a power failure can cut the last line
         last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
         return Progress(int(last["epoch"]), float(last["seconds"]))
     return Progress()
@@ -111,7 +111,7 @@ def read_progress(folder: Path) -> Progress:
 def kept_progress(job: Job) -> Progress:
     """Returns the progress of a job that is not running, up to its last checkpoint.
 
-    One that was killed between its last epoch and its pictures is an epoch short of its end.
+    A job that was killed between its last epoch and its pictures counts as one epoch short of its end.
     """
     done, home = read_progress(job.folder), RunFolder(job.folder)
     if done.epochs >= job.recipe.run.epochs and home.is_done:
@@ -123,7 +123,7 @@ def kept_progress(job: Job) -> Progress:
 def run_job(job: Job) -> Outcome:
     """Runs a job, or resumes it from its checkpoint. Ctrl-C ends it at the next good moment.
 
-    Whatever goes wrong is an outcome; the whole story of it is left in ``error.txt``.
+    Raises no errors: an error is part of the outcome, and its traceback is in ``error.txt``.
     """
     story = job.folder / "error.txt"
     try:
@@ -144,7 +144,7 @@ def _train(job: Job) -> RunResult:
         if can_resume(job.folder):
             return resume(job.folder, callbacks=callbacks, progress=False)
         home = RunFolder(job.folder)
-        for left in (home.config, home.metrics):  # the run was stopped before its first checkpoint
+        for left in (home.config, home.metrics):  # left by a stop before the first checkpoint
             left.unlink(missing_ok=True)
         return run(build(job.recipe), job.folder, callbacks=callbacks, progress=False)
 
@@ -153,8 +153,8 @@ def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:
     """Reads the files of a run's folder, to be sent to another machine.
 
     Args:
-        folder: folder of the run; there may be none yet.
-        checkpoints: whether to take them along. They hold the replay buffers: gigabytes, for many runs.
+        folder: folder of the run; it may not exist yet.
+        checkpoints: whether to include checkpoints. They hold replay buffers, gigabytes for many runs.
 
     Returns:
         Contents by path within the folder.
@@ -175,7 +175,7 @@ def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:
 def unpack(files: dict[str, bytes], folder: Path) -> None:
     """Writes the files from :func:`pack` into a folder, and replaces an existing one.
 
-    It appears as a whole: written beside it, and then renamed.
+    The folder never is incomplete: files are written into another one, which is then renamed.
     """
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)

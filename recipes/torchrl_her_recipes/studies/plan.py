@@ -10,7 +10,7 @@ from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.studies.jobs import Job, kept_progress
 
-# Cost of a gradient step besides its matrix products, in rows times weights of such products.
+# Cost of a gradient step besides its matrix products, in their unit: rows times weights.
 _OVERHEAD = 1e7
 
 
@@ -29,7 +29,7 @@ def relative_cost(recipe: Recipe, epochs: int) -> float:
 
 
 def wall_clock(seconds: Iterable[float], at_once: int) -> float:
-    """Computes the time until all jobs are done, each of which starts when a worker is free.
+    """Computes the seconds until all jobs are done, if a job starts whenever a worker is free.
 
     Example:
         >>> wall_clock([3.0, 2.0, 2.0], at_once=2)
@@ -58,10 +58,10 @@ class Plan:
     """The jobs of a study, and the progress of each.
 
     Args:
-        jobs: in the order of the table.
+        jobs: jobs in the order of the table.
 
     Attributes:
-        progress: how far each is, by label.
+        progress: epochs and seconds of each job, by label.
 
     Raises:
         ValueError: the folder of a job holds a run with other options.
@@ -80,7 +80,7 @@ class Plan:
 
     @property
     def to_go(self) -> list[Job]:
-        """Unfinished jobs, the longest first, so that no core waits for long at the end."""
+        """Unfinished jobs, the longest first, so that cores are idle only shortly at the end."""
         return sorted((job for job in self.jobs if not self.is_done(job)), key=self._cost_to_go, reverse=True)
 
     @property
@@ -112,7 +112,7 @@ class Plan:
         return lines
 
     def about(self, jobs: Iterable[Job], at_once: int, text: str) -> str:
-        """Inserts the time until some jobs are done in place of ``{}``; empty if it is not known yet."""
+        """Replaces ``{}`` in a text by the time until jobs are done; empty if the time is not known yet."""
         seconds = self.wall_clock(jobs, at_once)
         return "" if math.isnan(seconds) else text.format(f"about {duration(seconds)}")
 
@@ -131,7 +131,7 @@ class Plan:
 
 
 def _begun(job: Job) -> Recipe:
-    """Returns the recipe in a job's folder, or that of the job if the file is missing or damaged."""
+    """Returns the recipe in a job's folder, or the job's recipe if the file is missing or damaged."""
     try:
         return RunFolder(job.folder).recipe()
     except ValueError:

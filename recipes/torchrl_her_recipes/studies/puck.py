@@ -16,7 +16,7 @@ _NEAR = 0.1  # distance from the goal, in half tables, below which it is achieve
 
 
 class Puck(EnvBase):
-    """N pucks without friction on tables with cushions that stop them, each pushed by a force.
+    """N pucks without friction, each pushed by a force on a table whose cushions stop it.
 
     An episode has 50 steps and begins at rest. Starts and goals are uniform on the table [-1, 1]². Nothing
     ends an episode early: a puck that arrives too fast slides past its goal.
@@ -51,12 +51,12 @@ class Puck(EnvBase):
         self.set_seeds([seed] if isinstance(seed, int) else seed)
 
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Returns 0 where goals [..., 2] are near each other and -1 elsewhere: [..., 1]."""
+        """Returns rewards [..., 1]: 0 if two goals [..., 2] are near each other, else -1."""
         near = (achieved_goal - desired_goal).norm(dim=-1, keepdim=True) < _NEAR
         return near.float() - 1.0
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
-        """Seeds R equal blocks of environments, each as if alone."""
+        """Seeds R equal blocks of environments; what a block draws does not depend on other blocks."""
         self._generators = [torch.Generator().manual_seed(seed) for seed in seeds]
 
     def _set_seed(self, seed: int | None) -> None:

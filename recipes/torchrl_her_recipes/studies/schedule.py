@@ -14,7 +14,7 @@ from torchrl_her_recipes.studies.jobs import Job, Outcome, kept_progress
 from torchrl_her_recipes.studies.plan import Plan
 from torchrl_her_recipes.studies.workers_local import Workers
 
-_TICK = 1.0  # seconds
+_TICK = 1.0  # seconds between two updates of the progress
 _BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [{elapsed}{postfix}]"
 _STOPPING = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [saving what there is]"
 _PART = 0.05  # fraction of all steps after which a line is printed, if there is no terminal
@@ -23,11 +23,11 @@ _PART = 0.05  # fraction of all steps after which a line is printed, if there is
 def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str, Outcome]:
     """Runs all unfinished jobs of a plan.
 
-    One that fails holds no other back. The first Ctrl-C lets all of them save what they have; a later
-    one ends them at once.
+    If a job fails, the others are still run. The first Ctrl-C stops all jobs after they have saved their
+    state; the second one ends them at once.
 
     Returns:
-        What came of each job, by label.
+        The outcome of each job, by label.
     """
     jobs = plan.to_go
     outcomes: dict[str, Outcome] = {}
@@ -60,7 +60,7 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
 
 
 def outcome_of(future: Future[Outcome]) -> Outcome:
-    """Returns the outcome of a job, also if the worker itself has failed."""
+    """Returns the outcome of a job, even if the worker itself has failed."""
     error = future.exception()
     return future.result() if error is None else Outcome(error=" ".join(f"{error!r}".split()))
 

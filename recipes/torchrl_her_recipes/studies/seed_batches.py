@@ -47,7 +47,7 @@ class Batches:
 
     @cached_property
     def shown(self) -> list[RunFolder]:
-        """Folders that are read: the finished ones, or else those with results."""
+        """Folders that are read: finished ones, or those with results if none is finished."""
         return self._done or [home for home in self.homes if home.rows()]
 
     @property
@@ -126,7 +126,7 @@ def share_out(seeds: Sequence[int], *, most: int) -> list[list[int]]:
     """Divides neighboring seeds into batches, as few and as equal as possible.
 
     Args:
-        seeds: in rising order, not all of them neighbours.
+        seeds: in rising order, possibly with gaps.
         most: maximum number of seeds in a batch.
 
     Example:

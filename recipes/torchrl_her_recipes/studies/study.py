@@ -1,4 +1,4 @@
-"""Runs a study or single runs, as far as unfinished, on all cores or a cluster."""
+"""Runs the unfinished runs of a study or sweep, on all cores or a cluster."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class StudyResult:
     """The result of a study, or of single runs.
 
     Attributes:
-        figure: the picture of a study, if all of it is done.
-        successes: success of each run in its last evaluation, by the name of its combination if all runs of
-            that are done; of a single run by its own name.
-        failed: reasons by the label of the job. The others are not held back by it.
-        interrupted: whether it was stopped; it can be resumed.
+        figure: the picture of a study, if all its runs are done.
+        successes: success of each run in its last evaluation, by the name of the combination (of several
+            options), or of the single run. Combinations with unfinished runs are left out.
+        failed: reasons of failures, by the label of the job. Other jobs are run nevertheless.
+        interrupted: whether the study was stopped; it can be resumed.
     """
 
     figure: Path | None = None
@@ -50,8 +50,8 @@ def plan_study(study: Study | Mapping[str, Recipe], folder: Path) -> Plan:
 
     Args:
         study: study to run; or recipes of single runs, by the names of their folders.
-        folder: a folder of each combination or single run goes into it, or is there already. Seeds that a
-            combination lacks are added to those that it has.
+        folder: folder with a folder for each combination or single run, which may exist already. If an
+            existing combination lacks seeds of the study, jobs are planned for these seeds.
 
     Raises:
         ValueError: the folder has a run of other options under the same name.
@@ -77,14 +77,14 @@ def run_study(
 
     Args:
         study: study to run; or recipes of single runs, by the names of their folders.
-        folder: a folder of each combination or single run goes into it.
-        workers: who does it; by default a process for each core. They are closed in the end.
-        progress: whether to show a progress bar over all of it.
+        folder: folder in which each combination or single run gets a folder.
+        workers: workers that run the jobs, by default a process for each core; closed at the end.
+        progress: whether to show a progress bar for the whole study.
 
     Raises:
         ValueError: the folder has a run of other options under the same name, another process is using it, or
             a task names a module that must not be imported.
-        KeyboardInterrupt: by a second Ctrl-C.
+        KeyboardInterrupt: Ctrl-C was pressed a second time.
     """
     runs = dict(study.cells()) if isinstance(study, Study) else study
     for recipe in runs.values():
@@ -132,7 +132,7 @@ def _note(runs: Mapping[str, Recipe]) -> str:
 
 
 def draw_study(study: Study, folder: Path) -> Path:
-    """Draws metrics over environment steps: a panel for each task, a curve for each other combination."""
+    """Draws metrics over environment steps: a panel for each task, with a curve for each combination."""
     path = folder / f"{study.name}.png"
     panels: dict[str, dict[str, list[dict[str, float]]]] = {}
     for label, recipe in study.cells():

@@ -1,4 +1,4 @@
-"""A task whose lengths are in another unit, to test whether an agent depends on units."""
+"""A task whose lengths are multiplied by a factor, to test whether an agent depends on their unit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class InUnits(GoalEnv):
 
     Args:
         env: environments from :func:`~torchrl_her_envs.make_env`.
-        factor: factor of all observations and goals, and of how near to a goal is achieved.
+        factor: factor of observations and goals, and of the distance below which a goal is achieved.
     """
 
     def __init__(self, env: EnvBase, factor: float) -> None:

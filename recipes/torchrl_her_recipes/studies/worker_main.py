@@ -1,7 +1,7 @@
 """Worker process: runs the jobs from its standard input, one after the other, until the input ends.
 
-The end of its input also stops it in the middle of a job, so it stops as well if
-the process that started it is gone: it saves its run and ends.
+If the input ends in the middle of a job, the process saves its run and ends. So it also stops if
+the process that started it is gone.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ def main() -> None:
     logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
     try:
         with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as answers:
-            os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keeps other output out of them
+            os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keeps other output out of the outcomes
             _serve(answers)
     except BrokenPipeError:
-        pass  # the other process is gone
+        pass  # the process that started this one is gone
 
 
 def _serve(answers: BinaryIO) -> None:
@@ -37,8 +37,8 @@ def _serve(answers: BinaryIO) -> None:
     working = False
 
     def stop(_number: int, _frame: FrameType | None) -> None:
-        # Between jobs there is nothing to stop, and raising in the garbage collection or at exit would only
-        # keep semaphores from being given back.
+        # Between jobs there is nothing to stop, and an error in the garbage collection or at exit would only
+        # prevent the release of semaphores.
         if working:
             raise KeyboardInterrupt
 

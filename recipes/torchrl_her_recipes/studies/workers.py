@@ -20,7 +20,7 @@ def make_workers(*, jobs: int | None = None, ray: str | None = None, gpus_per_jo
 
     Raises:
         ImportError: Ray is not installed.
-        ValueError: no node of the cluster has so much of a GPU.
+        ValueError: no node of the cluster has this share of a GPU.
         ConnectionError: there is no cluster at the address.
     """
     if ray is None:

@@ -26,8 +26,8 @@ class Workers(Protocol):
     def run(self, job: Job) -> Outcome:
         """Waits for a free worker, runs the job there, and returns when it has ended.
 
-        Called from threads. Jobs must not overlap within a process: TorchRL's exploration type, and torch's
-        random numbers, are those of all its threads.
+        Called from threads. Two jobs must not run in one process at the same time, since threads share
+        TorchRL's exploration type and torch's random numbers.
         """
 
     def progress(self) -> dict[str, Progress]:
@@ -43,7 +43,7 @@ class Workers(Protocol):
 class LocalWorkers:
     """Worker processes on this machine, each of which does one job at a time; see :class:`Workers`.
 
-    They are in sessions of their own: Ctrl-C reaches them by :meth:`stop` only, never in a bad moment.
+    Each process is in its own session, so that Ctrl-C does not reach it: it is stopped by :meth:`stop`.
 
     Args:
         at_once: number of processes; by default one for each core.
@@ -53,7 +53,7 @@ class LocalWorkers:
         if at_once is not None and at_once < 1:
             raise ValueError(f"jobs must be at least 1, got {at_once}")
         self.at_once = at_once or _cores()
-        self._places: LifoQueue[_Worker | None] = LifoQueue()  # with the process that waits there, if any
+        self._places: LifoQueue[_Worker | None] = LifoQueue()  # free places, with an idle process or None
         for _ in range(self.at_once):
             self._places.put(None)
         self._busy: dict[str, tuple[Job, _Worker]] = {}
@@ -65,7 +65,7 @@ class LocalWorkers:
             if self._stopped:
                 return Outcome(interrupted=True)
             worker = worker or _Worker()
-            self._busy[job.label] = job, worker  # from here on, stop() reaches it
+            self._busy[job.label] = job, worker  # from here on, stop() stops the job
             if self._stopped:
                 worker.stop()
             outcome = worker.run(job)
@@ -93,7 +93,7 @@ class LocalWorkers:
             for place in places:
                 if place is not None:
                     place.end()
-        finally:  # also after a Ctrl-C: it may be closed once more
+        finally:  # after Ctrl-C, too, since close() may be called again
             for _ in places:
                 self._places.put(None)
 
@@ -109,7 +109,7 @@ class _Worker:
     """A worker process, seen from outside; see :mod:`torchrl_her_recipes.studies.worker_main`."""
 
     def __init__(self) -> None:
-        environment = {"OMP_NUM_THREADS": "1", **os.environ}  # each has a core for itself, and no more
+        environment = {"OMP_NUM_THREADS": "1", **os.environ}  # one thread: each has one core
         self._process = subprocess.Popen(
             _COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True
         )
@@ -123,7 +123,7 @@ class _Worker:
             pickle.dump(job.to_plain(), self._jobs)
             self._jobs.flush()
             return pickle.load(self._answers)
-        except (OSError, EOFError, ValueError, pickle.UnpicklingError):  # its pipes are broken, or closed
+        except (OSError, EOFError, ValueError, pickle.UnpicklingError):  # the pipes are broken or closed
             return Outcome(error=self.end(), died=True)
 
     def stop(self) -> None:

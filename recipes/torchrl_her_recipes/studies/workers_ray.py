@@ -1,7 +1,7 @@
 """Workers on the nodes of a Ray cluster for the jobs of a study. Needs the extra `cluster`.
 
-Nothing is asked of the nodes but this package: no shared disk. A job is done in a temporary folder of
-whichever node has a core free, and its files come home when it ends.
+Nodes need only this package, and no shared disk. A job runs in a temporary folder on a node with a free
+core, and its files are sent to this machine when it ends.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from torchrl_her_recipes.studies.jobs import (
 )
 
 _RETRIES = 3  # retries of a job whose node died
-_REPORT = 0.5  # seconds between two looks at how far a run is
+_REPORT = 0.5  # seconds between two reports of a run's progress
 
 
 class RayWorkers:
     """The nodes of a Ray cluster, one job for each core.
 
-    Ray does a job again, up to three times, if its node or process dies.
+    Ray runs a job again, up to three times, if its node or process dies.
 
     Args:
         address: address of the cluster, HOST:PORT, or ``auto`` for the one that this machine is a node of.
         gpus_per_job: the share of a GPU that each job gets, such as 0.25; 0 for none.
 
     Raises:
-        ConnectionError: there is none.
-        ValueError: it has no node with so much of a GPU.
+        ConnectionError: there is no cluster at the address.
+        ValueError: no node of the cluster has this share of a GPU.
     """
 
     def __init__(self, address: str = "auto", *, gpus_per_job: float = 0.0) -> None:
@@ -82,7 +82,7 @@ class RayWorkers:
         """Runs a job on a node with a free core, and fetches its files."""
         needs = _work.options(num_cpus=job.recipe.run.threads, num_gpus=self._gpus)
         task = needs.remote(job.to_plain(), _begun(job), self._board)
-        self._tasks[job.label] = task  # from here on, stop() cancels it
+        self._tasks[job.label] = task  # from here on, stop() cancels the job
         if self._stopped:
             ray.cancel(task)
         try:
@@ -98,14 +98,14 @@ class RayWorkers:
     def progress(self) -> dict[str, Progress]:
         try:
             board = ray.get(self._board.read.remote())
-        except RayError:  # this machine's node is gone, and run() raises, too
+        except RayError:  # this machine's node is gone; run() raises an error, too
             board = {}
         return {label: board[label] for label in list(self._tasks) if label in board}
 
     def stop(self) -> None:
         self._stopped = True
         for task in list(self._tasks.values()):
-            ray.cancel(task)  # acts as Ctrl-C on jobs that have begun
+            ray.cancel(task)  # jobs that have begun get a KeyboardInterrupt, as by Ctrl-C
 
     def close(self) -> None:
         """Kills running jobs and leaves the cluster."""

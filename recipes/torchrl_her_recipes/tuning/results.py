@@ -23,7 +23,7 @@ from torchrl_her_recipes.runs.plots import save_figure
 
 _FEWEST = 5  # least number of complete trials for estimates of importance
 _SHOWN = 5  # number of trials in the printed table
-# Attribute of the trial of the recipe as it is: its values, some of which may lie outside of the space.
+# Attribute of the trial of the unchanged recipe: its values, some of which may be outside of the space.
 DEFAULT = "default"
 
 

@@ -37,9 +37,9 @@ from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
 from torchrl_her_recipes.tuning.results import DEFAULT, folder_of, write_pictures, write_results
 
 _NAME, _SETTINGS, _DATABASE = "search", "search.yaml", "search.db"
-_TICK = 1.0  # seconds
+_TICK = 1.0  # seconds between two checks of running trials
 _ATTEMPTS = 3  # attempts at a trial whose process dies
-_FAILURES = 5  # failures before any success: something other than the options is wrong
+_FAILURES = 5  # failures before any success after which the search ends, since options cannot be the cause
 _ATTEMPT, _REPEATED, _PRUNED, _ERROR = "attempt", "repeated", "pruned", "error"
 
 
@@ -49,7 +49,7 @@ class SearchResult:
 
     Attributes:
         study: Optuna's study. Trials with the attribute ``repeated`` were cut short and run again.
-        folder: with the best trial as a preset, a table and pictures.
+        folder: folder with the best trial as a preset, a table and pictures.
         interrupted: whether the user stopped the search. The same call resumes it.
     """
 
@@ -70,7 +70,7 @@ class SearchResult:
 
     @property
     def failed(self) -> dict[int, str]:
-        """Why trials failed, by the number of the trial."""
+        """Reasons why trials failed, by the number of the trial."""
         failed = (trial for trial in self.trials if trial.state == TrialState.FAIL)
         return {trial.number: trial.user_attrs.get(_ERROR, "") for trial in failed}
 
@@ -96,7 +96,7 @@ def tune(
     Keyword Args:
         trials: number of trials in the folder at the end; 50 if ``minutes`` is not given either.
         minutes: time after which no further trial begins.
-        workers: run the trials; by default a process for each core. They are closed at the end.
+        workers: workers that run the trials, by default a process for each core; closed at the end.
         say: called with a line for each trial that ends.
         progress: whether to show a progress bar.
 
@@ -105,7 +105,7 @@ def tune(
             positive, or the task names a module that must not be imported.
         ImportError: the sampler needs a package that is not installed.
         OSError: the database cannot be used, for instance because the disk is full.
-        KeyboardInterrupt: at a second Ctrl-C.
+        KeyboardInterrupt: Ctrl-C was pressed a second time.
     """
     if trials is not None and trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")
@@ -172,7 +172,7 @@ def _begin(search: Search, database: Path) -> Study:
 def _storage(database: Path) -> RDBStorage:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
 
-    def connect() -> sqlite3.Connection:  # characters of the path may have a meaning in a URL
+    def connect() -> sqlite3.Connection:  # not by a URL, in which characters of the path may have a meaning
         return sqlite3.connect(database, timeout=60, check_same_thread=False)
 
     return RDBStorage("sqlite:///search.db", engine_kwargs={"creator": connect})
@@ -182,7 +182,7 @@ def make_sampler(name: str, seed: int) -> optuna.samplers.BaseSampler:
     """Makes one of Optuna's samplers.
 
     Raises:
-        ImportError: it needs a package that is not installed.
+        ImportError: the sampler needs a package that is not installed.
     """
     if name == "cmaes" and find_spec("cmaes") is None:
         raise ImportError("--sampler cmaes needs cmaes: pip install '.[tune]'")
@@ -195,7 +195,7 @@ def make_sampler(name: str, seed: int) -> optuna.samplers.BaseSampler:
 
 
 def _make_pruner(name: str, epochs: int) -> optuna.pruners.BasePruner:
-    if name == "median":  # no earlier than two fifths of the way: success comes late
+    if name == "median":  # from two fifths of the epochs on, since success comes late
         return optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=2 * epochs // 5)
     if name == "halving":
         return optuna.pruners.SuccessiveHalvingPruner(min_resource=max(epochs // 9, 1), reduction_factor=3)
@@ -230,7 +230,7 @@ class _TrialRuns:
         self._running: dict[Future[Outcome], Trial] = {}
 
     def run(self, trials: int | None, minutes: float | None, *, progress: bool) -> bool:
-        """Runs trials up to a limit; returns whether it was interrupted."""
+        """Runs trials up to a limit; returns whether the user interrupted them."""
         end = None if minutes is None else time.monotonic() + 60 * minutes
         bar = tqdm(total=trials, initial=self._done(), unit=" trials", disable=None if progress else True)
         with bar, ThreadPoolExecutor(max(self.workers.at_once, 1)) as threads, soft_interrupt() as check:
@@ -266,7 +266,7 @@ class _TrialRuns:
         space, ranges = self.search.space, self.search.space.distributions()
         waiting = self.study.get_trials(deepcopy=False, states=(TrialState.WAITING,))
         if waiting and (default := waiting[0].user_attrs.get(DEFAULT)) is not None:
-            # Other values of the first trial lie outside of the space.
+            # The first trial lacks options whose values in the recipe are outside of the space.
             ranges = {name: ranges[name] for name in space.inside(default)}
         trial = self.study.ask(ranges)
         try:
@@ -307,7 +307,7 @@ class _TrialRuns:
         else:
             self._tell(trial, TrialState.COMPLETE, value=score(run.rows()))
             return
-        for path in run.checkpoints:  # large, and no longer needed
+        for path in run.checkpoints:  # checkpoints are large, and no longer needed
             path.unlink(missing_ok=True)
 
     def _tell(self, trial: Trial, state: TrialState, *, value: float | None = None, error: str = "") -> None:
