@@ -25,7 +25,7 @@ def uniform(
     Args:
         counts: R numbers of rows; a run without rows draws nothing.
         width: numbers in a row.
-        generators: R, one of each run; None for torch's own.
+        generators: R generators, one for each run; None for torch's own.
 
     Keyword Args:
         dtype, device: type and device of the numbers.
@@ -52,7 +52,7 @@ class RunDraws:
     """Uniform numbers for transitions, from the generator of each transition's run.
 
     Args:
-        generators: R.
+        generators: R generators, one for each run.
         run: [n], ascending; None for one run.
 
     Example:

@@ -55,10 +55,10 @@ class StackedLinear(nn.Module):
 class StackedBatchNorm(nn.Module):
     """Batch normalization in which each run has its own statistics.
 
-    A batch is normalized by its own statistics only where the weights learn from it, in the critic's own
-    loss; these alone move the running statistics. Where weights get no gradient, in target networks and in
-    the actor's loss, and in evaluation mode, the running statistics are used. With the statistics of the
-    batch, an actor could hardly raise the mean of the values, which the normalization takes out.
+    In the critic's own loss, where weights learn, a batch is normalized by its own statistics and moves the
+    running ones. In target networks, in the actor's loss and in evaluation mode, the running statistics are
+    used and stay. With those of the batch, an actor could hardly raise the mean of the values, since
+    normalization takes it out.
 
     Args:
         width: Width of the input.
@@ -126,7 +126,7 @@ class NetworkShape:
     Args:
         hidden: width of each hidden layer.
         depth: number of hidden layers, at least 2.
-        activation: behind each of them: ``"relu"``, ``"tanh"`` or ``"elu"``.
+        activation: function behind each hidden layer: ``"relu"``, ``"tanh"`` or ``"elu"``.
         norm: ``"layer"`` for layer normalization before each activation, ``"none"`` without; ``"batch"`` for
             batch normalization of the hidden layers and, in a critic, of its input, but not in actors.
 
@@ -157,7 +157,7 @@ def hidden_layers(inputs: int, shape: NetworkShape, *, joined: int = 0, runs: in
     Args:
         inputs: width of the input.
         shape: width, number and kind of the layers.
-        joined: width of what the second one takes in besides the outputs of the first.
+        joined: width of a further input that the second layer takes besides the outputs of the first.
         runs: R.
 
     Example:
@@ -286,7 +286,7 @@ def stack_runs(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
         states: ``state_dict()`` of R networks of the same shape, each of a single run.
 
     Returns:
-        What ``load_state_dict`` of the same network with ``runs=R`` takes.
+        The state dict for the same network with ``runs=R``.
 
     Example:
         >>> pair = ActorNet(3, 1, runs=2)

@@ -29,7 +29,7 @@ class RunNoise:
     What a run draws then does not depend on which other runs are trained beside it.
 
     Args:
-        generators: R of them; None for torch's own generator, which all runs share.
+        generators: R generators; None for torch's own, which all runs share.
 
     Attributes:
         generators: generators of the runs. Copies of this object share them.

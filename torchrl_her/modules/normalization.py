@@ -79,19 +79,19 @@ def normalize(values: Tensor, mean: Tensor, std: Tensor, limit: Tensor) -> Tenso
 class RunningNorm(nn.Module):
     """Running mean and variance of observations and goals, and the normalization by them.
 
-    Raw values are what is collected, relabeled and stored. They are normalized where networks read them: in
-    what is sampled, by :class:`~torchrl_her.modules.NormalizeBatch`, and while acting, by
+    Transitions are collected, relabeled and stored with raw values. These are normalized where networks read
+    them: in sampled batches by :class:`~torchrl_her.modules.NormalizeBatch`, and while acting by
     :class:`~torchrl_her.modules.NormalizedPolicy`. So virtual goals are normalized like desired ones, and old
     transitions by the same statistics as new ones.
 
-    Only :meth:`update` and :meth:`count` change the statistics; a :class:`~torchrl_her.HERWriter` calls the
-    first one with all that it writes (``on_write=norm.update``), virtual transitions included. Acting,
-    evaluating and learning leave them as they are. Before anything was counted, normalization changes
+    Only :meth:`update` and :meth:`count` change the statistics; a :class:`~torchrl_her.HERWriter` calls
+    :meth:`update` with all rows that it writes (``on_write=norm.update``), virtual transitions included.
+    Acting, evaluating and learning leave them as they are. Before anything was counted, normalization changes
     nothing.
 
     R independent runs have statistics of their own; batches are R equal blocks, in the order of the runs.
-    ``state_dict`` holds all statistics, as does that of a policy with this normalization. Each number is
-    normalized by itself, so statistics of a concatenation are those of its parts, side by side.
+    ``state_dict`` holds all statistics, as does that of a policy with this normalization. Each coordinate is
+    normalized by itself, so concatenated entries have the concatenated statistics.
 
     Args:
         widths: widths of the entries that are normalized, by their keys.
@@ -99,11 +99,11 @@ class RunningNorm(nn.Module):
     Keyword Args:
         runs: R.
         clip: normalized values are clipped to [-clip, clip].
-        least_std: least standard deviation, so that entries that hardly ever change are not blown up, in the
-            unit of the values. None for one ten-thousandth of an entry's mean, in whatever unit it is.
+        least_std: least standard deviation, in the unit of the values, so that coordinates that hardly ever
+            change are not blown up. None for one ten-thousandth of their mean, whatever the unit.
 
     Attributes:
-        n, mean, var: [R, W] of float64, the moments of all numbers of all entries, in their order.
+        n, mean, var: [R, W] of float64, the moments of all coordinates of all entries, in their order.
         frozen: whether :meth:`update` and :meth:`count` do nothing. It is no part of ``state_dict``.
 
     Raises:
@@ -196,11 +196,11 @@ class RunningNorm(nn.Module):
             counts: number of rows of each of these runs; None if all have the same.
 
         Returns:
-            What undoes it, see :meth:`snapshot`.
+            A function that undoes the call, see :meth:`snapshot`.
 
         Raises:
             KeyError: an entry is missing.
-            ValueError: it has another width or is not finite, or rows cannot be divided among the runs.
+            ValueError: an entry has another width or is not finite, or rows cannot be divided among the runs.
         """
         undo = self.snapshot()
         if self.frozen:
@@ -247,7 +247,7 @@ class RunningNorm(nn.Module):
 
         Args:
             key: key of the entry.
-            values: [..., width], or less wide: then they are the first numbers of the entry.
+            values: [..., width]; narrower values are the first coordinates of the entry.
 
         Keyword Args:
             run: index of the run that they belong to.

@@ -29,10 +29,10 @@ class NormalizeBatch(Transform):
         norm: the statistics, shared with the policy (:class:`~torchrl_her.modules.NormalizedPolicy`).
 
     Keyword Args:
-        counted_k: None if written transitions are counted elsewhere, as ``HERWriter(on_write=norm.update)``
+        counted_k: None if another part counts written transitions, as ``HERWriter(on_write=norm.update)``
             does. In a buffer with a plain writer and a :class:`~torchrl_her.HERSampleUnit`, the k of that
-            unit: then all that is written counts here, and each achieved goal under ``next`` as k desired
-            goals.
+            unit: this transform then counts all that is written, and each achieved goal under ``next`` as k
+            desired goals.
         keys: keys of the goals, for ``counted_k``.
 
     Raises:
@@ -95,10 +95,10 @@ class NormalizeBatch(Transform):
 class NormalizedPolicy(TensorDictModuleBase):
     """Gives a policy normalized inputs, and leaves the entries that others read unchanged.
 
-    Only what the actor writes is put into the tensordict, so collectors yield raw observations and goals,
-    which is what has to be stored. Exploration belongs behind this module, or within the actor. The
-    statistics are part of this module's ``state_dict``, so checkpoints have them, and collectors in other
-    processes get them with the weights.
+    Only the actor's outputs are put into the tensordict, so collectors yield raw observations and goals, as
+    buffers must store them. Exploration belongs behind this module, or within the actor. The statistics are
+    part of this module's ``state_dict``, so checkpoints have them, and collectors in other processes get them
+    with the weights.
 
     Args:
         actor: trained on batches of :class:`~torchrl_her.modules.NormalizeBatch`. Losses take the actor

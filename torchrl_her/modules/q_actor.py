@@ -27,7 +27,7 @@ class BestAction(nn.Module):
     """Greedy policy: maps (observation, goal) to the action of the greatest value.
 
     Args:
-        net: gives the values; it may be shared.
+        net: network that gives the values; other modules may share it.
 
     Example:
         >>> import torch

@@ -45,7 +45,7 @@ class StochasticActor(ProbabilisticActor):
 
     Args:
         *args: arguments of :class:`torchrl.modules.ProbabilisticActor`.
-        generators: R of them; None for torch's own generator, which all runs share.
+        generators: R generators; None for torch's own, which all runs share.
         **kwargs: keyword arguments of the same class.
     """
 
@@ -79,9 +79,9 @@ class SquashedLocation(nn.Module):
     """The greedy action of a stochastic actor: the location of its normal distribution, squashed and scaled.
 
     Args:
-        net: network of the actor; it may be shared.
+        net: network of the actor, which may share it.
         low: the least actions [width].
-        high: the greatest ones.
+        high: the greatest actions [width].
 
     Example:
         >>> greedy = SquashedLocation(StochasticActorNet(3, 1), torch.tensor([0.0]), torch.tensor([10.0]))

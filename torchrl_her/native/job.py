@@ -42,7 +42,7 @@ class Norm(IntEnum):
 
 
 class Layer(ctypes.Structure):
-    """Layer of a network: its widths, and how many of its inputs come in here (the action, in a critic).
+    """Layer of a network: its widths, and how many inputs join the network here (in a critic, the action).
 
     A layer of no inputs normalizes the network's input.
     """

@@ -1,4 +1,4 @@
-"""Compiling C++ for this machine, once, and loading it; or loading what a wheel carries.
+"""Compiling C++ for this machine, once, and loading it; or loading the library in a wheel.
 
 The build of a wheel runs this file where torch is not installed (``hatch_build.py``).
 """
@@ -28,7 +28,7 @@ _FLAGS = (
     "-shared",
     "-fPIC",
 )
-# Tried in this order, since not every compiler knows them, and some (zig) have no library for OpenMP.
+# Options, tried in this order: not every compiler knows all, and some (zig) have no library for OpenMP.
 _EXTRAS = (
     ("-march=native", "-mprefer-vector-width=512", "-fopenmp"),
     ("-march=native", "-mprefer-vector-width=512", "-fopenmp-simd"),
@@ -40,7 +40,8 @@ _EXTRAS = (
 )
 _V3 = frozenset(("abm", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"))
 _ARM: dict[str, frozenset[str]] = {"armv8-a": frozenset()}  # any processor of this kind
-# Levels that wheels carry libraries for, the fastest first, and what /proc/cpuinfo lists for each.
+# Levels, that is sets of instructions, for which wheels have libraries: the fastest first, with the flags of
+# each in /proc/cpuinfo.
 LEVELS = {
     "x86_64": {
         "x86-64-v4": _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
@@ -62,17 +63,17 @@ def load_library(source: str, *, headers: Sequence[str] = (), real: str = "float
 
     It is compiled for this processor the first time, which takes some seconds, and kept in the user's cache:
     the folder that ``TORCHRL_HER_CACHE`` names, or ``torchrl_her`` in that of ``XDG_CACHE_HOME``. The
-    compiler is ``CXX`` from the environment, or else g++, clang++ or c++. Without one, the library is the
-    one that the wheel carries for such processors, or else it is compiled by the package ``ziglang``.
+    compiler is ``CXX`` from the environment, or else g++, clang++ or c++. Without a compiler, the wheel's
+    library for such processors is loaded, or else the package ``ziglang`` compiles.
 
     Args:
         source: the file's name.
         headers: the files that it includes.
-        real: what ``REAL`` stands for in it.
+        real: type that ``REAL`` stands for in the source.
 
     Raises:
         CannotCompile: there is no compiler, or it failed, or the library cannot be loaded; the message says
-            which. No wheel's library can be loaded instead.
+            which. Nor can a wheel's library be loaded.
     """
     errors: list[Exception] = []
     for load in (
@@ -82,7 +83,7 @@ def load_library(source: str, *, headers: Sequence[str] = (), real: str = "float
     ):
         try:
             return load()
-        # A compiler that cannot run, no home, a full disk, a folder that must not be written.
+        # Possible causes: a compiler that cannot run, no home, a full disk, a folder without write access.
         except (OSError, RuntimeError) as error:
             errors.append(error)
     if isinstance(errors[0], CannotCompile):
@@ -116,7 +117,7 @@ def shipped_name(source: str, real: str) -> str:
 
 
 def levels(machine: str, flags: Collection[str]) -> list[str]:
-    """Returns the levels whose libraries a processor can run, the fastest first.
+    """Returns the levels (sets of instructions) whose libraries a processor can run, the fastest first.
 
     Args:
         machine: kind of processor, as ``platform.machine()`` names it.
@@ -141,12 +142,12 @@ def _load_shipped(source: str, real: str) -> ctypes.CDLL:
 def _load_compiled(compiler: Sequence[str], source: str, headers: Sequence[str], real: str) -> ctypes.CDLL:
     folder = Path(__file__).parent
     text = "".join((folder / name).read_text(encoding="utf-8") for name in (source, *headers))
-    # The processor is part of it: machines that need other instructions may share a cache.
+    # The processor is part of the name: machines that need other instructions may share a cache.
     processor = (platform.machine(), platform.processor(), _processor_flags())
     made_of = (text, real, *compiler, _version(compiler), str(_FLAGS), str(_EXTRAS), *processor)
     name = hashlib.sha256("\n".join(made_of).encode()).hexdigest()[:20]
     library = _cache() / f"{Path(source).stem}-{real}-{name}.so"
-    with contextlib.suppress(OSError):  # it is not there yet, or damaged
+    with contextlib.suppress(OSError):  # the library is missing or damaged
         return ctypes.CDLL(str(library))
     _LOGGER.info("compiling %s (%s), once for this machine", source, real)
     return _compile(compiler, folder / source, real, library)
@@ -165,13 +166,13 @@ def _compile(compiler: Sequence[str], source: Path, real: str, library: Path) ->
             except (CannotCompile, OSError) as error:
                 errors.append(error)
             else:
-                os.replace(compiled, library)  # at once: other processes may be compiling the same
+                os.replace(compiled, library)  # atomic: other processes may compile it, too
                 return loaded
     raise errors[0]
 
 
 def find_compiler() -> list[str]:
-    """Returns the compiler and options of its own: ``CXX`` may say ``ccache g++``.
+    """Returns the compiler with its own options, since ``CXX`` may be ``ccache g++``.
 
     Raises:
         CannotCompile: there is none.

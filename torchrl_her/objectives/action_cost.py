@@ -12,7 +12,7 @@ def action_cost(action: Tensor, *, l2: float = 0.0, saturation: float = 0.0) -> 
     """Cost of actions in an actor's loss: their mean square, and how far they are saturated.
 
     An actor that ends in tanh gets no gradient where its actions are at their bounds. The action L2 penalty
-    of OpenAI's HER prevents that by pulling all actions towards 0, and an actor whose critic cannot tell
+    of OpenAI's HER prevents that by pulling all actions towards 0, but then an actor whose critic cannot tell
     actions apart yet learns to stand still. The saturation penalty acts on ``atanh(action)`` beyond 2 alone,
     where its slope is not flattened by tanh, and leaves all other actions free.
 

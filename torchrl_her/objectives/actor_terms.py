@@ -19,7 +19,7 @@ class ActorTerms:
     Args:
         action_penalty: weight of the action L2 penalty, see :func:`~torchrl_her.objectives.action_cost`.
         saturation_penalty: weight of the saturation penalty, which is for deterministic actors.
-        cloning: clones the behavior in rows that are marked as demonstrations; None for none.
+        cloning: options for cloning the actions of rows marked as demonstrations; None for no cloning.
     """
 
     action_penalty: float = 0.0
@@ -30,9 +30,9 @@ class ActorTerms:
         """Adds the terms to the loss of an actor.
 
         Args:
-            value: its loss: the mean over all rows, or one number for each.
+            value: the actor's loss: the mean over all rows, or one number for each row.
             loss: TorchRL loss that has the actor.
-            action: [..., a], from -1 to 1, of the actor.
+            action: [..., a], the actor's actions, from -1 to 1.
             transitions: rows [...].
         """
         cost = action_cost(action, l2=self.action_penalty, saturation=self.saturation_penalty)

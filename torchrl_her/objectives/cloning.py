@@ -49,8 +49,8 @@ def cloning_terms(
     demonstrations, 2018 (arXiv 1709.10089), equations 2 and 3.
 
     Args:
-        action: [..., B, a], of the policy.
-        demonstrated: [..., B, a].
+        action: [..., B, a], actions of the policy.
+        demonstrated: [..., B, a], actions of the demonstrations.
         flagged: [..., B] of bool, which rows are demonstrations.
 
     Keyword Args:
@@ -78,9 +78,9 @@ def with_cloning(value: Tensor, loss: Any, cloning: Cloning, transitions: Tensor
     For stochastic policies the cloned action is the greedy one.
 
     Args:
-        value: the actor's loss: the mean over all rows, or one number for each.
+        value: the actor's loss: the mean over all rows, or one number for each row.
         loss: TorchRL loss that has the actor.
-        cloning: how it clones.
+        cloning: options of cloning.
         transitions: rows [..., B]; each block of B is averaged by itself.
 
     Raises:

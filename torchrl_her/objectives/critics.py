@@ -20,10 +20,10 @@ from torchrl_her.modules.noise import RunNoise
 def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None:
     """Returns the value of actions, from the critics of a loss.
 
-    TD3 and SAC train several critics, which they make anew from the one they are given. Their value is the
-    least of these, as in their targets. Where targets take some critics at random, it is the mean of all, and
-    in TQC the mean of all quantiles, since the actors follow these means. That of DQN is the value of the
-    best action.
+    TD3 and SAC train several critics, made anew from the one they are given. The value is the least of
+    theirs, as in the targets. If targets use some critics drawn at random, the value is the mean of all
+    critics, and in TQC the mean of all quantiles, since the actors follow these means. In DQN it is the value
+    of the best action.
 
     Args:
         loss: loss of TorchRL, for example from :func:`~torchrl_her.objectives.make_td3_loss`.
@@ -85,7 +85,7 @@ def critic_values(loss: LossModule, transitions: TensorDictBase) -> Tensor | Non
 
 
 def action_key(loss: LossModule) -> Any:
-    """Returns the key of the actions of a loss; DDPG's does not name it, but its actor does."""
+    """Returns the key of the actions of a loss; DDPG's loss does not name it, but its actor does."""
     return loss.actor_network.out_keys[0] if isinstance(loss, DDPGLoss) else loss.tensor_keys.action
 
 
@@ -93,9 +93,9 @@ def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
     """Returns the least value of all critics, or of some that are drawn at random for each run.
 
     Args:
-        values: [N, ...] of N critics; the rest is one equal block for each run.
+        values: [N, ...] of N critics; those of a critic are one equal block for each run.
         count: number of critics that are drawn; 0 for all of them.
-        noise: draws them, if ``count`` is not 0.
+        noise: draws the critics, if ``count`` is not 0.
 
     Returns:
         [...].
@@ -133,10 +133,11 @@ def checked_subset(target_critics: int, critics: int) -> int:
 def as_critics(
     critic: TensorDictModule | Sequence[TensorDictModule],
 ) -> tuple[TensorDictModule | list[TensorDictModule], int]:
-    """Returns one critic that two are made like, or a list of all, as TorchRL takes them, and their number.
+    """Returns one critic, from which TorchRL makes two, or a list of all critics, and their number.
 
-    TorchRL registers the weights of a list of one critic as buffers, which are not trained. So a single one
-    is handed over by itself; TorchRL then draws weights anew, which :func:`connect_critics` puts back.
+    TorchRL registers the weights of a list of one critic as buffers, which are not trained. So a single
+    critic is passed by itself; TorchRL then draws new weights, and :func:`connect_critics` puts the old ones
+    back.
 
     Raises:
         ValueError: the list is empty, or a critic has batch normalization, whose statistics a stack of

@@ -21,7 +21,7 @@ class PenalizedDDPGLoss(DDPGLoss):
     Args:
         *args: arguments of :class:`torchrl.objectives.DDPGLoss`.
         **kwargs: keyword arguments of the same class.
-        terms: these terms.
+        terms: the further terms of the actor's loss.
     """
 
     def __init__(self, *args: Any, terms: ActorTerms = ActorTerms(), **kwargs: Any) -> None:

@@ -34,9 +34,9 @@ class PenalizedSACLoss(SACLoss):
     Args:
         *args: arguments of :class:`torchrl.objectives.SACLoss`.
         **kwargs: keyword arguments of the same class.
-        terms: these terms; penalties are on drawn actions.
+        terms: the further terms of the actor's loss; penalties are on drawn actions.
         target_critics: number of critics that are drawn for targets; 0 for all.
-        noise: source of its random numbers.
+        noise: source of the loss's random numbers.
 
     Raises:
         ValueError: ``target_critics`` is not from 0 to the number of critics, ``alpha_init`` is not positive,
@@ -126,19 +126,19 @@ def make_sac_loss(
 
     Targets contain the policy's entropy besides the rewards, so they may rightly be outside of the range of
     possible returns, and are not clamped unless ``targets`` have a range of rewards. Clamping them makes
-    sense where rewards outweigh entropy, as they do when the temperature has become small: an overestimated
-    value cannot exceed what is possible then.
+    sense where rewards outweigh entropy, as they do when the temperature has become small: then no
+    overestimated value exceeds the possible returns.
 
     Haarnoja et al., Soft actor-critic algorithms and applications, 2018.
 
     Args:
         actor: from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators. Each run that its
             networks are stacked for has a temperature of its own.
-        critic: from :func:`~torchrl_her.make_critic`, a second one is made like it; or all critics in a list.
-            Targets and policy use the least of their values.
+        critic: one from :func:`~torchrl_her.make_critic`; TorchRL makes a second like it. Or a list of all.
+            Targets and policy use the least of the critics' values.
         target_critics: number of critics drawn at random in each gradient step: targets use the least of
-            their values alone, while the policy has the mean of all. 0: both have the least of all. Chen et
-            al., Randomized ensembled double Q-learning, 2021.
+            their values, while the policy has the mean of all critics. With 0, both have the least of all
+            critics. Chen et al., Randomized ensembled double Q-learning, 2021.
         targets: discount, and the rewards whose returns targets are clamped to.
         temperature: first value of the temperature. At TorchRL's 1, entropy outweighs rewards of -1 and 0 for
             so long that some runs never find what is rewarded.

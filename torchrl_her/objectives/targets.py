@@ -22,10 +22,10 @@ class ClampedTD0(TD0Estimator):
     With rewards in [-1, 0], for example, no value is below -1 / (1 - gamma) or above 0. Andrychowicz et al.,
     Hindsight Experience Replay, 2017, appendix A.
 
-    A row may span several steps: its reward is then the discounted sum of their rewards, its ``next`` is that
-    of the last step, and the entry ``steps_to_next_obs`` [B, 1], int64, says how many they are. The next
-    state's value is discounted by ``gamma ** steps_to_next_obs``. Without the entry each row is one step.
-    The bounds are the same in both cases, since the value of a state does not depend on how it is estimated.
+    A row may span several steps: its reward is then the discounted sum of their rewards, its ``next`` is the
+    one of the last step, and the entry ``steps_to_next_obs`` [B, 1], int64, is their number. The next state's
+    value is discounted by ``gamma ** steps_to_next_obs``. Without the entry each row is one step. The bounds
+    are the same in both cases, since the value of a state does not depend on how it is estimated.
 
     Args:
         low: least target.
@@ -78,7 +78,7 @@ class Targets:
         """
         least, greatest = self.reward_range or (-math.inf, math.inf)
         estimator = ClampedTD0(
-            low=min(least, least / (1.0 - self.gamma)),  # once, if the episode ends there, or forever
+            low=min(least, least / (1.0 - self.gamma)),  # one reward, or one in every step forever
             high=max(greatest, greatest / (1.0 - self.gamma)),
             gamma=self.gamma,
             value_network=value_network,

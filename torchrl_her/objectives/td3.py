@@ -29,15 +29,15 @@ class PenalizedTD3Loss(TD3Loss):
     Args:
         *args: arguments of :class:`torchrl.objectives.TD3Loss`.
         **kwargs: keyword arguments of the same class, without ``policy_noise`` and ``noise_clip``.
-        terms: these terms.
+        terms: the further terms of the actor's loss.
         target_critics: number of critics that are drawn for targets; 0 for all.
-        noise: source of its random numbers.
+        noise: source of the loss's random numbers.
 
     Raises:
         ValueError: ``target_critics`` is not from 0 to the number of critics.
     """
 
-    target_noise, target_noise_clip = 0.2, 0.5  # deviation of the noise on the target's actions; the greatest
+    target_noise, target_noise_clip = 0.2, 0.5  # noise on the target's actions: standard deviation, bound
 
     def __init__(
         self,
@@ -120,8 +120,8 @@ def make_td3_loss(
 
     Args:
         actor: from :func:`~torchrl_her.make_actor`.
-        critic: from :func:`~torchrl_her.make_critic`, a second one is made like it; or all critics in a list.
-            Targets use the least of their values.
+        critic: one from :func:`~torchrl_her.make_critic`; TorchRL makes a second like it. Or a list of all.
+            Targets use the least of the critics' values.
         action_spec: least and greatest actions, of one environment.
         target_critics: number of critics drawn at random in each gradient step: targets use the least of
             their values alone; 0 for all. Chen et al., Randomized ensembled double Q-learning, 2021.

@@ -23,10 +23,10 @@ class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
     """TorchRL's TQC loss with more terms in the loss of its actor, for one run or several.
 
     Critics give quantiles of the return instead of its mean. Targets are the quantiles of all critics without
-    the greatest ones, and each critic learns all of them. The actor follows the mean of all quantiles.
+    the greatest ones, and each critic learns all targets. The actor follows the mean of all quantiles.
 
-    Priorities are absolute TD errors: the mean distance between a critic's quantiles and the targets, of the
-    critic where it is greatest.
+    Priorities are absolute TD errors: the mean distance between a critic's quantiles and the targets, for the
+    critic with the greatest distance.
 
     Args:
         *args: arguments of :class:`torchrl.objectives.TQCLoss`.

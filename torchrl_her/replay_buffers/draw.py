@@ -37,7 +37,7 @@ def draw_goals(
 ) -> tuple[Tensor, Tensor]:
     """Draws k virtual goals for each transition, or each episode, by strategy times weights times filter.
 
-    This is for goals of the same episode; see :class:`~torchrl_her.HindsightOptions` for those of others.
+    Goals are of the same episode; for goals of others see :class:`~torchrl_her.HindsightOptions`.
 
     Args:
         before: [n, g], the goals that were achieved before the actions.
@@ -48,15 +48,15 @@ def draw_goals(
     Keyword Args:
         strategy: a name or a function, see :func:`~torchrl_her.goals.candidate_range`.
         weights: maps goals [..., g] to how useful each is, [...], such as
-            :class:`~torchrl_her.GoalWeights`; None for all alike.
+            :class:`~torchrl_her.GoalWeights`; None for equal weights.
         keep: the filter. It maps goals achieved before and goals wanted, [..., g] each and broadcast against
             each other, to bool [...]: which of them may be drawn; None for all.
-        per: whether each transition gets k goals, or each episode: those of its first transition.
+        per: whether each transition gets k goals, or each episode, drawn for its first transition.
         generator: source of the random numbers.
 
     Returns:
-        ``(source, goal_source)``, [V] each: the transitions to be relabeled, each of them k times, and those
-        whose ``after`` is the goal. Transitions without a goal that may be drawn are left out.
+        ``(source, goal_source)``, [V] each: the transitions to be relabeled, each of them k times, and the
+        transitions whose ``after`` is the goal. Transitions without a goal that may be drawn are left out.
 
     Raises:
         ValueError: weights are negative or not finite, or the strategy leaves an episode.
@@ -107,17 +107,17 @@ def draw_for_runs(
 ) -> DrawnGoals:
     """Draws the virtual goals of episodes of several runs, each run with its own weights and generator.
 
-    Each source is a factor of its own: its goals are drawn by candidate times weight times filter, where
-    its candidates are goals of the same episode, or those that the run remembers of recent episodes.
+    Goals are drawn for each source apart, by candidate times weight times filter. The candidates of a source
+    are goals of the same episode, or goals of recent episodes that the run remembers.
 
     Args:
         chunk: Episodes of m runs.
 
     Keyword Args:
-        weights: weights of all runs; None for all goals alike.
-        generators: m of them.
-        recent: the goals of recent episodes of all runs, those of these episodes among them.
-        times: factor for the number of goals drawn in the same episode, relative to the options.
+        weights: weights of all runs; None for equal weights.
+        generators: m generators, one for each run.
+        recent: the goals of recent episodes of all runs, the episodes of ``chunk`` included.
+        times: factor by which the options' number of goals of the same episode is multiplied.
     """
     rows, piece, reward_fn, options = chunk.rows, chunk.piece, chunk.reward_fn, chunk.options
     episodes = piece.episodes
@@ -199,7 +199,7 @@ class _Transitions(NamedTuple):
 
         Args:
             goals: [p, g].
-            lines: positions of each run's goals among these.
+            lines: positions of each run's goals in ``goals``.
             position: [E] int64, the position of each episode's run; None if there is only one.
         """
         line = torch.zeros_like(self.episode) if position is None else position[self.episode]
@@ -210,8 +210,8 @@ class _Transitions(NamedTuple):
     ) -> Callable[[Index, Tensor], Tensor] | None:
         """Returns the filter in the form that :func:`choose_goals` takes.
 
-        Where episodes go on at their goals, it also keeps goals that were not achieved at their ``starts``
-        [E, g].
+        If episodes continue at their goals, the filter also keeps goals that were not achieved at the
+        episodes' ``starts`` [E, g].
         """
         if keep is None:
             return None

@@ -86,9 +86,9 @@ def index_episodes(
         done: [T, N] of bool, time first, N environments; or flat, [T].
         trajectory: ids of the trajectories, integers of the same shape.
         oldest: slot of the oldest row: 0 until the ring is full, then the slot that is overwritten next.
-        seams: pairs of entries, [n, g] each in the order of rows: what a row has after its action, and what
-            the next row of its episode must have before it. An episode ends where they differ: where a
-            second collector uses an id again, or another environment's rows follow.
+        seams: pairs of entries, [n, g] each in the order of rows: one from after a row's action, and the one
+            from before the action that must equal it in the episode's next row. An episode ends where they
+            differ: where a second collector uses an id again, or another environment's rows follow.
 
     Returns:
         The index. An episode that was partly overwritten consists of the rows that are left.

@@ -106,7 +106,7 @@ def failures(
 ) -> tuple[Tensor, Tensor]:
     """Returns where an episode terminated without its goal, as by a fall, and the cost of that.
 
-    It would have terminated there whatever the goal, and at the same cost, so it does for virtual goals, too.
+    Such an end and its cost do not depend on the goal, so virtual goals get both, too.
 
     Args:
         transitions: [n], as collected.
@@ -115,8 +115,8 @@ def failures(
         achieved_reward: the reward of an achieved goal.
 
     Returns:
-        ``(failed, cost)``, [n, 1] of bool, and of rewards: how much less than the reward of the goals there
-        was, 0 where nothing failed.
+        ``(failed, cost)``, [n, 1] each: bool, and the reward minus that of the reward function, which is
+        below 0, or 0 where nothing failed.
 
     Example:
         >>> import torch

@@ -38,7 +38,7 @@ def n_step_return(reward: Tensor, terminated: Tensor, inside: Tensor, gamma: flo
     Args:
         reward: [..., n, 1], of each step of the window.
         terminated: [..., n, 1] of bool.
-        inside: [..., n] of bool, which steps belong to the episode: the first one, and no gap.
+        inside: [..., n] of bool, which steps belong to the episode: the first ones, at least one.
         gamma: the discount of one step.
 
     Example:

@@ -1,4 +1,4 @@
-"""Refuses parts of a replay buffer beside which hindsight would silently be wrong."""
+"""Refuses parts of a replay buffer beside which relabeling would be wrong without an error."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def refuse_beside_writer(
         name: name of the writer, for messages.
         storage: storage into which it writes.
         transitions: the batch that it is to write.
-        options: its own.
+        options: options of the writer.
         runs: number of runs of the writer.
 
     Raises:
@@ -127,8 +127,8 @@ def has_slices(storage: Storage) -> bool:
 def refuse_slices(name: str, storage: Storage) -> None:
     """Raises a ValueError if TorchRL samples wrong sequences from a storage of this kind.
 
-    A sampler of slices writes its marks into a storage of lists. In a full storage of several dimensions,
-    what a prioritized one takes for sequences are none.
+    A sampler of slices writes its marks into the rows of a list storage. In a full storage of several
+    dimensions, the slices of a prioritized sampler are no sequences.
     """
     if isinstance(storage, ListStorage) and has_slices(storage):
         raise ValueError(
@@ -166,7 +166,7 @@ def refuse_n_steps(name: str, transitions: TensorDictBase) -> None:
 def refuse_copies_in_slices(name: str, storage: Storage, options: HindsightOptions) -> None:
     """Raises a ValueError if sequences are sampled from a storage of single transitions.
 
-    These would be copies of one transition, or overlap.
+    The sequences would be copies of one transition, or overlap.
     """
     if not has_slices(storage):
         return

@@ -39,26 +39,27 @@ class HindsightOptions:
             given to :func:`~torchrl_her.register_strategy`, or a function as described there.
         goal_sources: number of virtual goals by source, in place of ``k`` and ``strategy``, which are short
             for a single source: ``k=4, strategy="future"`` is ``{"future": 4}``. Besides strategies there are
-            two sources that look beyond the episode: ``"actual"``, goals that were really wanted in
-            recent episodes, and ``"achieved"``, goals that were achieved in them. ``weights`` and filter act
-            on the goals of all sources. None: ``k`` and ``strategy`` count.
+            two sources that look beyond the episode: ``"actual"``, the desired goals of recent episodes, and
+            ``"achieved"``, goals that were achieved in these episodes. ``weights`` and filter act on the
+            goals of all sources. None: ``k`` and ``strategy`` count.
         recent_actual, recent_achieved: number of the newest goals that these two sources remember: one
             desired goal for each episode, and one achieved goal for each transition. Episodes that are being
-            written are included. If they alone have more goals, those that are kept are spread evenly over
-            environments and time. A sample unit reads the same numbers of the newest stored episodes and
+            written are included. If these alone have more goals, a part is kept that is spread evenly over
+            environments and time. A sample unit takes goals from this number of the newest stored episodes or
             transitions. Large numbers cost time only if the filter refuses nearly all goals.
         per: unit that gets a goal of its own. ``"transition"``: each transition, for learning from single
             transitions. ``"episode"``: each copy of a whole episode, for learning from sequences, as
             recurrent policies do; see :class:`~torchrl_her.HERWriter`.
-        n_steps: transitions reach over up to n steps: ``reward`` is the discounted sum of the rewards for
-            their goal, ``next`` is that of the last step, and ``steps_to_next_obs`` the number of steps,
-            by which TorchRL's losses discount. They end where the reward function terminates, or with the
+        n_steps: transitions span up to n steps: ``reward`` is the discounted sum of the rewards for their
+            goal, ``next`` is the one of the last step, and ``steps_to_next_obs`` the number of steps, by
+            which TorchRL's losses discount. Transitions end where the reward function terminates, or with the
             episode. Sutton and Barto, Reinforcement Learning, 2018, equation 7.1.
         gamma: the discount of these sums; needed with ``n_steps`` above 1, and the same as the loss's.
         filter_achieved: take no goal that was already achieved in the state before the action
-            (Filtered-HER). This asks the reward and not ``terminated``, since many environments never
-            terminate. If episodes continue at their goals, such transitions teach to stay there. Then a goal
-            is left out only if it was also achieved at the start of the episode, when nothing had moved yet.
+            (Filtered-HER). The reward decides, and not ``terminated``, since many environments never
+            terminate. If episodes continue at their goals, transitions at the goal teach the agent to stay
+            there. Then a goal is left out only if it was also achieved at the start of the episode, when
+            nothing had moved yet.
         redraw: True replaces a goal that the filter refuses by one that it keeps. False writes no virtual
             transition for it.
         achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved. A
@@ -72,7 +73,7 @@ class HindsightOptions:
             may be missing, and is not stored by the writer.
         real_goal_key: the goal that the task itself asked for, where another one was proposed in its place
             (:class:`~torchrl_her.behavior.BehaviorGoals`); the entry may be missing, and is left out like
-            those of ``exclude``. The source ``"actual"`` takes these.
+            those of ``exclude``. The source ``"actual"`` takes these goals.
         stage_key: key of the stage [..., 1] that an episode was played in, for writers with ``stages``.
         virtual_key: key of a bool [..., 1] that marks virtual transitions; None for no mark.
 
@@ -155,7 +156,7 @@ class HindsightOptions:
     def changed(self, changes: dict[str, Any]) -> HindsightOptions:
         """Returns the options with changes. Goal sources take the place of ``k`` and ``strategy``.
 
-        Without the sources that there were, ``k`` and ``strategy`` are the defaults, unless they are given.
+        If goal sources are taken away, ``k`` and ``strategy`` become the defaults, unless they are given.
 
         Raises:
             TypeError: there is no option of one of these names.
@@ -225,20 +226,20 @@ class HindsightBase:
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
-        options: None for the defaults.
+        options: options of relabeling; None for the defaults.
 
     Keyword Args:
-        weights: prefers some goals to others; None for all alike.
+        weights: weights by which goals are drawn; None for equal weights.
         **changes: options that differ from ``options``.
 
     Attributes:
-        options: as a whole; assign another :class:`~torchrl_her.HindsightOptions` to change them.
+        options: all options; assign another :class:`~torchrl_her.HindsightOptions` to change them.
         k, strategy, goal_sources, filter_achieved, achieved_reward: the options of that name; they can be
             set, too.
 
     Raises:
-        ValueError: an option that cannot be.
-        TypeError: an unknown option.
+        ValueError: an option is out of its range.
+        TypeError: an option is unknown.
     """
 
     k: int = _option("k")

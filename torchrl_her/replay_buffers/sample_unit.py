@@ -5,12 +5,12 @@ must stay small (a fifth of the transitions), if goals should be drawn anew each
 holds [T, N] transitions; prefer the writer if sampling must be as fast as possible.
 
 Why this is a ``SampleUnit``, and none of TorchRL's other hooks: a sampler that wraps another one is not a
-``PrioritizedSampler`` any more, and ``update_tensordict_priority`` then silently does nothing. A transform is
-not told which transitions it was given, as their index is added after all transforms. A subclass that
-relabels what ``_sample`` returns comes too late for transforms that use the goal. A ``SampleUnit`` is shown
-the index and the storage between drawing and reading, under the buffer's lock. It changes neither of them.
-The goals that it chose are put in by the collate function, which runs before all transforms. So sampler,
-index and priorities are those of the real transitions, and reading (``buffer[:]``) shows real ones.
+``PrioritizedSampler`` any more, and ``update_tensordict_priority`` then silently does nothing. A transform
+cannot know which transitions it gets, as their index is added after all transforms. A subclass that relabels
+what ``_sample`` returns comes too late for transforms that use the goal. A ``SampleUnit`` gets the index and
+the storage between drawing and reading, under the buffer's lock, and changes neither. The goals that it chose
+are put in by the collate function, which runs before all transforms. So sampler, index and priorities are
+those of the real transitions, and reading (``buffer[:]``) shows real ones.
 """
 
 from __future__ import annotations
@@ -108,13 +108,13 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     transition may take and, with the filter, that was not achieved before. A priority belongs to the real
     transition, whatever goal it had when the priority was computed.
 
-    With several ``goal_sources``, each gives its part of the virtual transitions. What was wanted or achieved
-    in recent episodes is what the newest stored transitions say, those of open episodes included.
+    With several ``goal_sources``, each gives its part of the virtual transitions. Goals of recent episodes
+    are read from the newest stored transitions, those of open episodes included.
 
-    After each write, the next batch looks through all that is stored for the ends of episodes.
+    After each write, sampling the next batch searches the whole storage for the ends of episodes.
 
-    Read stored transitions from the storage (``buffer.storage[:]``), not from the buffer. In a
-    ``ReplayBufferEnsemble``, which samples without its members' units, this raises an error, too.
+    Read stored transitions from the storage (``buffer.storage[:]``): the buffer itself raises an error if it
+    is read without sampling. So does a ``ReplayBufferEnsemble``, which samples without its members' units.
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated), for instance
@@ -122,23 +122,23 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         options: how transitions are relabeled; None for the defaults.
 
     Keyword Args:
-        weights: weights of goals, updated with those that were given; None if all goals are equal. It is
-            not told when the buffer is emptied, so call its ``clear`` then. It is not part of the buffer's
-            state but has a ``state_dict`` of its own.
+        weights: weights of goals, updated with the virtual goals that were chosen; None for equal weights.
+            Call their ``clear`` when you empty the buffer. The buffer's state does not contain them: save
+            their own ``state_dict``, too.
         generator: source of the random numbers; None for the buffer's (``buffer.set_rng``).
-        metadata: whether batches say where goals are from, under the names of TorchRL's units.
+        metadata: whether batches have entries on the origin of goals, named as in TorchRL's units.
             ``"step_offset"`` is the number of steps from a transition's first state to that in which its goal
             was achieved: 1 for what its own action achieved, and below 1 for goals of the past.
-            ``"validity_mask"`` tells where that counts: at virtual transitions whose goal is of their own
-            episode, those that fill up a slice excepted. Elsewhere the offset is 0. ``"anchor_index"`` is the
-            index in the storage.
+            ``"validity_mask"`` marks where the offset counts: at virtual transitions whose goal is of their
+            own episode, those that fill up a slice excepted. Elsewhere the offset is 0. ``"anchor_index"`` is
+            the index in the storage.
         **changes: options by name, as in the example; all are listed in
             :class:`~torchrl_her.HindsightOptions`.
 
     Raises:
-        ValueError: an option cannot be; when sampling, weights are negative or not finite, or the unit cannot
-            work beside another part of the buffer.
-        TypeError: an unknown option; when sampling, the storage holds no tensordicts.
+        ValueError: an option is out of its range; when sampling, weights are negative or not finite, or the
+            unit cannot work beside another part of the buffer.
+        TypeError: an option is unknown; when sampling, the storage holds no tensordicts.
         KeyError: when sampling, the storage lacks an entry.
         RuntimeError: the buffer is shared between processes; :meth:`relabel` was not handed to the buffer, or
             is given a batch for which no goals were chosen.
@@ -195,8 +195,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         self._stored: _Stored | None = None
         self._token = uuid4().hex
 
-    # Waits for ``relabel``, for each unit and thread: a buffer that prefetches draws several batches at once.
-    # It is kept here because unit and ``relabel`` may be copied to another process one by one (Ray).
+    # Goals for ``relabel``, by unit and thread, since a buffer that prefetches draws several batches at once.
+    # A class attribute, because unit and ``relabel`` may be copied to another process one by one (Ray).
     _chosen: ClassVar[dict[tuple[str, int], _Chosen]] = {}
 
     # TorchRL's hooks
@@ -307,7 +307,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return out
 
     def __getstate__(self) -> dict[str, Any]:
-        # As TorchRL does: a generator cannot be copied to another process. The storage can be read again.
+        # No generator, as in TorchRL, since none can be copied to another process; the storage is read again.
         return {**self.__dict__, "generator": None, "_stored": None}
 
     # The work

@@ -14,7 +14,7 @@ def slice_positions(
     Args:
         place: [B] int64, places in :class:`~torchrl_her.replay_buffers.EpisodeIndex`: those of a slice follow
             each other.
-        episode: [B] int64, what differs between episodes.
+        episode: [B] int64, a number that differs between episodes.
         ends: [B, 1] of bool, the last transitions of slices. Without them, slices that happen to follow each
             other are one.
         inside: [B] of bool, False where a slice was padded with its last transition; None for no padding.

@@ -18,9 +18,8 @@ class StageRule(NamedTuple):
     Attributes:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
         weighted: whether the weights of goals apply, and are updated with the goals that were written.
-        view: shows transitions [n] of any stage as this one would have
-            (:class:`~torchrl_her.curriculum.StageView`): those of all episodes are then written for this
-            stage. None for episodes that were played in it alone.
+        view: converts transitions [n] of any stage to this one (:class:`~torchrl_her.curriculum.StageView`):
+            all episodes are then written for this stage. None to write only those that were played in it.
     """
 
     reward_fn: RewardFunction
@@ -35,7 +34,7 @@ def split_stages(
 
     Args:
         rows: [n], transitions.
-        episodes: positions among them.
+        episodes: positions of the episodes in ``rows``.
         run: [E] int64, the run of each episode; None if there is only one.
         key: key of the stage [n, 1].
         stages: rules of the stages; empty if episodes have none.

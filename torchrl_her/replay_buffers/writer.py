@@ -105,7 +105,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         options: how transitions are relabeled; None for the defaults.
 
     Keyword Args:
-        weights: prefers some goals to others; None for equal weights. Weights are updated only after the
+        weights: weights by which goals are drawn; None for equal weights. Weights are updated only after the
             goals of a batch are drawn. For several runs a list, one for each run (``goal_weights``).
         runs: R.
         generators: R sources of random numbers; None for the buffer's, with one run only.
@@ -202,7 +202,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         self._recent = [RecentGoals.none(runs) for _ in range(max(1, len(self.stages)))]  # by stage
         self._episodes = 0  # copies of episodes ever written, if whole ones are
         self._process = os.getpid()
-        # Whether the rows held back come from a loaded state, or are over, and nothing was written since.
+        # Whether held-back rows come from a loaded state, or their episodes are over, without a write since.
         self._loaded = self._all_over = self._overfull = False
 
     @property
@@ -269,8 +269,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         """Writes all episodes that end in a batch.
 
         Args:
-            data: [N, T] with time last; or flat, with trajectory ids or environment ids, without which all of
-                it is one environment's. Within an environment, transitions are in the order of time.
+            data: [N, T] with time last; or flat, with trajectory ids or environment ids. Without ids, the
+                batch is one environment's. Within an environment, transitions are in the order of time.
 
         Returns:
             The index of each incoming transition in the storage, in the incoming shape; -1 if it is held
@@ -355,7 +355,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores the state that :meth:`state_dict` returned.
 
-        Episodes that were held back go on if the collector does
+        Episodes that were held back continue if the collector's state is restored, too
         (:func:`~torchrl_her.trainers.load_collector_state_dict`). They end if the next transitions do not
         continue them.
         """
@@ -384,7 +384,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     def empty_run(self, run: int) -> None:
         """Discards all rows of one of several runs, and its open episodes.
 
-        Call :func:`~torchrl_her.replay_buffers.empty_run`, which tells the sampler, too.
+        Call :func:`~torchrl_her.replay_buffers.empty_run` instead, which also empties the sampler.
         """
         self._rings.empty(run)
         self._counts.empty(run)
@@ -491,8 +491,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     def _commit(self, drafts: list[_Draft], places: Places) -> None:
         """Stores and counts real and virtual transitions, and notes where the real ones went.
 
-        If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out.
-        What is not ours is asked first: if it raises an error, nothing of the batch is stored or counted.
+        If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out. A
+        user's functions are called first: if one raises an error, nothing of the batch is stored or counted.
         """
         exclude = [*self._exclude, *in_root_and_next([self._keys.env_ids])]
 

@@ -198,8 +198,8 @@ def collector_state_dict(collector: BaseCollector) -> dict[str, Any]:
     """Returns the state of a collector between two batches, without its policy: counters and open episodes.
 
     TorchRL's own state leaves out open episodes, since most environments cannot continue them. If the
-    environment's state is restored too, a run continues exactly. Collectors in several processes do not
-    give their episodes away: they continue with new ones.
+    environment's state is restored too, a run continues exactly. Collectors in several processes do not give
+    their open episodes away: a restored one begins new episodes.
     """
     state = {name: value for name, value in collector.state_dict().items() if name != "policy_state_dict"}
     carrier = carrier_of(collector)
@@ -210,7 +210,7 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
     """Restores the state that :func:`~torchrl_her.trainers.collector_state_dict` returned.
 
     Args:
-        collector: made in the same way as the one that the state is of.
+        collector: made in the same way as the collector that returned the state.
         state: the state.
     """
     collector_state = {name: value for name, value in state.items() if name != "carrier"}
@@ -221,22 +221,22 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
     carrier: Any = carrier_of(collector)
     collected = TensorDict.from_dict(state["carrier"], batch_size=carrier.batch_size)
     set_carrier(collector, carrier.empty().update(collected))
-    if "traj_pool" in collector_state:  # TorchRL has drawn new ids, but the episodes have theirs
+    if "traj_pool" in collector_state:  # open episodes keep their ids; TorchRL drew new ones
         set_next_ids(collector, collector_state["traj_pool"])
 
 
 def buffer_state_dict(buffer: TensorDictReplayBuffer, *, copy: bool = True) -> dict[str, Any]:
     """Returns the state of a replay buffer: stored transitions, writer and sampler.
 
-    With it, the next batches are those of the unbroken buffer if the random numbers are, too. TorchRL's own
-    state has the size of the whole capacity, and with a prioritized sampler it holds objects that a safe load
-    refuses.
+    A restored buffer samples the same batches as an uninterrupted one, if the random numbers are the same.
+    TorchRL's own state has the size of the whole capacity, and with a prioritized sampler it holds objects
+    that a safe load refuses.
 
     Args:
         buffer: the buffer.
 
     Keyword Args:
-        copy: whether the transitions are copied. If not, save them before the buffer changes.
+        copy: whether the transitions are copied. If not, save the state before the buffer changes.
     """
     convert = torch.clone if copy else _alone
     blocks = [bounds_of_run(buffer, run) for run in range(runs_of(buffer))]
@@ -285,7 +285,7 @@ def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]
     """Restores the state that :func:`~torchrl_her.trainers.buffer_state_dict` returned.
 
     Args:
-        buffer: empty, and made in the same way as the one that the state is of.
+        buffer: empty, and made in the same way as the buffer that returned the state.
         state: the state.
 
     Raises:

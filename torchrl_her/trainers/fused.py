@@ -45,7 +45,7 @@ class FusedLearner:
             or float64, on the CPU.
         optimizer: a plain ``torch.optim.Adam`` over the loss module's parameters.
         target: update of the loss's target networks.
-        max_grad_norm: to which the gradients of each network of each run are clipped separately; all
+        max_grad_norm: norm to which the gradients of each network of each run are clipped separately; all
             critics count as one network.
         matmul_dtype: the type of the numbers that are multiplied between hidden layers of at least 32 units.
             ``"bfloat16"`` makes a step of 3 x 256 units in two thirds of the time on processors with
@@ -61,8 +61,8 @@ class FusedLearner:
 
     Raises:
         ValueError: the loss, its targets or the optimizer are set to what the fused steps do not do, see
-            :func:`~torchrl_her.trainers.why_not_fused`: use :class:`~torchrl_her.LossLearner`. Or there are
-            no such products for these weights.
+            :func:`~torchrl_her.trainers.why_not_fused`: use :class:`~torchrl_her.LossLearner`. Or
+            ``matmul_dtype`` does not fit these weights.
         CannotCompile: there is no C++ compiler, and no library in a wheel.
 
     Example:
@@ -175,7 +175,7 @@ class FusedLearner:
                 for step in range(1, steps + 1)
             ]
 
-        # As its step() would: schedulers of learning rates check it.
+        # The optimizer's step() would set this, and schedulers of learning rates check it.
         self.optimizer._opt_called = True  # type: ignore[attr-defined]
         return (kind * (steps * self.runs))(
             *(entry for run in range(self.runs) for entry in numbers(counts[run % len(counts)]))

@@ -30,7 +30,7 @@ class FusedCall:
     """Arguments of one compiled update. Attributes keep the memory alive to which the arguments point.
 
     Args:
-        loss: whose numbers are read anew for each update, since they may be scheduled.
+        loss: its options are read anew for each update, since they may be scheduled.
         fused: names of its networks, and the steps.
         kinds: the structures for the type of the weights.
         rows: [R, S * B] transitions of R runs.
@@ -39,8 +39,8 @@ class FusedCall:
         actor: layers of the actor.
 
     Raises:
-        ValueError: an entry has another width, a discrete action is none of those that there are, or the loss
-            was set to leave out more quantiles than there are.
+        ValueError: an entry has another width, a discrete action is out of range, or the loss was set to
+            leave out more quantiles than there are.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ def layers_of(net: nn.Module) -> list[Layer] | None:
     """Returns the layers of one of this library's networks, from its input on; None if others occur.
 
     The tensors of the layers, in the same order, are those of ``net.state_dict()``: weight and bias, behind
-    them scale and shift of a normalization, and the running mean and variance of one of batches.
+    them scale and shift of a normalization, and the running mean and variance of a batch normalization.
 
     Args:
         net: exactly one of this library's types, since a subclass may compute something else.

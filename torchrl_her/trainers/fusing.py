@@ -37,7 +37,7 @@ class FusedLoss:
     Attributes:
         algorithm: the steps.
         actor_net: type of the actor's network.
-        losses: the names of what is measured.
+        losses: the names of the measured losses.
         fixed: attributes of the loss and the values that they must have, besides those of all losses.
         actor: the attribute of the actor, or of the values of discrete actions.
         critic: the attribute of the critic or critics, None if there is none.

@@ -22,8 +22,8 @@ class GraphLearner(LossLearner):
 
     A gradient step of small networks is hundreds of small kernels, each of which takes longer to launch than
     to run. Here the kernels of several steps are recorded as a CUDA graph and then launched together. The
-    first update with a number of steps is made without a graph. ``torch.compile`` makes fewer and larger
-    kernels of them before.
+    first update with each number of steps is made without a graph. Before kernels are recorded,
+    ``torch.compile`` makes fewer and larger ones of them.
 
     A graph repeats kernels with the numbers that Python gave them when they were recorded. So gamma, tau, and
     all other options of the loss, the targets and the optimizer must stay as they are, but for the learning
@@ -131,7 +131,7 @@ class _Recorded:
     """Function that is called directly at first, then recorded as a CUDA graph, and launched from then on.
 
     Args:
-        call: always computes the same of rows of the same shape.
+        call: function that makes the same computation for all rows of the same shape.
         device: GPU on which it runs.
         generators: generators of its random numbers, besides torch's own.
     """

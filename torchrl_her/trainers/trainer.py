@@ -95,12 +95,12 @@ class Trainer:
     one batch, and one replay buffer holds the rows of all runs.
 
     Args:
-        collector: yields batches [R * E, T] that the exploring policy played. One that
-            :class:`CollectsAhead` collects the next batch while this loop learns from the last one.
+        collector: yields batches [R * E, T] that the exploring policy played. With :class:`CollectsAhead` it
+            collects the next batch while this loop learns from the last one.
         buffer: replay buffer: for one run any, usually with a :class:`~torchrl_her.HERWriter`; for several
             one whose writer (``HERWriter(..., runs=R)``) and sampler are for R runs. With demonstrations a
             :class:`~torchrl_her.demonstrations.MixedReplay`.
-        learner: learns from what is sampled.
+        learner: learns from sampled rows.
         schedules: take a step after each epoch, for example exploration and weights of goals.
 
     Keyword Args:
@@ -115,7 +115,7 @@ class Trainer:
         batch_size: transitions in a gradient step of one run.
         batches_per_sample: gradient steps whose transitions are drawn in one call. Priorities that change
             during these steps count from the next call on.
-        average: follows the policy that learns, after each update.
+        average: average of the policy's weights, which is moved after each update.
 
     Raises:
         ValueError: a number is too small, or the buffer is for another number of runs; when running, a batch
@@ -184,7 +184,7 @@ class Trainer:
     def run(self, frames: int, on_batch: Callable[[Trainer], None] | None = None) -> dict[str, Tensor]:
         """Collects and learns for a number of frames of each run, rounded up to whole batches.
 
-        Episodes that are open at the end go on in the next call, unless that is an epoch.
+        Episodes that are open at the end continue in the next call, unless that is a call of :meth:`epoch`.
         """
         measured: list[dict[str, Tensor]] = []
         before = self.frames

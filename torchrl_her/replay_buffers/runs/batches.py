@@ -63,7 +63,7 @@ class Batch:
         """Returns the transitions that were held back, followed by these.
 
         Raises:
-            ValueError: their environments are distinguished by something else.
+            ValueError: the environments of both are distinguished by different properties.
         """
         if len(held) == 0:
             return self

@@ -42,8 +42,8 @@ class RunCounts:
         runs: R.
 
     Attributes:
-        counts: R, since each run was last emptied.
-        totals: R, ever.
+        counts: R counts, each since its run was last emptied.
+        totals: R counts of all transitions ever written.
 
     Example:
         >>> run_counts = RunCounts(2)

@@ -53,11 +53,11 @@ def split_runs(
     Args:
         episodes: episodes, run after run.
         run: [E] int64, ascending: the run of each episode, of R; None if there is only one.
-        settings: R, one of each run: only episodes of runs with the same are written at once.
+        settings: R settings, one of each run; only runs with equal settings share a piece.
 
     Keyword Args:
-        each: entries of the table of a single run's episodes. One episode may have more.
-        together: entries of the table of several runs' episodes.
+        each: most entries in the table of a single run's episodes. One episode may have more.
+        together: most entries in the table of several runs' episodes.
     """
     if len(episodes.lengths) == 0:
         return

@@ -100,7 +100,7 @@ class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
     Args:
         capacity: rows of each run's block.
         alpha: how much priorities count; 0 for not at all.
-        beta: how far the weights make up for that; 1 for all of it.
+        beta: how far importance weights make up for priorities; 1 for fully.
 
     Keyword Args:
         runs: R.

@@ -19,9 +19,9 @@ class SumTrees:
     """Sum trees of R runs, drawn from and updated together in a few tensor operations.
 
     Each run has ``capacity`` leaves, which are at least 0. Each node above holds the sum of its 16 children.
-    A draw goes down from the top: at each node it takes the child in which its random number lies. Leaves
-    and sums have single precision, the rest of the random number has double precision: even each of a
-    million equal leaves is drawn equally often.
+    A draw goes down from the top: at each node it takes the child in which its random number lies. Leaves and
+    sums have single precision. The random number has double precision on its way down, so that even a million
+    equal leaves are drawn equally often.
 
     Args:
         capacity: number of leaves of each run.

@@ -58,10 +58,10 @@ class WrittenRows:
 
 
 def real_rows(chunk: Chunk, *, first_id: int) -> WrittenRows:
-    """Returns all transitions of a chunk, for the goals that were wanted.
+    """Returns all transitions of a chunk, for their desired goals.
 
-    Where whole episodes are written, those that were ended from outside are truncated, so that samplers of
-    slices see their end.
+    If whole episodes are written, those ended by a reset from outside are truncated, so that samplers of
+    slices find their end.
 
     Args:
         chunk: Episodes of m runs.
@@ -91,9 +91,9 @@ def virtual_rows(chunk: Chunk, source: Tensor, goals: Tensor, *, first_id: int) 
     """Returns copies of a chunk's transitions, each for a virtual goal.
 
     Over several steps, a transition ends where it terminates: by the reward function, or because the episode
-    did so although its goal was not achieved. What such a failure cost besides the goal's reward is kept.
-    Copies of whole episodes end where the reward function terminates them, and are truncated at the
-    episode's end otherwise.
+    did so although its goal was not achieved. The cost of such a failure, besides the goal's reward, is kept.
+    Copies of whole episodes end where the reward function terminates them, and are truncated at the episode's
+    end otherwise.
 
     Args:
         chunk: Episodes of m runs.
