@@ -2,8 +2,8 @@
 
     python recipes/one_file_cher.py --seed 0    # about a minute; 96 to 100 % at the end
 
-Everything that a run needs is here, from the library's parts alone: the environment as its stage shows it,
-the writer that relabels, the networks, the loop of collection and gradient steps, and the change of stage.
+The file has all that a run needs, and uses only parts of the library: the environment in its stage, the
+writer that relabels, the networks, the loop of collection and gradient steps, and the change of stage.
 The package ``torchrl_her_recipes`` adds options, several runs at once, checkpoints and reports.
 
 Filtered-HER and CHER: Manela, Deep Reinforcement Learning for Complex Manipulation Tasks with Sparse
@@ -58,7 +58,7 @@ class Options:
     epochs: int = 30
     epoch_frames: int = 10_240
     num_envs: int = 64
-    steps_per_batch: int = 10  # steps of each environment
+    steps_per_batch: int = 10  # steps of each environment between gradient steps
     frames_per_update: int = 5
     warmup_frames: int = 3_200
     episodes: int = 100  # episodes of an evaluation
@@ -76,11 +76,11 @@ class Options:
     learning_rate: float = 1e-3
     gamma: float = 0.98
     tau: float = 0.02
-    action_penalty: float = 0.3  # keeps tanh from its ends, where its gradient vanishes
+    action_penalty: float = 0.3  # keeps the actor's tanh from its ends, where the gradient vanishes
     max_grad_norm: float = 3.0
     ema_decay: float = 0.9995  # decay of the average of weights that is evaluated
-    # Exploration: a share epsilon of the actions has noise, a fifth of it is uniform
-    epsilon_decay: float = 0.9  # each epoch
+    # Exploration: of a share epsilon of the actions, a fifth is uniform, and the others have noise
+    epsilon_decay: float = 0.9  # factor of epsilon after each epoch
     epsilon_end: float = 0.05
     noise: float = 0.05
 
@@ -102,10 +102,10 @@ def make_stages() -> CurriculumProgress:
 
 
 def make_staged_env(progress: CurriculumProgress, num_envs: int, seed: int) -> EnvBase:
-    """Returns environments that show the observation and the goals of the present stage.
+    """Returns environments whose observation and goals are those of the present stage.
 
-    ``StateToObs`` takes them out of the state and rewards the stage's goal. ``ZeroPad`` writes ``input``,
-    which has each entry at the same place in all stages, and zeros for those that a stage does not use.
+    ``StateToObs`` reads observation and goals from the state, and rewards the stage's goal. ``ZeroPad``
+    writes ``input``, where an entry has the same place in all stages; unused entries are 0.
     """
     stages = StateToObs(progress.curriculum, progress), ZeroPad(progress.curriculum, progress)
     return TransformedEnv(make_env("hand_v1", num_envs=num_envs, seed=seed), Compose(*stages))
@@ -114,7 +114,7 @@ def make_staged_env(progress: CurriculumProgress, num_envs: int, seed: int) -> E
 def make_network(
     make: Callable[..., TensorDictModule], curriculum: Curriculum, hidden: int
 ) -> TensorDictModule:
-    """Returns an actor or a critic whose weights of inputs that the first stage does not use are 0."""
+    """Returns an actor or a critic. If the first stage does not use an input, its weights begin at 0."""
     shape = NetworkShape(hidden=hidden, norm="layer")
     network = make([curriculum.input_width], 3, shape=shape, in_keys=["input"])
     first = next(module for module in network.modules() if isinstance(module, StackedLinear))
@@ -123,7 +123,7 @@ def make_network(
 
 
 def make_buffer(options: Options, progress: CurriculumProgress) -> TensorDictReplayBuffer:
-    """Returns a replay buffer that relabels what is written and prefers transitions with a large error."""
+    """Returns a replay buffer that relabels written transitions and prefers those with a large TD error."""
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(options.capacity),
         sampler=PrioritizedSampler(
@@ -133,12 +133,12 @@ def make_buffer(options: Options, progress: CurriculumProgress) -> TensorDictRep
             progress.stage_of(0).reward_fn or GoalReward(0.1),
             k=options.k,
             strategy="future",
-            filter_achieved=True,  # no goals that were achieved before the action
+            filter_achieved=True,  # leaves out goals that were achieved before the action
             exclude=("state", "input"),
         ),
         priority_key="td_error",
     )
-    buffer.append_transform(ZeroPad(progress.curriculum, progress))  # ``input`` depends on the virtual goal
+    buffer.append_transform(ZeroPad(progress.curriculum, progress))  # ``input`` contains the virtual goal
     return buffer
 
 
@@ -182,9 +182,7 @@ def train(options: Options) -> Iterator[Evaluation]:
     for epoch in range(1, options.epochs + 1):
         while frames < epoch * options.epoch_frames:
             batch = collector.next()
-            buffer.extend(
-                batch
-            )  # writes the episodes that have ended, each transition for its own and k goals
+            buffer.extend(batch)  # writes ended episodes: each transition with its own goal and with k others
             frames += batch.numel()
             if frames < options.warmup_frames:
                 updates = frames // options.frames_per_update

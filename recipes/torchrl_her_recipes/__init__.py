@@ -1,7 +1,7 @@
 """Recipes: whole training runs composed of the library and the tasks.
 
-Names are loaded when they are first used (they are listed in ``__init__.pyi``): asking for the list of
-tasks must not import torch.
+The names, listed in ``__init__.pyi``, are loaded when they are first used, so that a list of tasks does not
+import torch.
 """
 
 import lazy_loader

@@ -122,7 +122,7 @@ def _make_writer(options: HindsightConfig, env: EnvBase, **others: Any) -> HERWr
 
 
 def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) -> list[StageRule] | None:
-    """Returns each stage's rules for relabeling; None if stages belong to runs and not to single episodes.
+    """Returns each stage's rules for relabeling if each episode has a stage of its own, else None.
 
     Args:
         every: whether episodes are written for all stages.

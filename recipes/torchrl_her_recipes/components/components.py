@@ -42,7 +42,7 @@ class Components(Agent):
     Attributes:
         recipe: recipe of the components.
         env: batched training environments, one block of equal size for each of the R runs. If other processes
-        collect, a block is one environment.
+            collect, a block is one environment.
         eval_env: batched environments for evaluation: R equal blocks.
         actor: the greedy policy. With ``normalize=true`` it is a
             :class:`~torchrl_her.modules.NormalizedPolicy`, and losses take its ``actor``.

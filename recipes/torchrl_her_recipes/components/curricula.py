@@ -31,7 +31,7 @@ class CurriculumState:
     Attributes:
         progress: the stage of each run.
         stage_env: environments for evaluation at the goals of the runs' stages; None if each episode has a
-        stage of its own.
+            stage of its own.
     """
 
     progress: CurriculumProgress

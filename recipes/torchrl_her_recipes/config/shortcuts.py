@@ -109,7 +109,7 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
         name: short (``seed``), with its group (``run.seed``), or a group (``task``) in place of its ``name``.
             Options of some groups (``demonstrations.file``) have no short name.
         values: Options that are set. If several groups have the short name, their choices decide, the first
-        values first.
+            values first.
 
     Raises:
         ValueError: the option does not exist, or its short name is not unique; the message suggests names.

@@ -34,7 +34,7 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     learner, sources = groups.learner, groups.hindsight.sources
     takes, with_task = get_task_spec(groups.task.name).options, f"with task={groups.task.name}"
     yield "threshold" not in takes, with_task, ["task.threshold"]
-    # Episodes of such tasks end at their goals in any case.
+    # Tasks without this option end their episodes at goals in any case, so that nothing is a failure.
     yield "termination" not in takes, with_task, ["task.failure"]
     yield "dtype" not in takes, with_task, ["run.dtype"]
 

@@ -284,8 +284,8 @@ def export_policy(
         source: The policy, as for :meth:`Policy.load`.
         out: The file; its suffix ``.safetensors`` or ``.onnx`` is its format, see :meth:`Policy.save`.
         run: Index of the run, if the folder has several side by side; the run with the median success if
-        None.
-            task: Name of the task that the policy is for, if not the run's own. Its observations, goals and
+            None.
+        task: Name of the task that the policy is for, if not the run's own. Its observations, goals and
             actions must have the same widths.
         best: Whether to take the policy of the evaluation with the best median success, not the last.
         card: Whether a model card is written beside the file, with the suffix ``.md``.

@@ -102,7 +102,7 @@ def run_state(parts: dict[str, Any], *, buffer: bool = True) -> dict[str, Any]:
 
     Keyword Args:
         buffer: whether to include transitions, of demonstrations too; a run cannot continue without them.
-        They are views of the buffer: save them before it changes.
+            They are views of the buffer: save them before it changes.
     """
     return {name: part.state_dict() if buffer or name not in _ROWS else None for name, part in parts.items()}
 

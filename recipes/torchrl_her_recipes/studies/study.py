@@ -33,8 +33,8 @@ class StudyResult:
 
     Attributes:
         figure: the picture of a study, if all its runs are done.
-        successes: success of each run in its last evaluation, by the name of the combination (of several
-            options), or of the single run. Combinations with unfinished runs are left out.
+        successes: success of each run in its last evaluation, by the name of its combination or single run.
+            Combinations with unfinished runs are left out.
         failed: reasons of failures, by the label of the job. Other jobs are run nevertheless.
         interrupted: whether the study was stopped; it can be resumed.
     """
@@ -132,7 +132,7 @@ def _note(runs: Mapping[str, Recipe]) -> str:
 
 
 def draw_study(study: Study, folder: Path) -> Path:
-    """Draws metrics over environment steps: a panel for each task, with a curve for each combination."""
+    """Draws metrics over environment steps: a panel for each task, a curve for each combination on it."""
     path = folder / f"{study.name}.png"
     panels: dict[str, dict[str, list[dict[str, float]]]] = {}
     for label, recipe in study.cells():
