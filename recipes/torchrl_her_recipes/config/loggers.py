@@ -17,8 +17,8 @@ class LoggerSpec:
         name: name of the logger, and of its folder in the run's folder.
         factory: function that opens it, as ``module:function``; it is imported when a run begins. It is
             called with the :class:`~torchrl_her_recipes.RunView` and a number of frames. It removes what was
-            logged after this number of frames. It returns a TorchRL ``Logger`` and the number of frames up to
-            which this logger already has the rows of the metrics table: 0 for a new one.
+            logged after this number of frames. It returns a TorchRL ``Logger`` and the number of frames up
+            to which the rows of the metrics table are logged already: 0 for a new logger.
         needs: the package that it needs, which is also the name of the extra; empty for none.
     """
 

@@ -75,7 +75,7 @@ class RunFolder:
     def at_work(self, *, wait: float = 0.0) -> Iterator[None]:
         """Keeps other processes from training into the folder, and removes unfinished files of a killed run.
 
-        The folder is free again when the process ends, even if it is killed. A process may nest this.
+        The folder is free again when the process ends, even if it is killed. One process may nest calls.
 
         Args:
             wait: seconds to wait for another process to end; one that lost its parent first saves its run.

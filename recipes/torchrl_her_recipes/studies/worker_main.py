@@ -1,7 +1,7 @@
 """Worker process: runs the jobs from its standard input, one after the other, until the input ends.
 
-If the input ends in the middle of a job, the process saves its run and ends. So it also stops if
-the process that started it is gone.
+If the input ends in the middle of a job, the process saves the run and ends. So it also stops if the
+process that started it is gone.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class Workers(Protocol):
 class LocalWorkers:
     """Worker processes on this machine, each of which does one job at a time; see :class:`Workers`.
 
-    Each process is in its own session, so that Ctrl-C does not reach it: it is stopped by :meth:`stop`.
+    Each process is in its own session, so that Ctrl-C never interrupts it: :meth:`stop` lets it save first.
 
     Args:
         at_once: number of processes; by default one for each core.
