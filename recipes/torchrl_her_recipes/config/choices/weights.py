@@ -26,7 +26,7 @@ WEIGHTS = Kind("weights", Weights, default="none")
 
 @dataclass(frozen=True, kw_only=True)
 class Equal(Weights):
-    """Gives all goals equal weight, and counts them for the metric ``kl`` if their range is known."""
+    """Gives all goals equal weight; counts goals of a known range, for the metric kl."""
 
     name = "none"
     maker = f"{_MAKERS}:make_counts"
